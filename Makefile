@@ -1,0 +1,78 @@
+# Every target makes what it needs: on a machine with Python 3.11 to 3.13 and a C compiler,
+# `make demo` and `make test` work in a fresh clone. A second call installs nothing.
+#
+#   make demo       the ice varves, from the model to its posterior
+#   make test       format, lint, types, tests
+#   make slow       the long statistical checks
+#   make examples   run every file under examples/
+#   make docs       the documentation, notebooks executed, warnings are errors
+#   make bench      speed against plain C and other packages
+#   make format     put the code into shape
+#   make clean      remove what the build made (the environment stays)
+#
+# PYTHON=... chooses the interpreter, VENV=... the environment, WORKERS=... the parallel tests.
+
+PYTHON  ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,$(shell command -v $(p) 2>/dev/null)))
+VENV    ?= .venv
+WORKERS ?= 2
+BIN     := $(VENV)/bin
+PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+export MPLBACKEND ?= Agg
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test slow examples docs bench format clean
+
+help:
+	@sed -n 's/^#   //p' Makefile
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "no Python found: install Python 3.11, or say PYTHON=/path/to/python3.11"; exit 1; }
+	$(PYTHON) -c 'import sys; ok = (3, 11) <= sys.version_info[:2] < (3, 14); sys.exit(0 if ok else "ssmppl needs Python 3.11 to 3.13; say PYTHON=/path/to/python3.11")'
+	$(PYTHON) -m venv $(VENV)
+
+# One stamp per set of packages; the package itself is installed in place.
+$(VENV)/.installed-run: pyproject.toml | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[dev]'
+	@touch $@ $(VENV)/.installed-run
+
+$(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[docs]'
+	@touch $@ $(VENV)/.installed-run
+
+demo: $(VENV)/.installed-run
+	$(BIN)/ssmppl demo
+
+test: $(VENV)/.installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q -n $(WORKERS)
+
+slow: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -q -n $(WORKERS) -m slow || test $$? -eq 5
+
+examples: $(VENV)/.installed-run
+	@set -e; for file in $(sort $(wildcard examples/*.py)); do \
+	    echo "== $$file"; $(BIN)/python $$file; \
+	done
+
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+bench: $(VENV)/.installed-dev
+	@set -e; for file in $(sort $(wildcard bench/bench_*.py)); do \
+	    echo "== $$file"; $(BIN)/python $$file; \
+	done
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:
+	rm -rf build dist docs/_build docs/generated bench/build .mypy_cache .pytest_cache .ruff_cache
+	find ssmppl tests docs -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,58 @@
+"""Series embedded in the package, for examples and tests.
+
+Every loader returns plain NumPy arrays, and reads the file afresh: what it returns may be changed.
+"""
+
+import csv
+from importlib import resources
+
+import numpy as np
+
+__all__ = ["ice_varves", "lgss_appendix", "lgss_main_text", "load", "names"]
+
+
+def names() -> tuple[str, ...]:
+    """Names that `load` knows."""
+    files = (entry.name for entry in resources.files(__name__).iterdir())
+    return tuple(sorted(name.removesuffix(".csv") for name in files if name.endswith(".csv")))
+
+
+def load(name: str) -> dict[str, np.ndarray]:
+    """Columns of an embedded data set, each of shape (T,), under their names in the file."""
+    known = names()
+    if name not in known:
+        raise ValueError(f"no data set is called {name!r}; there are {', '.join(known)}")
+    with resources.files(__name__).joinpath(f"{name}.csv").open(encoding="utf-8", newline="") as f:
+        header, *rows = csv.reader(f)
+    columns = np.array(rows, dtype=np.float64).T
+    return {column: values.copy() for column, values in zip(header, columns, strict=True)}
+
+
+def ice_varves() -> np.ndarray:
+    """Thickness of 634 yearly layers of glacial sediment (varves) in Massachusetts, shape (634,).
+
+    The layers were laid down over 634 years from about 11,800 years ago; thick layers mark warm
+    years. The series is that of Shumway and Stoffer, *Time Series Analysis and Its Applications*
+    (3rd edition, Springer 2011), analysed with a Gamma observation model by Langrock, *Journal of
+    Applied Statistics* 38 (2011), and by Schön et al., "Sequential Monte Carlo methods for system
+    identification" (2015).
+    """
+    return load("ice_varves")["y"]
+
+
+def lgss_main_text() -> np.ndarray:
+    """A simulated linear Gaussian series, shape (100,).
+
+    x_1 ~ N(0, 1/(0.51 theta)), x_{t+1} = 0.7 x_t + N(0, 1/theta), y_t = 0.5 x_t + N(0, 0.1) with
+    variances as second arguments and theta = 1: the example in the main text of Schön et al.
+    (2015). Simulated anew from these laws; it is not the series plotted there.
+    """
+    return load("lgss_main_text")["y"]
+
+
+def lgss_appendix() -> np.ndarray:
+    """A simulated linear Gaussian series, shape (100,).
+
+    As `lgss_main_text`, with y_t = x_t + N(0, 0.1), as in the appendix of Schön et al. (2015).
+    """
+    return load("lgss_appendix")["y"]
