@@ -1,0 +1,114 @@
+"""Errors of ssmppl: one class per whose-fault-it-is, each saying where, what was found and the fix.
+
+==================  =========================================================================
+class               whose fault, and what its message names
+==================  =========================================================================
+ModelError          the model file: function, file, line, what was found, what to write
+DataError           the data: data set, variable, row (and column), the value, what to change
+ArgumentError       the call: the argument, its value, the valid options
+SamplingError       the numbers at run time: time step, site, the user's line, parameter values
+==================  =========================================================================
+
+Everything derives from `SSMError`, so that `except ssm.SSMError` catches all of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import linecache
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Location:
+    """A place in the user's source: file, line and the function that holds it."""
+
+    file: str
+    line: int
+    function: str = ""
+
+    @property
+    def text(self) -> str:
+        """The source line itself, stripped; empty where the file is not at hand."""
+        return linecache.getline(self.file, self.line).strip()
+
+    def __str__(self) -> str:
+        inside = f" in {self.function}()" if self.function else ""
+        return f'File "{self.file}", line {self.line}{inside}'
+
+
+class SSMError(Exception):
+    """Base of every error that ssmppl raises on purpose.
+
+    Parameters
+    ----------
+    found : what is wrong, with the value or name that was found.
+    fix : what to write or change instead.
+    where : place in the user's source or data, if there is one.
+    """
+
+    def __init__(self, found: str, *, fix: str = "", where: Location | str | None = None):
+        self.found, self.fix, self.where = found, fix, where
+        lines = []
+        if where is not None:
+            lines.append(str(where))
+            if isinstance(where, Location) and where.text:
+                lines.append(f"    {where.text}")
+        lines.append(found)
+        if fix:
+            lines.append(f"Fix: {fix}")
+        super().__init__("\n".join(lines))
+
+    def __reduce__(self):  # exceptions cross process borders when an Executor runs chains
+        return _rebuild, (type(self), self.found, self.fix, self.where)
+
+
+def _rebuild(cls: type[SSMError], found: str, fix: str, where: Location | str | None) -> SSMError:
+    return cls(found, fix=fix, where=where)
+
+
+class ModelError(SSMError):
+    """The model as written breaks a rule of the language."""
+
+
+class UnsupportedOperation(ModelError, TypeError):
+    """An operation on symbols that has no symbolic meaning (a Python `if`, `float(x)`, ...)."""
+
+
+class DataError(SSMError):
+    """The data do not fit the model."""
+
+
+class ArgumentError(SSMError, ValueError):
+    """An argument of a verb is out of range, unknown or contradicts another."""
+
+
+class SamplingError(SSMError):
+    """Something went wrong numerically while an algorithm ran."""
+
+
+@dataclass(frozen=True)
+class NotApplicable:
+    """The outcome of an analysis that does not apply: the reason and the line it stems from."""
+
+    reason: str
+    where: Location | None = None
+
+    def __bool__(self) -> bool:
+        return False
+
+    def __str__(self) -> str:
+        return f"{self.reason} ({self.where})" if self.where else self.reason
+
+
+def nearest_first(name: str, known: Iterable[str]) -> list[str]:
+    """`known` with the spellings closest to `name` first."""
+    known = list(known)
+    score = {k: difflib.SequenceMatcher(None, name.lower(), k.lower()).ratio() for k in known}
+    return sorted(known, key=lambda k: (-score[k], k))
+
+
+def listing(name: str, known: Iterable[str]) -> str:
+    """`known` as text, nearest spelling to `name` first; "none" when empty."""
+    return ", ".join(nearest_first(name, known)) or "none"

@@ -1,0 +1,1 @@
+"""Symbols without probability: expressions, their derivatives, algebraic forms and meaning."""
