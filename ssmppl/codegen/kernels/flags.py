@@ -1,0 +1,63 @@
+"""Compiler flags shared by every kernel.
+
+LLVM's fast-math flags are given one by one.  ``nnan`` and ``ninf`` are never set: with them
+a weight of -inf or a NaN from the user's model is undefined behaviour.  With the flags below
+NaN and infinities keep their meaning, and only the last digits may depend on the width of
+the vector registers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+import numba
+import numpy as np
+
+FAST = frozenset({"reassoc", "contract", "arcp", "nsz", "afn"})
+"""For loops over particles: sums may be reordered (so that they vectorise), a*b+c fused."""
+
+PRECISE = frozenset({"contract", "nsz"})
+"""For polynomials with an argument reduction: fused multiply-add, but no reordering."""
+
+
+def _decorator(**options: Any) -> Callable[[Callable], Any]:
+    compile_function = numba.njit(
+        nogil=True, error_model="numpy", boundscheck=False, **options
+    )
+
+    def decorate(function: Callable) -> Any:
+        if numba.config.DISABLE_JIT:
+            return _interpreted(function)
+        return compile_function(function)
+
+    return decorate
+
+
+def _interpreted(function: Callable) -> Callable:
+    """`function` in plain Python, for debugging, with the arithmetic of the compiled code.
+
+    Unsigned words wrap around and 1/0 is inf: NumPy does that, with a warning, where
+    Python's own float would raise.
+    """
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return function(*(np.float64(a) if isinstance(a, float) else a for a in args))
+
+    return call
+
+
+kernel = _decorator(fastmath=set(FAST))
+"""Decorator of passes over particles."""
+
+precise = _decorator(fastmath=set(PRECISE), forceinline=True)
+"""Decorator of scalar functions that are to vectorise where they are called.
+
+Inlining is forced, because a loop with a call in it does not vectorise.
+"""
+
+exact = _decorator()
+"""Decorator of functions in which the order of the operations is part of the method."""
