@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from ssmppl import datasets
+from ssmppl.errors import ArgumentError
 
 
 def test_names_are_the_loaders():
@@ -32,7 +33,7 @@ def test_loaded_arrays_belong_to_the_caller():
 
 
 def test_unknown_name_lists_the_known_ones():
-    with pytest.raises(ValueError, match="varve.*ice_varves, lgss_appendix, lgss_main_text"):
+    with pytest.raises(ArgumentError, match=r"'varves'.*\n.*ice_varves, "):
         datasets.load("varves")
 
 

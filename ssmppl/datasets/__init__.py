@@ -8,6 +8,8 @@ from importlib import resources
 
 import numpy as np
 
+from ssmppl.errors import ArgumentError, listing
+
 __all__ = ["ice_varves", "lgss_appendix", "lgss_main_text", "load", "names"]
 
 
@@ -21,9 +23,11 @@ def load(name: str) -> dict[str, np.ndarray]:
     """Columns of an embedded data set, each of shape (T,), under their names in the file."""
     known = names()
     if name not in known:
-        raise ValueError(f"no data set is called {name!r}; there are {', '.join(known)}")
-    with resources.files(__name__).joinpath(f"{name}.csv").open(encoding="utf-8", newline="") as f:
-        header, *rows = csv.reader(f)
+        raise ArgumentError(
+            f"no embedded data set is called {name!r}.", fix=f"there are {listing(name, known)}"
+        )
+    text = resources.files(__name__).joinpath(f"{name}.csv").read_text(encoding="utf-8")
+    header, *rows = csv.reader(text.splitlines())
     columns = np.array(rows, dtype=np.float64).T
     return {column: values.copy() for column, values in zip(header, columns, strict=True)}
 
@@ -31,11 +35,11 @@ def load(name: str) -> dict[str, np.ndarray]:
 def ice_varves() -> np.ndarray:
     """Thickness of 634 yearly layers of glacial sediment (varves) in Massachusetts, shape (634,).
 
-    The layers were laid down over 634 years from about 11,800 years ago; thick layers mark warm
-    years. The series is that of Shumway and Stoffer, *Time Series Analysis and Its Applications*
-    (3rd edition, Springer 2011), analysed with a Gamma observation model by Langrock, *Journal of
-    Applied Statistics* 38 (2011), and by Schön et al., "Sequential Monte Carlo methods for system
-    identification" (2015).
+    One layer for each year from 9883 to 9250 BC; changes of thickness indicate changes of
+    temperature. The series is that of Shumway and Stoffer, *Time Series Analysis and Its
+    Applications* (3rd edition, Springer 2011). Langrock, *Journal of Applied Statistics* 38 (2011),
+    gave it the Gamma observation model that Schön et al., "Sequential Monte Carlo methods for
+    system identification" (2015), and the examples here use.
     """
     return load("ice_varves")["y"]
 

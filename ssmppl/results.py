@@ -1,0 +1,299 @@
+"""Arrays in, labelled results out: xarray Datasets, and ArviZ's container of posterior draws.
+
+ArviZ 0.2x keeps groups in its own `InferenceData`; ArviZ 1.x in an `xarray.DataTree`. The groups
+are xarray Datasets under both, so they are built here once, and only the container differs.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError, listing
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+__all__ = ["arviz", "save", "summary", "to_dataset", "to_inference_data"]
+
+SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
+
+# What a netCDF attribute may hold in the 64 KB that HDF5 leaves for one; longer text is cut.
+LONGEST_ATTRIBUTE = 60_000
+
+
+def to_inference_data(
+    *,
+    posterior: Mapping[str, np.ndarray] | None = None,
+    sample_stats: Mapping[str, np.ndarray] | None = None,
+    observed_data: Mapping[str, np.ndarray] | None = None,
+    constant_data: Mapping[str, np.ndarray] | None = None,
+    log_likelihood: Mapping[str, np.ndarray] | None = None,
+    prior: Mapping[str, np.ndarray] | None = None,
+    posterior_predictive: Mapping[str, np.ndarray] | None = None,
+    over_time: Collection[str] = (),
+    time: Any = None,
+    dims: Mapping[str, Sequence[str]] | None = None,
+    coords: Mapping[str, Any] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+) -> Any:
+    """ArviZ InferenceData of a run; under ArviZ 1.x an `xarray.DataTree` with the same groups.
+
+    Groups that are None or empty are left out.
+
+    Parameters
+    ----------
+    posterior, sample_stats, prior
+        Arrays of shape (chain, draw, ...); (chain, draw, T, ...) for the names in `over_time`.
+    log_likelihood, posterior_predictive
+        Arrays of shape (chain, draw, T, ...).
+    observed_data, constant_data
+        Arrays of shape (T, ...).
+    over_time
+        Names whose first axis after chain and draw is time: the states, and statistics per step.
+    time
+        The T values of the `time` coordinate; row numbers from 1 if None.
+    dims
+        For single variables, names of all dims after chain and draw, instead of the rule above.
+    coords
+        Values of further coordinates, by dim.
+    attrs
+        What the run was. Made fit for netCDF (see `netcdf_attributes`), and written on the whole
+        and on every group of draws.
+    """
+    sampled = {
+        "posterior": posterior,
+        "sample_stats": sample_stats,
+        "log_likelihood": log_likelihood,
+        "posterior_predictive": posterior_predictive,
+        "prior": prior,
+    }
+    fixed = {"observed_data": observed_data, "constant_data": constant_data}
+    written = _provenance() | netcdf_attributes(attrs or {})
+    groups: dict[str, xr.Dataset] = {}
+    for group, variables in {**sampled, **fixed}.items():
+        if not variables:
+            continue
+        by_row = group in fixed or group in ("log_likelihood", "posterior_predictive")
+        groups[group] = _dataset(
+            variables,
+            sample_dims=() if group in fixed else ("chain", "draw"),
+            over_time=variables if by_row else over_time,
+            time=time,
+            dims=dims or {},
+            coords=coords or {},
+            attrs={} if group in fixed else written,
+        )
+    return _container(groups, written)
+
+
+def to_dataset(
+    variables: Mapping[str, np.ndarray],
+    *,
+    sample_dim: str | None = "draw",
+    over_time: Collection[str] | None = None,
+    time: Any = None,
+    dims: Mapping[str, Sequence[str]] | None = None,
+    coords: Mapping[str, Any] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+) -> xr.Dataset:
+    """A Dataset with dims `sample_dim` ("draw" or "trajectory"), `time`, then `<name>_dim_0`, ...
+
+    Parameters
+    ----------
+    variables
+        Arrays of shape (draws, T, ...), or (draws, ...) for names that are not in `over_time`;
+        without the first axis if `sample_dim` is None.
+    over_time
+        Names with a time axis; None means all.
+    time, dims, coords, attrs
+        As in `to_inference_data`.
+    """
+    return _dataset(
+        variables,
+        sample_dims=() if sample_dim is None else (sample_dim,),
+        over_time=variables if over_time is None else over_time,
+        time=time,
+        dims=dims or {},
+        coords=coords or {},
+        attrs=_provenance() | netcdf_attributes(attrs or {}),
+    )
+
+
+def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
+    """Mean, sd, their Monte Carlo errors, bulk and tail ESS, and R-hat; one row per scalar.
+
+    Without `var_names`, all of the posterior that has no time: the parameters. The numbers are
+    not rounded. R-hat is NaN for a single chain.
+    """
+    import pandas as pd
+
+    posterior = idata["posterior"]
+    if var_names is None:
+        names = [name for name, v in posterior.data_vars.items() if not _has_time(v.dims)]
+    else:
+        names = list(var_names)
+        unknown = [name for name in names if name not in posterior.data_vars]
+        if unknown:
+            known = listing(str(unknown[0]), map(str, posterior.data_vars))
+            raise ArgumentError(
+                f"the posterior has no variable {unknown[0]!r}.", fix=f"it has {known}"
+            )
+    if not names:
+        return pd.DataFrame(columns=SUMMARY_COLUMNS, dtype=float)
+    table = arviz().summary(idata, var_names=names, round_to="none", kind="all")
+    return pd.DataFrame(table)[SUMMARY_COLUMNS].astype(float)
+
+
+def save(idata: Any, path: str | os.PathLike[str]) -> Path:
+    """Write a result of `to_inference_data` to a netCDF file, which `arviz.from_netcdf` reads.
+
+    The file appears whole or not at all: it is written beside `path` first.
+    """
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        # Both containers have the method; both take the engine by this name.
+        idata.to_netcdf(str(partial), engine="h5netcdf")
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+    return target
+
+
+def arviz() -> Any:
+    """The arviz module: imported on first use, which takes seconds, and without its greeting."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+    return arviz
+
+
+def netcdf_attributes(attrs: Mapping[str, Any]) -> dict[str, Any]:
+    """`attrs` in types that netCDF can hold.
+
+    Numbers and text stay; booleans become 0 and 1, so that they keep their truth; mappings and
+    sequences become JSON; None and everything else (settings, say) becomes its `repr`.
+    """
+    return {str(name): _attribute(value) for name, value in attrs.items()}
+
+
+def _attribute(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, int):
+        return value if -(2**63) <= value < 2**63 else str(value)
+    if isinstance(value, float):
+        return value
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping | list | tuple):
+        value = json.dumps(value, default=_json_value)
+    text = value if isinstance(value, str) else repr(value)
+    if len(text.encode()) > LONGEST_ATTRIBUTE:
+        kept = text.encode()[:LONGEST_ATTRIBUTE].decode(errors="ignore")
+        text = f"{kept}\n[cut: the whole had {len(text)} characters]"
+    return text
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return str(value) if isinstance(value, Path | datetime.date) else repr(value)
+
+
+def _provenance() -> dict[str, str]:
+    """Who made a result, and when; the names of the first three are ArviZ's."""
+    found = {
+        "created_at": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "inference_library": "ssmppl",
+        "inference_library_version": _version("ssmppl"),
+        "python_version": platform.python_version(),
+    }
+    return found | {f"{name}_version": _version(name) for name in ("numpy", "numba", "arviz")}
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _dataset(
+    variables: Mapping[str, np.ndarray],
+    *,
+    sample_dims: tuple[str, ...],
+    over_time: Collection[str],
+    time: Any,
+    dims: Mapping[str, Sequence[str]],
+    coords: Mapping[str, Any],
+    attrs: Mapping[str, Any],
+) -> xr.Dataset:
+    import xarray as xr
+
+    arrays: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
+    sizes: dict[str, tuple[int, str]] = {}
+    for name, values in variables.items():
+        array = np.asarray(values)
+        if name in dims:
+            labels = (*sample_dims, *dims[name])
+        else:
+            labels = (*sample_dims, "time") if name in over_time else sample_dims
+            labels += tuple(f"{name}_dim_{i}" for i in range(array.ndim - len(labels)))
+        if len(labels) != array.ndim:
+            expected = ", ".join(labels)
+            raise ValueError(f"{name!r} has shape {array.shape}, but its dims are ({expected})")
+        for label, size in zip(labels, array.shape, strict=True):
+            first_size, first = sizes.setdefault(label, (size, name))
+            if size != first_size:
+                raise ValueError(
+                    f"{name!r} has {size} along {label!r}, but {first!r} has {first_size}"
+                )
+        arrays[name] = (labels, array)
+
+    coordinates: dict[str, np.ndarray] = {
+        dim: np.arange(size) for dim, (size, _) in sizes.items() if dim in sample_dims
+    }
+    if "time" in sizes:
+        n_rows = sizes["time"][0]
+        coordinates["time"] = np.arange(1, n_rows + 1) if time is None else _labels(time)
+    for dim, (size, _) in sizes.items():
+        if dim in coords:
+            coordinates[dim] = _labels(coords[dim])
+        elif dim not in coordinates:
+            coordinates[dim] = np.arange(size)
+    return xr.Dataset(arrays, coords=coordinates, attrs=dict(attrs))
+
+
+def _labels(values: Any) -> np.ndarray:
+    """Coordinate values in a type that netCDF can hold: objects other than text become text."""
+    array = np.asarray(values)
+    return array.astype(str) if array.dtype == object else array
+
+
+def _has_time(dims: Iterable[Any]) -> bool:
+    """Whether there is a time axis: `time`, or `time_<experiment>` where there are several."""
+    return any(dim == "time" or str(dim).startswith("time_") for dim in dims)
+
+
+def _container(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Any:
+    az = arviz()
+    if az.__version__.startswith("0."):
+        return az.InferenceData(**groups, attrs=dict(attrs))
+
+    import xarray as xr
+
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=dict(attrs)), **groups})
