@@ -36,6 +36,16 @@ class ExprArray(np.ndarray):
     def __array_function__(self, func, types, args, kwargs):
         return apply_function(func, args, kwargs)
 
+    def __getitem__(self, index):
+        """As NumPy's; a symbol as the (first) index selects by np.where over the positions."""
+        first, *rest = (index or (None,)) if isinstance(index, tuple) else (index,)
+        if not isinstance(first, Expr):
+            return super().__getitem__(index)
+        chosen = super().__getitem__((len(self) - 1, *rest))
+        for k in range(len(self) - 2, -1, -1):
+            chosen = elementwise("where", apply("eq", first, k), self[(k, *rest)], chosen)
+        return chosen
+
     # NumPy's methods, which would bypass the protocols, by the functions of the same name.
     def sum(self, axis=None, **kwargs):
         return _reduce("add", self, axis, **kwargs)
@@ -254,30 +264,43 @@ def _matrix(op: str, a: Any) -> ExprArray:
                   for i in range(n)])  # fmt: skip
 
 
+def _is_diagonal(a: np.ndarray) -> bool:
+    return all(
+        a[i] == 0 if not isinstance(a[i], Expr) else a[i].op == "const" and a[i].data == 0
+        for i in np.ndindex(a.shape)
+        if i[0] != i[1]
+    )
+
+
 def cholesky(a: Any) -> ExprArray:
     """Lower Cholesky factor of a symmetric positive definite matrix (its lower half is read)."""
+    a = square_matrix(a, "linalg.cholesky")
+    if _is_diagonal(a):
+        return array(np.diag(array([apply("sqrt", d) for d in np.diagonal(a)])))
     return _matrix("cholesky", a)
 
 
 def inverse(a: Any) -> ExprArray:
     """Inverse of a square matrix."""
     a = square_matrix(a, "linalg inverse")
-    if len(a) == 1:
-        return array([[1.0 / as_expr(a[0, 0])]])
+    if _is_diagonal(a):
+        return array(np.diag(array([1.0 / as_expr(d) for d in np.diagonal(a)])))
     return _matrix("inverse", a)
 
 
 def log_determinant(a: Any) -> Expr:
     """log |det a|."""
     a = square_matrix(a, "linalg log determinant")
-    if len(a) == 1:
-        return apply("log", a[0, 0])
+    if _is_diagonal(a):
+        return _reduce("add", [apply("log", d) for d in np.diagonal(a)])
     return matrix_op("logdet", a.flat, len(a))
 
 
 def _det(a: Any) -> Expr:
     a = square_matrix(a, "linalg.det")
-    return as_expr(a[0, 0]) if len(a) == 1 else matrix_op("det", a.flat, len(a))
+    if _is_diagonal(a):
+        return _reduce("mul", list(np.diagonal(a)))
+    return matrix_op("det", a.flat, len(a))
 
 
 def _where(condition: Any, *branches: Any) -> Any:
@@ -324,6 +347,9 @@ FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     np.einsum: lambda spec, *ops: scalar_or_array(np.einsum(spec, *map(_plain, ops))),
     np.clip: _clip,
     np.trace: _trace,
+    np.take: lambda a, index, axis=None: array(a)[index]
+    if isinstance(index, Expr) and axis in (None, 0)
+    else scalar_or_array(np.take(_plain(a), np.asarray(index, dtype=int), axis)),
     np.diff: lambda a, **kw: scalar_or_array(np.diff(_plain(a), **kw)),
     np.copyto: _copyto,
     np.zeros_like: _like(0.0),
@@ -344,7 +370,7 @@ STRUCTURAL = {
     np.concatenate, np.stack, np.hstack, np.vstack, np.column_stack, np.block, np.append,
     np.reshape, np.ravel, np.transpose, np.squeeze, np.expand_dims, np.moveaxis, np.swapaxes,
     np.tile, np.repeat, np.flip, np.roll, np.split, np.array_split, np.diag, np.diagonal,
-    np.broadcast_to, np.atleast_1d, np.atleast_2d, np.take, np.copy, np.triu, np.tril, np.delete,
+    np.broadcast_to, np.atleast_1d, np.atleast_2d, np.copy, np.triu, np.tril, np.delete,
     np.diagflat, np.fliplr, np.flipud, np.insert,
 }  # fmt: skip
 

@@ -22,6 +22,14 @@ MEANING: dict[str, Callable[..., Any]] = {
     **{n: getattr(sp, n) for n in "gammaln digamma ndtr log_ndtr ndtri erf erfc".split()},
     **{n: getattr(sp, n) for n in "gammainc gammaincinv betainc betaincinv".split()},
     "trigamma": lambda a: sp.polygamma(1, a),
+    # smallest k with cdf(k) >= q; scipy's inverses are continuous in k
+    "poisson_quantile": lambda rate, q: _round_up(sp.pdtrik(q, rate), lambda k: sp.pdtr(k, rate), q),
+    "binomial_quantile": lambda n, p, q: _round_up(
+        sp.bdtrik(q, n, p), lambda k: sp.bdtr(k, n, p), q
+    ),
+    "negbinomial_quantile": lambda r, p, q: _round_up(
+        sp.nbdtrik(q, r, p), lambda k: sp.betainc(r, k + 1.0, p), q
+    ),
     "neg": np.negative,
     "not": np.logical_not,
     "add": np.add,
@@ -38,6 +46,12 @@ MEANING: dict[str, Callable[..., Any]] = {
     "or": np.logical_or,
     "where": np.where,
 }
+
+
+def _round_up(k: Any, cdf: Callable[[Any], Any], q: Any) -> Any:
+    k = np.maximum(np.ceil(k), 0.0)
+    below = np.maximum(k - 1.0, 0.0)
+    return np.where(cdf(below) >= q, below, k)
 
 
 def evaluate(

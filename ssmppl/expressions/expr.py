@@ -33,9 +33,9 @@ UNARY = (
 ).split()
 BINARY = (
     "add sub mul div pow mod maximum minimum arctan2 logaddexp "
-    "lt le eq ne and or gammainc gammaincinv"
+    "lt le eq ne and or gammainc gammaincinv poisson_quantile"
 ).split()
-TERNARY = ["where", "betainc", "betaincinv"]
+TERNARY = ["where", "betainc", "betaincinv", "binomial_quantile", "negbinomial_quantile"]
 MATRIX_OPS = ("cholesky", "inverse", "logdet", "det")  # args: the n*n entries, row by row
 OPS = frozenset(
     [*UNARY, *BINARY, *TERNARY, *MATRIX_OPS, "const", "symbol", "item", "random", "call"]
@@ -298,12 +298,19 @@ def _simplify_sub(a, b):
 def _simplify_mul(a, b):
     if _is(a, 0.0) or _is(b, 0.0):
         return constant(0.0)
-    for one, other in ((a, b), (b, a)):
-        if _is(one, 1.0):
-            return other
-        if _is(one, -1.0):
-            return apply("neg", other)
-    return None
+    if b.op == "const" and a.op != "const":  # the number first, so that spellings meet
+        return apply("mul", b, a)
+    if a.op == "neg":
+        return apply("neg", apply("mul", a.args[0], b))
+    if b.op == "neg":
+        if a.op == "const":
+            return apply("mul", constant(-a.data), b.args[0])
+        return apply("neg", apply("mul", a, b.args[0]))
+    if a.op == "const" and b.op == "mul" and b.args[0].op == "const":
+        return apply("mul", constant(a.data * b.args[0].data), b.args[1])
+    if _is(a, 1.0):
+        return b
+    return apply("neg", b) if _is(a, -1.0) else None
 
 
 def _simplify_div(a, b):
@@ -320,6 +327,14 @@ def _simplify_pow(a, b):
     return rules[b.data]() if b.data in rules else None
 
 
+def _simplify_neg(a):
+    if a.op == "neg":
+        return a.args[0]
+    if a.op == "mul" and a.args[0].op == "const":
+        return apply("mul", constant(-a.args[0].data), a.args[1])
+    return None
+
+
 def _simplify_where(c, a, b):
     if c.op == "const":
         return a if c.data else b
@@ -332,7 +347,7 @@ _SIMPLIFY = {
     "mul": _simplify_mul,
     "div": _simplify_div,
     "pow": _simplify_pow,
-    "neg": lambda a: a.args[0] if a.op == "neg" else None,
+    "neg": _simplify_neg,
     "where": _simplify_where,
 }
 # Constants are folded with NumPy's arithmetic, which is the meaning of these operations.

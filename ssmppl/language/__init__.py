@@ -1,0 +1,1 @@
+"""The language: distributions, models and their traces."""

@@ -1,0 +1,259 @@
+"""Discrete distributions of scalars, and elementwise of arrays; and Dirac.
+
+Johnson, Kemp and Kotz (2005), "Univariate discrete distributions". Values are whole numbers held
+as floating point, as all values of a model are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import ModelError
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import constant
+from ssmppl.language.continuous import _each, _where
+from ssmppl.language.distribution import INFINITY, Distribution, Support
+
+
+def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
+    """count * log(p), 0 where the count is 0 whatever p is."""
+    return _where(ew("eq", count, 0.0), 0.0, array(count) * ew(log, p))
+
+
+class _Counts(Distribution):
+    discrete = True
+
+    def support(self):
+        return Support("integers", self._full(0.0), self._full(INFINITY))
+
+    def _floor(self, value: Any) -> ExprArray:
+        return array(ew("floor", value))
+
+    def _below_zero(self, value: Any, otherwise: Any) -> ExprArray:
+        return _where(ew("lt", value, 0.0), 0.0, otherwise)
+
+
+class Poisson(_Counts):
+    """Poisson(rate)."""
+
+    def __init__(self, rate: Any):
+        self._set(rate=rate)
+        self._require("rate", 0.0, strict=False)
+
+    def log_densities(self, value):
+        v = array(value)
+        return _times_log(v, self.rate) - self.rate - ew("gammaln", v + 1.0)
+
+    def sample(self, draws):
+        return _each(self, lambda i: draws.poisson(self.rate[i]))
+
+    def mean(self):
+        return self.rate
+
+    def variance(self):
+        return self.rate
+
+    def cdf(self, value):
+        k = array(ew("maximum", self._floor(value), 0.0))
+        return self._below_zero(value, 1.0 - array(ew("gammainc", k + 1.0, self.rate)))
+
+    def quantile(self, p):
+        return array(ew("poisson_quantile", self.rate, p))
+
+
+class NegativeBinomial(_Counts):
+    """NegativeBinomial(mean, dispersion=): variance mean + mean^2 / dispersion."""
+
+    def __init__(self, mean: Any, *, dispersion: Any):
+        self._set(mean_=mean, dispersion=dispersion)
+        self._require("mean_", 0.0, strict=False)
+        self._require("dispersion", 0.0)
+
+    def log_densities(self, value):
+        v, m, r = array(value), self.mean_, self.dispersion
+        choose = ew("gammaln", v + r) - array(ew("gammaln", r)) - ew("gammaln", v + 1.0)
+        return choose - r * ew("log1p", m / r) + _times_log(v, m / (r + m))
+
+    def sample(self, draws):
+        def draw(i):
+            r = self.dispersion[i]
+            return draws.poisson(draws.gamma(r) * self.mean_[i] / r)
+
+        return _each(self, draw)
+
+    def mean(self):
+        return self.mean_
+
+    def variance(self):
+        return self.mean_ + self.mean_**2 / self.dispersion
+
+    def cdf(self, value):
+        k, r = array(ew("maximum", self._floor(value), 0.0)), self.dispersion
+        return self._below_zero(value, ew("betainc", r, k + 1.0, r / (r + self.mean_)))
+
+    def quantile(self, p):
+        r = self.dispersion
+        return array(ew("negbinomial_quantile", r, r / (r + self.mean_), p))
+
+
+class Binomial(_Counts):
+    """Binomial(n, p)."""
+
+    def __init__(self, n: Any, p: Any):
+        self._set(n=n, p=p)
+        self._require("n", 0.0, strict=False)
+        self._require("p", 0.0, 1.0, strict=False)
+        for e in self.n.ravel():
+            if e.op == "const" and e.data != int(e.data):
+                raise ModelError(
+                    f"Binomial: n = {e.data:g} is no whole number",
+                    fix="give a whole number of trials",
+                    where=self.location,
+                )
+
+    def support(self):
+        return Support("integers", self._full(0.0), self.n)
+
+    def log_densities(self, value):
+        v, n = array(value), self.n
+        choose = ew("gammaln", n + 1.0) - array(ew("gammaln", v + 1.0))
+        choose = choose - ew("gammaln", n - v + 1.0)
+        return choose + _times_log(v, self.p) + _times_log(n - v, -self.p, "log1p")
+
+    def sample(self, draws):
+        return _each(self, lambda i: draws.binomial(self.n[i], self.p[i]))
+
+    def mean(self):
+        return self.n * self.p
+
+    def variance(self):
+        return self.n * self.p * (1.0 - self.p)
+
+    def cdf(self, value):
+        k = array(ew("maximum", self._floor(value), 0.0))
+        inside = ew("betainc", ew("maximum", self.n - k, 0.5), k + 1.0, 1.0 - self.p)
+        return self._below_zero(value, _where(ew("le", self.n, k), 1.0, inside))
+
+    def quantile(self, p):
+        return array(ew("binomial_quantile", self.n, self.p, p))
+
+
+class Bernoulli(_Counts):
+    """Bernoulli(p): 1 with probability p, else 0."""
+
+    def __init__(self, p: Any):
+        self._set(p=p)
+        self._require("p", 0.0, 1.0, strict=False)
+
+    def support(self):
+        return Support("integers", self._full(0.0), self._full(1.0))
+
+    def log_densities(self, value):
+        return _where(ew("eq", value, 0.0), ew("log1p", -self.p), ew("log", self.p))
+
+    def sample(self, draws):
+        return _each(self, lambda i: ew("lt", draws.uniform(), self.p[i]) * 1.0)
+
+    def mean(self):
+        return self.p
+
+    def variance(self):
+        return self.p * (1.0 - self.p)
+
+    def cdf(self, value):
+        below = _where(ew("lt", value, 1.0), 1.0 - self.p, 1.0)
+        return self._below_zero(value, below)
+
+    def quantile(self, p):
+        return _where(ew("le", p, 1.0 - self.p), 0.0, 1.0)
+
+
+class Categorical(_Counts):
+    """Categorical(p): 0, ..., K-1 with probabilities p, shape (K,)."""
+
+    def __init__(self, p: Any):
+        self.joint, self.shape = True, ()
+        self._set(p=p)
+        if self.p.ndim != 1 or len(self.p) < 2:
+            raise ModelError(
+                f"Categorical: p has shape {self.p.shape}",
+                fix="give a vector of at least two probabilities; for a transition matrix, "
+                "select its row: Categorical(P[state])",
+                where=self.location,
+            )
+        self._require("p", 0.0, 1.0, strict=False)
+        if all(e.op == "const" for e in self.p):
+            total = sum(e.data for e in self.p)
+            if abs(total - 1.0) > 1e-8:
+                raise ModelError(
+                    f"Categorical: p sums to {total:.9g}",
+                    fix="divide p by its sum",
+                    where=self.location,
+                )
+
+    def support(self):
+        return Support("integers", self._full(0.0), self._full(len(self.p) - 1.0))
+
+    def log_densities(self, value):
+        v, total = array(value)[()], constant(0.0)
+        for k, p in enumerate(self.p):
+            total = total + ew("where", ew("eq", v, float(k)), ew("log", p), 0.0)
+        return array(total)
+
+    def sample(self, draws):
+        u = draws.uniform()
+        return self.quantile(array(u))
+
+    def quantile(self, p):
+        # the count of cumulative probabilities below p
+        below, out, p = constant(0.0), constant(0.0), array(p)[()]
+        for probability in self.p[:-1]:
+            below = below + probability
+            out = out + ew("lt", below, p) * 1.0
+        return array(out)
+
+    def cdf(self, value):
+        v, total = array(value)[()], constant(0.0)
+        for k, p in enumerate(self.p):
+            total = total + ew("where", ew("le", float(k), v), p, 0.0)
+        return array(total)
+
+    def mean(self):
+        return array(np.sum(self.p * np.arange(len(self.p))))
+
+    def variance(self):
+        k = np.arange(len(self.p))
+        return array(np.sum(self.p * k**2)) - self.mean() ** 2
+
+
+class Dirac(Distribution):
+    """Dirac(value): a deterministic component."""
+
+    discrete = False
+
+    def __init__(self, value: Any):
+        self._set(value=value)
+
+    def support(self):
+        return Support("point", self.value, self.value)
+
+    def log_densities(self, value):
+        return _where(ew("eq", value, self.value), 0.0, -INFINITY)
+
+    def sample(self, draws):
+        return self.value
+
+    def mean(self):
+        return self.value
+
+    def variance(self):
+        return self._full(0.0)
+
+    def cdf(self, value):
+        return _where(ew("le", self.value, value), 1.0, 0.0)
+
+    def quantile(self, p):
+        return self.value

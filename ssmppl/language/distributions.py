@@ -1,0 +1,40 @@
+"""All distributions of the language, by name."""
+
+from ssmppl.language.continuous import (
+    Beta,
+    Cauchy,
+    Exponential,
+    Flat,
+    Gamma,
+    HalfCauchy,
+    HalfFlat,
+    HalfNormal,
+    InverseGamma,
+    Laplace,
+    LogNormal,
+    Normal,
+    StudentT,
+    Uniform,
+)
+from ssmppl.language.discrete import (
+    Bernoulli,
+    Binomial,
+    Categorical,
+    Dirac,
+    NegativeBinomial,
+    Poisson,
+)
+from ssmppl.language.distribution import Distribution, Draws, Support
+from ssmppl.language.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
+from ssmppl.language.truncated import Truncated
+
+DISTRIBUTIONS: dict[str, type[Distribution]] = {
+    cls.__name__: cls
+    for cls in (
+        Normal, MvNormal, LogNormal, StudentT, Laplace, Cauchy, HalfNormal, HalfCauchy, Uniform,
+        Exponential, Gamma, InverseGamma, Beta, Dirichlet, Wishart, InverseWishart, Poisson,
+        NegativeBinomial, Binomial, Bernoulli, Categorical, Dirac, Truncated, Flat, HalfFlat,
+    )
+}  # fmt: skip
+
+__all__ = [*DISTRIBUTIONS, "DISTRIBUTIONS", "Distribution", "Draws", "Support"]

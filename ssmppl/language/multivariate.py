@@ -1,0 +1,236 @@
+"""Distributions of vectors and matrices with one joint density.
+
+Gelman et al. (2013), "Bayesian data analysis", appendix A, for densities and moments; samplers:
+Cholesky (MvNormal), normalised gammas (Dirichlet), Bartlett's decomposition (Wishart), Smith and
+Hocking (1972), algorithm AS 53.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import ModelError
+from ssmppl.expressions.arrays import (
+    ExprArray,
+    array,
+    cholesky,
+    inverse,
+    log_determinant,
+)
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.calculus import lower_inverse
+from ssmppl.expressions.expr import constant
+from ssmppl.language.continuous import LOG_2PI
+from ssmppl.language.distribution import Distribution, Draws, Support, one_of
+
+
+class _Joint(Distribution):
+    joint = True
+
+    def _matrix(self, name: str) -> ExprArray:
+        """A parameter that must be a square, symmetric, positive definite matrix."""
+        m = self.parameters[name]
+        if m.ndim != 2 or m.shape[0] != m.shape[1]:
+            raise ModelError(
+                f"{type(self).__name__}: {name} has shape {m.shape}",
+                fix="give a square matrix",
+                where=self.location,
+            )
+        if all(e.op == "const" for e in m.ravel()):
+            numbers = np.array([e.data for e in m.ravel()]).reshape(m.shape)
+            lower = name == "cholesky"
+            symmetric = lower or np.allclose(numbers, numbers.T, rtol=1e-10, atol=0)
+            positive = (
+                bool(np.all(np.diagonal(numbers) > 0))
+                if lower
+                else symmetric and bool(np.all(np.linalg.eigvalsh(numbers) > 0))
+            )
+            if not symmetric or not positive:
+                what = "positive definite" if symmetric else "symmetric"
+                raise ModelError(
+                    f"{type(self).__name__}: {name} is not {what}: {numbers.tolist()}",
+                    fix="check its entries; a noise that is exactly zero is ssm.Dirac",
+                    where=self.location,
+                )
+        return m
+
+
+class MvNormal(_Joint):
+    """MvNormal(mean, covariance= | precision= | cholesky=), mean of shape (d,)."""
+
+    def __init__(
+        self, mean: Any, *, covariance: Any = None, precision: Any = None, cholesky: Any = None
+    ):
+        options = {"covariance": covariance, "precision": precision, "cholesky": cholesky}
+        self.spread, value = one_of("MvNormal", options)
+        self._set(**{"mean_": mean, self.spread: value})
+        matrix = self._matrix(self.spread)
+        if self.mean_.ndim == 0:
+            self.parameters["mean_"] = array(np.full(len(matrix), self.mean_[()]))
+        if self.mean_.shape != (len(matrix),):
+            raise ModelError(
+                f"MvNormal: mean has shape {self.mean_.shape}, {self.spread} {matrix.shape}",
+                fix="give a mean of shape (d,) and a matrix of shape (d, d)",
+                where=self.location,
+            )
+        self.shape = self.mean_.shape
+
+    def mean(self):
+        return self.mean_
+
+    def covariance_matrix(self) -> ExprArray:
+        """(d, d), however the spread was given."""
+        m = self.parameters[self.spread]
+        if self.spread == "covariance":
+            return m
+        if self.spread == "precision":
+            return inverse(m)
+        return array(m @ m.T)
+
+    def variance(self):
+        return array(np.diagonal(self.covariance_matrix().view(np.ndarray)))
+
+    def log_densities(self, value):
+        m, d = self.parameters[self.spread], array(value) - self.mean_
+        constant_term = -0.5 * len(d) * LOG_2PI
+        if self.spread == "cholesky":
+            z = lower_inverse(m) @ d
+            log_root = np.sum(array([ew("log", e) for e in np.diagonal(m.view(np.ndarray))]))
+            return array(constant_term - log_root - 0.5 * np.sum(z**2))
+        if self.spread == "precision":
+            return array(constant_term + 0.5 * log_determinant(m) - 0.5 * (d @ m @ d))
+        return array(constant_term - 0.5 * log_determinant(m) - 0.5 * (d @ inverse(m) @ d))
+
+    def factor(self) -> ExprArray:
+        """A matrix L, (d, d), with L L' = covariance."""
+        m = self.parameters[self.spread]
+        if self.spread == "cholesky":
+            return m
+        if self.spread == "covariance":
+            return cholesky(m)
+        return array(lower_inverse(cholesky(m)).T)  # P = K K', so (K^-T)(K^-T)' = P^-1
+
+    def sample(self, draws):
+        z = array([draws.normal() for _ in range(len(self.mean_))])
+        return array(self.mean_ + self.factor() @ z)
+
+
+class Dirichlet(_Joint):
+    """Dirichlet(concentration), concentration of shape (K,)."""
+
+    def __init__(self, concentration: Any):
+        self._set(concentration=concentration)
+        if self.concentration.ndim != 1 or len(self.concentration) < 2:
+            raise ModelError(
+                f"Dirichlet: concentration has shape {self.concentration.shape}",
+                fix="give a vector of at least two concentrations",
+                where=self.location,
+            )
+        self._require("concentration", 0.0)
+        self.shape = self.concentration.shape
+
+    def support(self):
+        return Support("simplex", self._full(0.0), self._full(1.0))
+
+    def log_densities(self, value):
+        a, v = self.concentration, array(value)
+        norm = np.sum(array(ew("gammaln", a))) - ew("gammaln", np.sum(a))
+        return array(np.sum((a - 1.0) * ew("log", v)) - norm)
+
+    def sample(self, draws):
+        g = array([draws.gamma(a) for a in self.concentration])
+        return array(g / np.sum(g))
+
+    def mean(self):
+        return array(self.concentration / np.sum(self.concentration))
+
+    def variance(self):
+        m = self.mean()
+        return array(m * (1.0 - m) / (np.sum(self.concentration) + 1.0))
+
+
+def _log_gamma_p(x: Any, p: int) -> Any:
+    """log of the multivariate gamma function of dimension p."""
+    total = constant(0.25 * p * (p - 1) * math.log(math.pi))
+    for j in range(p):
+        total = total + ew("gammaln", x - 0.5 * j)
+    return total
+
+
+class _WishartFamily(_Joint):
+    def __init__(self, df: Any, *, scale: Any):
+        self._set(df=df, scale=scale)
+        p = len(self._matrix("scale"))
+        self._require("df", p - 1.0)
+        self.shape = (p, p)
+
+    def support(self):
+        return Support("positive definite", self._full(-math.inf), self._full(math.inf))
+
+    def _bartlett(self, draws: Draws) -> ExprArray:
+        """A with A A' ~ Wishart(df, identity)."""
+        p, zero = len(self.scale), constant(0.0)
+        out = np.empty((p, p), dtype=object)
+        for i in range(p):
+            for j in range(p):
+                if i == j:
+                    out[i, j] = ew("sqrt", 2.0 * draws.gamma(0.5 * (self.df[()] - i)))
+                else:
+                    out[i, j] = draws.normal() if j < i else zero
+        return array(out)
+
+
+class Wishart(_WishartFamily):
+    """Wishart(df, scale=V): mean df V; df > p - 1."""
+
+    def log_densities(self, value):
+        x, p, nu = array(value), len(self.scale), self.df[()]
+        trace = np.sum(inverse(self.scale) * x)
+        norm = 0.5 * nu * (p * math.log(2.0) + log_determinant(self.scale))
+        log_det = log_determinant(x)
+        return array(
+            0.5 * (nu - p - 1.0) * log_det - 0.5 * trace - norm - _log_gamma_p(0.5 * nu, p)
+        )
+
+    def sample(self, draws):
+        root = cholesky(self.scale) @ self._bartlett(draws)
+        return array(root @ root.T)
+
+    def mean(self):
+        return array(self.df[()] * self.scale)
+
+    def variance(self):
+        d = array(np.diagonal(self.scale.view(np.ndarray)))
+        return array(self.df[()] * (self.scale**2 + np.outer(d, d)))
+
+
+class InverseWishart(_WishartFamily):
+    """InverseWishart(df, scale=S): X^-1 ~ Wishart(df, scale=S^-1); mean S / (df - p - 1)."""
+
+    def log_densities(self, value):
+        x, p, nu = array(value), len(self.scale), self.df[()]
+        trace = np.sum(self.scale * inverse(x))
+        norm = 0.5 * nu * (log_determinant(self.scale) - p * math.log(2.0))
+        log_det = log_determinant(x)
+        return array(
+            norm - 0.5 * (nu + p + 1.0) * log_det - 0.5 * trace - _log_gamma_p(0.5 * nu, p)
+        )
+
+    def sample(self, draws):
+        # X = C (A A')^-1 C' for S = C C', from X^-1 = C^-T (A A') C^-1
+        root = cholesky(self.scale) @ lower_inverse(self._bartlett(draws)).T
+        return array(root @ root.T)
+
+    def mean(self):
+        p, nu = len(self.scale), self.df[()]
+        return array(ew("where", ew("lt", p + 1.0, nu), self.scale / (nu - p - 1.0), math.nan))
+
+    def variance(self):
+        p, nu = len(self.scale), self.df[()]
+        d = array(np.diagonal(self.scale.view(np.ndarray)))
+        top = (nu - p + 1.0) * self.scale**2 + (nu - p - 1.0) * np.outer(d, d)
+        bottom = (nu - p) * (nu - p - 1.0) ** 2 * (nu - p - 3.0)
+        return array(ew("where", ew("lt", p + 3.0, nu), top / bottom, math.nan))
