@@ -60,7 +60,7 @@ def _fault(log_w):
 def normalise(log_w, w):
     """Write the normalised exp(log_w) to `w`; return (log of the sum, ESS, status).
 
-    log_w : (N,) log-weights.  w : (N,), may be `log_w` itself.
+    log_w : (N,) log-weights.  w : (N,), another array.
     The log of the *sum*: subtract log N for the mean.  With a status other than `OK` the two
     numbers are (-inf, 0) for `ALL_ZERO` and NaN otherwise, and `w` is not to be used.
     """
