@@ -214,7 +214,7 @@ def _trig_reduce(x):
 
 
 @precise
-def _sin_cos_reduced(r):
+def sin_cos_reduced(r):
     """sin r and cos r for |r| <= pi/4."""
     z = r * r
     q = 1.5917988979397435e-10
@@ -240,7 +240,7 @@ def _sin_cos_reduced(r):
 @precise
 def _quadrant(k, r):
     """sin(k pi/2 + r): sine or cosine by the lowest bit of k, sign by the next one."""
-    sine, cosine = _sin_cos_reduced(r)
+    sine, cosine = sin_cos_reduced(r)
     value = cosine if (k & np.int64(1)) != 0 else sine
     return bits_float(float_bits(value) ^ ((k & np.int64(2)) << np.int64(62)))
 

@@ -23,9 +23,7 @@ PRECISE = frozenset({"contract", "nsz"})
 
 
 def _decorator(**options: Any) -> Callable[[Callable], Any]:
-    compile_function = numba.njit(
-        nogil=True, error_model="numpy", boundscheck=False, **options
-    )
+    compile_function = numba.njit(nogil=True, error_model="numpy", boundscheck=False, **options)
 
     def decorate(function: Callable) -> Any:
         if numba.config.DISABLE_JIT:

@@ -18,8 +18,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.codegen.kernels.elementary import _sin_cos_reduced, bits_float, log_normal_number
-from ssmppl.codegen.kernels.flags import kernel, precise
+from ssmppl.codegen.kernels.elementary import (
+    bits_float,
+    exp,
+    log,
+    log1p,
+    log_normal_number,
+    sin_cos_reduced,
+)
+from ssmppl.codegen.kernels.flags import exact, kernel, precise
+from ssmppl.codegen.kernels.special import deviance_part, stirling_error
 
 KEY0, KEY1, COUNTER = 0, 1, 2
 """Where the parts of a state are."""
@@ -65,7 +73,7 @@ def _box_muller(radius_word, angle_word):
     bits of its word, which `word_uniform` does not use, turn it to one of four quadrants.
     """
     radius = np.sqrt(-2.0 * log_normal_number(word_uniform(radius_word)))
-    sine, cosine = _sin_cos_reduced(_TURN * (word_uniform(angle_word) - 0.5))
+    sine, cosine = sin_cos_reduced(_TURN * (word_uniform(angle_word) - 0.5))
     sine *= radius
     cosine *= radius
     cosine = cosine if (angle_word & np.uint64(1)) != 0 else -cosine
@@ -129,3 +137,158 @@ def normal(state):
 def exponential(state):
     """An exponential with mean 1."""
     return -log_normal_number(uniform(state))
+
+
+@exact
+def _gamma_from_one(state, shape):
+    """Gamma(shape, 1) for 1 <= shape < inf: G. Marsaglia, W. W. Tsang, *ACM TOMS* 26 (2000)."""
+    d = shape - 1.0 / 3.0
+    c = 1.0 / np.sqrt(9.0 * d)
+    while True:
+        x = normal(state)
+        v = 1.0 + c * x
+        if v > 0.0:
+            v = v * v * v
+            u = uniform(state)
+            if log_normal_number(u) < 0.5 * x * x + d * (1.0 - v + log_normal_number(v)):
+                return d * v
+
+
+@exact
+def log_gamma_draw(state, shape):
+    """The logarithm of a Gamma(shape, 1) variate.
+
+    Below shape 1 it is log G(shape + 1) + (log U)/shape (Marsaglia and Tsang, section 6), which
+    is finite where the variate itself is 0: beta and Dirichlet variates need that.
+    """
+    if not (0.0 < shape < np.inf):
+        return np.nan
+    if shape >= 1.0:
+        return log(_gamma_from_one(state, shape))
+    boost = log_normal_number(uniform(state)) / shape
+    return log(_gamma_from_one(state, shape + 1.0)) + boost
+
+
+@exact
+def gamma(state, shape):
+    """A Gamma(shape, 1) variate; 0 only where the variate is below the least float."""
+    if not (0.0 < shape < np.inf):
+        return np.nan
+    if shape >= 1.0:
+        return _gamma_from_one(state, shape)
+    return exp(log_gamma_draw(state, shape))
+
+
+@exact
+def _poisson_log_mass(k, rate):
+    if k == 0.0:
+        return -rate
+    return -stirling_error(k) - deviance_part(k, rate) - 0.5 * log(2.0 * np.pi * k)
+
+
+@exact
+def poisson(state, rate):
+    """A Poisson variate, as float64: inversion below rate 10, else W. Hörmann's PTRS,
+    *Insurance: Mathematics and Economics* 12 (1993), with Loader's form of the mass."""
+    if not (0.0 <= rate < np.inf):
+        return np.nan
+    if rate < 10.0:
+        left = uniform(state)
+        mass = exp(-rate)
+        k = 0.0
+        while left > mass and mass > 0.0:
+            left -= mass
+            k += 1.0
+            mass *= rate / k
+        return k
+    b = 0.931 + 2.53 * np.sqrt(rate)
+    a = -0.059 + 0.02483 * b
+    log_inverse_alpha = log(1.1239 + 1.1328 / (b - 3.4))
+    squeeze = 0.9277 - 3.6224 / (b - 2.0)
+    while True:
+        u = uniform(state) - 0.5
+        v = uniform(state)
+        us = 0.5 - abs(u)
+        k = np.floor((2.0 * a / us + b) * u + rate + 0.43)
+        if us >= 0.07 and v <= squeeze:
+            return k
+        if k < 0.0 or (us < 0.013 and v > us):
+            continue
+        ratio = log(v) + log_inverse_alpha - log(a / (us * us) + b)
+        if ratio <= _poisson_log_mass(k, rate):
+            return k
+
+
+@exact
+def _binomial_log_mass(k, n, p, q):
+    if k == 0.0 or k == n:
+        return n * (log1p(-p) if k == 0.0 else log(p))
+    error = stirling_error(n) - stirling_error(k) - stirling_error(n - k)
+    deviance = deviance_part(k, n * p) + deviance_part(n - k, n * q)
+    return error - deviance + 0.5 * log(n / (2.0 * np.pi * k * (n - k)))
+
+
+@exact
+def _binomial_half(state, n, p):
+    """Binomial for p <= 1/2: inversion if n p < 10, else W. Hörmann's BTRS, *J. Statist. Comput.
+    Simul.* 46 (1993)."""
+    q = 1.0 - p
+    if n * p < 10.0:
+        left = uniform(state)
+        mass = exp(n * log1p(-p))
+        odds = p / q
+        k = 0.0
+        while left > mass and mass > 0.0 and k < n:
+            left -= mass
+            mass *= odds * (n - k) / (k + 1.0)
+            k += 1.0
+        return k
+    spread = np.sqrt(n * p * q)
+    b = 1.15 + 2.53 * spread
+    a = -0.0873 + 0.0248 * b + 0.01 * p
+    centre = n * p + 0.5
+    squeeze = 0.92 - 4.2 / b
+    alpha = (2.83 + 5.1 / b) * spread
+    at_mode = _binomial_log_mass(np.floor((n + 1.0) * p), n, p, q)
+    while True:
+        u = uniform(state) - 0.5
+        v = uniform(state)
+        us = 0.5 - abs(u)
+        k = np.floor((2.0 * a / us + b) * u + centre)
+        if k < 0.0 or k > n:
+            continue
+        if us >= 0.07 and v <= squeeze:
+            return k
+        if log(v * alpha / (a / (us * us) + b)) <= _binomial_log_mass(k, n, p, q) - at_mode:
+            return k
+
+
+@exact
+def binomial(state, n, p):
+    """A binomial variate, as float64; NaN unless n is a whole number >= 0 and 0 <= p <= 1."""
+    if not (0.0 <= n < np.inf and 0.0 <= p <= 1.0) or n != np.floor(n):
+        return np.nan
+    if p <= 0.5:
+        return _binomial_half(state, float(n), p)
+    return n - _binomial_half(state, float(n), 1.0 - p)
+
+
+@exact
+def categorical(state, p):
+    """An index, as float64, drawn in proportion to p, shape (n,); NaN unless p >= 0, 0 < sum < inf."""
+    total = 0.0
+    for i in range(p.size):
+        if not (p[i] >= 0.0):
+            return np.nan
+        total += p[i]
+    if not (0.0 < total < np.inf):
+        return np.nan
+    left = total * uniform(state)
+    chosen = 0
+    for i in range(p.size):
+        if p[i] > 0.0:
+            chosen = i
+            left -= p[i]
+            if left < 0.0:
+                break
+    return float(chosen)
