@@ -255,9 +255,22 @@ def square_matrix(a: Any, what: str) -> np.ndarray:
     return a
 
 
+def _constants(a: np.ndarray) -> np.ndarray | None:
+    """The matrix as numbers where it holds no symbols."""
+    exprs = [as_expr(e) for e in a.flat]
+    if any(e.op != "const" for e in exprs):
+        return None
+    return np.array([e.data for e in exprs]).reshape(a.shape)
+
+
 def _matrix(op: str, a: Any) -> ExprArray:
     a = square_matrix(a, f"linalg {op}")
-    n = len(a)
+    n, numbers = len(a), _constants(a)
+    if numbers is not None:
+        try:
+            return array((np.linalg.inv if op == "inverse" else np.linalg.cholesky)(numbers))
+        except np.linalg.LinAlgError as error:
+            _refuse(f"{op} of {numbers.tolist()}: {error}", "check the matrix's entries")
     node = matrix_op(op, a.flat, n)
     zero = constant(0.0)
     return array([[zero if op == "cholesky" and j > i else item(node, i, j) for j in range(n)]
@@ -293,6 +306,9 @@ def log_determinant(a: Any) -> Expr:
     a = square_matrix(a, "linalg log determinant")
     if _is_diagonal(a):
         return _reduce("add", [apply("log", d) for d in np.diagonal(a)])
+    numbers = _constants(a)
+    if numbers is not None:
+        return constant(np.linalg.slogdet(numbers)[1])
     return matrix_op("logdet", a.flat, len(a))
 
 

@@ -1,0 +1,1 @@
+"""Algorithms over generated programs, one file per family: settings, loop, result."""

@@ -1,0 +1,80 @@
+"""What a run shows while it goes on: a bar on a terminal, a few lines elsewhere. To stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+
+from tqdm import tqdm
+
+__all__ = ["Progress"]
+
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
+
+# Where there is no terminal: one line for so much of the work done, and seconds since the last.
+SPARSE_SHARE = 0.2
+SPARSE_SECONDS = 5.0
+
+
+class Progress:
+    """Counts steps done out of `total`; used as a context manager, by one thread.
+
+    Parameters
+    ----------
+    total : number of steps in all, over all chains.
+    title : what is being done.
+    shown : False shows nothing.
+    """
+
+    def __init__(self, total: int, title: str, shown: bool = True):
+        self.total = total
+        self.title = title
+        self.done = 0
+        self._started = self._last_line = time.monotonic()
+        self._next_share = SPARSE_SHARE
+        self._lines = shown and not sys.stderr.isatty()
+        self._bar = None
+        if shown and not self._lines:
+            self._bar = tqdm(
+                total=total, desc=title, bar_format=BAR, file=sys.stderr, dynamic_ncols=True
+            )
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def advance(self, steps: int, note: str = "") -> None:
+        """Count `steps` more; `note` says how it goes (phase, acceptance)."""
+        self.done += steps
+        if self._bar is not None:
+            self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(steps)
+        elif self._lines:
+            self._print_sparsely(note)
+
+    def _print_sparsely(self, note: str) -> None:
+        now = time.monotonic()
+        finished = self.done >= self.total
+        early = self.done < self._next_share * self.total
+        if not finished and (early or now - self._last_line < SPARSE_SECONDS):
+            return
+        elapsed = now - self._started
+        left = elapsed * (self.total - self.done) / self.done
+        clock = f"{_clock(elapsed)}<{_clock(left)}" if not finished else _clock(elapsed)
+        parts = [f"{100 * self.done // self.total}%", f"{self.done}/{self.total}", f"[{clock}]"]
+        print(f"{self.title}:", *parts, note, file=sys.stderr, flush=True)
+        self._last_line = now
+        self._next_share = self.done / self.total + SPARSE_SHARE
+
+
+def _clock(seconds: float) -> str:
+    return tqdm.format_interval(int(seconds))

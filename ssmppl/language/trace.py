@@ -1,0 +1,396 @@
+"""Model -> Trace: the user's functions run once on symbols, giving ordered sites.
+
+A `Trace` holds, for every parameter, state and observation, its distribution(s) in terms of
+symbols, and where each expression was written. Kinds of symbols:
+
+================  ============================================================
+parameter         theta
+state             x_t where it is drawn, weighed and observed
+state_prev        x_{t-1}, the arguments of a transition
+observation       y_t;  seen: 1 where that component of y_t was measured
+observation_prev  y_{t-1}, where a transition names a channel
+input, input_prev u_t and u_{t-1};  time, time_prev: the row number, from 1
+================  ============================================================
+"""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import Location, ModelError, SSMError, listing
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import Expr, recording, symbol
+from ssmppl.language.distributions import Categorical, Dirac, Distribution, Flat
+from ssmppl.language.distributions import InverseWishart, Wishart
+from ssmppl.language.model import Model, location_of
+
+
+@dataclass(frozen=True)
+class Site:
+    """One named quantity under one law.
+
+    value : the symbols of the quantity, of the distribution's shape (symmetric matrices share
+        the symbols of their lower half).
+    """
+
+    name: str
+    role: str
+    distribution: Distribution
+    value: ExprArray
+    where: Location
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.value.shape
+
+    @property
+    def components(self) -> list[Expr]:
+        """The distinct symbols of the value, row by row."""
+        return list(dict.fromkeys(self.value.ravel()))
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The traced model; see the module's docstring for its symbols."""
+
+    name: str
+    parameters: dict[str, Site]
+    initial: dict[str, Site]
+    transition: dict[str, Site]
+    observations: dict[str, Site]
+    proposal: dict[str, Site]
+    inputs: dict[str, tuple[int, ...]]
+    locations: dict[Expr, Location]
+    functions: dict[str, list[Location]] = field(default_factory=dict)
+
+    @property
+    def parameter_symbols(self) -> list[Expr]:
+        return [s for site in self.parameters.values() for s in site.components]
+
+    @property
+    def state_symbols(self) -> list[Expr]:
+        return [s for site in self.initial.values() for s in site.components]
+
+    @property
+    def state_prev_symbols(self) -> list[Expr]:
+        return [previous(s) for s in self.state_symbols]
+
+    @property
+    def observation_symbols(self) -> list[Expr]:
+        return [s for site in self.observations.values() for s in site.components]
+
+    @property
+    def input_symbols(self) -> list[Expr]:
+        return [s for n, shape in self.inputs.items() for s in symbols("input", n, shape).ravel()]
+
+
+def previous(s: Expr) -> Expr:
+    """The symbol of the same quantity one step earlier."""
+    kind, name, index = s.data
+    return symbol(kind + "_prev", name, index)
+
+
+def seen(s: Expr) -> Expr:
+    """The symbol that is 1 where this component of an observation was measured, else 0."""
+    return symbol("seen", *s.data[1:])
+
+
+def symbols(kind: str, name: str, shape: tuple[int, ...], symmetric: bool = False) -> ExprArray:
+    """The symbols of a named quantity, of the given shape."""
+    out = np.empty(shape, dtype=object)
+    for i in np.ndindex(*shape):
+        index = (max(i), min(i)) if symmetric else i
+        out[i] = symbol(kind, name, index)
+    return array(out)
+
+
+_traces: weakref.WeakKeyDictionary[Model, tuple[tuple, Trace]] = weakref.WeakKeyDictionary()
+
+
+def trace(model: Model) -> Trace:
+    """Run the model's functions on symbols.
+
+    Raises
+    ------
+    ModelError : a rule of the language is broken; names function, file, line and the fix.
+    """
+    if not isinstance(model, Model):
+        raise ModelError(
+            f"expected a Model, found {type(model).__name__}",
+            fix="pass the object made by ssm.Model(...), not its name or a function of it",
+        )
+    cached = _traces.get(model)
+    if cached is None or cached[0] != model.signature:
+        _traces[model] = cached = (model.signature, _Tracer(model).run())
+    return cached[1]
+
+
+class _Tracer:
+    def __init__(self, model: Model):
+        self.model = model
+        self.known: dict[str, tuple[str, tuple[int, ...]]] = {}  # name -> (role, shape)
+        self.owner: dict[str, Location] = {}
+        self.symmetric: set[str] = set()  # parameters that are symmetric matrices
+
+    def run(self) -> Trace:
+        model = self.model
+        for role, needed in (("initial", "x_1"), ("transition", "x_{t+1}")):
+            if not model.functions[role]:
+                raise ModelError(
+                    f"model {model.name!r} has no @{role} function",
+                    fix=f"declare the law of {needed} with @model.{role}",
+                    where=model.location,
+                )
+        for name in model.inputs:
+            self._claim(name, "input", model.inputs[name], model.location)
+        with recording() as locations:
+            parameters = self._sites("prior", "parameter")
+            initial = self._sites("initial", "state")
+            observations = self._sites("observation", "observation")
+            transition = self._sites("transition", "state")
+            proposal = self._sites("proposal", "state")
+        self._check_states(initial, transition, proposal)
+        return Trace(
+            name=model.name,
+            parameters=parameters,
+            initial=initial,
+            transition={n: transition[n] for n in initial},
+            observations=observations,
+            proposal=proposal,
+            inputs=dict(model.inputs),
+            locations=locations,
+            functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
+        )
+
+    def _sites(self, function_role: str, role: str) -> dict[str, Site]:
+        sites: dict[str, Site] = {}
+        for function in self.model.functions[function_role]:
+            where = location_of(function)
+            returned = self._call(function, function_role, where)
+            for name, distribution in self._checked(returned, function_role, where).items():
+                if name in sites:
+                    raise ModelError(
+                        f"{name!r} is given by two @{function_role} functions; the other is at "
+                        f"{sites[name].where}",
+                        fix="give each quantity one law",
+                        where=where,
+                    )
+                if function_role in ("prior", "initial", "observation"):
+                    self._claim(name, role, distribution.shape, where)
+                symmetric = isinstance(distribution, (Wishart, InverseWishart))
+                value = symbols(role, name, distribution.shape, symmetric)
+                sites[name] = Site(name, role, distribution, value, where)
+        return sites
+
+    def _claim(self, name: str, role: str, shape: tuple[int, ...], where: Location) -> None:
+        if name in self.known:
+            raise ModelError(
+                f"{name!r} is declared as {_a(role)} and already {_a(self.known[name][0])}"
+                + (f" at {self.owner[name]}" if name in self.owner else ""),
+                fix="rename one of them",
+                where=where,
+            )
+        if name == "t":
+            raise ModelError(
+                f"{_a(role)} is named 't', which means the row number",
+                fix="choose another name",
+                where=where,
+            )
+        self.known[name] = (role, shape)
+        self.owner[name] = where
+
+    # -- calling a law with symbols for its arguments
+    def _call(self, function: Callable[..., Any], role: str, where: Location) -> Any:
+        arguments = {}
+        for name, parameter in inspect.signature(function).parameters.items():
+            if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+                raise ModelError(
+                    f"@{role} {function.__name__} takes *{name}: arguments are bound by name",
+                    fix="name each parameter, state and input that the law depends on",
+                    where=where,
+                )
+            value = self._argument(name, role)
+            if value is None:
+                if parameter.default is not parameter.empty:
+                    continue  # a plain Python constant of the user's
+                raise self._unknown(name, role, where)
+            arguments[name] = value
+        try:
+            return function(**arguments)
+        except SSMError:
+            raise
+        except Exception as error:
+            raise _wrapped(error, function, role, arguments) from error
+
+    def _allowed(self, role: str) -> dict[str, str]:
+        """Role of a known name -> kind of symbol, for arguments of this kind of function."""
+        return {
+            "prior": {"parameter": "parameter"},
+            "initial": {"parameter": "parameter", "input": "input"},
+            "transition": {
+                "parameter": "parameter",
+                "state": "state_prev",
+                "input": "input_prev",
+                "observation": "observation_prev",
+            },
+            "observation": {"parameter": "parameter", "state": "state", "input": "input"},
+            "proposal": {
+                "parameter": "parameter",
+                "state": "state_prev",
+                "input": "input_prev",
+                "observation": "observation",
+            },
+        }[role]
+
+    def _argument(self, name: str, role: str) -> Expr | ExprArray | None:
+        if name == "t" and role != "prior":
+            return symbol("time_prev" if role in ("transition", "proposal") else "time", "t")
+        if name not in self.known or self.known[name][0] not in self._allowed(role):
+            return None
+        known_as, shape = self.known[name]
+        kind = self._allowed(role)[known_as]
+        value = symbols(kind, name, shape, name in self.symmetric)
+        return value[()] if shape == () else value
+
+    def _unknown(self, name: str, role: str, where: Location) -> ModelError:
+        allowed = self._allowed(role)
+        names = [n for n, (kind, _) in self.known.items() if kind in allowed]
+        names += ["t"] if role != "prior" else []
+        if name in self.known:
+            kind = self.known[name][0]
+            reason = {
+                "prior": f"a prior depends on parameters declared earlier only, and {name!r} is "
+                f"{_a(kind)}",
+                "initial": f"the initial law cannot depend on {_a(kind)}",
+                "observation": f"an observation cannot depend on {_a(kind)} of the same time",
+            }.get(role, f"{name!r} is {_a(kind)}")
+        elif name == "t":
+            reason = "a prior does not depend on time"
+        else:
+            reason = f"@{role} {where.function} asks for {name!r}, which the model does not know"
+        later = " (declare it in an earlier @prior)" if role == "prior" else ""
+        return ModelError(
+            reason, fix=f"use one of: {listing(name, names)}{later}", where=where
+        )
+
+    # -- what a law returned
+    def _checked(self, returned: Any, role: str, where: Location) -> dict[str, Distribution]:
+        if not isinstance(returned, Mapping) or not returned:
+            found = "nothing" if returned is None else repr(returned)
+            raise ModelError(
+                f"@{role} {where.function} returned {found}",
+                fix='return a dictionary {"name": distribution}',
+                where=where,
+            )
+        for name, distribution in returned.items():
+            if not isinstance(name, str) or not name.isidentifier():
+                raise ModelError(
+                    f"@{role} {where.function}: the name {name!r} is no Python identifier",
+                    fix="use letters, digits and underscores, starting with a letter",
+                    where=where,
+                )
+            if not isinstance(distribution, Distribution):
+                called = isinstance(distribution, type) and issubclass(distribution, Distribution)
+                value = f"ssm.Dirac(...) if {name!r} is deterministic, or "
+                raise ModelError(
+                    f"@{role} {where.function}: {name!r} is {distribution!r}, "
+                    f"which is no distribution",
+                    fix="call it with its parameters"
+                    if called
+                    else f"return {value}a distribution such as ssm.Normal(mean, sd=...)",
+                    where=where,
+                )
+            self._check_law(name, distribution, role)
+            if isinstance(distribution, (Wishart, InverseWishart)):
+                self.symmetric.add(name)
+        return dict(returned)
+
+    def _check_law(self, name: str, distribution: Distribution, role: str) -> None:
+        where = distribution.location
+        kind = type(distribution).__name__
+        if role == "prior":
+            if isinstance(distribution, Dirac):
+                raise ModelError(
+                    f"the prior of {name!r} is Dirac",
+                    fix=f"fix it by fixed={{{name!r}: value}} in the verb, or compute it inside "
+                    "the functions that use it",
+                    where=where,
+                )
+            if distribution.discrete:
+                raise ModelError(
+                    f"the prior of {name!r} is {kind}: parameters are continuous",
+                    fix="make it a state with a Dirac transition, or compare models",
+                    where=where,
+                )
+        elif isinstance(distribution, Flat):
+            raise ModelError(
+                f"the law of {name!r} is {kind}, which is improper",
+                fix=f"use {kind} as a prior only",
+                where=where,
+            )
+        elif role == "observation" and isinstance(distribution, Dirac):
+            raise ModelError(
+                f"the observation {name!r} is Dirac: data would have likelihood zero",
+                fix="give the channel a noise, for example ssm.Normal(value, sd=...)",
+                where=where,
+            )
+        if isinstance(distribution, Categorical) and role == "prior":
+            raise ModelError(
+                f"the prior of {name!r} is Categorical", fix="use a state", where=where
+            )
+
+    def _check_states(
+        self, initial: dict[str, Site], transition: dict[str, Site], proposal: dict[str, Site]
+    ) -> None:
+        for name, site in initial.items():
+            if name not in transition:
+                raise ModelError(
+                    f"state {name!r} has an initial law but no transition",
+                    fix=f"return {name!r} from a @transition function too; the transitions give: "
+                    f"{listing(name, transition)}",
+                    where=site.where,
+                )
+        for role, sites in (("transition", transition), ("proposal", proposal)):
+            for name, site in sites.items():
+                if name not in initial:
+                    raise ModelError(
+                        f"@{role} gives {name!r}, which has no initial law",
+                        fix=f"return it from @initial too; @initial gives: "
+                        f"{listing(name, initial)}",
+                        where=site.where,
+                    )
+                if site.shape != initial[name].shape:
+                    raise ModelError(
+                        f"state {name!r} has shape {site.shape} in its {role} and shape "
+                        f"{initial[name].shape} in its initial law",
+                        fix="give both the same shape; np.zeros(n) makes a mean of length n",
+                        where=site.distribution.location,
+                    )
+
+
+def _a(role: str) -> str:
+    return f"an {role}" if role[0] in "aeiou" else f"a {role}"
+
+
+def _wrapped(
+    error: Exception, function: Callable[..., Any], role: str, arguments: dict[str, Any]
+) -> ModelError:
+    """An exception inside a user's function, at the user's line."""
+    file = function.__code__.co_filename
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
+    last = frames[-1] if frames else None
+    where = Location(file, last.lineno or 0, last.name) if last else location_of(function)
+    shapes = ", ".join(f"{n} of shape {np.shape(v)}" for n, v in arguments.items())
+    return ModelError(
+        f"@{role} {function.__name__} raised {type(error).__name__}: {error}",
+        fix="the function runs once on symbols, for one particle and one time step; its "
+        f"arguments were {shapes or 'none'}",
+        where=where,
+    )
