@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from types import FrameType
 from typing import Any, Generic, TypeVar
@@ -127,9 +127,7 @@ def run_chains(
         Progress(total, title, shown=progress) as bar,
         _interrupt_flag() as stop,
     ):
-        # Raised where the signal is another's, and by a worker process that got it too.
-        with suppress(KeyboardInterrupt):
-            run.to_the_end(pool, stop, lambda n: bar.advance(n, run.note(describe)))
+        run.to_the_end(pool, stop, lambda n: bar.advance(n, run.note(describe)))
         run.drain()
     return run.result()
 
@@ -149,13 +147,16 @@ def run_tasks(
     with (
         _threads_unless(executor, len(arguments)) as pool,
         Progress(len(arguments), title, shown=progress) as bar,
+        _interrupt_flag() as stop,
     ):
         futures = [pool.submit(task, argument) for argument in arguments]
         numbers = {future: i for i, future in enumerate(futures)}
         waiting = set(futures)
         try:
             while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                done, waiting = wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
+                if stop.is_set():
+                    raise KeyboardInterrupt
                 for future in done:
                     if (error := future.exception()) is not None:
                         error.add_note(f"in task {numbers[future] + 1} of {len(futures)}")
@@ -177,7 +178,7 @@ def stack(chains: Sequence[ChainDraws[Any]]) -> tuple[dict[str, np.ndarray], dic
 
 @dataclass(frozen=True)
 class _Chain(Generic[State]):
-    """How far a chain has come. Replaced as a whole, never changed: an interrupt finds it whole."""
+    """How far a chain has come, and its block under way; replaced, never changed."""
 
     state: State
     done: int = 0
@@ -214,8 +215,11 @@ class _Run(Generic[State]):
             for number in range(len(self.chains)):
                 self._submit(pool, number)
             while (running := self._running()) and not stop.is_set():
-                done, _ = wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
+                done, _ = wait(running, POLL_SECONDS, FIRST_COMPLETED)
                 for future in done:
+                    if isinstance(future.exception(), KeyboardInterrupt):
+                        stop.set()  # a worker process got the signal too, and first
+                        break
                     number = running[future]
                     report(self._collect(number))
                     self._submit(pool, number)
@@ -341,8 +345,9 @@ def _cpu_count() -> int:
 def _interrupt_flag() -> Iterator[threading.Event]:
     """An event that Ctrl-C sets, in place of an exception at an arbitrary line.
 
-    A second Ctrl-C does what the first would have done. Signals belong to the main thread: in
-    others, and where somebody has turned them off, the event is never set.
+    Inside of `concurrent.futures` such an exception can leave a lock taken for good. A second
+    Ctrl-C does what the first would have done. Signals belong to the main thread: in others, and
+    where somebody has turned them off, the event is never set.
     """
     stop = threading.Event()
     earlier = signal.getsignal(signal.SIGINT)
