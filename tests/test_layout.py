@@ -1,0 +1,169 @@
+"""The layers of the package, read from its sources: who may import whom, and when."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = "ssmppl"
+LONGEST = 380
+
+# Each layer and what it may import besides itself. The main chain, in its one direction:
+CHAIN = ["errors", "expressions", "language", "analysis", "codegen"]
+ALLOWED = {layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)}
+# Arrays in, ArviZ out, and the embedded series stand beside it ...
+ALLOWED["data"] = {"errors", "expressions", "language"}
+ALLOWED["results"] = {"errors"}
+ALLOWED["datasets"] = {"errors"}
+# ... and serve what follows.
+ALLOWED["inference"] = {*CHAIN, "data", "results"}
+ALLOWED["gap"] = ALLOWED["inference"] | {"inference"}
+ALLOWED["plots"] = ALLOWED["gap"] | {"gap"}
+ALLOWED["cli"] = ALLOWED["plots"] | {"plots", "datasets", PACKAGE}
+ALLOWED["__main__"] = {"cli"}
+# The package itself holds the public names: it may import all but those who are above it.
+ALLOWED[PACKAGE] = set(ALLOWED) - {"cli", "__main__"}
+
+SLOW = ("arviz", "matplotlib", "pandas", "scipy.stats", "xarray")
+
+
+def dotted_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {dotted_name(path): path for path in sorted((ROOT / PACKAGE).rglob("*.py"))}
+
+
+def layer_of(name):
+    """Layer of a module: the first part of its name below the package."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 else PACKAGE
+
+
+class Imports(ast.NodeVisitor):
+    """Every imported name of a module, absolute, with its line and how it is imported."""
+
+    def __init__(self, name, source, is_package=False):
+        self.found = []  # (imported name, line, inside of a function, for type checking only)
+        self._package = name.split(".") if is_package else name.split(".")[:-1]
+        self._functions = self._typing = 0
+        self.visit(ast.parse(source))
+
+    def _add(self, imported, node):
+        self.found.append((imported, node.lineno, self._functions > 0, self._typing > 0))
+
+    def visit_Import(self, node):
+        for alias in node.names:
+            self._add(alias.name, node)
+
+    def visit_ImportFrom(self, node):
+        base = self._package[: len(self._package) - node.level + 1] if node.level else []
+        base = ".".join([*base, *filter(None, [node.module])])
+        for alias in node.names:
+            self._add(f"{base}.{alias.name}", node)
+
+    def visit_If(self, node):
+        typing = "TYPE_CHECKING" in ast.unparse(node.test)
+        self._typing += typing
+        for child in node.body:
+            self.visit(child)
+        self._typing -= typing
+        for child in node.orelse:
+            self.visit(child)
+
+    def _visit_function(self, node):
+        self._functions += 1
+        self.generic_visit(node)
+        self._functions -= 1
+
+    visit_FunctionDef = visit_AsyncFunctionDef = visit_Lambda = _visit_function
+
+
+def within(name, package):
+    return name == package or name.startswith(package + ".")
+
+
+def faults(name, source, is_package=False):
+    """What a module does that the layout forbids."""
+    layer = layer_of(name)
+    if layer not in ALLOWED:
+        yield f"{name}: the layer {layer!r} is not in the layout"
+        return
+    for imported, line, in_function, for_types in Imports(name, source, is_package).found:
+        place = f"{name}:{line}"
+        if within(imported, PACKAGE):
+            target = layer_of(imported)
+            if target not in ALLOWED:  # a name of the package itself
+                target = PACKAGE
+            if in_function:
+                yield f"{place} imports {imported} inside of a function"
+            if target != layer and target not in ALLOWED[layer]:
+                yield f"{place} imports {imported}, which is not below {layer}"
+        elif layer == "analysis" and within(imported, "numba"):
+            yield f"{place}: analyses do not import numba"
+        elif not in_function and not for_types and any(within(imported, slow) for slow in SLOW):
+            yield f"{place} imports {imported} at the top of the module, which is slow"
+    if (length := len(source.splitlines())) > LONGEST:
+        yield f"{name} has {length} lines; does it still have one reason to exist?"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_module_keeps_to_the_layout(name):
+    path = MODULES[name]
+    source = path.read_text(encoding="utf-8")
+    assert list(faults(name, source, path.name == "__init__.py")) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("ssmppl.errors", "from ssmppl.expressions import expr"),
+        ("ssmppl.expressions.expr", "import ssmppl.language.model"),
+        ("ssmppl.expressions.expr", "from ..language import model"),
+        ("ssmppl.analysis.structure", "from ssmppl import codegen"),
+        ("ssmppl.language.model", "from ssmppl import Model"),
+        ("ssmppl.language.model", "if TYPE_CHECKING:\n    from ssmppl.analysis import plan"),
+        ("ssmppl.codegen.program", "from ssmppl import data"),
+        ("ssmppl.results", "from ssmppl.data import read"),
+        ("ssmppl.inference.pgas", "def f():\n    from ssmppl.codegen import program"),
+        ("ssmppl.inference.pgas", "f = lambda: __import__\nclass A:\n  import ssmppl.cli"),
+        ("ssmppl.analysis.conjugacy", "from numba import njit"),
+        ("ssmppl.analysis.conjugacy", "def f():\n    import numba.typed"),
+        ("ssmppl.plots", "import matplotlib.pyplot as plt"),
+        ("ssmppl.cli", "try:\n    import pandas as pd\nexcept ImportError:\n    pass"),
+        ("ssmppl.language.continuous", "from scipy import stats"),
+        ("ssmppl", "from ssmppl.cli import main"),
+        ("ssmppl.helpers", ""),
+        ("ssmppl.data", "\n" * (LONGEST + 1)),
+    ],
+)
+def test_faults_are_found(name, source):
+    assert len(list(faults(name, source))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("ssmppl.language.model", "from ssmppl.expressions.expr import Expr\nfrom . import trace"),
+        ("ssmppl.inference.pgas", "from ssmppl import data, results\nimport numba"),
+        ("ssmppl.results", "def f():\n    import arviz"),
+        ("ssmppl.results", "if TYPE_CHECKING:\n    import xarray as xr"),
+        ("ssmppl.language.continuous", "from scipy import special"),
+        ("ssmppl.cli", "import ssmppl as ssm\nfrom ssmppl import Model, plots"),
+    ],
+)
+def test_what_is_allowed_passes(name, source):
+    assert list(faults(name, source)) == []
+
+
+def test_importing_the_package_imports_nothing_slow():
+    """Neither directly nor through what it imports."""
+    code = f"import sys, {PACKAGE}; print(*(m for m in {SLOW!r} if m in sys.modules))"
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert run.stdout.split() == []
