@@ -1,0 +1,36 @@
+"""Sphinx configuration; built by `make docs`, with warnings as errors."""
+
+from importlib.metadata import version as installed_version
+
+project = "ssmppl"
+author = "The ssmppl developers"
+copyright = "the ssmppl developers"
+version = release = installed_version("ssmppl")
+
+extensions = [
+    "myst_nb",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+
+# Notebooks are Markdown files. All are run anew for every build; an error in one fails it.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 900
+nb_execution_show_tb = True
+nb_merge_streams = True
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+
+autodoc_typehints = "none"  # the docstrings give shapes, which say more
+autosummary_generate = True
+numpydoc_class_members_toctree = False
+numpydoc_show_class_members = False
+
+
+html_theme = "furo"
+html_title = f"ssmppl {release}"
