@@ -5,7 +5,7 @@ are cut into calls.  The hash is a SplitMix64 generator (G. L. Steele, D. Lea, C
 *Fast splittable pseudorandom number generators*, OOPSLA 2014; the multipliers are D. Stafford's
 variant 13), keyed by 128 bits: the first key is where the counter starts, the second one enters
 after the first multiplication, so that two streams whose counters overlap still differ, and a
-third multiplication (that of `rrmxmx`-like mixers) follows to spread it over the word.
+third multiplication spreads it over the word.
 
 A state is a uint64 array of shape (4,): key 0, key 1, the counter, and one spare word.
 Each drawing function advances the counter in place.  2^64 words per stream.
@@ -53,7 +53,8 @@ def word(key0, key1, index):
     """Word `index` of the stream (key0, key1); all uint64."""
     z = key0 + index * _GOLDEN
     z = (z ^ (z >> np.uint64(30))) * _MULTIPLIER_1
-    z = (z ^ key1 ^ (z >> np.uint64(27))) * _MULTIPLIER_2
+    z ^= key1  # before the shift: else its top bit would reach few bits of the word
+    z = (z ^ (z >> np.uint64(27))) * _MULTIPLIER_2
     z = (z ^ (z >> np.uint64(31))) * _MULTIPLIER_3
     return z ^ (z >> np.uint64(28))
 
@@ -275,7 +276,10 @@ def binomial(state, n, p):
 
 @exact
 def categorical(state, p):
-    """An index, as float64, drawn in proportion to p, shape (n,); NaN unless p >= 0, 0 < sum < inf."""
+    """An index, as float64, with probabilities in proportion to p, shape (n,).
+
+    NaN unless every p_i >= 0 and their sum is positive and finite.
+    """
     total = 0.0
     for i in range(p.size):
         if not (p[i] >= 0.0):
