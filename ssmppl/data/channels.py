@@ -1,0 +1,125 @@
+"""One variable of a data set: found under the spellings users give it, as float64 (T, *shape)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data.sources import Source, check_single
+from ssmppl.data.values import Fault, as_numbers, number
+from ssmppl.errors import DataError, listing
+
+
+def _column_names(name: str, index: tuple[int, ...]) -> tuple[str, ...]:
+    inside = list(map(str, index))
+    return (f"{name}_{'_'.join(inside)}", f"{name}[{','.join(inside)}]",
+            f"{name}[{', '.join(inside)}]")  # fmt: skip
+
+
+def holds(source: Source, name: str, shape: tuple[int, ...]) -> bool:
+    """Whether the data hold anything of the variable: its name, or one of its components'."""
+    if name in source.columns:
+        return True
+    return any(
+        c in source.columns for index in np.ndindex(*shape) if shape
+        for c in _column_names(name, index)
+    )  # fmt: skip
+
+
+def channel(source: Source, name: str, shape: tuple[int, ...], role: str) -> np.ndarray:
+    """(T, *shape), NaN for missing."""
+    if name in source.columns:
+        value = source.columns[name]
+        check_single(value, name, source)
+        array = _converted(source, name, name, value, ())
+        if array.ndim == 1 and shape == (1,):
+            array = array[:, None]
+        if array.ndim == 0 or array.shape[1:] != shape:
+            raise _wrong_shape(source, name, array, shape, role)
+        return array
+    if not shape or not holds(source, name, shape):
+        raise _left_out(source, name, shape, role)
+    parts = {}
+    for index in np.ndindex(*shape):
+        column = next((c for c in _column_names(name, index) if c in source.columns), None)
+        if column is None:
+            raise _left_out(source, name, shape, role, index)
+        check_single(source.columns[column], name, source)
+        parts[index] = _converted(source, name, column, source.columns[column], index)
+        if parts[index].ndim != 1:
+            raise _wrong_shape(source, column, parts[index], (), role)
+    lengths = {len(p) for p in parts.values()}
+    if len(lengths) > 1:
+        raise DataError(
+            f"the columns of {name!r} have different lengths: {sorted(lengths)}",
+            fix="give all of them the same number of rows",
+            where=source.place(name),
+        )
+    out = np.empty((lengths.pop(), *shape))
+    for index, part in parts.items():
+        out[(slice(None), *index)] = part
+    return out
+
+
+def _converted(
+    source: Source, name: str, column: str, value: Any, component: tuple[int, ...]
+) -> np.ndarray:
+    array = as_numbers(value)
+    if isinstance(array, Fault):
+        index = (*array.index, *component) if array.index else None
+        found = array.found if array.index else f"{column!r} {array.found}"
+        raise DataError(found, fix=array.fix, where=source.place(name, index, column))
+    return array
+
+
+def _wrong_shape(
+    source: Source, name: str, array: np.ndarray, shape: tuple[int, ...], role: str
+) -> DataError:
+    found = f"{name!r} has shape {array.shape}, and the {role} of the model has shape {shape}"
+    wanted = "(T,)" if not shape else f"(T, {', '.join(map(str, shape))})"
+    if array.ndim == 0:
+        found = f"{name!r} is the number {number(float(array))}, no array"
+        fix = f"give an array of shape {wanted}, one value for each row: " + (
+            f"np.full(T, {number(float(array))})" if not shape else "np.tile(value, (T, 1))"
+        )
+    elif not shape and array.ndim == 2 and 1 in array.shape:
+        taken = "[:, 0]" if array.shape[1] == 1 else "[0]"
+        fix = f"give an array of shape (T,): data[{name!r}]{taken}"
+    elif len(shape) == 1 and array.shape[:-1] == shape and array.ndim == 2:
+        fix = f"rows come first, shape {wanted}: transpose it, data[{name!r}].T"
+    elif shape and array.ndim == 1 and source.kind == "DataFrame":
+        names = ", ".join(_column_names(name, i)[0] for i in np.ndindex(*shape))
+        fix = f"give one column for each component: {names}"
+    else:
+        fix = f"give an array of shape {wanted}, or the model's {role} the shape {array.shape[1:]}"
+    return DataError(found, fix=fix, where=source.place(name))
+
+
+def _left_out(
+    source: Source,
+    name: str,
+    shape: tuple[int, ...],
+    role: str,
+    index: tuple[int, ...] | None = None,
+) -> DataError:
+    things = "columns" if source.kind == "DataFrame" else "variables"
+    wanted = f" of shape (T, {', '.join(map(str, shape))})" if shape else ""
+    found = f"{_a(role)} named {name!r}{wanted} is missing from the {source.kind}"
+    if index is not None:
+        names = ", ".join(_column_names(name, i)[0] for i in np.ndindex(*shape))
+        first = _column_names(name, index)[0]
+        found = f"{_a(role)} named {name!r} lacks its component {first!r}; needed are {names}"
+    wanted_name = name if index is None else _column_names(name, index)[0]
+    fix = f"its {things} are: {listing(wanted_name, source.known)}; rename one, or add "
+    fix += repr(wanted_name)
+    if role == "observation":
+        fix += " (a column of NaN, if nothing of it was measured)"
+    if not source.known:
+        found = f"the {source.kind} holds no {things}, and needs {_a(role)} named {name!r}{wanted}"
+        fix = f"give an array for {name!r}"
+    return DataError(found, fix=fix, where=source.place())
+
+
+def _a(word: str) -> str:
+    return f"an {word}" if word[0] in "aeiou" else f"a {word}"

@@ -1,0 +1,170 @@
+"""Parameter values of a call: checked, packed into theta over the trace's symbols, and unpacked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data.values import Fault, as_numbers, number, outside, short
+from ssmppl.errors import ArgumentError, listing
+from ssmppl.expressions.expr import Expr
+from ssmppl.language.trace import Site, Trace
+
+
+def check_parameters(
+    trace: Trace, parameters: Mapping[str, Any] | None, fixed: Mapping[str, Any] | None = None
+) -> np.ndarray:
+    """theta, float64 (P,), over `trace.parameter_symbols`.
+
+    Raises
+    ------
+    ArgumentError : a name is unknown, missing or given twice; a value has the wrong shape, is not
+        finite, or lies outside the support of the parameter's prior.
+    """
+    given = check_values(trace, parameters, argument="parameters")
+    for name, value in check_values(trace, fixed, argument="fixed").items():
+        if name in given and not np.array_equal(given[name], value):
+            raise ArgumentError(
+                f"parameter {name!r} is {short(given[name].tolist())} in parameters and "
+                f"{short(value.tolist())} in fixed",
+                fix=f"leave {name!r} out of one of them",
+            )
+        given[name] = value
+    missing = [name for name in trace.parameters if name not in given]
+    if missing:
+        raise ArgumentError(
+            f"no value is given for {_plural('parameter', missing)}; given: "
+            f"{', '.join(given) or 'none'}",
+            fix="give every parameter of the model a value: "
+            f"{{{', '.join(f'{n!r}: ...' for n in trace.parameters)}}}",
+        )
+    _check_supports(trace, given, "parameters")
+    return pack(trace.parameters.values(), given)
+
+
+def check_values(
+    trace: Trace, values: Mapping[str, Any] | None, argument: str = "fixed"
+) -> dict[str, np.ndarray]:
+    """Values of some of the parameters (`fixed`, `start`), each float64 of the site's shape.
+
+    Raises
+    ------
+    ArgumentError : as `check_parameters`, save that names may be missing.
+    """
+    if values is None:
+        return {}
+    if not isinstance(values, Mapping):
+        example = ", ".join(f"{n!r}: ..." for n in trace.parameters)
+        raise ArgumentError(
+            f"{argument} is {short(values)} of type {type(values).__name__}",
+            fix=f"give a dictionary of the parameters' values, {argument}={{{example}}}",
+        )
+    out = {}
+    for name, value in values.items():
+        site = trace.parameters.get(name)
+        if site is None:
+            raise ArgumentError(
+                f"{argument} names {name!r}, which is {_role(trace, name)}",
+                fix=f"the parameters of the model are: {listing(str(name), trace.parameters)}",
+            )
+        out[name] = _value(site, value, argument)
+    _check_supports(trace, out, argument)
+    return out
+
+
+def _value(site: Site, value: Any, argument: str) -> np.ndarray:
+    array = as_numbers(value)
+    shape = f"of shape {site.shape}" if site.shape else "number"
+    if isinstance(array, Fault):
+        raise ArgumentError(
+            f"{argument}: parameter {site.name!r}{_index(array.index)}: {array.found}"
+            if array.index
+            else f"{argument}: parameter {site.name!r} is {short(value)}",
+            fix=f"give an array {shape}" if site.shape else "give a number",
+        )
+    if array.shape != site.shape:
+        raise ArgumentError(
+            f"{argument}: parameter {site.name!r} has shape {array.shape}: {short(value)}",
+            fix=f"give an array {shape}, the shape of its prior" if site.shape
+            else "give one number, as its prior is scalar",
+        )  # fmt: skip
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ArgumentError(
+            f"{argument}: parameter {site.name!r}{_index(index)} is {number(array[index])}",
+            fix="give a finite number",
+        )
+    return array
+
+
+def _check_supports(trace: Trace, values: Mapping[str, np.ndarray], argument: str) -> None:
+    env = {s: values[s.data[1]][s.data[2]] for s in trace.parameter_symbols if s.data[1] in values}
+    for name, value in values.items():
+        site = trace.parameters[name]
+        fault = outside(site.distribution, value[None], env)
+        if fault is not None:
+            place = f" ({site.distribution.location})"
+            raise ArgumentError(
+                f"{argument}: parameter {name!r}{_index((fault.index or ())[1:])}: {fault.found}",
+                fix=f"give {fault.fix}, or change its prior{place}",
+            )
+
+
+def pack(sites: Iterable[Site], values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Values (..., *shape) by name as one array (..., number of distinct symbols)."""
+    columns = [values[s.name][(..., *c.data[2])] for s in sites for c in s.components]
+    return np.stack(columns, axis=-1).astype(np.float64) if columns else np.zeros(0)
+
+
+def unpack(sites: Iterable[Site], packed: np.ndarray) -> dict[str, np.ndarray]:
+    """The reverse of `pack`: name -> (..., *shape), symmetric matrices filled on both sides."""
+    sites = list(sites)
+    position: dict[Expr, int] = {}
+    for site in sites:
+        for symbol in site.components:
+            position[symbol] = len(position)
+    packed = np.asarray(packed)
+    if packed.ndim == 0 or packed.shape[-1] != len(position):
+        raise ArgumentError(
+            f"an array of shape {packed.shape} for {len(position)} components",
+            fix=f"its last axis must have length {len(position)}: "
+            f"{', '.join(s.name for s in sites) or 'none'}",
+        )
+    out = {}
+    for site in sites:
+        columns = np.array([position[s] for s in site.value.ravel()], dtype=np.intp)
+        out[site.name] = packed[..., columns].reshape(packed.shape[:-1] + site.shape)
+    return out
+
+
+def unpack_parameters(trace: Trace, theta: np.ndarray) -> dict[str, np.ndarray]:
+    """theta (..., P) as name -> (..., *shape)."""
+    return unpack(trace.parameters.values(), theta)
+
+
+def unpack_states(trace: Trace, x: np.ndarray) -> dict[str, np.ndarray]:
+    """States (..., D) as name -> (..., *shape)."""
+    return unpack(trace.initial.values(), x)
+
+
+def unpack_observations(trace: Trace, y: np.ndarray) -> dict[str, np.ndarray]:
+    """Observations (..., K) as name -> (..., *shape)."""
+    return unpack(trace.observations.values(), y)
+
+
+def _index(index: tuple[int, ...] | None) -> str:
+    return f"[{', '.join(map(str, index))}]" if index else ""
+
+
+def _plural(word: str, names: list[str]) -> str:
+    return f"{word}{'s' * (len(names) > 1)} {', '.join(map(repr, names))}"
+
+
+def _role(trace: Trace, name: object) -> str:
+    for role, sites in (("a state", trace.initial), ("an observation", trace.observations),
+                        ("an input", trace.inputs)):  # fmt: skip
+        if name in sites:
+            return f"{role}, no parameter"
+    return "no parameter of the model"

@@ -1,0 +1,260 @@
+"""What users hold data in: mappings of arrays, DataFrames and Datasets, as named columns.
+
+pandas and xarray are recognised by what their objects can do, so that neither is imported here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data.values import Fault, as_numbers, short
+from ssmppl.errors import DataError
+from ssmppl.language.model import Model
+
+
+@dataclass
+class Source:
+    """One data set: its columns as the user holds them, and the labels of its rows.
+
+    label : "data", or "data set 2" where there are several.
+    time : labels of the rows, None where the data have none.
+    """
+
+    label: str
+    kind: str
+    columns: dict[str, Any]
+    time: np.ndarray | None = None
+    time_name: str = "time"
+    known: list[str] = field(default_factory=list)
+
+    def place(
+        self, name: str = "", index: tuple[int, ...] | None = None, column: str | None = None
+    ) -> str:
+        """Where in the data: data set, variable (with its component) and row, from 1."""
+        parts = []
+        if name:
+            entry = ", ".join(map(str, index[1:])) if index else ""
+            parts.append(f"{name!r}" + (f"[{entry}]" if entry else ""))
+            if column and column != name:
+                parts[-1] += f" (column {column!r})"
+        if index:
+            row = index[0]
+            parts.append(f"row {row + 1}" + self.at(row))
+        return f"In {self.label}" + (f", {', '.join(parts)}" if parts else "")
+
+    def at(self, row: int) -> str:
+        """The label of a row, in brackets; empty where rows have none."""
+        if self.time is None or row >= len(self.time):
+            return ""
+        return f" ({self.time_name} {self.time[row]})"
+
+
+def sources(data: Any, named: Iterable[str], argument: str = "data") -> list[Source]:
+    """The data sets in `data`; `named` are the quantities of the model that data may hold."""
+    named = list(named)
+    if isinstance(data, (list, tuple)) and not _is_table(data):
+        if not data:
+            raise DataError(
+                f"{argument} is an empty list of data sets",
+                fix="give at least one data set; a single one needs no list",
+            )
+        if all(isinstance(d, (int, float, np.number)) or d is None for d in data):
+            raise _not_a_data_set(data, argument, argument, named)
+        return [
+            _source(d, f"{argument} set {i}" if len(data) > 1 else argument, argument, named)
+            for i, d in enumerate(data, start=1)
+        ]
+    return [_source(data, argument, argument, named)]
+
+
+def _source(data: Any, label: str, argument: str, named: list[str]) -> Source:
+    if hasattr(data, "data_vars") and hasattr(data, "coords"):
+        return _from_dataset(data, label)
+    if _is_table(data):
+        return _from_frame(data, label, named)
+    if isinstance(data, Mapping):
+        return _from_mapping(data, label, named)
+    raise _not_a_data_set(data, label, argument, named)
+
+
+def _is_table(data: Any) -> bool:
+    return hasattr(data, "iloc") and hasattr(data, "columns")
+
+
+def _not_a_data_set(data: Any, label: str, argument: str, named: list[str]) -> DataError:
+    some = next(iter(named), "y")
+    example = f"{{{some!r}: array}}"
+    if data is None:
+        found, fix = f"{label} is None", f"give a mapping of arrays such as {example}"
+    elif isinstance(data, (str, os.PathLike)):
+        path = os.fspath(data)
+        found = f"{label} is the {'text' if isinstance(data, str) else 'path'} {path!r}"
+        fix = f"read the file first, pd.read_csv({path!r}) for a CSV, and pass the DataFrame"
+    elif isinstance(data, Model):
+        found = f"{label} is the model {data.name!r}"
+        fix = "pass the model first and the data second"
+    elif isinstance(data, (np.ndarray, list, tuple)) or hasattr(data, "__array__"):
+        found = f"{label} is {short(data)} of type {type(data).__name__}, which names no variable"
+        fix = f"name it: {{{some!r}: {argument}}}"
+    else:
+        found = f"{label} is {short(data)} of type {type(data).__name__}"
+        fix = (
+            f"give a mapping of arrays such as {example}, a pandas DataFrame, an xarray Dataset, "
+            "or a list of those"
+        )
+    return DataError(found, fix=fix)
+
+
+def _from_mapping(data: Mapping[Any, Any], label: str, named: list[str]) -> Source:
+    columns = {str(k): v for k, v in data.items()}
+    known = list(columns)
+    source = Source(label, "mapping", columns, known=known)
+    if "time" in columns and "time" not in named:
+        source.time = _labels(columns.pop("time"), source)
+        return source
+    for name, column in columns.items():  # Series bring an index, which must be the same for all
+        index = getattr(column, "index", None)
+        if not (hasattr(column, "iloc") and _informative(index)):
+            continue
+        labels = _labels(index, source, "index")
+        if source.time is None:
+            source.time, source.time_name, first = labels, "index", name
+        elif not np.array_equal(source.time, labels):
+            raise DataError(
+                f"{first!r} and {name!r} are Series with different indices",
+                fix="put them into one DataFrame, pd.DataFrame({...}), which aligns the rows",
+                where=source.place(),
+            )
+    return source
+
+
+def _from_frame(data: Any, label: str, named: list[str]) -> Source:
+    names = ["_".join(map(str, c)) if isinstance(c, tuple) else str(c) for c in data.columns]
+    source = Source(label, "DataFrame", {}, known=names, time_name="index")
+    repeated = [n for i, n in enumerate(names) if n in names[:i]]
+    if repeated:
+        raise DataError(
+            f"the DataFrame has more than one column named {repeated[0]!r}",
+            fix="rename or drop one of them",
+            where=source.place(),
+        )
+    source.columns = {n: data.iloc[:, i] for i, n in enumerate(names)}
+    if getattr(data.index, "nlevels", 1) > 1:
+        raise DataError(
+            "the rows have an index of several levels",
+            fix="one data set holds one experiment: pass a list, "
+            "[part.droplevel(0) for _, part in data.groupby(level=0)]",
+            where=source.place(),
+        )
+    if _informative(data.index):
+        source.time = _labels(data.index, source, "index")
+    elif "time" in names and "time" not in named:
+        source.time_name = "time"
+        source.time = _labels(source.columns.pop("time"), source)
+    return source
+
+
+def _from_dataset(data: Any, label: str) -> Source:
+    source = Source(label, "Dataset", {}, known=[str(n) for n in data.data_vars])
+    if "time" not in data.dims:
+        dims = ", ".join(map(str, data.dims)) or "none"
+        raise DataError(
+            f"the Dataset has no dimension 'time'; its dimensions are: {dims}",
+            fix='rename the one that counts the rows, data.rename({"step": "time"})',
+            where=source.place(),
+        )
+    for name, variable in data.data_vars.items():
+        if "time" not in variable.dims:
+            source.columns[str(name)] = variable
+            continue
+        extra = [d for d in variable.dims if d in ("draw", "trajectory", "chain", "sample")]
+        wide = [d for d in extra if variable.sizes[d] > 1]
+        if wide and str(name) in source.known:
+            source.columns[str(name)] = _Wide(wide[0], variable.sizes[wide[0]])
+            continue
+        variable = variable.squeeze(extra, drop=True)
+        source.columns[str(name)] = variable.transpose("time", ...).values
+    if "time" in data.coords:
+        source.time = _labels(data["time"], source)
+    return source
+
+
+@dataclass(frozen=True)
+class _Wide:
+    """Stands for a variable of a Dataset that holds several draws."""
+
+    dim: str
+    size: int
+
+
+def check_single(value: Any, name: str, source: Source) -> None:
+    """Refuse a variable that holds several draws of the series."""
+    if isinstance(value, _Wide):
+        raise DataError(
+            f"{name!r} holds {value.size} series along the dimension {value.dim!r}",
+            fix=f"choose one, data.isel({value.dim}=0); or pass a list of data sets, if each is "
+            "an experiment of its own",
+            where=source.place(name),
+        )
+
+
+def _informative(index: Any) -> bool:
+    """Whether an index says more than the row number."""
+    if index is None or callable(index):
+        return False
+    plain = type(index).__name__ == "RangeIndex" and index.start == 0 and index.step == 1
+    return not plain
+
+
+def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
+    """Labels of the rows as an array, increasing where they have an order."""
+    where = source.place()
+    if getattr(values, "dt", None) is not None:  # a Series of dates
+        values = type(values.index)(values) if hasattr(values, "index") else values
+    if getattr(values, "tz", None) is not None:
+        values = values.tz_convert(None)
+    if hasattr(values, "to_timestamp"):
+        values = values.to_timestamp()
+    labels = np.asarray(values)
+    if labels.ndim != 1:
+        raise DataError(
+            f"the {name} has shape {labels.shape}", fix="give one label for each row", where=where
+        )
+    if labels.dtype.kind == "O":
+        numbers = as_numbers(labels)
+        labels = labels.astype(str) if isinstance(numbers, Fault) else numbers
+    ordered = labels.dtype.kind in "iufmM"
+    if labels.dtype.kind in "fmM":
+        absent = ~np.isfinite(labels)
+        if absent.any():
+            row = int(np.argmax(absent))
+            raise DataError(
+                f"the {name} is {labels[row]} in row {row + 1}",
+                fix=f"give every row a {name}, or drop the {name} altogether",
+                where=where,
+            )
+    first: dict[Any, int] = {}
+    for row, value in enumerate(labels.tolist()):
+        if value in first:
+            raise DataError(
+                f"the {name} {labels[row]} stands in rows {first[value] + 1} and {row + 1}",
+                fix="one data set holds one experiment with one row for each time: remove the "
+                "repetition, or pass a list of data sets for several experiments",
+                where=where,
+            )
+        first[value] = row
+    if ordered and len(labels) > 1 and not (labels[1:] > labels[:-1]).all():
+        row = int(np.argmax(~(labels[1:] > labels[:-1]))) + 1
+        raise DataError(
+            f"the {name} is not increasing: {labels[row]} in row {row + 1} follows "
+            f"{labels[row - 1]} in row {row}",
+            fix="sort the rows by time (data.sort_index() or data.sort_values('time')); years "
+            "before an epoch are negative",
+            where=where,
+        )
+    return labels

@@ -1,0 +1,211 @@
+"""Numbers as users write them, as float64; and what lies outside a distribution's support."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.language.distribution import isinstance_bound_closed
+from ssmppl.language.distributions import Beta, Distribution, Truncated
+
+Values = Mapping[Expr, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something wrong with an array: where in it (None: everywhere), what, and the fix."""
+
+    index: tuple[int, ...] | None
+    found: str
+    fix: str
+
+
+def as_numbers(value: Any) -> np.ndarray | Fault:
+    """`value` as float64, NaN where it is masked, None, NA or NaT; or what forbids that."""
+    if isinstance(value, np.ma.MaskedArray):
+        masked = np.ma.getmaskarray(value)
+        if value.dtype.kind in "biuf":
+            return np.where(masked, np.nan, value.data.astype(np.float64))
+        entries = np.array(value.data, dtype=object)
+        entries[masked] = None
+        return as_numbers(entries)
+    if isinstance(value, (dict, set, frozenset, str, bytes)):
+        return Fault(None, f"is {short(value)}, which is no array", "give an array of numbers")
+    kind = getattr(getattr(value, "dtype", None), "kind", "O")
+    if kind in "biuf" and not isinstance(value, (np.ndarray, np.generic)):
+        try:  # pandas' nullable columns: pd.NA becomes NaN
+            return np.asarray(value.to_numpy(dtype=np.float64, na_value=np.nan))
+        except (AttributeError, TypeError, ValueError):
+            pass
+    try:
+        plain = np.asarray(value)
+    except (TypeError, ValueError):
+        return Fault(
+            None,
+            f"is no rectangular array: {short(value)}",
+            "give every row the same number of entries, NaN where one is missing",
+        )
+    if plain.dtype.kind in "biuf":
+        return plain.astype(np.float64)
+    if plain.dtype.kind in "mM":
+        return Fault(
+            (0,) * plain.ndim if plain.size else None,
+            f"holds dates or durations: {plain.ravel()[0] if plain.size else plain.dtype}",
+            "convert it to numbers, for example seconds / np.timedelta64(1, 's'); times of the "
+            "rows are the index or the coordinate 'time'",
+        )
+    if plain.dtype.kind == "c":
+        return Fault(
+            (0,) * plain.ndim if plain.size else None,
+            f"is complex: {plain.ravel()[0] if plain.size else plain.dtype}",
+            "give real and imaginary parts as two channels, or as a vector of length 2",
+        )
+    if plain.ndim == 0 and plain.dtype.kind == "O" and not _missing(plain[()]):
+        if not isinstance(plain[()], (numbers.Real, Decimal)):
+            return Fault(
+                None, f"is {short(plain[()])}, which is no array", "give an array of numbers"
+            )
+    return _objects(plain)
+
+
+def _objects(plain: np.ndarray) -> np.ndarray | Fault:
+    out = np.empty(plain.shape)
+    for index in np.ndindex(plain.shape):
+        entry = plain[index]
+        if _missing(entry):
+            out[index] = np.nan
+        elif isinstance(entry, (numbers.Real, np.bool_, Decimal)):
+            out[index] = float(entry)
+        else:
+            text = isinstance(entry, (str, bytes))
+            return Fault(
+                index,
+                f"{'the text ' if text else ''}{short(entry)} stands where a number is expected",
+                "convert the column, for example by pd.to_numeric(column, errors='coerce'), "
+                "which writes NaN for what is no number"
+                if text
+                else "give numbers, NaN where a value is missing",
+            )
+    return out
+
+
+def _missing(entry: Any) -> bool:
+    return entry is None or type(entry).__name__ in ("NAType", "NaTType", "MaskedConstant")
+
+
+def short(value: Any) -> str:
+    """A value's repr, cut to one line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def number(value: float) -> str:
+    """A value as the user wrote it, in short."""
+    return f"{value:.10g}"
+
+
+def outside(distribution: Distribution, values: np.ndarray, env: Values) -> Fault | None:
+    """The first of `values` (T, *shape) that `distribution` gives no density; NaN pass.
+
+    Bounds are numbers, or expressions of the symbols in `env` (each (T,) or scalar); bounds that
+    depend on anything else are not looked at. The index of the fault starts with the row.
+    """
+    support = distribution.support()
+    if support.kind == "simplex":
+        return _outside_simplex(distribution, values)
+    if support.kind == "positive definite":
+        return _outside_cone(distribution, values)
+    if support.kind not in ("interval", "integers"):
+        return None
+    lower = _bound(support.lower, env, len(values), -math.inf)
+    upper = _bound(support.upper, env, len(values), math.inf)
+    closed = support.kind == "integers" or isinstance_bound_closed(distribution)
+    with np.errstate(invalid="ignore"):
+        bad = (values < lower) | (values > upper)
+        if not closed:
+            bad |= (values == lower) | ((values == upper) & isinstance(distribution, Beta))
+        if support.kind == "integers":
+            bad |= np.isfinite(values) & (values != np.floor(values))
+    if not bad.any():
+        return None
+    index = tuple(int(i) for i in np.argwhere(bad)[0])
+    low, high = lower[index], upper[index]
+    if support.kind == "integers":
+        bounds = f"the whole numbers from {number(low)}" + (
+            f" to {number(high)}" if math.isfinite(high) else ""
+        )
+    else:
+        left, right = "[" if closed else "(", "]" if closed else ")"
+        left, right = left if math.isfinite(low) else "(", right if math.isfinite(high) else ")"
+        bounds = f"{left}{number(low)}, {number(high)}{right}"
+    return Fault(
+        index,
+        f"{number(values[index])} is outside the support of {name_of(distribution)}, {bounds}",
+        f"a value in {bounds}" if support.kind == "interval" else f"one of {bounds}",
+    )
+
+
+def name_of(distribution: Distribution) -> str:
+    """The distribution's name as in the language."""
+    if isinstance(distribution, Truncated):
+        return f"the truncated {name_of(distribution.base)}"
+    return type(distribution).__name__
+
+
+def _bound(bounds: np.ndarray, env: Values, rows: int, none: float) -> np.ndarray:
+    """(rows, *shape) of the bounds that can be computed from `env`, `none` elsewhere."""
+    out = np.full((rows, *bounds.shape), none)
+    for index in np.ndindex(bounds.shape):
+        if all(s in env for s in symbols_of(bounds[index])):
+            value = evaluate(bounds[index], env)
+            out[(slice(None), *index)] = np.where(np.isnan(value), none, value)
+    return out
+
+
+def _outside_simplex(distribution: Distribution, values: np.ndarray) -> Fault | None:
+    for row, p in enumerate(values):
+        if not np.isfinite(p).all():
+            continue
+        if (p <= 0).any() or (p >= 1).any():
+            k = int(np.argmax((p <= 0) | (p >= 1)))
+            return Fault(
+                (row, k),
+                f"{number(p[k])} is outside the support of {name_of(distribution)}, (0, 1)",
+                "shares strictly between 0 and 1",
+            )
+        if abs(p.sum() - 1.0) > 1e-6:
+            return Fault((row,), f"the shares {p.tolist()} sum to {number(p.sum())}, not to 1",
+                         "shares divided by their sum")  # fmt: skip
+    return None
+
+
+def _outside_cone(distribution: Distribution, values: np.ndarray) -> Fault | None:
+    for row, m in enumerate(values):
+        if not np.isfinite(m).all():
+            continue
+        gap = np.abs(m - m.T)
+        if (gap > 1e-8 * max(1e-300, float(np.abs(m).max()))).any():
+            i, j = (int(k) for k in np.unravel_index(np.argmax(gap), m.shape))
+            return Fault(
+                (row, i, j),
+                f"the matrix is not symmetric: entry [{i}, {j}] is {number(m[i, j])}, "
+                f"[{j}, {i}] is {number(m[j, i])}",
+                "a symmetric matrix, for example (m + m.T) / 2",
+            )
+        least = float(np.linalg.eigvalsh(m)[0])
+        if not least > 0:
+            return Fault(
+                (row,),
+                f"the matrix {m.tolist()} is not positive definite: its least eigenvalue is "
+                f"{number(least)}",
+                "a positive definite matrix",
+            )
+    return None
