@@ -183,7 +183,7 @@ def test_conditional_systematic_law(weights):
     slot = rng.integers(n, size=REPEATS)
     parent = (np.cumsum(direct, axis=1) <= slot[:, None]).sum(axis=1)
     tested = 0
-    for keep in np.flatnonzero(w * REPEATS > 200):
+    for keep in np.flatnonzero(w * REPEATS > 100):
         restricted = direct[parent == keep]
         out = np.empty((REPEATS, n), dtype=np.int64)
         repeat_conditional(state(keep), w, keep, buffer(n), out)

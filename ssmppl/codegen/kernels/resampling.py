@@ -133,7 +133,7 @@ def stratified(state, w, ancestors):
         s += m * w[j]
         k = _floor_below(s, m)
         below = word_uniform(word(key0, key1, start + k)) < s - np.float64(k)
-        q = min(k + (_1 if below else np.uint64(0)), np.uint64(m))
+        q = min(k + np.uint64(below), np.uint64(m))
         _place(ancestors, p, q, j)
         p = q
     state[2] = start + np.uint64(m)
