@@ -26,7 +26,7 @@ def _decorator(**options: Any) -> Callable[[Callable], Any]:
     compile_function = numba.njit(nogil=True, error_model="numpy", boundscheck=False, **options)
 
     def decorate(function: Callable) -> Any:
-        if numba.config.DISABLE_JIT:
+        if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
             return _interpreted(function)
         return compile_function(function)
 
