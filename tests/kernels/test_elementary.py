@@ -101,7 +101,7 @@ def test_coefficients_can_be_recomputed(name):
     numba.config.DISABLE_JIT or platform.machine().lower() not in ("x86_64", "amd64"),
     reason="reads x86 assembly",
 )
-@pytest.mark.parametrize("name", ACCURACY)
+@pytest.mark.parametrize("name", sorted(ACCURACY.keys() - {"sqrt"}))
 def test_loops_vectorise(name):
     loop = loop_over(getattr(elementary, name))
     a = np.linspace(0.1, 1.0, 64)
