@@ -62,7 +62,7 @@ examples: $(VENV)/.installed-run
 	done
 
 docs: $(VENV)/.installed-docs
-	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -T -W --keep-going -b html docs docs/_build/html
 
 bench: $(VENV)/.installed-dev
 	@set -e; for file in $(sort $(wildcard bench/bench_*.py)); do \
