@@ -1,6 +1,6 @@
 """The polynomials of `ssmppl.codegen.kernels.elementary`, computed anew with mpmath.
 
-Each is the interpolant of an even-tempered function at the Chebyshev nodes of its interval,
+Each is the interpolant of a smooth function at the Chebyshev nodes of its interval,
 which is within a small factor of the best approximation.  `python -m tests.kernels.coefficients`
 prints them.
 """

@@ -91,7 +91,7 @@ def test_limits():
     assert special.logaddexp(-np.inf, 1.5) == 1.5
     assert special.log_diff_exp(2.0, 2.0) == -np.inf
     assert special.log_diff_exp(2.0, -np.inf) == 2.0
-    assert special.log_ndtr(-np.inf) == -np.inf or np.isnan(special.log_ndtr(-np.inf))
+    assert special.log_ndtr(-np.inf) == -np.inf
     assert incomplete.gammainc(2.0, 0.0) == 0.0
     assert incomplete.gammainc(2.0, np.inf) == 1.0
     assert incomplete.gammaincinv(2.0, 1.0) == np.inf
