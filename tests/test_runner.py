@@ -1,5 +1,6 @@
 """The runner of chains, on a random walk."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -81,7 +82,8 @@ EXECUTORS = {
     "default": lambda: None,
     "one thread": lambda: ThreadPoolExecutor(1),
     "eight threads": lambda: ThreadPoolExecutor(8),
-    "processes": lambda: ProcessPoolExecutor(2),
+    # Not forked: the process that runs the tests has threads by now.
+    "processes": lambda: ProcessPoolExecutor(2, multiprocessing.get_context("forkserver")),
     "inline": Inline,
 }
 
