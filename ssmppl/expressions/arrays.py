@@ -143,7 +143,8 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "conjugate": lambda a: a,
 }
 _DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "where")} | {
-    "add", "maximum", "minimum", "arctan2", "logaddexp", "gammainc", "gammaincinv",
+    "add", "maximum", "minimum", "arctan2", "logaddexp", "gammainc", "gammaincc", "gammaincinv",
+    "gammainccinv",
 }  # fmt: skip
 
 

@@ -72,12 +72,14 @@ PARTIALS: dict[str, Partial] = {
     "arctan2": lambda d, a, b: [b / (a**2 + b**2), -a / (a**2 + b**2)],
     "logaddexp": lambda d, a, b: [_f("exp", a - d), _f("exp", b - d)],
     "gammainc": lambda d, a, x: [None, _gamma_density(a, x)],
+    "gammaincc": lambda d, a, x: [None, -_gamma_density(a, x)],
     "gammaincinv": lambda d, a, p: [None, 1.0 / _gamma_density(a, d)],
+    "gammainccinv": lambda d, a, p: [None, -1.0 / _gamma_density(a, d)],
     "betainc": lambda d, a, b, x: [None, None, _beta_density(a, b, x)],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
 }
 # Piecewise constant: derivative zero wherever there is one.
-FLAT = frozenset("sign floor ceil lt le eq ne and or not".split())
+FLAT = frozenset(["sign", "floor", "ceil", "lt", "le", "eq", "ne", "and", "or", "not"])
 
 
 class NotDifferentiable(SSMError):

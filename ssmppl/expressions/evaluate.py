@@ -16,16 +16,17 @@ from ssmppl.expressions.expr import MATRIX_OPS, Expr, constant, topological
 Draw = Callable[[str, tuple[np.ndarray, ...]], np.ndarray]
 
 MEANING: dict[str, Callable[..., Any]] = {
-    **{n: getattr(np, n) for n in "exp log log1p expm1 sqrt sin cos tan sinh cosh tanh".split()},
-    **{n: getattr(np, n) for n in "arcsin arccos arctan arcsinh arccosh arctanh".split()},
-    **{n: getattr(np, n) for n in "abs sign floor ceil maximum minimum arctan2 logaddexp".split()},
-    **{n: getattr(sp, n) for n in "gammaln digamma ndtr log_ndtr ndtri erf erfc".split()},
-    **{n: getattr(sp, n) for n in "gammainc gammaincinv betainc betaincinv".split()},
+    **{n: getattr(np, n) for n in ["exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh"]},
+    **{n: getattr(np, n) for n in ["arcsin", "arccos", "arctan", "arcsinh", "arccosh", "arctanh"]},
+    **{n: getattr(np, n) for n in ["abs", "sign", "floor", "ceil", "maximum", "minimum", "arctan2", "logaddexp"]},
+    **{n: getattr(sp, n) for n in ["gammaln", "digamma", "ndtr", "log_ndtr", "ndtri", "erf", "erfc"]},
+    **{n: getattr(sp, n) for n in ["gammainc", "gammaincc", "gammaincinv", "betainc"]},
+    **{n: getattr(sp, n) for n in ["gammainccinv", "betaincinv"]},
     "trigamma": lambda a: sp.polygamma(1, a),
     # smallest k with cdf(k) >= q; scipy's inverses are continuous in k
     "poisson_quantile": lambda rate, q: _round_up(sp.pdtrik(q, rate), lambda k: sp.pdtr(k, rate), q),
     "binomial_quantile": lambda n, p, q: _round_up(
-        sp.bdtrik(q, n, p), lambda k: sp.bdtr(k, n, p), q
+        sp.bdtrik(q, n, p), lambda k: _binomial_cdf(k, n, p), q
     ),
     "negbinomial_quantile": lambda r, p, q: _round_up(
         sp.nbdtrik(q, r, p), lambda k: sp.betainc(r, k + 1.0, p), q
@@ -48,10 +49,14 @@ MEANING: dict[str, Callable[..., Any]] = {
 }
 
 
+def _binomial_cdf(k: Any, n: Any, p: Any) -> Any:
+    return np.where(k >= n, 1.0, sp.betainc(np.maximum(n - k, 0.5), k + 1.0, 1.0 - p))
+
+
 def _round_up(k: Any, cdf: Callable[[Any], Any], q: Any) -> Any:
     k = np.maximum(np.ceil(k), 0.0)
     below = np.maximum(k - 1.0, 0.0)
-    return np.where(cdf(below) >= q, below, k)
+    return np.where(np.asarray(q) == 1.0, np.inf, np.where(cdf(below) >= q, below, k))
 
 
 def evaluate(

@@ -27,20 +27,14 @@ import numpy as np
 
 from ssmppl.errors import Location, UnsupportedOperation
 
-UNARY = (
-    "neg exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh "
-    "arctanh abs sign floor ceil gammaln digamma trigamma ndtr log_ndtr ndtri erf erfc not"
-).split()
-BINARY = (
-    "add sub mul div pow mod maximum minimum arctan2 logaddexp "
-    "lt le eq ne and or gammainc gammaincinv poisson_quantile"
-).split()
+UNARY = ["neg", "exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh", "abs", "sign", "floor", "ceil", "gammaln", "digamma", "trigamma", "ndtr", "log_ndtr", "ndtri", "erf", "erfc", "not"]
+BINARY = ["add", "sub", "mul", "div", "pow", "mod", "maximum", "minimum", "arctan2", "logaddexp", "lt", "le", "eq", "ne", "and", "or", "gammainc", "gammaincc", "gammaincinv", "gammainccinv", "poisson_quantile"]
 TERNARY = ["where", "betainc", "betaincinv", "binomial_quantile", "negbinomial_quantile"]
 MATRIX_OPS = ("cholesky", "inverse", "logdet", "det")  # args: the n*n entries, row by row
 OPS = frozenset(
     [*UNARY, *BINARY, *TERNARY, *MATRIX_OPS, "const", "symbol", "item", "random", "call"]
 )
-BOOLEAN = frozenset("lt le eq ne and or not".split())
+BOOLEAN = frozenset(["lt", "le", "eq", "ne", "and", "or", "not"])
 
 _interned: weakref.WeakValueDictionary[tuple, Expr] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
@@ -59,7 +53,7 @@ class Expr:
     "item", (kind, key) of a "random" draw, the function of a "call", the size of a matrix.
     """
 
-    __slots__ = ("args", "data", "op", "__weakref__")
+    __slots__ = ("__weakref__", "args", "data", "op")
     op: str
     args: tuple[Expr, ...]
     data: Any
@@ -92,7 +86,7 @@ class Expr:
     size = 1
 
     @property
-    def T(self) -> Expr:  # noqa: N802 - NumPy's name
+    def T(self) -> Expr:
         return self
 
     __hash__ = object.__hash__
@@ -256,7 +250,8 @@ def _binary(op: str, a: Any, b: Any):
 def apply(op: str, *operands: Any) -> Expr:
     """The node of `op` on nodes or numbers, with constants folded and neutral elements dropped.
 
-    0 * x is 0 whatever x is, as in the algebra of polynomials (IEEE's 0 * inf is nan).
+    As in the algebra of real numbers, 0 * x and x - x are 0 and log(exp(x)) is x whatever x is,
+    also where IEEE arithmetic would overflow or give nan.
     """
     args = tuple(as_expr(a) for a in operands)
     if op not in BOOLEAN and op != "where":  # arithmetic on a condition: 1 where it holds
@@ -292,6 +287,8 @@ def _simplify_sub(a, b):
         return a
     if _is(a, 0.0):
         return apply("neg", b)
+    if a is b:
+        return constant(0.0)
     return apply("add", a, b.args[0]) if b.op == "neg" else None
 
 
@@ -316,6 +313,8 @@ def _simplify_mul(a, b):
 def _simplify_div(a, b):
     if _is(b, 1.0):
         return a
+    if a.op == "const" and b.op == "div" and b.args[0].op == "const" and b.args[0].data != 0:
+        return apply("mul", a.data / b.args[0].data, b.args[1])  # 1 / (1 / x)
     return constant(0.0) if _is(a, 0.0) and not _is(b, 0.0) else None
 
 
@@ -325,6 +324,17 @@ def _simplify_pow(a, b):
     rules = {0.0: lambda: constant(1.0), 1.0: lambda: a, 0.5: lambda: apply("sqrt", a)}
     rules[-1.0] = lambda: apply("div", 1.0, a)
     return rules[b.data]() if b.data in rules else None
+
+
+def _simplify_log(a):
+    """log(exp x) = x, and positive factors that are numbers come out."""
+    if a.op == "exp":
+        return a.args[0]
+    if a.op == "mul" and a.args[0].op == "const" and a.args[0].data > 0:
+        return constant(math.log(a.args[0].data)) + apply("log", a.args[1])
+    if a.op == "div" and a.args[0].op == "const" and a.args[0].data > 0:
+        return constant(math.log(a.args[0].data)) - apply("log", a.args[1])
+    return None
 
 
 def _simplify_neg(a):
@@ -347,18 +357,19 @@ _SIMPLIFY = {
     "mul": _simplify_mul,
     "div": _simplify_div,
     "pow": _simplify_pow,
+    "log": _simplify_log,
     "neg": _simplify_neg,
     "where": _simplify_where,
 }
 # Constants are folded with NumPy's arithmetic, which is the meaning of these operations.
 _FOLD = {
     **{name: getattr(np, name) for name in UNARY if hasattr(np, name)},
-    **{"neg": operator.neg, "abs": abs, "add": operator.add, "sub": operator.sub},
-    **{"mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod},
-    **{"maximum": np.maximum, "minimum": np.minimum, "arctan2": np.arctan2},
-    **{"logaddexp": np.logaddexp, "gammaln": lambda x: _gammaln(x), "where": np.where},
-    **{"lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne},
-    **{"and": np.logical_and, "or": np.logical_or, "not": np.logical_not},
+    "neg": operator.neg, "abs": abs, "add": operator.add, "sub": operator.sub,
+    "mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod,
+    "maximum": np.maximum, "minimum": np.minimum, "arctan2": np.arctan2,
+    "logaddexp": np.logaddexp, "gammaln": lambda x: _gammaln(x), "where": np.where,
+    "lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne,
+    "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
 }
 
 
@@ -407,6 +418,11 @@ def dependent(roots: Iterable[Expr], on: Iterable[Expr]) -> set[Expr]:
         if any(a in found for a in node.args):
             found.add(node)
     return found
+
+
+def depends_on(expression: Expr, symbols: Iterable[Expr]) -> bool:
+    """Whether the expression depends on some symbol of `symbols`."""
+    return expression in dependent([expression], symbols)
 
 
 def substitute(roots: list[Expr], replacement: dict[Expr, Expr]) -> list[Expr]:

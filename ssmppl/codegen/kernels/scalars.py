@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from ssmppl.codegen.kernels.elementary import exp, log1p
 from ssmppl.codegen.kernels.flags import exact, precise
 from ssmppl.codegen.kernels.incomplete import betainc, gammaincc
 
@@ -25,6 +26,13 @@ def maximum(a, b):
 @precise
 def minimum(a, b):
     return a if (a <= b) | (a != a) else b
+
+
+@precise
+def logaddexp(a, b):
+    """log(exp a + exp b), in a form that vectorises."""
+    top = a if (a >= b) | (a != a) else b
+    return top if (top == -np.inf) | (top == np.inf) else top + log1p(exp(-abs(a - b)))
 
 
 @precise

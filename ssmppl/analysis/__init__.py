@@ -1,0 +1,1 @@
+"""Analyses of a traced model: each gives a finding, or NotApplicable with the reason."""

@@ -1,0 +1,104 @@
+"""The complete-data density of a trace, as terms that can be weighed, summed and separated.
+
+log p(x_{1:T}, y_{1:T}, theta) = sum of the terms of `prior`, of `initial` at t = 1, of
+`transition` at t = 2..T and of `observation` at t = 1..T.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.errors import Location
+from ssmppl.expressions.arrays import ExprArray, array, inverse, log_determinant
+from ssmppl.expressions.expr import Expr, apply, constant
+from ssmppl.language.continuous import LOG_2PI
+from ssmppl.language.distributions import MvNormal
+from ssmppl.language.trace import Site, Trace, seen
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What the data lack, as far as the generated code depends on it.
+
+    none : every entry was measured, so no term is ever left out.
+    partial : names of channels with a joint law of which single components are missing.
+    """
+
+    none: bool = False
+    partial: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Term:
+    """One summand of a log density.
+
+    guard : the term counts where this is true (1); None: always.
+    """
+
+    site: Site
+    log_density: Expr
+    guard: Expr | None
+
+    @property
+    def where(self) -> Location:
+        return self.site.distribution.location
+
+    def guarded(self) -> Expr:
+        """The term as one expression, 0 where the guard is false."""
+        if self.guard is None:
+            return self.log_density
+        return apply("where", self.guard, self.log_density, 0.0)
+
+
+def terms(trace: Trace, role: str, missing: Missing = Missing(), guard: bool = True) -> list[Term]:
+    """The terms of one role: "prior", "initial", "transition" or "observation".
+
+    guard=False leaves the supports out of the densities, as algebra on them needs it.
+    """
+    if role == "observation":
+        return [t for s in trace.observations.values() for t in _observed(s, missing, guard)]
+    sites = {
+        "prior": trace.parameters, "initial": trace.initial, "transition": trace.transition
+    }[role]  # fmt: skip
+    return [Term(s, s.distribution.log_density(s.value, guard), None) for s in sites.values()]
+
+
+def _observed(site: Site, missing: Missing, guard: bool) -> list[Term]:
+    d = site.distribution
+    if missing.none:
+        return [Term(site, d.log_density(site.value, guard), None)]
+    masks = array([seen(s) for s in site.components])
+    if d.joint:
+        if site.name in missing.partial and isinstance(d, MvNormal):
+            return [Term(site, marginal_normal(d, site.value, masks), any_of(masks))]
+        return [Term(site, d.log_density(site.value, guard), masks[0])]
+    densities = d.guarded_log_densities(site.value) if guard else d.log_densities(site.value)
+    flat = array(np.broadcast_to(array(densities).view(np.ndarray), site.shape)).ravel()
+    return [Term(site, e, m) for e, m in zip(flat, masks, strict=True)]
+
+
+def any_of(masks: ExprArray) -> Expr:
+    """1 where any component was measured."""
+    total = constant(0.0)
+    for m in masks:
+        total = apply("maximum", total, m) if total.op != "const" else m
+    return total
+
+
+def marginal_normal(d: MvNormal, value: ExprArray, masks: ExprArray) -> Expr:
+    """Log density of the measured components of a Gaussian vector.
+
+    With m the 0/1 vector of measured components, the marginal law of these is that of m * y
+    under covariance (m m') * C + diag(1 - m), less the unit variances of the others.
+    """
+    residual = masks * (value - d.mean_)
+    covariance = mask_covariance(d.covariance_matrix(), masks)
+    quadratic = residual @ inverse(covariance) @ residual
+    return -0.5 * (np.sum(masks) * LOG_2PI + log_determinant(covariance) + quadratic)
+
+
+def mask_covariance(covariance: ExprArray, masks: ExprArray) -> ExprArray:
+    """(m m') * C + diag(1 - m): unit variance, uncorrelated, where not measured."""
+    return array(np.outer(masks, masks) * covariance + np.diag(array(1.0 - masks)))

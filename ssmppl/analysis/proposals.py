@@ -1,0 +1,395 @@
+"""Proposals of the particle filter, derived from the model.
+
+A `Proposal` says how a particle moves and what it weighs, as expressions:
+
+* `draw` gives x_t from x_{t-1} and random draws, `initial_draw` gives x_1;
+* `weight` are the terms of log [ f(x_t | x_{t-1}) g(y_t | x_t) / q(x_t | x_{t-1}, y_t) ];
+* `look_ahead` approximates log p(y_t | x_{t-1}), the auxiliary weight of Pitt and Shephard (1999).
+
+Tiers, best first (Doucet, Godsill and Andrieu 2000, section II): the locally optimal proposal of
+a Gaussian transition with an observation affine in the state; a Laplace approximation to it
+(a few Newton steps per particle, curvature clipped to its concave part, in a defensive mixture
+with the transition); the transition itself (bootstrap).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
+from ssmppl.analysis.structure import GaussianBlock, affine_observation, gaussian_block
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import ExprArray, array, cholesky, inverse, log_determinant
+from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
+from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, topological
+from ssmppl.language.continuous import LOG_2PI
+from ssmppl.language.distributions import Draws
+from ssmppl.language.trace import Site, Trace, seen
+
+NEWTON_STEPS = 3
+LONGEST_STEP = 2.0  # in standard deviations of the transition
+DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """How particles move and what they weigh; see the module's docstring."""
+
+    name: str
+    initial_draw: dict[Expr, Expr]
+    initial_weight: tuple[Term, ...]
+    draw: dict[Expr, Expr]
+    weight: tuple[Term, ...]
+    look_ahead: Expr | None = None
+    exact_look_ahead: bool = False
+    explanation: str = ""
+
+
+def bootstrap(trace: Trace, missing: Missing) -> Proposal:
+    """Move by the transition, weigh by the observation (Gordon, Salmond and Smith 1993)."""
+    observed = tuple(terms(trace, "observation", missing))
+    return Proposal(
+        "bootstrap",
+        _draws(list(trace.initial.values())),
+        observed,
+        _draws(list(trace.transition.values())),
+        observed,
+        explanation="particles move by the transition and are weighed by the observation",
+    )
+
+
+def _draws(sites: list[Site]) -> dict[Expr, Expr]:
+    out: dict[Expr, Expr] = {}
+    for site in sites:
+        sample = array(site.distribution.sample(Draws(site.name)))
+        out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
+    return out
+
+
+def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:
+    """All proposals by name: "bootstrap", "guided", "auxiliary", and the user's own."""
+    found: dict[str, Proposal | NotApplicable] = {"bootstrap": bootstrap(trace, missing)}
+    if trace.proposal:
+        found["user"] = _user(trace, missing)
+    guided = _locally_optimal(trace, missing)
+    if isinstance(guided, NotApplicable):
+        affine_reason = guided
+        guided = _laplace(trace, missing)
+        if isinstance(guided, NotApplicable):
+            same = affine_reason.reason == guided.reason
+            reason = guided.reason if same else f"{affine_reason.reason}; {guided.reason}"
+            guided = NotApplicable(reason, affine_reason.where)
+    found["guided"] = guided
+    if isinstance(guided, NotApplicable):
+        found["auxiliary"] = guided
+    elif guided.look_ahead is None:
+        found["auxiliary"] = NotApplicable(
+            "a state with neither a Gaussian nor a deterministic law stands between x_{t-1} and y_t"
+        )
+    else:
+        found["auxiliary"] = replace(
+            guided,
+            name="auxiliary",
+            explanation=guided.explanation + ", and resampled by how well their successors are "
+            "expected to fit y_t",
+        )
+        found["guided"] = replace(guided, look_ahead=None)
+    return found
+
+
+@dataclass(frozen=True)
+class _Split:
+    """The states of one law: Gaussian ones, and the others with their draws."""
+
+    gaussian: GaussianBlock
+    others: dict[Expr, Expr]
+    random: bool  # whether some other state is random
+
+    def insert(self, expressions: dict[Expr, Expr]) -> dict[Expr, Expr]:
+        """`expressions` with the other states replaced by their draws."""
+        values = substitute(list(expressions.values()), self.others)
+        return dict(zip(expressions, values, strict=True))
+
+
+def _split(sites: list[Site]) -> _Split:
+    block = gaussian_block(sites)
+    own = set(block.symbols)
+    others = {s: e for s, e in _draws(sites).items() if s not in own}
+    random = any(n.op == "random" for n in topological(others.values()))
+    return _Split(block, others, random)
+
+
+# -- tier 2: locally optimal
+
+
+def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
+    sites = list(trace.observations.values())
+    if not sites:
+        return NotApplicable("there is no observation")
+    move = _split(list(trace.transition.values()))
+    if not len(move.gaussian):
+        where = next(iter(trace.transition.values())).distribution.location
+        return NotApplicable("no state has a Gaussian transition", where)
+    observation = affine_observation(sites, move.gaussian.symbols)
+    if isinstance(observation, NotApplicable):
+        return observation
+    if all(e.op == "const" and e.data == 0.0 for e in observation.matrix.ravel()):
+        return NotApplicable(
+            "the observation does not depend on the states with a Gaussian transition",
+            sites[0].distribution.location,
+        )
+    masks = None if missing.none else array([seen(s) for s in observation.symbols])
+    y = array(list(observation.symbols))
+
+    def law(split: _Split) -> tuple[dict[Expr, Expr], Expr]:
+        """Draw of x given y, and log p(y | x_prev), for a Gaussian block of states."""
+        h, d, r = observation.matrix, observation.offset, observation.covariance
+        block = split.gaussian
+        residual = y - h @ block.mean - d
+        if masks is not None:
+            h, residual = array(masks[:, None] * h), masks * residual
+            r = mask_covariance(r, masks)
+        draw, predictive = _condition(block, h, r, residual, masks)
+        return {**split.others, **split.insert(draw)}, predictive
+
+    draw, predictive = law(move)
+    start = _split(list(trace.initial.values()))
+    same = set(start.gaussian.symbols) == set(move.gaussian.symbols)
+    if same:
+        order = [start.gaussian.symbols.index(s) for s in move.gaussian.symbols]
+        start = replace(start, gaussian=_reorder(start.gaussian, order))
+        initial_draw, initial_predictive = law(start)
+        site = sites[0]
+        initial_weight: tuple[Term, ...] = (Term(site, initial_predictive, None),)
+    else:
+        initial_draw = _draws(list(trace.initial.values()))
+        initial_weight = tuple(terms(trace, "observation", missing))
+    weight = Term(sites[0], predictive, None)
+    look_ahead = None if move.random else move.insert({predictive: predictive})[predictive]
+    return Proposal(
+        "guided",
+        initial_draw,
+        initial_weight,
+        draw,
+        (weight,),
+        look_ahead,
+        exact_look_ahead=look_ahead is not None,
+        explanation="locally optimal: particles are drawn from p(x_t | x_{t-1}, y_t), which is "
+        "Gaussian, and weighed by p(y_t | x_{t-1})",
+    )
+
+
+def _reorder(block: GaussianBlock, order: list[int]) -> GaussianBlock:
+    return GaussianBlock(
+        tuple(block.symbols[i] for i in order),
+        array(block.mean[order]),
+        array(block.covariance[np.ix_(order, order)]),
+        block.diagonal,
+    )
+
+
+def _condition(
+    block: GaussianBlock,
+    h: ExprArray,
+    r: ExprArray,
+    residual: ExprArray,
+    masks: ExprArray | None,
+) -> tuple[dict[Expr, Expr], Expr]:
+    """Condition a Gaussian block on h x + noise; masked entries of h and residual are zero."""
+    draws, n, k = Draws("guided"), len(block), len(residual)
+    q = block.covariance
+    s = array(h @ q @ h.T + r)
+    gain = array(q @ h.T @ inverse(s))
+    count = constant(float(k)) if masks is None else np.sum(masks)
+    predictive = -0.5 * (count * LOG_2PI + log_determinant(s) + residual @ inverse(s) @ residual)
+    mean = block.mean + gain @ residual
+    if n == 1:
+        information = 1.0 / q[0, 0] + (array(h.T @ inverse(r) @ h))[0, 0]
+        x = mean[0] + apply("sqrt", 1.0 / information) * draws.normal()
+        return {block.symbols[0]: x}, predictive
+    # Matheron's rule: a joint draw (x*, e*) from the prior, corrected by the gain. No posterior
+    # covariance is factorised, so a nearly singular one is no trouble.
+    prior = array([draws.normal() for _ in range(n)])
+    noise = array([draws.normal() for _ in range(k)])
+    x_star = cholesky(q) @ prior
+    e_star = cholesky(r) @ noise
+    x = mean + x_star - gain @ (h @ x_star + e_star)
+    return dict(zip(block.symbols, x, strict=True)), predictive
+
+
+# -- tier 3: Laplace
+
+
+def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
+    sites = list(trace.observations.values())
+    if not sites:
+        return NotApplicable("there is no observation")
+    observed = terms(trace, "observation", missing)
+    # the density without the guards of its support: these depend on y alone or end the particle
+    smooth = terms(trace, "observation", missing, guard=False)
+    total = constant(0.0)
+    for t in smooth:
+        total = total + t.guarded()
+    move = _split(list(trace.transition.values()))
+    where = sites[0].distribution.location
+    if not len(move.gaussian):
+        law = next(iter(trace.transition.values())).distribution
+        return NotApplicable("no state has a Gaussian transition", law.location)
+    if not depends_on(total, move.gaussian.symbols):
+        return NotApplicable("no state with a Gaussian transition is observed", where)
+    try:
+        slope = array(gradient(total, move.gaussian.symbols))
+        curvature = hessian(total, move.gaussian.symbols)
+    except NotDifferentiable as error:
+        return NotApplicable(f"the observation is not twice differentiable: {error.found}", where)
+    if all(e.op == "const" and e.data == 0.0 for e in curvature.ravel()):
+        return NotApplicable("the observation has no curvature in the state", where)
+    draw, log_q, look_ahead = _newton(move, total, slope, curvature)
+    transition = tuple(
+        t for t in terms(trace, "transition") if not set(t.site.value.ravel()) & set(move.others)
+    )
+    correction = Term(observed[0].site, -log_q, None)
+    return Proposal(
+        "guided",
+        _draws(list(trace.initial.values())),
+        tuple(observed),
+        draw,
+        (*observed, *transition, correction),
+        None if move.random else look_ahead,
+        explanation="Laplace: particles are drawn from a Gaussian fitted to "
+        "f(x_t | x_{t-1}) g(y_t | x_t) by "
+        f"{NEWTON_STEPS} Newton steps each, mixed with {DEFENSIVE:.0%} of the transition",
+    )
+
+
+def _newton(
+    move: _Split, total: Expr, slope: ExprArray, curvature: ExprArray
+) -> tuple[dict[Expr, Expr], Expr, Expr]:
+    """(draw, log q(x_t | x_{t-1}, y_t), log of the Laplace approximation to p(y_t | x_{t-1}))."""
+    block, n = move.gaussian, len(move.gaussian)
+    precision = inverse(block.covariance)
+    spread = array([apply("sqrt", block.covariance[i, i]) for i in range(n)])
+    x = block.mean
+    for _ in range(NEWTON_STEPS):
+        factor, g = _curved(block, x, slope, curvature, precision)
+        pull = g - precision @ (x - block.mean)
+        root = lower_inverse(factor)
+        step = array(root.T @ (root @ pull))
+        limit = LONGEST_STEP * spread
+        x = array(x + np.minimum(np.maximum(step, -limit), limit))
+    factor, _ = _curved(block, x, slope, curvature, precision)
+    draws = Draws("laplace")
+    z = array([draws.normal() for _ in range(n)])
+    from_fit = x + lower_inverse(factor).T @ z
+    from_transition = block.mean + cholesky(block.covariance) @ z
+    defend = apply("lt", draws.uniform(), DEFENSIVE)
+    chosen = {
+        s: apply("where", defend, b, a)
+        for s, a, b in zip(block.symbols, from_fit, from_transition, strict=True)
+    }
+    log_fit = _log_normal(array(list(block.symbols)) - x, factor)
+    log_f = _log_transition(array(list(block.symbols)) - block.mean, block.covariance, precision)
+    log_q = apply(
+        "logaddexp", math.log1p(-DEFENSIVE) + log_fit, math.log(DEFENSIVE) + log_f
+    )
+    at_mode = dict(zip(block.symbols, x, strict=True))
+    (g_mode,) = substitute([total], at_mode)
+    look_ahead = (
+        g_mode
+        + _log_transition(array(x - block.mean), block.covariance, precision)
+        - _log_normal(array([constant(0.0)] * n), factor)
+    )
+    ahead = move.insert({look_ahead: look_ahead})[look_ahead]
+    return {**move.others, **move.insert(chosen)}, log_q, ahead
+
+
+def _curved(
+    block: GaussianBlock,
+    x: ExprArray,
+    slope: ExprArray,
+    curvature: ExprArray,
+    precision: ExprArray,
+) -> tuple[ExprArray, ExprArray]:
+    """Cholesky factor of the fitted precision at x, and the slope of the log density there."""
+    n = len(block)
+    at = dict(zip(block.symbols, x, strict=True))
+    flat = substitute([*slope, *curvature.ravel()], at)
+    g, w = array(flat[:n]), -array(flat[n:]).reshape(n, n)
+    if n == 1:
+        w = array(np.maximum(w, 0.0))
+        return array([[apply("sqrt", (precision + w)[0, 0])]]), g
+    full = written_cholesky(array(precision + w))
+    last = full[n - 1, n - 1]
+    concave = apply("eq", last, last)  # nan where the matrix is not positive definite
+    diagonal = np.diag(array(np.maximum(np.diagonal(w.view(np.ndarray)), 0.0)))
+    safe = written_cholesky(array(precision + diagonal))
+    return array(np.where(concave, full, safe)), g
+
+
+def written_cholesky(a: ExprArray) -> ExprArray:
+    """Cholesky factor written out in scalars (nan where a is not positive definite)."""
+    n, zero = len(a), constant(0.0)
+    out = np.empty((n, n), dtype=object)
+    out[...] = [[zero] * n] * n
+    for j in range(n):
+        total = a[j, j]
+        for k in range(j):
+            total = total - out[j, k] ** 2
+        out[j, j] = apply("sqrt", total)
+        for i in range(j + 1, n):
+            total = a[i, j]
+            for k in range(j):
+                total = total - out[i, k] * out[j, k]
+            out[i, j] = total / out[j, j]
+    return array(out)
+
+
+def _log_normal(d: ExprArray, factor: ExprArray) -> Expr:
+    """Log density at distance d from the mean, precision factor @ factor.T."""
+    log_root = np.sum(array([apply("log", factor[i, i]) for i in range(len(d))]))
+    return log_root - 0.5 * np.sum(array(factor.T @ d) ** 2) - 0.5 * len(d) * LOG_2PI
+
+
+def _log_transition(d: ExprArray, covariance: ExprArray, precision: ExprArray) -> Expr:
+    return -0.5 * (len(d) * LOG_2PI + log_determinant(covariance) + d @ precision @ d)
+
+
+# -- the user's own
+
+
+def _user(trace: Trace, missing: Missing) -> Proposal:
+    """@proposal where the channels it names were measured, the transition elsewhere."""
+    base = bootstrap(trace, missing)
+    laws = [p for site in trace.proposal.values()
+            for a in site.distribution.parameters.values() for p in a.ravel()]  # fmt: skip
+    named = [s for s in trace.observation_symbols if any(depends_on(p, [s]) for p in laws)]
+    measured: Expr | None = None
+    if not missing.none:
+        for s in named:
+            measured = seen(s) if measured is None else apply("minimum", measured, seen(s))
+    draw = dict(base.draw)
+    correction = constant(0.0)
+    own: set[Expr] = set()
+    for site in trace.proposal.values():
+        sample = array(site.distribution.sample(Draws("proposal_" + site.name)))
+        for s, e in zip(site.value.ravel(), sample.ravel(), strict=True):
+            draw[s] = e if measured is None else apply("where", measured, e, draw[s])
+            own.add(s)
+        correction = correction - site.distribution.log_density(site.value)
+    transition = [
+        t for t in terms(trace, "transition") if set(t.site.value.ravel()) & own
+    ]
+    site = transition[0].site
+    ratio = tuple(
+        [replace(t, guard=measured) for t in transition] + [Term(site, correction, measured)]
+    )
+    return replace(
+        base,
+        name="user",
+        draw=draw,
+        weight=(*base.weight, *ratio),
+        explanation=f"@proposal of {next(iter(trace.proposal.values())).where}",
+    )

@@ -1,0 +1,161 @@
+"""Structure of a traced model: which states are Gaussian given the past, which are deterministic,
+and which observations are affine and Gaussian in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.algebra import affine
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import Expr, constant, depends_on
+from ssmppl.language.distributions import Dirac, MvNormal, Normal
+from ssmppl.language.trace import Site, Trace
+
+
+@dataclass(frozen=True)
+class GaussianBlock:
+    """Components that are jointly Gaussian: symbols (n,), mean (n,), covariance (n, n)."""
+
+    symbols: tuple[Expr, ...]
+    mean: ExprArray
+    covariance: ExprArray
+    diagonal: bool
+
+    def __len__(self) -> int:
+        return len(self.symbols)
+
+
+def gaussian_block(sites: Sequence[Site]) -> GaussianBlock:
+    """The Normal and MvNormal sites stacked; empty where there are none."""
+    symbols: list[Expr] = []
+    means: list[Expr] = []
+    blocks: list[np.ndarray] = []
+    for site in sites:
+        d = site.distribution
+        if isinstance(d, Normal):
+            blocks += [np.array([[v]], dtype=object) for v in array(d.variance()).ravel()]
+            means += list(array(d.mean()).ravel())
+        elif isinstance(d, MvNormal):
+            blocks.append(d.covariance_matrix().view(np.ndarray))
+            means += list(d.mean())
+        else:
+            continue
+        symbols += list(site.value.ravel())
+    n, at = len(symbols), 0
+    covariance = np.empty((n, n), dtype=object)
+    covariance[...] = [[constant(0.0)] * n] * n if n else covariance
+    for block in blocks:
+        k = len(block)
+        covariance[at : at + k, at : at + k] = block
+        at += k
+    diagonal = all(len(b) == 1 for b in blocks)
+    return GaussianBlock(tuple(symbols), array(means), array(covariance), diagonal)
+
+
+def deterministic(sites: Sequence[Site]) -> list[Site]:
+    """The Dirac sites."""
+    return [s for s in sites if isinstance(s.distribution, Dirac)]
+
+
+@dataclass(frozen=True)
+class AffineObservation:
+    """y = matrix @ x + offset + Gaussian noise, for the given observed components."""
+
+    symbols: tuple[Expr, ...]
+    matrix: ExprArray
+    offset: ExprArray
+    covariance: ExprArray
+
+
+def affine_observation(
+    sites: Sequence[Site], states: Sequence[Expr]
+) -> AffineObservation | NotApplicable:
+    """All observations as one affine Gaussian law in `states`; the reason where one is not."""
+    for site in sites:
+        if not isinstance(site.distribution, (Normal, MvNormal)):
+            kind = type(site.distribution).__name__
+            return NotApplicable(f"{site.name} is {kind}", site.distribution.location)
+    block = gaussian_block(sites)
+    form = affine(block.mean, states)
+    if isinstance(form, NotApplicable):
+        where = sites[0].distribution.location
+        return NotApplicable(f"the mean of the observation: {form.reason}", where)
+    if any(depends_on(e, states) for e in block.covariance.ravel()):
+        where = sites[0].distribution.location
+        return NotApplicable("the spread of the observation depends on the state", where)
+    return AffineObservation(block.symbols, form[0], form[1], block.covariance)
+
+
+@dataclass(frozen=True)
+class LinearGaussian:
+    """x_1 ~ N(m, P), x_t = A x_{t-1} + b + N(0, Q), y_t = C x_t + d + N(0, R); x in trace order.
+
+    Entries may depend on theta, inputs, time and (in A, b, Q) on y_{t-1}; Q and P may be singular
+    (Dirac components).
+    """
+
+    m: ExprArray
+    P: ExprArray
+    A: ExprArray
+    b: ExprArray
+    Q: ExprArray
+    C: ExprArray
+    d: ExprArray
+    R: ExprArray
+
+
+def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
+    """The whole model as a linear Gaussian one, or the first reason why it is not."""
+    states, prev = trace.state_symbols, trace.state_prev_symbols
+    laws = []
+    for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
+        means, covariance = _gaussian_law(role, list(sites.values()), states)
+        if isinstance(means, NotApplicable):
+            return means
+        laws.append((means, covariance))
+    (m, p), (mean, q) = laws
+    where = next(iter(trace.transition.values())).distribution.location
+    form = affine(mean, prev)
+    if isinstance(form, NotApplicable):
+        return NotApplicable(f"the transition: {form.reason}", where)
+    if any(depends_on(e, prev) for e in q.ravel()):
+        return NotApplicable("the spread of the transition depends on the state", where)
+    if not trace.observations:
+        return NotApplicable("there is no observation")
+    observation = affine_observation(list(trace.observations.values()), states)
+    if isinstance(observation, NotApplicable):
+        return observation
+    return LinearGaussian(
+        m, p, form[0], form[1], q,
+        observation.matrix, observation.offset, observation.covariance,
+    )  # fmt: skip
+
+
+def _gaussian_law(
+    role: str, sites: list[Site], states: list[Expr]
+) -> tuple[ExprArray | NotApplicable, ExprArray]:
+    """Mean and covariance over `states`, Dirac components with zero variance."""
+    zero = constant(0.0)
+    n = len(states)
+    place = {s: i for i, s in enumerate(states)}
+    mean = np.empty(n, dtype=object)
+    covariance = np.empty((n, n), dtype=object)
+    covariance[...] = [[zero] * n] * n
+    for site in sites:
+        d = site.distribution
+        if not isinstance(d, (Normal, MvNormal, Dirac)):
+            reason = f"the {role} law of {site.name} is {type(d).__name__}"
+            return NotApplicable(reason, d.location), array(covariance)
+    block = gaussian_block(sites)
+    index = [place[s] for s in block.symbols]
+    mean[index] = list(block.mean)
+    if index:
+        covariance[np.ix_(index, index)] = block.covariance.view(np.ndarray)
+    for site in deterministic(sites):
+        mean[[place[s] for s in site.value.ravel()]] = list(array(site.distribution.mean()).ravel())
+    return array(mean), array(covariance)

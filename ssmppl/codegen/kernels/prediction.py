@@ -1,0 +1,41 @@
+"""One-step predictions of the observation, from weighted particles moved by the transition."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssmppl.codegen.kernels.flags import exact
+from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
+from ssmppl.codegen.kernels.summaries import weighted_mean
+
+
+@exact
+def predict_step(
+    prepare, step, draw_initial, draw, moments, sizes,
+    theta, y, seen, u, t, x_prev, w_prev, rng, prediction,
+):  # fmt: skip
+    """Write prediction[t] : (4, K): mean, variance, P(Y <= y_t) and P(Y < y_t) of each channel."""
+    n, n_channels = w_prev.size, y.shape[1]
+    c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    x, out = np.empty((sizes[2], n)), np.empty((4 * n_channels, n))
+    normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
+    prepare(theta, c)
+    step(theta, c, y, seen, u, t, s)
+    fill_normal(rng, normals)
+    fill_uniform(rng, uniforms)
+    if t == 0:
+        draw_initial(theta, c, s, x, normals, uniforms, rng)
+        w = np.full(n, 1.0 / n)
+    else:
+        draw(theta, c, s, x_prev, x, normals, uniforms, rng)
+        w = w_prev
+    moments(theta, c, s, x, out)
+    for k in range(n_channels):
+        mean = weighted_mean(out[4 * k], w)
+        square = 0.0
+        for i in range(n):
+            square += w[i] * (out[4 * k, i] - mean) ** 2
+        prediction[t, 0, k] = mean
+        prediction[t, 1, k] = weighted_mean(out[4 * k + 1], w) + square
+        prediction[t, 2, k] = weighted_mean(out[4 * k + 2], w)
+        prediction[t, 3, k] = weighted_mean(out[4 * k + 3], w)

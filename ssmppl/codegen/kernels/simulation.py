@@ -1,0 +1,38 @@
+"""Simulation of states and observations, many draws side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssmppl.codegen.kernels.flags import exact
+from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
+
+
+@exact
+def simulate(
+    prepare, step, draw_initial, draw, observe, sizes,
+    theta, y, seen, u, rng, states, observations, feedback,
+):  # fmt: skip
+    """Fill states (T, D, n) and observations (T, K, n) by the model's laws.
+
+    feedback : the transition names observations, so y_t must be in place when x_{t+1} is drawn;
+        then n = 1 and y : (T, K) is written as it is drawn.
+    """
+    n_steps, n = states.shape[0], states.shape[2]
+    c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
+    prepare(theta, c)
+    for t in range(n_steps):
+        step(theta, c, y, seen, u, t, s)
+        fill_normal(rng, normals)
+        fill_uniform(rng, uniforms)
+        if t == 0:
+            draw_initial(theta, c, s, states[0], normals, uniforms, rng)
+        else:
+            draw(theta, c, s, states[t - 1], states[t], normals, uniforms, rng)
+        fill_normal(rng, normals)
+        fill_uniform(rng, uniforms)
+        observe(theta, c, s, states[t], observations[t], normals, uniforms, rng)
+        if feedback:
+            for k in range(y.shape[1]):
+                y[t, k] = observations[t, k, 0]

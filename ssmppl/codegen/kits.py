@@ -1,0 +1,120 @@
+"""Which generated functions each algorithm needs, written from the findings of the analyses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ssmppl.analysis.density import Term
+from ssmppl.analysis.proposals import Proposal
+from ssmppl.codegen.module import Layout, Section, Target
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import Expr, constant
+from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
+from ssmppl.language.trace import Site, Trace
+
+DRAW_INITIAL = "theta, c, s, states, normals, uniforms, rng"
+DRAW = "theta, c, s, states_prev, states, normals, uniforms, rng"
+WEIGH_INITIAL = "theta, c, s, states, log_w"
+WEIGH = "theta, c, s, states_prev, states, log_w"
+LOOK_AHEAD = "theta, c, s, states_prev, log_w"
+OBSERVE = "theta, c, s, states, out, normals, uniforms, rng"
+
+
+def _state_targets(layout: Layout, draws: dict[Expr, Expr]) -> list[Target]:
+    ordered = sorted(draws.items(), key=lambda p: layout.column(p[0]))
+    return [Target(f"states[{layout.column(s)}, i]", e) for s, e in ordered]
+
+
+def weight_targets(weight: Sequence[Term]) -> list[Target]:
+    """Terms of a log weight as targets, guarded where a measurement may be missing."""
+    found = [Target("log_w[i]", t.log_density, t.guard) for t in weight]
+    return found or [Target("log_w[i]", constant(0.0))]
+
+
+def moves(section: Section, initial: dict[Expr, Expr], draw: dict[Expr, Expr]) -> None:
+    """`draw_initial` and `draw`: how particles are born and move."""
+    section.particle_pass(
+        "draw_initial", "Draw x_1 for each particle.", DRAW_INITIAL,
+        _state_targets(section.layout, initial),
+    )  # fmt: skip
+    section.particle_pass(
+        "draw", "Draw x_t given x_{t-1} for each particle.", DRAW,
+        _state_targets(section.layout, draw),
+    )  # fmt: skip
+
+
+def filter_kit(layout: Layout, proposal: Proposal) -> Section:
+    """The particle filter's functions under one proposal."""
+    section = Section(layout, proposal.name)
+    moves(section, proposal.initial_draw, proposal.draw)
+    section.particle_pass(
+        "weigh_initial", "Log weight of x_1.", WEIGH_INITIAL,
+        weight_targets(proposal.initial_weight), accumulate="log_w",
+    )  # fmt: skip
+    section.particle_pass(
+        "weigh", "Log weight of x_t: log f + log g - log q.", WEIGH,
+        weight_targets(proposal.weight), accumulate="log_w",
+    )  # fmt: skip
+    if proposal.look_ahead is not None:
+        section.particle_pass(
+            "look_ahead", "About log p(y_t | x_{t-1}).", LOOK_AHEAD,
+            [Target("log_w[i]", proposal.look_ahead)],
+        )  # fmt: skip
+    return section
+
+
+def observation_draws(trace: Trace) -> list[Expr]:
+    """A draw of every observed component given x_t, in the trace's order."""
+    out: list[Expr] = []
+    for site in trace.observations.values():
+        sample = array(site.distribution.sample(Draws(site.name))).ravel()
+        by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
+        out += [by_symbol[s] for s in site.components]
+    return out
+
+
+def simulation_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
+    """Functions that simulate states and observations."""
+    section = Section(layout, "simulate")
+    moves(section, plain.initial_draw, plain.draw)
+    targets = [Target(f"out[{k}, i]", e) for k, e in enumerate(observation_draws(trace))]
+    section.particle_pass("observe", "Draw y_t given x_t.", OBSERVE, targets)
+    return section
+
+
+def prediction_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
+    """Functions for one-step predictions of the observations."""
+    section = Section(layout, "predict")
+    moves(section, plain.initial_draw, plain.draw)
+    targets = []
+    k = 0
+    for site in trace.observations.values():
+        for mean, variance, below, strictly in _predictive(site):
+            for j, e in enumerate((mean, variance, below, strictly)):
+                targets.append(Target(f"out[{4 * k + j}, i]", e))
+            k += 1
+    section.particle_pass(
+        "moments", "Mean, variance and distribution function of y_t given x_t.",
+        "theta, c, s, states, out", targets,
+    )  # fmt: skip
+    return section
+
+
+def _predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
+    """(mean, variance, P(Y <= y), P(Y < y)) for every component; nan where there is none."""
+    d = site.distribution
+    y = site.value
+    if isinstance(d, MvNormal):
+        d = Normal(d.mean(), variance=d.variance())
+    nothing = array(np.full(site.shape, np.nan))
+    if d.joint and not isinstance(d, Categorical):
+        below = strictly = nothing
+    else:
+        below = array(d.cdf(y))
+        strictly = array(d.cdf(array(y - 1.0))) if d.discrete else below
+    forms = [array(np.broadcast_to(array(f).view(np.ndarray), site.shape))
+             for f in (d.mean(), d.variance(), below, strictly)]  # fmt: skip
+    first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}
+    return [tuple(f.ravel()[first[s]] for f in forms) for s in site.components]

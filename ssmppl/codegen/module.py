@@ -1,0 +1,327 @@
+"""Generated functions, written as text.
+
+Three binding times (`CONSTANT < THETA < STEP < PARTICLE`): what depends on theta alone is computed
+once per call and kept in the array `c`, on theta and time once per step, kept in `s`, the rest in
+the loop over particles. A `Section` is one algorithm's functions over one pair of such arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from ssmppl.codegen.render import Names, Writer, comment, depends, symbol_name, topological_until
+from ssmppl.expressions.expr import Expr
+from ssmppl.language.trace import Trace
+
+CONSTANT, THETA, STEP, PARTICLE = 0, 1, 2, 3
+LEVELS = {
+    "parameter": THETA, "time": STEP, "time_prev": STEP, "input": STEP, "input_prev": STEP,
+    "observation": STEP, "observation_prev": STEP, "seen": STEP,
+    "state": PARTICLE, "state_prev": PARTICLE,
+}  # fmt: skip
+
+
+def level_of(node: Expr) -> int:
+    """Binding time of a symbol or a random draw."""
+    return PARTICLE if node.op == "random" else LEVELS[node.data[0]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """target = expression, where guard (an expression of the step) holds; else 0 is added."""
+
+    text: str
+    expression: Expr
+    guard: Expr | None = None
+
+
+class Layout:
+    """Where each symbol of a trace stands in the arrays that the kernels pass round."""
+
+    def __init__(self, trace: Trace):
+        self.trace = trace
+        self.place: dict[tuple[str, Expr], int] = {}
+        order = {
+            "parameter": trace.parameter_symbols,
+            "state": trace.state_symbols,
+            "observation": trace.observation_symbols,
+            "input": trace.input_symbols,
+        }
+        self.index: dict[tuple[str, tuple], int] = {
+            (kind, s.data[1:]): i for kind, symbols in order.items() for i, s in enumerate(symbols)
+        }
+
+    def element(self, node: Expr, row: str = "t") -> str:
+        """Text of the array element that holds a symbol of theta or of a step."""
+        kind, name, index = node.data
+        if kind == "time":
+            return f"{row} + 1.0"
+        if kind == "time_prev":
+            return f"{row} + 0.0"
+        base = kind.removesuffix("_prev")
+        column = self.index[("observation" if base == "seen" else base, (name, index))]
+        if base == "parameter":
+            return f"theta[{column}]"
+        array = {"observation": "y", "seen": "seen", "input": "u", "state": "trajectory"}[base]
+        at = f"max({row} - 1, 0)" if kind.endswith("_prev") else row
+        return f"{array}[{at}, {column}]"
+
+    def column(self, node: Expr) -> int:
+        """Index of a state's component."""
+        return self.index[("state", node.data[1:])]
+
+
+@dataclass
+class Section:
+    """One algorithm's generated functions, over its own arrays `c` and `s`.
+
+    suffix : ends the name of each function.
+    """
+
+    layout: Layout
+    suffix: str
+    c: dict[Expr, int] = field(default_factory=dict)
+    s: dict[Expr, int] = field(default_factory=dict)
+    functions: list[str] = field(default_factory=list)
+    normals: int = 0
+    uniforms: int = 0
+
+    def name(self, role: str) -> str:
+        """Name of the function of this role."""
+        return f"{role}_{self.suffix}"
+
+    def particle_pass(
+        self, role: str, doc: str, arguments: str, targets: Sequence[Target], *,
+        accumulate: str | None = None, scalars: dict[Expr, str] | None = None,
+        rows: Iterable[str] = (),
+    ) -> None:  # fmt: skip
+        """A function that loops over particles and writes `targets` for each.
+
+        accumulate : name of the array that targets with guards add up in; it starts at 0.
+        scalars : state symbols bound to array elements instead of to the particles' rows.
+        rows : state arrays among the arguments whose rows targets write to.
+        """
+        scalars = scalars or {}
+        roots = [t.expression for t in targets] + [t.guard for t in targets if t.guard is not None]
+        level = depends(roots, level_of)
+        for node in scalars:
+            level[node] = PARTICLE
+        reserved = Names()
+        head: list[str] = []
+        names = self._load_outer(roots, level, reserved, head)
+        self._load_rows(roots, scalars, reserved, head, names)
+        self._load_noise(roots, reserved, head, names)
+        body: list[str] = []
+        for group in _grouped(targets):
+            body += self._loop(group, names, reserved, accumulate, first=not body)
+        lines = [f"@kernel\ndef {self.name(role)}({arguments}):", f'    """{doc}"""']
+        size = "log_w.shape[0]" if "log_w" in arguments else "states.shape[1]"
+        lines.append(f"    n = {size}")
+        self.functions.append("\n".join([*lines, *head, *body]) + "\n")
+
+    def _load_outer(
+        self, roots: list[Expr], level: dict[Expr, int], reserved: Names, head: list[str]
+    ) -> dict[Expr, str]:
+        """Load what was computed once per call and once per step into local names."""
+        names: dict[Expr, str] = {}
+        for node in self._frontier(roots, level):
+            if node.op == "symbol" and level[node] == THETA:
+                source, wanted = self.layout.element(node), symbol_name(node)
+            elif level[node] == THETA:
+                k = self.c.setdefault(node, len(self.c))
+                source, wanted = f"c[{k}]", f"c{k}"
+            else:
+                k = self.s.setdefault(node, len(self.s))
+                source = f"s[{k}]"
+                wanted = symbol_name(node) if node.op == "symbol" else f"s{k}"
+            names[node] = reserved.fresh(wanted)
+            note = "" if node.op == "symbol" else f"  # {comment(node)}"
+            head.append(f"    {names[node]} = {source}{note}")
+        return names
+
+    def _frontier(self, roots: list[Expr], level: dict[Expr, int]) -> list[Expr]:
+        """The largest subexpressions that are known before the loop over particles."""
+        outer = {n: True for n, lv in level.items() if lv in (THETA, STEP) and not _is_matrix(n)}
+        used = topological_until(roots, outer)
+        inside = [n for n in used if n not in outer]
+        needed = {a for n in inside for a in n.args} | set(roots)
+        return [n for n in used if n in outer and n in needed]
+
+    def _load_rows(
+        self, roots: list[Expr], scalars: dict[Expr, str], reserved: Names, head: list[str],
+        names: dict[Expr, str],
+    ) -> None:  # fmt: skip
+        """Name the rows of the particles' arrays that the loop reads."""
+        for node in topological_until(roots, names):
+            if node.op != "symbol" or not node.data[0].startswith("state"):
+                continue
+            if node in scalars:
+                names[node] = reserved.fresh(symbol_name(node))
+                head.append(f"    {names[node]} = {scalars[node]}")
+                continue
+            array = "states_prev" if node.data[0] == "state_prev" else "states"
+            row = reserved.fresh(symbol_name(node) + "s")
+            head.append(f"    {row} = {array}[{self.layout.column(node)}]")
+            names[node] = f"{row}[i]"
+
+    def _load_noise(
+        self, roots: list[Expr], reserved: Names, head: list[str], names: dict[Expr, str]
+    ) -> None:
+        """Name the buffers of normals and uniforms, one per draw of a particle."""
+        counts = {"normal": 0, "uniform": 0}
+        for node in topological_until(roots, names):
+            if node.op == "random" and node.data[0] in counts:
+                kind = node.data[0]
+                k = counts[kind]
+                counts[kind] += 1
+                row = reserved.fresh(f"{kind}_{k}")
+                head.append(f"    {row} = {kind}s[{k} * n:{k + 1} * n]")
+                names[node] = f"{row}[i]"
+        self.normals = max(self.normals, counts["normal"])
+        self.uniforms = max(self.uniforms, counts["uniform"])
+
+    def _loop(
+        self, group: list[Target], names: dict[Expr, str], reserved: Names,
+        accumulate: str | None, first: bool,
+    ) -> list[str]:  # fmt: skip
+        guard = group[0].guard
+        indent = "    " if guard is None else "        "
+        inner = Names(reserved.taken)
+        writer = Writer(dict(names), inner, self.layout.trace.locations, indent + "    ")
+        operator = "+=" if accumulate and not first else "="
+        if accumulate:
+            total = group[0].expression
+            for t in group[1:]:
+                total = total + t.expression
+            writer.assign([(group[0].text, total)], operator)
+        else:
+            writer.assign([(t.text, t.expression) for t in group])
+        lines = [] if guard is None else [f"    if {names[guard]} != 0.0:"]
+        lines += [f"{indent}for i in range(n):", *writer.lines]
+        if guard is not None and first and accumulate:
+            lines += ["    else:", f"        {accumulate}[:] = 0.0"]
+        return lines
+
+    def finish(self) -> str:
+        """The functions with `prepare` and `step`, which compute `c` and `s`."""
+        step = self._straight(
+            "step", "theta, c, y, seen, u, t, s", "What depends on theta and time.", self.s, "s"
+        )
+        prepare = self._straight("prepare", "theta, c", "What depends on theta alone.", self.c, "c")
+        return "\n\n".join([prepare, step, *self.functions])
+
+    def _straight(
+        self, role: str, arguments: str, doc: str, slots: dict[Expr, int], array: str
+    ) -> str:
+        head: list[str] = []
+        reserved = Names()
+        names: dict[Expr, str] = {}
+        roots = list(slots)
+        level = depends(roots, level_of)
+        if array == "s":
+            outer = {n: True for n, lv in level.items() if lv == THETA and not _is_matrix(n)}
+            used = topological_until(roots, outer)
+            inside = {a for n in used if n not in outer for a in n.args}
+            for node in used:
+                if node in outer and node in inside and node.op != "symbol":
+                    k = self.c.setdefault(node, len(self.c))
+                    names[node] = reserved.fresh(f"c{k}")
+                    head.append(f"    {names[node]} = c[{k}]  # {comment(node)}")
+        for node in topological_until(roots, names):
+            if node.op == "symbol" and node not in names:
+                names[node] = reserved.fresh(symbol_name(node))
+                head.append(f"    {names[node]} = {self.layout.element(node)}")
+        writer = Writer(names, reserved, self.layout.trace.locations)
+        writer.assign([(f"{array}[{k}]", node) for node, k in slots.items()])
+        text = [f"@exact\ndef {self.name(role)}({arguments}):", f'    """{doc}"""']
+        return "\n".join([*text, *head, *writer.lines]) + "\n"
+
+
+def _is_matrix(node: Expr) -> bool:
+    return node.op in ("cholesky", "inverse")
+
+
+def _grouped(targets: Sequence[Target]) -> list[list[Target]]:
+    """Targets with the same guard share one loop; unguarded ones come first."""
+    groups: dict[Expr | None, list[Target]] = {}
+    for t in targets:
+        groups.setdefault(t.guard, []).append(t)
+    return sorted(groups.values(), key=lambda g: g[0].guard is not None)
+
+
+def scalar_function(
+    layout: Layout, name: str, arguments: str, doc: str, outputs: list[tuple[str, Expr]],
+    sources: dict[Expr, str] | None = None, returns: str = "",
+) -> str:  # fmt: skip
+    """A function without a loop: statements `target = expression`."""
+    reserved, head = Names(), []
+    names: dict[Expr, str] = {}
+    for node in topological_until([e for _, e in outputs], names):
+        if node.op == "symbol":
+            names[node] = reserved.fresh(symbol_name(node))
+            source = (sources or {}).get(node) or layout.element(node)
+            head.append(f"    {names[node]} = {source}")
+    writer = Writer(names, reserved, layout.trace.locations)
+    writer.assign(outputs)
+    lines = [f"@exact\ndef {name}({arguments}):", f'    """{doc}"""', *head, *writer.lines]
+    return "\n".join([*lines, *([f"    return {returns}"] if returns else [])]) + "\n"
+
+
+def time_sum(
+    layout: Layout, name: str, doc: str, parts: dict[str, Sequence[Expr]], size: int
+) -> str:
+    """A function that adds expressions up over a trajectory.
+
+    parts : for "prior", "initial", "transition" and "observation" the summands of total[0], ...,
+        total[size - 1]; rows 1..T count for the observation, 2..T for the transition.
+    """
+    reserved = Names()
+    lines = [
+        f"@exact\ndef {name}(theta, y, seen, u, trajectory, total):",
+        f'    """{doc}"""',
+    ]
+    head: list[str] = []
+    names: dict[Expr, str] = {}
+    roots = [e for es in parts.values() for e in es]
+    level = depends(roots, level_of)
+    outer = {n: True for n, lv in level.items() if lv == THETA}
+    used = topological_until(roots, outer)
+    inside = {a for n in used if n not in outer for a in n.args} | set(roots)
+    needed = [n for n in used if n in outer and n in inside]
+    for node in topological_until(needed, {}):
+        if node.op == "symbol":
+            names[node] = reserved.fresh(symbol_name(node))
+            head.append(f"    {names[node]} = {layout.element(node)}")
+    writer = Writer(names, reserved, layout.trace.locations)
+    compound = [n for n in needed if n.op != "symbol" and not _is_matrix(n)]
+    targets = [(reserved.fresh(f"c{k}"), n) for k, n in enumerate(compound)]
+    writer.assign(targets)
+    head += writer.lines
+    names |= {n: text for text, n in targets}
+    zero = [f"    total[{k}] = 0.0" for k in range(size)]
+    prior = _sum_block(layout, parts.get("prior", ()), names, reserved, "    ")
+    body: list[str] = []
+    for role, condition in (("initial", "t == 0"), ("transition", "t > 0"), ("observation", "")):
+        indent = "            " if condition else "        "
+        block = _sum_block(layout, parts.get(role, ()), names, reserved, indent)
+        if block:
+            body += [*([f"        if {condition}:"] if condition else []), *block]
+    loop = ["    for t in range(y.shape[0]):", *body] if body else []
+    return "\n".join([*lines, *head, *zero, *prior, *loop]) + "\n"
+
+
+def _sum_block(
+    layout: Layout, summands: Sequence[Expr], names: dict[Expr, str], reserved: Names, indent: str
+) -> list[str]:
+    pairs = [
+        (k, e) for k, e in enumerate(summands) if not (e.op == "const" and e.data == 0.0)
+    ]
+    own, inner, head = dict(names), Names(reserved.taken), []
+    for node in topological_until([e for _, e in pairs], own):
+        if node.op == "symbol" and node not in own:
+            own[node] = inner.fresh(symbol_name(node))
+            head.append(f"{indent}{own[node]} = {layout.element(node)}")
+    writer = Writer(own, inner, layout.trace.locations, indent)
+    writer.assign([(f"total[{k}]", e) for k, e in pairs], "+=")
+    return [*head, *writer.lines] if pairs else []
