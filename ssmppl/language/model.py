@@ -6,14 +6,21 @@ needs the model, and raises there what is wrong with them.
 
 from __future__ import annotations
 
+import dis
 import inspect
+import linecache
+import numbers
 from collections.abc import Callable, Iterable, Mapping
+from types import CodeType, FunctionType
 from typing import Any, TypeVar
+
+import numpy as np
 
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.expr import user_location
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
+_MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
 
 
@@ -61,9 +68,15 @@ class Model:
                 fix=f"give a tuple of names, inputs=({inputs!r},)",
                 where=self.location,
             )
-        lengths = dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(inputs)
-        for key, length in lengths.items():
-            whole = length is None or (isinstance(length, int) and length > 0)
+        if not isinstance(inputs, Iterable):
+            raise ModelError(
+                f"inputs is {inputs!r}",
+                fix='give a tuple of names, inputs=("torque",), or their lengths by name',
+                where=self.location,
+            )
+        pairs = list(inputs.items() if isinstance(inputs, Mapping) else ((n, None) for n in inputs))
+        for key, length in pairs:
+            whole = length is None or (isinstance(length, (int, np.integer)) and length > 0)
             if not (isinstance(key, str) and key.isidentifier()) or not whole:
                 raise ModelError(
                     f"input {key!r} of length {length!r}",
@@ -71,37 +84,47 @@ class Model:
                     "positive whole number",
                     where=self.location,
                 )
+        if len(dict(pairs)) < len(pairs):
+            names = [key for key, _ in pairs]
+            raise ModelError(
+                f"inputs holds a name twice: {', '.join(map(repr, names))}",
+                fix="name each input once",
+                where=self.location,
+            )
         self.name = name
         self.inputs: dict[str, tuple[int, ...]] = {
-            key: () if length is None else (length,) for key, length in lengths.items()
+            key: () if length is None else (int(length),) for key, length in pairs
         }
         self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
 
-    def prior(self, function: Law) -> Law:
+    def prior(self, function: Law = _MISSING) -> Law:
         """Declare priors of parameters; arguments are parameters declared earlier."""
         return self._declare("prior", function)
 
-    def initial(self, function: Law) -> Law:
+    def initial(self, function: Law = _MISSING) -> Law:
         """Declare the law of x_1; arguments are parameters, inputs and ``t``."""
         return self._declare("initial", function)
 
-    def transition(self, function: Law) -> Law:
+    def transition(self, function: Law = _MISSING) -> Law:
         """Declare the law of x_{t+1} given x_t (and u_t, t, y_t where the arguments name them)."""
         return self._declare("transition", function)
 
-    def observation(self, function: Law) -> Law:
+    def observation(self, function: Law = _MISSING) -> Law:
         """Declare the law of y_t given x_t (and u_t, t)."""
         return self._declare("observation", function)
 
-    def proposal(self, function: Law) -> Law:
+    def proposal(self, function: Law = _MISSING) -> Law:
         """Override the derived proposal of x_{t+1}: arguments as in a transition, and
         observation channels, which mean y_{t+1} here."""
         return self._declare("proposal", function)
 
     def _declare(self, role: str, function: Law) -> Law:
-        if not inspect.isfunction(function):
+        if not (inspect.isfunction(function) or inspect.ismethod(function)):
+            found = f"@{role} of model {self.name!r} stands on {function!r}, which is no function"
+            if function is _MISSING:
+                found = f"@{role} of model {self.name!r} is called without a function"
             raise ModelError(
-                f"@{self.name}.{role} stands on {function!r}, which is no function",
+                found,
                 fix=f"write @model.{role} (without parentheses) on the line above a def",
                 where=user_location(),
             )
@@ -109,7 +132,8 @@ class Model:
             first = location_of(self.functions[role][0])
             raise ModelError(
                 f"a second @{role} function; the first is at {first}",
-                fix=f"return all states from one @{role} function",
+                fix=f"return all states from one @{role} function; in a notebook, run the cell of "
+                "ssm.Model(...) again before its functions",
                 where=location_of(function),
             )
         self.functions[role].append(function)
@@ -117,8 +141,15 @@ class Model:
 
     @property
     def signature(self) -> tuple:
-        """Changes when a function is declared: what traces of this model are cached by."""
-        return (self.name, tuple(self.inputs.items()), *map(tuple, self.functions.values()))
+        """What traces of this model are cached by: changes when a function is declared, and when a
+        variable that one reads from outside gets another value."""
+        outer = tuple(
+            (name, _fingerprint(value))
+            for functions in self.functions.values()
+            for function in functions
+            for name, value in outer_values(function).items()
+        )
+        return (self.name, tuple(self.inputs.items()), *map(tuple, self.functions.values()), outer)
 
     def __repr__(self) -> str:
         declared = ", ".join(
@@ -128,7 +159,52 @@ class Model:
         return f"<Model {self.name!r}{inputs}: {declared or 'nothing declared'}>"
 
 
+def plain_function(function: Any) -> FunctionType:
+    """The function of a bound method; functions as they are."""
+    plain: FunctionType = getattr(function, "__func__", function)
+    return plain
+
+
 def location_of(function: Callable[..., Any]) -> Location:
-    """Where a function is defined."""
-    code = function.__code__
-    return Location(code.co_filename, code.co_firstlineno, function.__name__)
+    """Where a function is defined: the line of its `def`, below its decorators."""
+    code = plain_function(function).__code__
+    line = code.co_firstlineno
+    for candidate in range(line, line + 20):
+        text = linecache.getline(code.co_filename, candidate).lstrip()
+        if text.startswith(("def ", "async def ")) or "lambda" in text:
+            line = candidate
+            break
+    return Location(code.co_filename, line, function.__name__)
+
+
+def outer_values(function: Callable[..., Any]) -> dict[str, Any]:
+    """The variables that a function reads from its module or from enclosing functions."""
+    plain = plain_function(function)
+    found = {}
+    for name, cell in zip(plain.__code__.co_freevars, plain.__closure__ or (), strict=True):
+        try:
+            found[name] = cell.cell_contents
+        except ValueError:  # assigned later
+            continue
+    for name in _global_names(plain.__code__):
+        if name in plain.__globals__:
+            found[name] = plain.__globals__[name]
+    return found
+
+
+def _global_names(code: CodeType) -> set[str]:
+    loads = ("LOAD_GLOBAL", "LOAD_NAME")
+    names = {i.argval for i in dis.get_instructions(code) if i.opname in loads}
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            names |= _global_names(inner)
+    return names
+
+
+def _fingerprint(value: Any) -> Any:
+    """Equal for equal numbers, texts, arrays and plain containers of them, else by identity."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
+        return value.shape, value.tobytes()
+    if isinstance(value, (numbers.Number, str, list, tuple, dict)):
+        return repr(value)
+    return id(value)

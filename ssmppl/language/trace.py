@@ -16,20 +16,28 @@ input, input_prev u_t and u_{t-1};  time, time_prev: the row number, from 1
 from __future__ import annotations
 
 import inspect
-import traceback
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import Location, ModelError, SSMError, listing
+from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, recording, symbol
-from ssmppl.language.distributions import Categorical, Dirac, Distribution, Flat
-from ssmppl.language.distributions import InverseWishart, Wishart
+from ssmppl.language.calling import call, check_outer_names, return_location
+from ssmppl.language.distributions import Distribution
 from ssmppl.language.model import Model, location_of
+from ssmppl.language.rules import (
+    RESERVED,
+    a,
+    check_law,
+    check_name,
+    check_returned,
+    check_states,
+    is_symmetric,
+)
 
 
 @dataclass(frozen=True)
@@ -149,6 +157,7 @@ class _Tracer:
                     where=model.location,
                 )
         for name in model.inputs:
+            check_name(name, "input", model.location)
             self._claim(name, "input", model.inputs[name], model.location)
         with recording() as locations:
             parameters = self._sites("prior", "parameter")
@@ -156,7 +165,8 @@ class _Tracer:
             observations = self._sites("observation", "observation")
             transition = self._sites("transition", "state")
             proposal = self._sites("proposal", "state")
-        self._check_states(initial, transition, proposal)
+        check_states(initial, transition, proposal)
+        self._check_outer_names()
         return Trace(
             name=model.name,
             parameters=parameters,
@@ -174,33 +184,33 @@ class _Tracer:
         for function in self.model.functions[function_role]:
             where = location_of(function)
             returned = self._call(function, function_role, where)
-            for name, distribution in self._checked(returned, function_role, where).items():
+            line = return_location(function)
+            laws = check_returned(returned, function_role, function.__name__, line)
+            for name, distribution in laws.items():
+                check_name(name, role, line)
+                check_law(name, distribution, function_role)
                 if name in sites:
                     raise ModelError(
                         f"{name!r} is given by two @{function_role} functions; the other is at "
                         f"{sites[name].where}",
-                        fix="give each quantity one law",
+                        fix="give each quantity one law; in a notebook, run the cell of "
+                        "ssm.Model(...) again before its functions",
                         where=where,
                     )
                 if function_role in ("prior", "initial", "observation"):
-                    self._claim(name, role, distribution.shape, where)
-                symmetric = isinstance(distribution, (Wishart, InverseWishart))
-                value = symbols(role, name, distribution.shape, symmetric)
+                    self._claim(name, role, distribution.shape, line)
+                    if is_symmetric(distribution):
+                        self.symmetric.add(name)
+                value = symbols(role, name, distribution.shape, name in self.symmetric)
                 sites[name] = Site(name, role, distribution, value, where)
         return sites
 
     def _claim(self, name: str, role: str, shape: tuple[int, ...], where: Location) -> None:
         if name in self.known:
             raise ModelError(
-                f"{name!r} is declared as {_a(role)} and already {_a(self.known[name][0])}"
+                f"{name!r} is declared as {a(role)} and already {a(self.known[name][0])}"
                 + (f" at {self.owner[name]}" if name in self.owner else ""),
                 fix="rename one of them",
-                where=where,
-            )
-        if name == "t":
-            raise ModelError(
-                f"{_a(role)} is named 't', which means the row number",
-                fix="choose another name",
                 where=where,
             )
         self.known[name] = (role, shape)
@@ -222,12 +232,17 @@ class _Tracer:
                     continue  # a plain Python constant of the user's
                 raise self._unknown(name, role, where)
             arguments[name] = value
-        try:
-            return function(**arguments)
-        except SSMError:
-            raise
-        except Exception as error:
-            raise _wrapped(error, function, role, arguments) from error
+        return call(function, role, arguments, self._roles())
+
+    def _roles(self) -> dict[str, str]:
+        """The quantities known so far, each with its role in words."""
+        return {name: a(role) for name, (role, _) in self.known.items()}
+
+    def _check_outer_names(self) -> None:
+        for role, functions in self.model.functions.items():
+            for function in functions:
+                known = self._roles() | ({} if role == "prior" else {"t": "the row number"})
+                check_outer_names(function, role, known)
 
     def _allowed(self, role: str) -> dict[str, str]:
         """Role of a known name -> kind of symbol, for arguments of this kind of function."""
@@ -267,130 +282,16 @@ class _Tracer:
             kind = self.known[name][0]
             reason = {
                 "prior": f"a prior depends on parameters declared earlier only, and {name!r} is "
-                f"{_a(kind)}",
-                "initial": f"the initial law cannot depend on {_a(kind)}",
-                "observation": f"an observation cannot depend on {_a(kind)} of the same time",
-            }.get(role, f"{name!r} is {_a(kind)}")
+                f"{a(kind)}",
+                "initial": f"the initial law cannot depend on {a(kind)}",
+                "observation": f"an observation cannot depend on {a(kind)} of the same time",
+            }.get(role, f"{name!r} is {a(kind)}")
         elif name == "t":
             reason = "a prior does not depend on time"
         else:
             reason = f"@{role} {where.function} asks for {name!r}, which the model does not know"
         later = " (declare it in an earlier @prior)" if role == "prior" else ""
-        return ModelError(
-            reason, fix=f"use one of: {listing(name, names)}{later}", where=where
-        )
-
-    # -- what a law returned
-    def _checked(self, returned: Any, role: str, where: Location) -> dict[str, Distribution]:
-        if not isinstance(returned, Mapping) or not returned:
-            found = "nothing" if returned is None else repr(returned)
-            raise ModelError(
-                f"@{role} {where.function} returned {found}",
-                fix='return a dictionary {"name": distribution}',
-                where=where,
-            )
-        for name, distribution in returned.items():
-            if not isinstance(name, str) or not name.isidentifier():
-                raise ModelError(
-                    f"@{role} {where.function}: the name {name!r} is no Python identifier",
-                    fix="use letters, digits and underscores, starting with a letter",
-                    where=where,
-                )
-            if not isinstance(distribution, Distribution):
-                called = isinstance(distribution, type) and issubclass(distribution, Distribution)
-                value = f"ssm.Dirac(...) if {name!r} is deterministic, or "
-                raise ModelError(
-                    f"@{role} {where.function}: {name!r} is {distribution!r}, "
-                    f"which is no distribution",
-                    fix="call it with its parameters"
-                    if called
-                    else f"return {value}a distribution such as ssm.Normal(mean, sd=...)",
-                    where=where,
-                )
-            self._check_law(name, distribution, role)
-            if isinstance(distribution, (Wishart, InverseWishart)):
-                self.symmetric.add(name)
-        return dict(returned)
-
-    def _check_law(self, name: str, distribution: Distribution, role: str) -> None:
-        where = distribution.location
-        kind = type(distribution).__name__
-        if role == "prior":
-            if isinstance(distribution, Dirac):
-                raise ModelError(
-                    f"the prior of {name!r} is Dirac",
-                    fix=f"fix it by fixed={{{name!r}: value}} in the verb, or compute it inside "
-                    "the functions that use it",
-                    where=where,
-                )
-            if distribution.discrete:
-                raise ModelError(
-                    f"the prior of {name!r} is {kind}: parameters are continuous",
-                    fix="make it a state with a Dirac transition, or compare models",
-                    where=where,
-                )
-        elif isinstance(distribution, Flat):
-            raise ModelError(
-                f"the law of {name!r} is {kind}, which is improper",
-                fix=f"use {kind} as a prior only",
-                where=where,
-            )
-        elif role == "observation" and isinstance(distribution, Dirac):
-            raise ModelError(
-                f"the observation {name!r} is Dirac: data would have likelihood zero",
-                fix="give the channel a noise, for example ssm.Normal(value, sd=...)",
-                where=where,
-            )
-        if isinstance(distribution, Categorical) and role == "prior":
-            raise ModelError(
-                f"the prior of {name!r} is Categorical", fix="use a state", where=where
-            )
-
-    def _check_states(
-        self, initial: dict[str, Site], transition: dict[str, Site], proposal: dict[str, Site]
-    ) -> None:
-        for name, site in initial.items():
-            if name not in transition:
-                raise ModelError(
-                    f"state {name!r} has an initial law but no transition",
-                    fix=f"return {name!r} from a @transition function too; the transitions give: "
-                    f"{listing(name, transition)}",
-                    where=site.where,
-                )
-        for role, sites in (("transition", transition), ("proposal", proposal)):
-            for name, site in sites.items():
-                if name not in initial:
-                    raise ModelError(
-                        f"@{role} gives {name!r}, which has no initial law",
-                        fix=f"return it from @initial too; @initial gives: "
-                        f"{listing(name, initial)}",
-                        where=site.where,
-                    )
-                if site.shape != initial[name].shape:
-                    raise ModelError(
-                        f"state {name!r} has shape {site.shape} in its {role} and shape "
-                        f"{initial[name].shape} in its initial law",
-                        fix="give both the same shape; np.zeros(n) makes a mean of length n",
-                        where=site.distribution.location,
-                    )
-
-
-def _a(role: str) -> str:
-    return f"an {role}" if role[0] in "aeiou" else f"a {role}"
-
-
-def _wrapped(
-    error: Exception, function: Callable[..., Any], role: str, arguments: dict[str, Any]
-) -> ModelError:
-    """An exception inside a user's function, at the user's line."""
-    file = function.__code__.co_filename
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
-    last = frames[-1] if frames else None
-    where = Location(file, last.lineno or 0, last.name) if last else location_of(function)
-    shapes = ", ".join(f"{n} of shape {np.shape(v)}" for n, v in arguments.items())
-    return ModelError(
-        f"@{role} {function.__name__} raised {type(error).__name__}: {error}",
-        fix="the function runs once on symbols, for one particle and one time step; its "
-        f"arguments were {shapes or 'none'}",
-        where=where,
-    )
+        if name not in self.known and role != "prior" and name not in RESERVED:
+            later = "; a parameter is declared by a @prior, a state by @initial, an input by "
+            later += f"ssm.Model(..., inputs=({name!r},))"
+        return ModelError(reason, fix=f"use one of: {listing(name, names)}{later}", where=where)

@@ -1,0 +1,174 @@
+"""Calling a user's law on symbols: what it reads, where it returns, and errors at its own lines."""
+
+from __future__ import annotations
+
+import dis
+import inspect
+import re
+import sysconfig
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from types import CodeType, TracebackType
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import Location, ModelError, SSMError
+from ssmppl.expressions.expr import topological
+from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
+from ssmppl.language.model import location_of, outer_values, plain_function
+
+Law = Callable[..., Any]
+Known = Mapping[str, str]  # name of a quantity -> its role
+# NumPy's messages about object arrays, which np.array makes of symbols
+_OBJECT_ARRAY = re.compile(
+    r"type Expr which has no callable|dtype\('O'\)|^'Expr' object has no att"
+)
+_INSTALLED = tuple(
+    path for key in ("stdlib", "platstdlib", "purelib", "platlib")
+    if (path := sysconfig.get_path(key))
+)  # fmt: skip
+
+
+def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> Any:
+    """What the law returns for these arguments.
+
+    It is called twice: a law that is not the same again draws random numbers or changes something,
+    and what was drawn would be frozen into the model.
+    """
+    try:
+        signature = inspect.signature(function)
+        bound = signature.bind_partial()
+        bound.arguments.update({n: arguments[n] for n in signature.parameters if n in arguments})
+        first = function(*bound.args, **bound.kwargs)
+        again = function(*bound.args, **bound.kwargs)
+    except SSMError as error:
+        raise _at_users_line(error, function) from error
+    except Exception as error:
+        raise _wrapped(error, function, role, arguments, known) from error
+    if not _same(first, again):
+        raise ModelError(
+            f"@{role} {function.__name__} gives another law when it is called again",
+            fix="draw no random numbers and change nothing inside of it: it runs on symbols, "
+            "and randomness belongs into the distributions that it returns",
+            where=return_location(function),
+        )
+    return first
+
+
+def _same(a: Any, b: Any) -> bool:
+    if not (isinstance(a, Mapping) and isinstance(b, Mapping)):
+        return True  # refused for what it is
+    if list(a) != list(b):
+        return False
+    pairs = [(a[n], b[n]) for n in a if isinstance(a[n], Distribution)]
+    return all(type(d) is type(e) and _content(d) == _content(e) for d, e in pairs)
+
+
+def _content(d: Distribution) -> list[tuple[str, str]]:
+    roots = [e for p in d.parameters.values() for e in p.ravel()]
+    return [(n.op, repr(n.data) if n.op in ("const", "symbol") else "") for n in topological(roots)]
+
+
+def return_location(function: Law) -> Location:
+    """The line of the law's only `return`; its `def` where there are several."""
+    plain = plain_function(function)
+    lines, line = set(), 0
+    for instruction in dis.get_instructions(plain.__code__):
+        position = instruction.positions
+        line = (position.lineno if position else None) or line
+        if instruction.opname in ("RETURN_VALUE", "RETURN_CONST"):
+            lines.add(line)
+    where = location_of(function)
+    return Location(where.file, lines.pop(), where.function) if len(lines) == 1 else where
+
+
+# -- names from outside of the law
+def check_outer_names(function: Law, role: str, known: Known) -> None:
+    """Refuse a law that reads a variable of Python's named as a quantity of the model.
+
+    With `phi = 0.9` at the top of the file, a law that forgets `phi` among its arguments would
+    quietly use 0.9.
+    """
+    for name, value in outer_values(function).items():
+        if name not in known or callable(value) or inspect.ismodule(value):
+            continue
+        where = _line_of_name(plain_function(function).__code__, name, location_of(function))
+        raise ModelError(
+            f"@{role} {function.__name__} reads the Python variable {name!r}, while {name!r} is "
+            f"{known[name]} of the model",
+            fix=f"add {name!r} to the arguments of {function.__name__}; if the variable is meant, "
+            "rename it",
+            where=where,
+        )
+
+
+def _line_of_name(code: CodeType, name: str, where: Location) -> Location:
+    for instruction, line in _instructions(code):
+        if instruction.opname.startswith("LOAD_") and instruction.argval == name and line:
+            return Location(where.file, line, where.function)
+    return where
+
+
+def _instructions(code: CodeType) -> Iterator[tuple[dis.Instruction, int | None]]:
+    for instruction in dis.get_instructions(code):
+        yield instruction, instruction.positions.lineno if instruction.positions else None
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _instructions(inner)
+
+
+# -- errors inside of the law
+def _frames(function: Law, trace: TracebackType | None) -> list[traceback.FrameSummary]:
+    file = plain_function(function).__code__.co_filename
+    return [f for f in traceback.extract_tb(trace) if f.filename == file]
+
+
+def _at_users_line(error: SSMError, function: Law) -> SSMError:
+    """`error`, moved to the user's line where it arose inside of an installed library."""
+    where = error.where
+    file = plain_function(function).__code__.co_filename
+    if not isinstance(where, Location) or where.file == file:
+        return error
+    frames = _frames(function, error.__traceback__)
+    if not where.file.startswith(_INSTALLED) or not frames:
+        return error
+    last = frames[-1]
+    place = Location(file, last.lineno or 0, last.name)
+    return type(error)(
+        f"{error.found} (inside of {where.function}() of a library)",
+        fix="write the computation by NumPy's functions, or wrap it by @ssm.primitive",
+        where=place,
+    )
+
+
+def _wrapped(
+    error: Exception, function: Law, role: str, arguments: dict[str, Any], known: Known
+) -> ModelError:
+    """An exception inside a user's function, at the user's line."""
+    frames = _frames(function, error.__traceback__)
+    where = location_of(function)
+    if frames:
+        where = Location(frames[-1].filename, frames[-1].lineno or 0, frames[-1].name)
+    shapes = ", ".join(f"{n} of shape {np.shape(v)}" for n, v in arguments.items())
+    fix = (
+        "the function runs once on symbols, for one particle and one time step; its "
+        f"arguments were {shapes or 'none'}"
+    )
+    found = f"@{role} {function.__name__} raised {type(error).__name__}: {error}"
+    if isinstance(error, NameError) and (role_of := known.get(str(error.name))):
+        fix = f"add {error.name!r}, {role_of} of the model, to the arguments of "
+        fix += function.__name__
+    elif _OBJECT_ARRAY.search(str(error)):
+        fix = "np.array([...]) of symbols is a plain object array to NumPy: build vectors by "
+        fix += "np.stack([a, b]) and matrices by np.block([[a, b], [c, d]])"
+    elif isinstance(error, AttributeError) and (attribute := _ssm_attribute(error)):
+        fix = attribute
+    return ModelError(found, fix=fix, where=where)
+
+
+def _ssm_attribute(error: AttributeError) -> str:
+    if inspect.ismodule(error.obj) and error.obj.__name__.startswith("ssmppl"):
+        from_names = sorted(DISTRIBUTIONS, key=lambda n: n.lower() != str(error.name).lower())
+        return f"the distributions are: {', '.join(from_names)}"
+    return ""
