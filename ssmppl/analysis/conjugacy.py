@@ -1,0 +1,189 @@
+"""Gibbs updates of the parameters given states and data, derived from the log density alone.
+
+`derive_updates` looks for the largest blocks with a closed-form conditional (`search.py`), by the
+table of families (`families.py`). What lies outside a family's span, if it comes from the prior or
+the initial law only (a bounded number of terms, however long the series), becomes a correction of
+the draw; if it grows with the series, the block is sampled by slices on its exact conditional.
+Every update is compared with the model's own density when it is derived (`check.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+from ssmppl.analysis import describe
+from ssmppl.analysis.check import verify
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.describe import Explanation, joined
+from ssmppl.analysis.families import Normal, NormalGamma
+from ssmppl.analysis.sampler import natural_bounds
+from ssmppl.analysis.search import Found, Search, kind_of
+from ssmppl.analysis.sufficient import (
+    NOTHING_MISSING,
+    ROLES,
+    BlockForm,
+    complete_data,
+    degenerate,
+    separate_block,
+)
+from ssmppl.analysis.update import Update, draw
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr, to_text
+from ssmppl.language.trace import Trace
+
+__all__ = ["Update", "derive_updates", "draw"]
+
+
+def derive_updates(
+    trace: Trace,
+    fixed: Iterable[str] = (),
+    missing: Missing = NOTHING_MISSING,
+    check: bool = True,
+) -> list[Update]:
+    """The updates that together move every parameter that is not fixed, in the order declared.
+
+    check=False leaves out the comparison with the model's own density.
+    """
+    data = complete_data(trace, missing)
+    search = Search(data, frozenset(fixed))
+    updates: list[Update] = []
+    waiting = [(unit, found, False) for unit, found in search.found()]
+    while waiting:
+        unit, found, refused = waiting.pop(0)
+        update = _update(search, unit, found, refused)
+        failure = verify(data, update) if check and update.functions else None
+        if failure is None:
+            updates.append(update)
+        elif unit in search.single:
+            waiting.append((unit, failure, True))
+        else:  # a joint block is taken apart
+            waiting += [
+                (u, f, False) for u, f in search.single.items() if not set(u).isdisjoint(unit)
+            ]
+    order = {s: i for i, s in enumerate(trace.parameter_symbols)}
+    return sorted(updates, key=lambda u: min(order[c] for c in u.components))
+
+
+def _update(
+    search: Search, unit: tuple[Expr, ...], found: Found | NotApplicable, refused: bool
+) -> Update:
+    if isinstance(found, Found):
+        return _conjugate(search, found)
+    return _slice(search, unit, found, use_statistics=not refused)
+
+
+def _conjugate(search: Search, found: Found) -> Update:
+    """A finding as an update, explained."""
+    form, family = found.form, found.family
+    site = search.site(found.components[0])
+    where, reason = site.distribution.location, ""
+    if found.correction:
+        sources = [f for j in found.correction for f in form.origins[form.monomials[j]]]
+        laws = " and the ".join(sorted({f"{f.role} law of {f.site}" for f in sources}))
+        left = ", ".join(to_text(form.functions[j]) for j in found.correction)
+        where = sources[0].where
+        reason = f"the {laws} leaves {left} outside the {family.name} family"
+    update = Update(
+        block=tuple(dict.fromkeys(c.data[1] for c in found.components)),
+        components=found.components,
+        family=family.name,
+        functions=form.functions,
+        coefficients=form.coefficients,
+        correction=found.correction,
+        bounds=tuple(search.bound[c] for c in found.components),
+        explanation=Explanation(joined(found.components), ""),
+        reason=reason,
+        where=where,
+        kind=kind_of(site),
+        conditional=family,
+    )
+    title = joined(found.components)
+    if len(update.block) > 1:
+        title += " jointly"
+    explanation = Explanation(
+        title,
+        describe.conditional(family, form),
+        describe.statistics(form),
+        tuple(_notes(update, form)),
+    )
+    return replace(update, explanation=explanation)
+
+
+def _notes(update: Update, form: BlockForm) -> list[str]:
+    notes = []
+    cut = [
+        f"{to_text(c)} to ({to_text(low)}, {to_text(high)})"
+        for c, (low, high), natural in zip(
+            update.components, update.bounds, natural_bounds(update), strict=True
+        )
+        if update.kind == "real"
+        and not (low.op == high.op == "const" and low.data <= natural[0] <= natural[1] <= high.data)
+    ]
+    if cut:
+        notes.append(f"truncated: {', '.join(cut)}")
+    if update.correction:
+        text = describe.correction_text(form, update.correction)
+        if _may_be_bounded(update):
+            notes.append(f"accepted with probability proportional to {text}: {update.reason}")
+        else:
+            notes.append(
+                f"corrected for {text} by a Metropolis step, as it has no known upper bound, and "
+                f"a slice sweep: {update.reason}"
+            )
+        notes.append(str(update.where))
+    if isinstance(update.conditional, NormalGamma):
+        notes.append("separate updates where the precision H is not positive definite")
+    elif isinstance(update.conditional, Normal):
+        notes.append("slice steps where the precision H is not positive definite")
+    return notes
+
+
+def _may_be_bounded(update: Update) -> bool:
+    """Whether the correction has a known bound, for whatever sign its coefficients can have."""
+    for (low, high), j in zip(update.sampler.ranges, update.correction, strict=True):
+        parts = [update.coefficients[r][j] for r in ("prior", "initial")]
+        total = math.fsum(e.data for e in parts) if all(e.op == "const" for e in parts) else None
+        if (total is None or total > 0.0) and high == math.inf:
+            return False
+        if (total is None or total < 0.0) and low == -math.inf:
+            return False
+    return True
+
+
+def _slice(
+    search: Search, unit: tuple[Expr, ...], why: NotApplicable, use_statistics: bool
+) -> Update:
+    """Slice steps on the exact conditional; through the statistics where it separates."""
+    kind = kind_of(search.site(unit[0]))
+    form = separate_block(search.data, unit) if use_statistics else why
+    separated = isinstance(form, BlockForm)
+    how = {
+        "real": "a slice step on its exact conditional",
+        "simplex": "slice steps on its log ratios, on their exact conditional",
+        "matrix": "slice steps on its Cholesky factor (log diagonal), on the exact conditional",
+    }[kind]
+    cost = "through its statistics" if separated else "each evaluation a pass over the data"
+    family, law = "slice", f"{how}, {cost}"
+    if degenerate(search.data, unit) is not None:
+        family, law = "none", "no update given the states: integrate them out (PMMH), or fix it"
+    return Update(
+        block=(unit[0].data[1],),
+        components=unit,
+        family=family,
+        functions=form.functions if separated else (),
+        coefficients=form.coefficients if separated else dict.fromkeys(ROLES, ()),
+        correction=(),
+        bounds=tuple(search.bound[c] for c in unit),
+        explanation=Explanation(
+            joined(unit),
+            law,
+            describe.statistics(form) if separated else (),
+            (f"because {why.reason}", *([str(why.where)] if why.where else [])),
+        ),
+        reason=why.reason,
+        where=why.where,
+        needs_log_joint=not separated and family == "slice",
+        kind=kind,
+    )

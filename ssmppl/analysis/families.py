@@ -1,0 +1,322 @@
+"""The conjugate families: functions of a block on the left, its law on the right.
+
+    log p(block | rest) = const + sum_i C_i s_i(block)
+
+=================================================  =============================================
+functions s_i in the span                          law
+=================================================  =============================================
+log v, v**k                                        v**k ~ Gamma   (k = 1: precisions, rates;
+                                                   k = -1: variances; k = -2: sds)
+theta, theta**2; theta_i, theta_i theta_j          Normal, joint Normal
+log v, v**k, v**k theta_i, v**k theta_i theta_j    Normal-Gamma: v**k ~ Gamma, theta | v Normal
+log p, log(1 - p)                                  Beta
+log p_1, ..., log p_K                              Dirichlet
+log det P, P_ij                                    Wishart
+log det C, (C^-1)_ij                               inverse Wishart
+=================================================  =============================================
+
+(Bernardo and Smith (1994), "Bayesian theory", appendix A.) Each class below holds the positions of
+its functions among those of the block, from which `parameters` computes the law's parameters out
+of the statistics C. C is a list with a 0 at its end, so that position -1 stands for a function that
+is absent. `draw` returns None where the law with these statistics is improper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+Statistics = Sequence[float]
+Values = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Gamma:
+    """v**power ~ Gamma(shape, rate)."""
+
+    power: float
+    log: int
+    pow: int
+
+    @property
+    def name(self) -> str:
+        return {1.0: "Gamma", -1.0: "inverse Gamma"}.get(
+            self.power, f"Gamma of the power {self.power:g}"
+        )
+
+    @property
+    def used(self) -> frozenset[int]:
+        return frozenset({self.log, self.pow}) - {-1}
+
+    def parameters(self, c: Statistics) -> tuple[float, float]:
+        """(shape, rate) of v**power: its density carries the Jacobian of the power."""
+        return (c[self.log] + 1.0) / self.power, -c[self.pow]
+
+    def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
+        shape, rate = self.parameters(c)
+        if not (shape > 0.0 and rate > 0.0):
+            return None
+        g = rng.standard_gamma(shape) / rate
+        return (_root(g, self.power),)
+
+    def log_q(self, c: Statistics, v: np.ndarray) -> float:
+        shape, rate = self.parameters(c)
+        log_v = math.log(v[0])
+        return (shape * self.power - 1.0) * log_v - rate * math.exp(self.power * log_v)
+
+
+def _root(g: float, power: float) -> float:
+    if power == 1.0:
+        return g
+    if power == -1.0:
+        return 1.0 / g if g > 0.0 else math.inf
+    return g ** (1.0 / power) if g > 0.0 else (0.0 if power > 0 else math.inf)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """theta ~ Normal(H^-1 h, H^-1), h = C[linear], H = -C[quadratic] (twice on the diagonal)."""
+
+    linear: tuple[int, ...]
+    quadratic: tuple[tuple[int, ...], ...]
+
+    @property
+    def name(self) -> str:
+        return "Normal" if len(self.linear) == 1 else "joint Normal"
+
+    @property
+    def used(self) -> frozenset[int]:
+        return frozenset({*self.linear, *(i for row in self.quadratic for i in row)}) - {-1}
+
+    def parameters(self, c: Statistics) -> tuple[np.ndarray, np.ndarray]:
+        """(h, H)."""
+        values = np.asarray(c)
+        precision = -values[np.array(self.quadratic)]
+        precision[np.diag_indices(len(self.linear))] *= 2.0
+        return values[np.array(self.linear)], precision
+
+    def draw(self, c: Statistics, rng: np.random.Generator, scale: float = 1.0) -> Values | None:
+        if len(self.linear) == 1:
+            h, precision = c[self.linear[0]], -2.0 * c[self.quadratic[0][0]]
+            if not precision > 0.0:
+                return None
+            return (h / precision + rng.standard_normal() / math.sqrt(scale * precision),)
+        solved = self.solve(c)
+        return None if solved is None else self.draw_solved(solved, rng, scale)
+
+    def solve(self, c: Statistics) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """(mean, K^-T, h' H^-1 h) for H = K K'; None where H is not positive definite."""
+        h, precision = self.parameters(c)
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(precision))
+        except np.linalg.LinAlgError:
+            return None
+        z = root @ h
+        if not np.all(np.isfinite(root)) or not np.all(np.isfinite(z)):
+            return None
+        return root.T @ z, root.T, float(z @ z)
+
+    @staticmethod
+    def draw_solved(
+        solved: tuple[np.ndarray, np.ndarray, float], rng: np.random.Generator, scale: float
+    ) -> Values:
+        mean, root, _ = solved
+        z = rng.standard_normal(len(mean))
+        return tuple((mean + root @ z / math.sqrt(scale)).tolist())
+
+    def log_q(self, c: Statistics, v: np.ndarray) -> float:
+        h, precision = self.parameters(c)
+        return float(h @ v - 0.5 * v @ precision @ v)
+
+
+@dataclass(frozen=True)
+class NormalGamma:
+    """v**power = g ~ Gamma(shape, rate), theta | g ~ Normal(H^-1 h, (g H)^-1).
+
+    With n = len(theta): shape = (C[log] + 1) / power - n / 2, rate = -(C[pow] + h' H^-1 h / 2).
+    The block is (theta, v).
+    """
+
+    power: float
+    log: int
+    pow: int
+    normal: Normal
+
+    @property
+    def name(self) -> str:
+        inverse = "inverse " if self.power < 0 else ""
+        return f"Normal-{inverse}Gamma"
+
+    @property
+    def used(self) -> frozenset[int]:
+        return self.normal.used | (frozenset({self.log, self.pow}) - {-1})
+
+    def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
+        normal = self.normal
+        n = len(normal.linear)
+        shape = (c[self.log] + 1.0) / self.power - 0.5 * n
+        if n == 1:
+            h, precision = c[normal.linear[0]], -2.0 * c[normal.quadratic[0][0]]
+            if not precision > 0.0:
+                return None
+            rate = -(c[self.pow] + 0.5 * h * h / precision)
+            if not (shape > 0.0 and rate > 0.0):
+                return None
+            g = rng.standard_gamma(shape) / rate
+            if g <= 0.0:
+                return (math.nan, math.nan)
+            theta = h / precision + rng.standard_normal() / math.sqrt(g * precision)
+            return theta, _root(g, self.power)
+        solved = normal.solve(c)
+        if solved is None:
+            return None
+        rate = -(c[self.pow] + 0.5 * solved[2])
+        if not (shape > 0.0 and rate > 0.0):
+            return None
+        g = rng.standard_gamma(shape) / rate
+        if g <= 0.0:
+            return (math.nan,) * (n + 1)
+        return (*normal.draw_solved(solved, rng, g), _root(g, self.power))
+
+    def given(self, c: Statistics, theta: np.ndarray) -> tuple[float, float]:
+        """(shape, rate) of v**power given theta."""
+        h, precision = self.normal.parameters(c)
+        quadratic = float(h @ theta - 0.5 * theta @ precision @ theta)
+        return (c[self.log] + 1.0) / self.power, -(c[self.pow] + quadratic)
+
+    def log_q(self, c: Statistics, v: np.ndarray) -> float:
+        theta, n = v[:-1], len(self.normal.linear)
+        h, precision = self.normal.parameters(c)
+        mean = np.linalg.solve(precision, h)
+        log_g = self.power * math.log(v[-1])
+        shape = (c[self.log] + 1.0) / self.power - 0.5 * n
+        rate = -(c[self.pow] + 0.5 * float(h @ mean))
+        d = theta - mean
+        gamma = (shape - 1.0) * log_g - rate * math.exp(log_g)
+        jacobian = log_g - math.log(v[-1])
+        return gamma + jacobian + 0.5 * n * log_g - 0.5 * math.exp(log_g) * float(d @ precision @ d)
+
+
+@dataclass(frozen=True)
+class Beta:
+    """p ~ Beta(C[log p] + 1, C[log(1 - p)] + 1)."""
+
+    first: int
+    second: int
+    name = "Beta"
+
+    @property
+    def used(self) -> frozenset[int]:
+        return frozenset({self.first, self.second}) - {-1}
+
+    def parameters(self, c: Statistics) -> tuple[float, float]:
+        return c[self.first] + 1.0, c[self.second] + 1.0
+
+    def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
+        a, b = self.parameters(c)
+        return (rng.beta(a, b),) if a > 0.0 and b > 0.0 else None
+
+    def log_q(self, c: Statistics, v: np.ndarray) -> float:
+        a, b = self.parameters(c)
+        return (a - 1.0) * math.log(v[0]) + (b - 1.0) * math.log1p(-v[0])
+
+
+@dataclass(frozen=True)
+class Dirichlet:
+    """p ~ Dirichlet(C[log p_k] + 1)."""
+
+    logs: tuple[int, ...]
+    name = "Dirichlet"
+
+    @property
+    def used(self) -> frozenset[int]:
+        return frozenset(self.logs) - {-1}
+
+    def parameters(self, c: Statistics) -> np.ndarray:
+        return np.asarray(c)[np.array(self.logs)] + 1.0
+
+    def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
+        a = self.parameters(c)
+        return tuple(rng.dirichlet(a).tolist()) if np.all(a > 0.0) else None
+
+    def log_q(self, c: Statistics, v: np.ndarray) -> float:
+        return float((self.parameters(c) - 1.0) @ np.log(v))
+
+
+@dataclass(frozen=True)
+class Wishart:
+    """P ~ Wishart(df, scale=V), log det P ** ((df - p - 1) / 2), exp(-tr(V^-1 P) / 2).
+
+    entries : positions of the functions P_ij (or (C^-1)_ij), row by row; of the symmetric matrix
+    P only those of the lower half. inverse : the block is C = P^-1, an inverse Wishart, whose
+    log determinant enters as -(df + p + 1) / 2.
+    """
+
+    size: int
+    log: int
+    entries: tuple[int, ...]
+    inverse: bool
+
+    @property
+    def name(self) -> str:
+        return "inverse Wishart" if self.inverse else "Wishart"
+
+    @property
+    def used(self) -> frozenset[int]:
+        return frozenset({self.log, *self.entries}) - {-1}
+
+    def parameters(self, c: Statistics) -> tuple[float, np.ndarray]:
+        """(df, S): S the inverse scale of a Wishart, the scale of an inverse Wishart."""
+        p = self.size
+        total = np.asarray(c)[np.array(self.entries)].reshape(p, p)
+        matrix = -(total + total.T)
+        sign = -1.0 if self.inverse else 1.0
+        return sign * 2.0 * c[self.log] + (-p - 1.0 if self.inverse else p + 1.0), matrix
+
+    def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
+        df, matrix = self.parameters(c)
+        p = self.size
+        if not df > p - 1.0:
+            return None
+        try:
+            root = np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            return None
+        bartlett = np.tril(rng.standard_normal((p, p)), -1)
+        bartlett += np.diag(np.sqrt(2.0 * rng.standard_gamma(0.5 * (df - np.arange(p)))))
+        if self.inverse:  # S = K K', C = K (A A')^-1 K'
+            half = root @ np.linalg.inv(bartlett).T
+        else:  # V = (K K')^-1 = K^-T K^-1
+            half = np.linalg.solve(root.T, bartlett)
+        value = half @ half.T
+        return tuple(value[i, j] for i, j in lower_half(p))
+
+    def log_q(self, c: Statistics, v: np.ndarray) -> float:
+        df, matrix = self.parameters(c)
+        p = self.size
+        value = symmetric(v, p)
+        log_det = float(np.linalg.slogdet(value)[1])
+        if self.inverse:
+            return -0.5 * (df + p + 1.0) * log_det - 0.5 * float(
+                np.trace(np.linalg.solve(value, matrix))
+            )
+        return 0.5 * (df - p - 1.0) * log_det - 0.5 * float(np.sum(matrix * value))
+
+
+Family = Gamma | Normal | NormalGamma | Beta | Dirichlet | Wishart
+
+
+def lower_half(p: int) -> list[tuple[int, int]]:
+    """(i, j) of a symmetric matrix's components, in the order of `Site.components`."""
+    return list(dict.fromkeys((max(i, j), min(i, j)) for i in range(p) for j in range(p)))
+
+
+def symmetric(v: Sequence[float] | np.ndarray, p: int) -> np.ndarray:
+    """The symmetric matrix with these components."""
+    out = np.empty((p, p))
+    for (i, j), x in zip(lower_half(p), v, strict=True):
+        out[i, j] = out[j, i] = x
+    return out

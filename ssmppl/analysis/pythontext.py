@@ -1,0 +1,101 @@
+"""Expr -> plain Python function of a list of numbers, by way of its text.
+
+For what is evaluated once a draw, on scalars, outside the compiled kernels: correction factors,
+bounds that depend on other parameters, slice densities. The interpreter defines the meaning;
+`math` raises where NumPy gives nan, so callers catch `DOMAIN` and take the density as zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.expressions.evaluate import MEANING
+from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
+
+DOMAIN = (ValueError, ZeroDivisionError, OverflowError)
+Function = Callable[[Sequence[float]], Any]
+
+_SAME_NAME = [
+    "exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "erf",
+    "erfc",
+]  # fmt: skip
+_TEXT = {
+    "neg": "(-{0})", "not": "(not {0})", "add": "({0} + {1})", "sub": "({0} - {1})",
+    "mul": "({0} * {1})", "div": "({0} / {1})", "pow": "math.pow({0}, {1})", "mod": "({0} % {1})",
+    "lt": "({0} < {1})", "le": "({0} <= {1})", "eq": "({0} == {1})", "ne": "({0} != {1})",
+    "and": "({0} and {1})", "or": "({0} or {1})", "where": "({1} if {0} else {2})",
+    "abs": "abs({0})", "maximum": "max({0}, {1})", "minimum": "min({0}, {1})",
+    "gammaln": "math.lgamma({0})", "arcsin": "math.asin({0})", "arccos": "math.acos({0})",
+    "arctan": "math.atan({0})", "arcsinh": "math.asinh({0})", "arccosh": "math.acosh({0})",
+    "arctanh": "math.atanh({0})", "arctan2": "math.atan2({0}, {1})",
+    **{n: f"math.{n}({{0}})" for n in _SAME_NAME},
+}  # fmt: skip
+
+
+def python_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
+    """A function of the arguments' values (in one sequence `v`) giving a tuple of values."""
+    places = {a: f"v[{i}]" for i, a in enumerate(arguments)}
+    texts = [_text(e, places) for e in expressions]
+    return _compiled("lambda v: (" + "".join(t + "," for t in texts) + ")", expressions)
+
+
+def python_sum(
+    functions: Sequence[Expr], arguments: Sequence[Expr]
+) -> Callable[[Sequence[float], Sequence[float]], float]:
+    """(v, c) -> sum_i c_i functions_i(v)."""
+    places = {a: f"v[{i}]" for i, a in enumerate(arguments)}
+    terms = [f"c[{i}]*{_text(f, places)}" for i, f in enumerate(functions)]
+    return _compiled("lambda v, c: " + (" + ".join(terms) or "0.0"), functions)
+
+
+def _text(root: Expr, places: dict[Expr, str]) -> str:
+    done: dict[Expr, str] = dict(places)
+    for node in topological([root]):
+        if node in done:
+            continue
+        parts = [done[a] for a in node.args]
+        if node.op == "const":
+            done[node] = f"({node.data!r})" if math.isfinite(node.data) else f"float('{node.data}')"
+        elif node.op == "symbol":
+            raise KeyError(f"no value given for {node!r}")
+        elif node.op in MATRIX_OPS:
+            done[node] = f"matrix_{node.op}({node.data}, ({', '.join(parts)},))"
+        elif node.op == "item":
+            done[node] = f"{parts[0]}[{node.data[0]}, {node.data[1]}]"
+        elif node.op == "call":
+            done[node] = f"calls[{id(node.data)}]({', '.join(parts)})"
+        elif node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
+            simple = node.args[0] in places
+            done[node] = f"({parts[0]}*{parts[0]})" if simple else f"math.pow({parts[0]}, 2.0)"
+        elif node.op in _TEXT:
+            done[node] = _TEXT[node.op].format(*parts)
+        else:
+            done[node] = f"float(meaning[{node.op!r}]({', '.join(parts)}))"
+    return done[root]
+
+
+def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], Any]:
+    def run(n: int, entries: tuple[float, ...]) -> Any:
+        try:
+            return function(np.array(entries).reshape(n, n))
+        except np.linalg.LinAlgError as error:
+            raise ValueError(str(error)) from None
+
+    return run
+
+
+def _compiled(text: str, expressions: Sequence[Expr]) -> Callable[..., Any]:
+    names = {
+        "math": math,
+        "meaning": MEANING,
+        "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
+        "matrix_cholesky": _matrix(np.linalg.cholesky),
+        "matrix_inverse": _matrix(np.linalg.inv),
+        "matrix_det": _matrix(lambda m: float(np.linalg.det(m))),
+        "matrix_logdet": _matrix(lambda m: float(np.linalg.slogdet(m)[1])),
+    }
+    return eval(text, names)

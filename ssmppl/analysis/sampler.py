@@ -1,0 +1,346 @@
+"""One draw of a derived update, given its statistics.
+
+The draw leaves the exact conditional invariant, whatever path it takes:
+
+- conjugate part, kept if it lies within the bounds and passes the correction: accept-reject, an
+  independent draw from the conditional itself;
+- after `MAX_TRIES` refusals a sweep of slice steps instead. How many refusals there were does not
+  depend on the current value, so this mixes two kernels that both leave the conditional invariant;
+- a correction without a known upper bound: a Metropolis-Hastings step that proposes from the
+  conjugate part, then always a sweep of slice steps, so that no value is held for long;
+- statistics under which the conjugate part is improper: slice steps. A Normal-Gamma block is then
+  updated separately, v by its Gamma given theta and theta by slices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.special as sp
+
+from ssmppl.analysis.bounds import WHOLE, interval
+from ssmppl.analysis.families import Beta, Gamma, Normal, NormalGamma, Values
+from ssmppl.analysis.pythontext import DOMAIN, python_function, python_sum
+from ssmppl.analysis.slices import sweep_matrix, sweep_real, sweep_simplex
+from ssmppl.errors import SamplingError
+from ssmppl.expressions.expr import Expr, symbols_of
+
+if TYPE_CHECKING:
+    from ssmppl.analysis.update import Update
+
+MAX_TRIES = 100
+LogJoint = Callable[[np.ndarray], float]
+
+
+class DrawInfo(NamedTuple):
+    """How a draw came about.
+
+    route : "conjugate", "metropolis" or "slice"; tries : proposals of the conjugate part;
+    accepted : whether the Metropolis step was (always true for the others).
+    """
+
+    route: str
+    tries: int
+    accepted: bool
+
+
+class Sampler:
+    """An update made ready to draw from: nothing symbolic is left to do but in open bounds."""
+
+    def __init__(self, update: Update):
+        self.update = update
+        functions, components = update.functions, update.components
+        self.log_density = _guarded(python_sum(functions, components))
+        self.corrections = update.correction
+        self.correct = _guarded(python_sum([functions[j] for j in update.correction], components))
+        self.bounds = [_constant_bounds(b) for b in update.bounds]
+        self.open_bounds = [
+            (i, *_open_bounds(b))
+            for i, (b, fixed) in enumerate(zip(update.bounds, self.bounds, strict=True))
+            if fixed is None
+        ]
+        natural = natural_bounds(update)
+        self.truncated = bool(self.open_bounds) or any(
+            b is not None and (b[0] > n[0] or b[1] < n[1])
+            for b, n in zip(self.bounds, natural, strict=True)
+        )
+        known = {c: WHOLE if b is None else b for c, b in zip(components, self.bounds, strict=True)}
+        self.ranges = [interval(functions[j], known) for j in update.correction]
+        v = components[-1]
+        self.v_is_gamma = isinstance(update.conditional, NormalGamma) and not any(
+            v in symbols_of(functions[j]) for j in update.correction
+        )
+        self.natural = natural
+
+    # -- the pieces of one draw
+    def limits(self, rest: Mapping[Expr, float]) -> list[tuple[float, float]]:
+        """Bounds of the components, those that depend on other parameters evaluated."""
+        if not self.open_bounds:
+            return self.bounds  # type: ignore[return-value]
+        out = list(self.bounds)
+        for i, symbols, function in self.open_bounds:
+            out[i] = function([rest[s] for s in symbols])
+        return out  # type: ignore[return-value]
+
+    def ceiling(self, c: Sequence[float]) -> float:
+        """An upper bound of the correction's logarithm; inf where none is known."""
+        total = 0.0
+        for j, (low, high) in zip(self.corrections, self.ranges, strict=True):
+            factor = c[j]
+            if factor != 0.0:
+                total += factor * (high if factor > 0.0 else low)
+        return total
+
+    def conjugate(
+        self, c: Sequence[float], limits: list[tuple[float, float]], rng: np.random.Generator
+    ) -> Values | None:
+        """A draw of the conjugate part; None where it is improper."""
+        family = self.update.conditional
+        if self.truncated and isinstance(family, (Gamma, Normal, Beta)) and len(limits) == 1:
+            value = truncated_draw(family, c, *limits[0], rng)
+            return None if value is None else (value,)
+        return family.draw(c, rng)
+
+    def draw(
+        self,
+        totals: np.ndarray,
+        current: np.ndarray,
+        rest: Mapping[Expr, float],
+        rng: np.random.Generator,
+        log_joint: LogJoint | None = None,
+    ) -> tuple[np.ndarray, DrawInfo]:
+        update = self.update
+        limits = self.limits(rest)
+        if update.conditional is None:
+            return self.slices(totals, current, limits, rng, log_joint, 0)
+        c = totals.tolist()
+        c.append(0.0)
+        weights = [c[j] for j in self.corrections]
+        ceiling = self.ceiling(c) if weights else 0.0
+        if not ceiling < math.inf:
+            return self.metropolis(totals, c, weights, current, limits, rng)
+        truncated = self.truncated
+        for tries in range(1, MAX_TRIES + 1):
+            v = self.conjugate(c, limits, rng)
+            if v is None:
+                return self.slices(totals, current, limits, rng, None, tries - 1)
+            if truncated and not _inside(v, limits):
+                continue
+            if weights:
+                excess = self.correct(v, weights) - ceiling
+                if not (excess >= 0.0 or rng.standard_exponential() >= -excess):
+                    continue
+            value = np.array(v)
+            if math.isfinite(value.sum()):
+                return value, DrawInfo("conjugate", tries, True)
+        return self.slices(totals, current, limits, rng, None, MAX_TRIES)
+
+    def metropolis(
+        self,
+        totals: np.ndarray,
+        c: list[float],
+        weights: list[float],
+        current: np.ndarray,
+        limits: list[tuple[float, float]],
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, DrawInfo]:
+        accepted, tries = False, 0
+        while tries < MAX_TRIES:
+            tries += 1
+            v = self.conjugate(c, limits, rng)
+            if v is None:
+                break
+            if self.truncated and not _inside(v, limits):
+                continue
+            change = self.correct(v, weights) - self.correct(current.tolist(), weights)
+            accepted = change >= 0.0 or rng.standard_exponential() > -change
+            if accepted:
+                current = np.array(v)
+            break
+        value, _ = self.slices(totals, current, limits, rng, None, tries)
+        return value, DrawInfo("metropolis", tries, accepted)
+
+    def slices(
+        self,
+        totals: np.ndarray,
+        current: np.ndarray,
+        limits: list[tuple[float, float]],
+        rng: np.random.Generator,
+        log_joint: LogJoint | None,
+        tries: int,
+    ) -> tuple[np.ndarray, DrawInfo]:
+        """A sweep of slice steps over the exact conditional."""
+        update = self.update
+        c = totals.tolist() if totals is not None else []
+        if update.needs_log_joint:
+            if log_joint is None:
+                raise SamplingError(
+                    f"the update of {', '.join(update.block)} needs the log joint density",
+                    fix="pass log_joint=, a function of the block's values",
+                    where=update.where,
+                )
+
+            def at(v: Sequence[float]) -> float:
+                return float(log_joint(np.array(v)))
+        else:
+
+            def at(v: Sequence[float]) -> float:
+                return self.log_density(v, c)
+
+        values = current.tolist()
+        if update.kind == "simplex":
+            new = sweep_simplex(at, values, rng)
+        elif update.kind == "matrix":
+            new = sweep_matrix(at, values, _size(len(values)), rng)
+        else:
+            natural = [
+                (max(a, n[0]), min(b, n[1])) for (a, b), n in zip(limits, self.natural, strict=True)
+            ]
+            if self.v_is_gamma:
+                values[-1] = self._gamma_given(c, values, limits[-1], rng)
+            new = sweep_real(at, values, natural, rng)
+        return np.array(new), DrawInfo("slice", tries, True)
+
+    def _gamma_given(
+        self,
+        c: list[float],
+        values: list[float],
+        limits: tuple[float, float],
+        rng: np.random.Generator,
+    ) -> float:
+        """v from its law given theta, if that is a proper Gamma; else as it was."""
+        family = self.update.conditional
+        shape, rate = family.given([*c, 0.0], np.array(values[:-1]))
+        gamma = Gamma(family.power, 0, 1)
+        v = truncated_draw(gamma, [shape * family.power - 1.0, -rate], *limits, rng)
+        return values[-1] if v is None else v
+
+
+def _guarded(function: Callable[..., float]) -> Callable[..., float]:
+    """The function with -inf where it is not defined."""
+
+    def run(*args: Sequence[float]) -> float:
+        try:
+            value = function(*args)
+        except DOMAIN:
+            return -math.inf
+        return value if value == value else -math.inf
+
+    return run
+
+
+def _inside(v: Sequence[float], limits: Sequence[tuple[float, float]]) -> bool:
+    return all(low <= x <= high for x, (low, high) in zip(v, limits, strict=True))
+
+
+def _constant_bounds(bounds: tuple[Expr, Expr]) -> tuple[float, float] | None:
+    low, high = bounds
+    return (low.data, high.data) if low.op == high.op == "const" else None
+
+
+def _open_bounds(bounds: tuple[Expr, Expr]) -> tuple[list[Expr], Callable]:
+    symbols = list(symbols_of(bounds))
+    return symbols, python_function(bounds, symbols)
+
+
+def natural_bounds(update: Update) -> list[tuple[float, float]]:
+    """Where the family itself lives."""
+    n, family = len(update.components), update.conditional
+    if isinstance(family, Gamma):
+        return [(0.0, math.inf)]
+    if isinstance(family, Beta):
+        return [(0.0, 1.0)]
+    if isinstance(family, NormalGamma):
+        return [WHOLE] * (n - 1) + [(0.0, math.inf)]
+    return [WHOLE] * n
+
+
+def _size(components: int) -> int:
+    return round((math.sqrt(8.0 * components + 1.0) - 1.0) / 2.0)
+
+
+# -- truncated laws of one number
+def truncated_draw(
+    family: Gamma | Normal | Beta,
+    c: Sequence[float],
+    low: float,
+    high: float,
+    rng: np.random.Generator,
+) -> float | None:
+    """A draw restricted to (low, high); None where the law is improper or has no mass there."""
+    if isinstance(family, Normal):
+        h, precision = c[family.linear[0]], -2.0 * c[family.quadratic[0][0]]
+        if not precision > 0.0:
+            return None
+        sd = 1.0 / math.sqrt(precision)
+        return _truncated_normal(h / precision, sd, low, high, rng)
+    if isinstance(family, Beta):
+        a, b = family.parameters(c)
+        if not (a > 0.0 and b > 0.0):
+            return None
+        value = _between(
+            lambda x: sp.betainc(a, b, x), lambda x: sp.betaincc(a, b, x),
+            lambda p: sp.betaincinv(a, b, p), lambda p: sp.betainccinv(a, b, p),
+            max(low, 0.0), min(high, 1.0), rng,
+        )  # fmt: skip
+        return value
+    shape, rate = family.parameters(c)
+    if not (shape > 0.0 and rate > 0.0):
+        return None
+    k = family.power
+    if low <= 0.0 and high == math.inf:
+        g = rng.standard_gamma(shape) / rate
+    else:
+        ends = [_to_power(max(low, 0.0), k), _to_power(high, k)]
+        ends.sort()
+        g = _between(
+            lambda x: sp.gammainc(shape, rate * x), lambda x: sp.gammaincc(shape, rate * x),
+            lambda p: sp.gammaincinv(shape, p) / rate, lambda p: sp.gammainccinv(shape, p) / rate,
+            *ends, rng,
+        )  # fmt: skip
+    if g is None or not 0.0 < g < math.inf:
+        return None
+    return g if k == 1.0 else g ** (1.0 / k)
+
+
+def _to_power(x: float, k: float) -> float:
+    if x == 0.0:
+        return 0.0 if k > 0 else math.inf
+    return x**k if x < math.inf else (math.inf if k > 0 else 0.0)
+
+
+def _between(cdf, survival, quantile, survival_quantile, low, high, rng) -> float | None:
+    """Inversion in whichever tail keeps the digits; None where the mass underflows."""
+    below, above = float(cdf(low)), float(cdf(high))
+    if below > 0.5:
+        below, above = float(survival(high)), float(survival(low))
+        quantile = survival_quantile
+    if not above - below > 1e-280:
+        return None
+    x = float(quantile(below + rng.random() * (above - below)))
+    return min(max(x, low), high)
+
+
+def _truncated_normal(
+    mean: float, sd: float, low: float, high: float, rng: np.random.Generator
+) -> float | None:
+    for _ in range(4):  # nearly always inside on the first try
+        x = mean + sd * rng.standard_normal()
+        if low <= x <= high:
+            return x
+    a, b = (low - mean) / sd, (high - mean) / sd
+    flip = a > 0.0
+    if flip:
+        a, b = -b, -a
+    log_a, log_b = float(sp.log_ndtr(a)), float(sp.log_ndtr(b))
+    if not log_b > log_a:
+        return None
+    u = rng.random()
+    # log(Phi(a) + u (Phi(b) - Phi(a)))
+    log_p = log_b + math.log(max(u - (u - 1.0) * math.exp(log_a - log_b), 1e-320))
+    z = float(sp.ndtri_exp(log_p))
+    x = mean + sd * (-z if flip else z)
+    return min(max(x, low), high) if math.isfinite(x) else None

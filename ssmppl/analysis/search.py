@@ -1,0 +1,256 @@
+"""The search for blocks of parameters with a closed-form conditional.
+
+Largest first: a Normal vector together with its precision, joint Normal vectors, then one unit at a
+time (a number, a simplex, a matrix). A block is told by its functions alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.analysis.describe import joined, shorten
+from ssmppl.analysis.families import Family, Gamma, Normal
+from ssmppl.analysis.recognise import (
+    match_dirichlet,
+    match_normal,
+    match_normal_gamma,
+    match_scalar,
+    match_wishart,
+)
+from ssmppl.analysis.sufficient import BlockForm, CompleteData, separate_block
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
+from ssmppl.language.trace import Site
+
+
+@dataclass(frozen=True)
+class Found:
+    """A family for a block, and what it leaves over."""
+
+    components: tuple[Expr, ...]
+    form: BlockForm
+    family: Family
+    correction: tuple[int, ...]
+
+
+class Search:
+    def __init__(self, data: CompleteData, fixed: frozenset[str]):
+        self.data = data
+        self.sites = {n: s for n, s in data.trace.parameters.items() if n not in fixed}
+        self.bound: dict[Expr, tuple[Expr, Expr]] = {}
+        for site in self.sites.values():
+            self.bound.update(bounds_of(site))
+        self.single: dict[tuple[Expr, ...], Found | NotApplicable] = {}
+        for unit in self._units():
+            self.single[unit] = self._alone(unit)
+
+    def _units(self) -> list[tuple[Expr, ...]]:
+        """What is drawn at least together: a matrix, a simplex, else one component."""
+        out: list[tuple[Expr, ...]] = []
+        for site in self.sites.values():
+            whole = kind_of(site) != "real"
+            out += [tuple(site.components)] if whole else [(c,) for c in site.components]
+        return out
+
+    def site(self, component: Expr) -> Site:
+        return self.sites[component.data[1]]
+
+    # -- one unit by itself
+    def _alone(self, unit: tuple[Expr, ...]) -> Found | NotApplicable:
+        form = separate_block(self.data, unit)
+        if not isinstance(form, BlockForm):
+            return form
+        site = self.site(unit[0])
+        kind, monomials = kind_of(site), form.monomials
+        if kind == "simplex":
+            candidates: list[Family] = [match_dirichlet(unit, monomials)]
+        elif kind == "matrix":
+            candidates = [match_wishart(unit, site.shape[0], monomials)]
+        else:
+            positive = self._positive(unit[0])
+            candidates = match_scalar(unit[0], monomials, positive)
+        found = [self._judged(unit, form, family) for family in candidates]
+        good = [f for f in found if isinstance(f, Found)]
+        if good:
+            return min(good, key=lambda f: len(f.correction))
+        return next(
+            (f for f in found if isinstance(f, NotApplicable)), self._outside(form, frozenset())
+        )
+
+    def _positive(self, component: Expr) -> bool:
+        lower = self.bound[component][0]
+        return lower.op == "const" and lower.data >= 0.0
+
+    def _judged(
+        self, components: tuple[Expr, ...], form: BlockForm, family: Family
+    ) -> Found | NotApplicable:
+        """The family with its correction, where that does not grow with the series."""
+        left = tuple(i for i in range(len(form.functions)) if i not in family.used)
+        growing = [i for i in left if form.roles(form.monomials[i]) & {"transition", "observation"}]
+        if growing:
+            return self._outside(form, family.used)
+        if not family.used:
+            return self._outside(form, frozenset())
+        return Found(components, form, family, left)
+
+    def _outside(self, form: BlockForm, used: frozenset[int]) -> NotApplicable:
+        """The reason naming the functions that no family holds, and the lines they stem from."""
+        names = joined(form.components)
+        growing, others = [], []
+        for i, m in enumerate(form.monomials):
+            if i not in used:
+                grows = form.roles(m) & {"transition", "observation"}
+                (growing if grows else others).append(i)
+        positions = growing or others or list(range(len(form.functions)))
+        if not positions:
+            where = self.site(form.components[0]).distribution.location
+            return NotApplicable(f"no density depends on {names}, an improper prior", where)
+        factor = form.origins[form.monomials[positions[0]]][-1]
+        text = ", ".join(shorten(to_text(form.functions[i])) for i in positions[:4])
+        more = ", ..." if len(positions) > 4 else ""
+        laws = sorted(
+            {f"{f.role} of {f.site}" for i in positions for f in form.origins[form.monomials[i]]}
+        )
+        return NotApplicable(
+            f"{names} enters the {' and the '.join(laws)} through {text}{more}, outside the span "
+            "of every family",
+            factor.where,
+        )
+
+    # -- blocks
+    def found(self) -> list[tuple[tuple[Expr, ...], Found | NotApplicable]]:
+        """Blocks that partition the parameters, each with its family or the reason why none."""
+        out: list[tuple[tuple[Expr, ...], Found | NotApplicable]] = []
+        taken: set[Expr] = set()
+        for block in self._normal_blocks():
+            found = self._normal_gamma(block, taken) or self._joint_normal(block)
+            if found is not None:
+                out.append((found.components, found))
+                taken.update(found.components)
+        out += [(u, f) for u, f in self.single.items() if taken.isdisjoint(u)]
+        return out
+
+    def _is_normal(self, unit: tuple[Expr, ...]) -> bool:
+        found = self.single[unit]
+        return isinstance(found, Found) and isinstance(found.family, Normal)
+
+    def _normal_blocks(self) -> list[tuple[Expr, ...]]:
+        """Components that are linear and quadratic together, joined where they meet in a term."""
+        candidates = [unit[0] for unit in self.single if self._is_normal(unit)]
+        blocks: list[tuple[Expr, ...]] = []
+        whole = self._quadratic(tuple(candidates)) if len(candidates) > 1 else None
+        if whole is not None:
+            return _connected(candidates, whole)
+        for c in candidates:  # greedily: into the first block that it is jointly quadratic with
+            for k, block in enumerate(blocks):
+                form = self._quadratic((*block, c))
+                if form is not None and len(_connected((*block, c), form)) == 1:
+                    blocks[k] = (*block, c)
+                    break
+            else:
+                blocks.append((c,))
+        return blocks
+
+    def _independent(self, components: Iterable[Expr]) -> bool:
+        """Whether no component's bounds depend on another."""
+        block = frozenset(components)
+        return not any(block & symbols_of(self.bound[c]) for c in block)
+
+    def _joint_normal(self, block: tuple[Expr, ...]) -> Found | None:
+        if len(block) == 1:
+            found = self.single[block]
+            return found if isinstance(found, Found) else None
+        form = self._quadratic(block)
+        return None if form is None else self._joint(block, form)
+
+    def _joint(self, block: tuple[Expr, ...], form: BlockForm) -> Found | None:
+        family = match_normal(block, form.monomials)
+        found = None if family is None else self._judged(block, form, family)
+        return found if isinstance(found, Found) else None
+
+    def _quadratic(self, block: tuple[Expr, ...]) -> BlockForm | None:
+        """The form of a block that is jointly Normal but for its components' own corrections."""
+        if not self._independent(block):
+            return None
+        form = separate_block(self.data, block)
+        if not isinstance(form, BlockForm):
+            return None
+        found = self._joint(block, form)
+        return form if found is not None and self._own(found) else None
+
+    def _own(self, found: Found) -> bool:
+        """Whether each function left over is one that some component alone cannot take either.
+
+        Otherwise (a prior Normal that is not scaled by the precision) separate updates are exact
+        where a joint one would have to reject.
+        """
+        for j in found.correction:
+            monomial = found.form.monomials[j]
+            if not any(self._refused_alone(c, monomial) for c in found.components):
+                return False
+        return True
+
+    def _refused_alone(self, component: Expr, monomial: frozenset) -> bool:
+        mine = frozenset((a, e) for a, e in monomial if component in symbols_of(a))
+        single = self.single.get((component,))
+        if not mine or not isinstance(single, Found):
+            return False
+        return any(
+            frozenset((a, e) for a, e in single.form.monomials[j] if component in symbols_of(a))
+            == mine
+            for j in single.correction
+        )
+
+    def _normal_gamma(self, block: tuple[Expr, ...], taken: set[Expr]) -> Found | None:
+        """The block together with the first parameter that scales its precision."""
+        for unit, found in self.single.items():
+            if not isinstance(found, Found) or not isinstance(found.family, Gamma):
+                continue
+            v = unit[0]
+            if v in taken or v in set(block) or not self._independent((*block, v)):
+                continue
+            form = separate_block(self.data, (*block, v))
+            if not isinstance(form, BlockForm):
+                continue
+            family = match_normal_gamma(block, v, form.monomials)
+            if family is None:
+                continue
+            joint = self._judged((*block, v), form, family)
+            if isinstance(joint, Found) and self._own(joint):
+                return joint
+        return None
+
+
+def _connected(components: Iterable[Expr], form: BlockForm) -> list[tuple[Expr, ...]]:
+    """The components in groups that share a function."""
+    groups = [{c} for c in components]
+    for monomial in form.monomials:
+        atoms = symbols_of([a for a, _ in monomial])
+        met = [g for g in groups if g & atoms]
+        if len(met) > 1:
+            groups = [g for g in groups if not g & atoms] + [set().union(*met)]
+    order = {c: i for i, c in enumerate(components)}
+    ordered = [tuple(sorted(g, key=order.__getitem__)) for g in groups]
+    return sorted(ordered, key=lambda g: order[g[0]])
+
+
+def kind_of(site: Site) -> str:
+    support = site.distribution.support().kind
+    return {"simplex": "simplex", "positive definite": "matrix"}.get(support, "real")
+
+
+def bounds_of(site: Site) -> dict[Expr, tuple[Expr, Expr]]:
+    """(lower, upper) of each component from its own prior."""
+    support = site.distribution.support()
+    infinite = (constant(-np.inf), constant(np.inf))
+    if support.kind != "interval":
+        return dict.fromkeys(site.components, infinite)
+    lower = np.broadcast_to(support.lower.view(np.ndarray), site.shape).ravel()
+    upper = np.broadcast_to(support.upper.view(np.ndarray), site.shape).ravel()
+    return {
+        value: (low, high)
+        for value, low, high in zip(site.value.ravel(), lower, upper, strict=True)
+    }

@@ -1,0 +1,181 @@
+"""Slice sampling of what fits no family, one coordinate of an unconstrained scale at a time.
+
+Neal (2003), "Slice sampling", Annals of Statistics 31: stepping out by doubling (figure 4), the
+acceptance test that doubling asks for (figure 6), shrinkage (figure 5). No tuning is needed, and
+the step leaves the conditional exactly invariant whatever the width.
+
+Coordinates: a number with one bound by the log of its distance from it; on an interval as it is,
+with the interval as the first slice; a simplex by log ratios to its last entry; a positive
+definite matrix by its Cholesky factor with the log of the diagonal. Their Jacobians are included.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ssmppl.analysis.families import lower_half, symmetric
+
+Density = Callable[[Sequence[float]], float]
+_DOUBLINGS = 60
+_SHRINKS = 200
+
+
+def slice_step(
+    log_density: Callable[[float], float],
+    x: float,
+    rng: np.random.Generator,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    width: float = 1.0,
+) -> float:
+    """One draw that leaves exp(log_density) on (lower, upper) invariant.
+
+    Returns x unmoved where the density at x is not positive: there is no slice to draw from.
+    """
+    level = log_density(x)
+    if not level > -math.inf:
+        return x
+    level -= rng.standard_exponential()
+    finite = math.isfinite(lower) and math.isfinite(upper)
+    if finite:
+        left, right = lower, upper
+    else:
+        left = x - width * rng.random()
+        right = left + width
+        low, high = log_density(left), log_density(right)
+        for _ in range(_DOUBLINGS):
+            if not (low > level or high > level):
+                break
+            if rng.random() < 0.5:
+                left -= right - left
+                low = log_density(left)
+            else:
+                right += right - left
+                high = log_density(right)
+    a, b = left, right
+    for _ in range(_SHRINKS):
+        proposal = a + rng.random() * (b - a)
+        if log_density(proposal) > level and (
+            finite or _acceptable(log_density, x, proposal, level, left, right, width)
+        ):
+            return proposal
+        if proposal < x:
+            a = proposal
+        else:
+            b = proposal
+    return x  # the slice is narrower than the spacing of floating point numbers
+
+
+def _acceptable(
+    log_density: Callable[[float], float],
+    x: float,
+    new: float,
+    level: float,
+    left: float,
+    right: float,
+    width: float,
+) -> bool:
+    """Whether doubling started from `new` could have given the same interval."""
+    differ = False
+    while right - left > 1.1 * width:
+        middle = 0.5 * (left + right)
+        differ = differ or (x < middle) != (new < middle)
+        if new < middle:
+            right = middle
+        else:
+            left = middle
+        if differ and not (log_density(left) > level or log_density(right) > level):
+            return False
+    return True
+
+
+def sweep_real(
+    log_density: Density,
+    values: Sequence[float],
+    bounds: Sequence[tuple[float, float]],
+    rng: np.random.Generator,
+) -> list[float]:
+    """Slice steps over the components of a vector, each within its own bounds."""
+    v = list(values)
+    for i, (lower, upper) in enumerate(bounds):
+
+        def at(x: float, i: int = i) -> float:
+            old, v[i] = v[i], x
+            out = log_density(v)
+            v[i] = old
+            return out
+
+        v[i] = _bounded_step(at, v[i], lower, upper, rng)
+    return v
+
+
+def _bounded_step(
+    at: Callable[[float], float], x: float, lower: float, upper: float, rng: np.random.Generator
+) -> float:
+    if math.isfinite(lower) == math.isfinite(upper):
+        return slice_step(at, x, rng, lower, upper)
+    sign, end = (1.0, lower) if math.isfinite(lower) else (-1.0, upper)
+
+    def log_scale(z: float) -> float:
+        if z > 700.0 or z < -740.0:
+            return -math.inf
+        return at(end + sign * math.exp(z)) + z
+
+    distance = sign * (x - end)
+    if not distance > 0.0:
+        return x
+    return end + sign * math.exp(slice_step(log_scale, math.log(distance), rng))
+
+
+def sweep_simplex(
+    log_density: Density, values: Sequence[float], rng: np.random.Generator
+) -> list[float]:
+    """Slice steps over the log ratios to the last entry; the Jacobian is prod_k p_k."""
+
+    def probabilities(z: np.ndarray) -> np.ndarray:
+        full = np.append(z, 0.0)
+        weights = np.exp(full - full.max())
+        return weights / weights.sum()
+
+    def at(z: list[float]) -> float:
+        p = probabilities(np.array(z))
+        if not np.all(p > 0.0):
+            return -math.inf
+        return log_density(p.tolist()) + float(np.sum(np.log(p)))
+
+    logs = np.log(np.maximum(np.asarray(values), 1e-300))
+    start = (logs[:-1] - logs[-1]).tolist()
+    free = [(-math.inf, math.inf)] * len(start)
+    return probabilities(np.array(sweep_real(at, start, free, rng))).tolist()
+
+
+def sweep_matrix(
+    log_density: Density, values: Sequence[float], size: int, rng: np.random.Generator
+) -> list[float]:
+    """Slice steps over the Cholesky factor L, the diagonal by its log.
+
+    dP = 2^p prod_i L_ii^(p - i + 1) dL (i from 1), and dL_ii = L_ii d log L_ii.
+    """
+    cells = lower_half(size)
+
+    def matrix(z: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        root = np.zeros((size, size))
+        for (i, j), x in zip(cells, z, strict=True):
+            root[i, j] = math.exp(x) if i == j else x
+        return root @ root.T, np.diagonal(root)
+
+    def at(z: list[float]) -> float:
+        if any(abs(x) > 300.0 for (i, j), x in zip(cells, z, strict=True) if i == j):
+            return -math.inf
+        value, diagonal = matrix(z)
+        weights = size + 1.0 - np.arange(size)
+        jacobian = float(weights @ np.log(diagonal))
+        return log_density([value[c] for c in cells]) + jacobian
+
+    root = np.linalg.cholesky(symmetric(values, size))
+    start = [math.log(root[c]) if c[0] == c[1] else float(root[c]) for c in cells]
+    value, _ = matrix(sweep_real(at, start, [(-math.inf, math.inf)] * len(cells), rng))
+    return [value[c] for c in cells]
