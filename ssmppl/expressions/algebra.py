@@ -207,9 +207,7 @@ class _Separator:
         ]
         for atom, _ in whole:
             del exponents[atom]
-        out: Terms = {
-            frozenset((x, e) for x, e in exponents.items() if e != 0): [constant(1.0)]
-        }
+        out: Terms = {frozenset((x, e) for x, e in exponents.items() if e != 0): [constant(1.0)]}
         for atom, e in whole:
             for _ in range(e):
                 out = self._multiply(out, self.sums[atom])

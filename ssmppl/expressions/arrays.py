@@ -179,9 +179,7 @@ def apply_ufunc(ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
 
 
 def _refuse(what: str, fix: str) -> None:
-    raise UnsupportedOperation(
-        f"{what} has no meaning on symbols", fix=fix, where=user_location()
-    )
+    raise UnsupportedOperation(f"{what} has no meaning on symbols", fix=fix, where=user_location())
 
 
 def _reduce(op: str, a: Any, axis: Any = None, keepdims: bool = False, **unused: Any) -> Any:
@@ -364,9 +362,11 @@ FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     np.einsum: lambda spec, *ops: scalar_or_array(np.einsum(spec, *map(_plain, ops))),
     np.clip: _clip,
     np.trace: _trace,
-    np.take: lambda a, index, axis=None: array(a)[index]
-    if isinstance(index, Expr) and axis in (None, 0)
-    else scalar_or_array(np.take(_plain(a), np.asarray(index, dtype=int), axis)),
+    np.take: lambda a, index, axis=None: (
+        array(a)[index]
+        if isinstance(index, Expr) and axis in (None, 0)
+        else scalar_or_array(np.take(_plain(a), np.asarray(index, dtype=int), axis))
+    ),
     np.diff: lambda a, **kw: scalar_or_array(np.diff(_plain(a), **kw)),
     np.copyto: _copyto,
     np.zeros_like: _like(0.0),

@@ -5,26 +5,29 @@ Everything else that computes expressions (generated code above all) is tested a
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import scipy.special as sp
 
-from ssmppl.expressions.expr import MATRIX_OPS, Expr, constant, topological
+from ssmppl.expressions.expr import BINARY, MATRIX_OPS, TERNARY, UNARY, Expr, constant, topological
 
 Draw = Callable[[str, tuple[np.ndarray, ...]], np.ndarray]
 
+_NUMPY = """exp log log1p expm1 sqrt sin cos tan sinh cosh tanh arcsin arccos arctan arcsinh arccosh
+    arctanh abs sign floor ceil maximum minimum arctan2 logaddexp"""
+_SCIPY = """gammaln digamma ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
+    betainc betaincinv"""
 MEANING: dict[str, Callable[..., Any]] = {
-    **{n: getattr(np, n) for n in ["exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh"]},
-    **{n: getattr(np, n) for n in ["arcsin", "arccos", "arctan", "arcsinh", "arccosh", "arctanh"]},
-    **{n: getattr(np, n) for n in ["abs", "sign", "floor", "ceil", "maximum", "minimum", "arctan2", "logaddexp"]},
-    **{n: getattr(sp, n) for n in ["gammaln", "digamma", "ndtr", "log_ndtr", "ndtri", "erf", "erfc"]},
-    **{n: getattr(sp, n) for n in ["gammainc", "gammaincc", "gammaincinv", "betainc"]},
-    **{n: getattr(sp, n) for n in ["gammainccinv", "betaincinv"]},
+    **{n: getattr(np, n) for n in UNARY + BINARY if n in _NUMPY.split()},
+    **{n: getattr(sp, n) for n in UNARY + BINARY + TERNARY if n in _SCIPY.split()},
     "trigamma": lambda a: sp.polygamma(1, a),
     # smallest k with cdf(k) >= q; scipy's inverses are continuous in k
-    "poisson_quantile": lambda rate, q: _round_up(sp.pdtrik(q, rate), lambda k: sp.pdtr(k, rate), q),
+    "poisson_quantile": lambda rate, q: _round_up(
+        sp.pdtrik(q, rate), lambda k: sp.pdtr(k, rate), q
+    ),
     "binomial_quantile": lambda n, p, q: _round_up(
         sp.bdtrik(q, n, p), lambda k: _binomial_cdf(k, n, p), q
     ),
@@ -122,10 +125,8 @@ def _matrix(op: str, n: int, entries: list[Any]) -> np.ndarray:
     function = np.linalg.inv if op == "inverse" else np.linalg.cholesky
     result = np.full(matrices.shape, np.nan)  # nan where there is no such factor
     for index in np.ndindex(matrices.shape[:-2]):
-        try:
+        with contextlib.suppress(np.linalg.LinAlgError):
             result[index] = function(matrices[index])
-        except np.linalg.LinAlgError:
-            pass
     return result
 
 

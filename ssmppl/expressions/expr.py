@@ -27,14 +27,17 @@ import numpy as np
 
 from ssmppl.errors import Location, UnsupportedOperation
 
-UNARY = ["neg", "exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh", "abs", "sign", "floor", "ceil", "gammaln", "digamma", "trigamma", "ndtr", "log_ndtr", "ndtri", "erf", "erfc", "not"]
-BINARY = ["add", "sub", "mul", "div", "pow", "mod", "maximum", "minimum", "arctan2", "logaddexp", "lt", "le", "eq", "ne", "and", "or", "gammainc", "gammaincc", "gammaincinv", "gammainccinv", "poisson_quantile"]
+_UNARY = """neg exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
+    arccosh arctanh abs sign floor ceil gammaln digamma trigamma ndtr log_ndtr ndtri erf erfc not"""
+_BINARY = """add sub mul div pow mod maximum minimum arctan2 logaddexp lt le eq ne and or
+    gammainc gammaincc gammaincinv gammainccinv poisson_quantile"""
+UNARY, BINARY = _UNARY.split(), _BINARY.split()
 TERNARY = ["where", "betainc", "betaincinv", "binomial_quantile", "negbinomial_quantile"]
 MATRIX_OPS = ("cholesky", "inverse", "logdet", "det")  # args: the n*n entries, row by row
 OPS = frozenset(
     [*UNARY, *BINARY, *TERNARY, *MATRIX_OPS, "const", "symbol", "item", "random", "call"]
 )
-BOOLEAN = frozenset(["lt", "le", "eq", "ne", "and", "or", "not"])
+BOOLEAN = frozenset(("lt", "le", "eq", "ne", "and", "or", "not"))
 
 _interned: weakref.WeakValueDictionary[tuple, Expr] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
@@ -370,7 +373,7 @@ _FOLD = {
     "logaddexp": np.logaddexp, "gammaln": lambda x: _gammaln(x), "where": np.where,
     "lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne,
     "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
-}
+}  # fmt: skip
 
 
 def _gammaln(x: float) -> float:

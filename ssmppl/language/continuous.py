@@ -14,7 +14,15 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.language.distribution import INFINITY, Distribution, Draws, Support, one_of
+from ssmppl.expressions.expr import Expr, apply
+from ssmppl.language.distribution import (
+    INFINITY,
+    Distribution,
+    Draws,
+    Support,
+    log_difference,
+    one_of,
+)
 
 LOG_2PI = math.log(2.0 * math.pi)
 _NAN = math.nan
@@ -70,21 +78,77 @@ class Normal(Distribution):
         sd = self.sd()
         return self.mean_ + _each(self, lambda i: sd[i] * draws.normal())
 
+    def _standard(self, value: Any) -> ExprArray:
+        return array((array(value) - self.mean_) / self.sd())
+
     def cdf(self, value):
-        return array(ew("ndtr", (array(value) - self.mean_) / self.sd()))
+        return array(ew("ndtr", self._standard(value)))
+
+    def survival(self, value):
+        return array(ew("ndtr", -self._standard(value)))
+
+    def log_cdf(self, value):
+        return array(ew("log_ndtr", self._standard(value)))
+
+    def log_survival(self, value):
+        return array(ew("log_ndtr", -self._standard(value)))
 
     def quantile(self, p):
         return self.mean_ + self.sd() * ew("ndtri", p)
 
-    def log_mass(self, lower, upper):
-        # From whichever tail the interval lies in, so that nothing cancels: with a flip where
-        # lower is above the mean, P = Phi(b) - Phi(a) for a < b in the lower tail.
-        sd = self.sd()
-        a, b = (array(lower) - self.mean_) / sd, (array(upper) - self.mean_) / sd
+    def survival_quantile(self, p):
+        return self.mean_ - self.sd() * ew("ndtri", p)
+
+    def _in_lower_tail(
+        self, lower: ExprArray, upper: ExprArray
+    ) -> tuple[ExprArray | bool, ExprArray, ExprArray]:
+        """(flip, a, b): the interval, standardised, mirrored where it lies above the mean."""
+        a, b = self._standard(lower), self._standard(upper)
+        whole_left, whole_right = self.open_sides(lower, upper)
+        if whole_left:
+            return False, a, b
+        if whole_right:
+            return True, -b, -a
         flip = array(ew("lt", 0.0, a))
-        low, high = _where(flip, -b, a), _where(flip, -a, b)
+        return flip, _where(flip, -b, a), _where(flip, -a, b)
+
+    def log_mass(self, lower, upper):
+        _, low, high = self._in_lower_tail(array(lower), array(upper))
+        return _log_ndtr_between(low, high)
+
+    def quantile_between(self, p, q, lower, upper):
+        flip, low, high = self._in_lower_tail(lower, upper)
+        if isinstance(flip, bool):
+            p, q = (q, p) if flip else (p, q)
+        else:
+            p, q = _where(flip, q, p), _where(flip, p, q)
+        z = array(ew("ndtri", q * ew("ndtr", low) + p * ew("ndtr", high)))
+        # Beyond 30 standard deviations: Newton's method for log Phi(z) = target, from the tail's
+        # leading term exp(-z^2 / 2); two steps are exact to rounding there.
         log_high = array(ew("log_ndtr", high))
-        return log_high + ew("log1p", -ew("exp", array(ew("log_ndtr", low)) - log_high))
+        target = log_high + ew("log", p)
+        if not _all_infinite(low):
+            target = array(ew("logaddexp", target, array(ew("log_ndtr", low)) + ew("log", q)))
+        far = -array(ew("sqrt", high**2 - 2.0 * (target - log_high)))
+        for _ in range(2):
+            value = array(ew("log_ndtr", far))
+            slope = array(ew("exp", -0.5 * far**2 - 0.5 * LOG_2PI - value))
+            far = far - (value - target) / slope
+        z = _where(ew("lt", high, -30.0), far, z)
+        if isinstance(flip, bool):
+            z = -z if flip else z
+        else:
+            z = _where(flip, -z, z)
+        return self.mean_ + self.sd() * z
+
+
+def _log_ndtr_between(low: Any, high: Any) -> ExprArray:
+    log_high = array(ew("log_ndtr", high))
+    return log_high if _all_infinite(low) else log_difference(log_high, ew("log_ndtr", low))
+
+
+def _all_infinite(a: Any) -> bool:
+    return all(e.op == "const" and e.data == -INFINITY for e in array(a).ravel())
 
 
 class LogNormal(Distribution):
@@ -112,16 +176,62 @@ class LogNormal(Distribution):
         return self.mean() ** 2 * ew("expm1", self.sd**2)
 
     def cdf(self, value):
-        return self._log.cdf(array(ew("log", value)))
+        return self._log.cdf(_log_of_positive(value))
+
+    def survival(self, value):
+        return self._log.survival(_log_of_positive(value))
+
+    def log_cdf(self, value):
+        return self._log.log_cdf(_log_of_positive(value))
+
+    def log_survival(self, value):
+        return self._log.log_survival(_log_of_positive(value))
 
     def quantile(self, p):
         return array(ew("exp", self._log.quantile(p)))
 
+    def survival_quantile(self, p):
+        return array(ew("exp", self._log.survival_quantile(p)))
+
     def log_mass(self, lower, upper):
-        return self._log.log_mass(array(ew("log", lower)), array(ew("log", upper)))
+        return self._log.log_mass(_log_of_positive(lower), _log_of_positive(upper))
+
+    def quantile_between(self, p, q, lower, upper):
+        bounds = _log_of_positive(lower), _log_of_positive(upper)
+        return array(ew("exp", self._log.quantile_between(p, q, *bounds)))
+
+    def weighted(self, power):
+        moment = ew("exp", power * self.mean_ + 0.5 * power**2 * self.sd**2)
+        return array(moment), LogNormal(self.mean_ + power * self.sd**2, sd=self.sd)
 
 
-class StudentT(Distribution):
+def _log_of_positive(value: Any) -> ExprArray:
+    return array(ew("log", ew("maximum", value, 0.0)))
+
+
+class _Symmetric(Distribution):
+    """loc + scale * Z with Z symmetric round zero."""
+
+    def _standard_cdf(self, z: ExprArray) -> ExprArray:
+        raise AttributeError
+
+    def _standard_quantile(self, p: ExprArray) -> ExprArray:
+        raise AttributeError
+
+    def cdf(self, value):
+        return self._standard_cdf((array(value) - self.loc) / self.scale)
+
+    def survival(self, value):
+        return self._standard_cdf((self.loc - array(value)) / self.scale)
+
+    def quantile(self, p):
+        return self.loc + self.scale * self._standard_quantile(array(p))
+
+    def survival_quantile(self, p):
+        return self.loc - self.scale * self._standard_quantile(array(p))
+
+
+class StudentT(_Symmetric):
     """StudentT(df, loc, scale=)."""
 
     def __init__(self, df: Any, loc: Any, *, scale: Any):
@@ -150,21 +260,30 @@ class StudentT(Distribution):
         infinite = _where(ew("lt", 1.0, self.df), INFINITY, _NAN)
         return _where(ew("lt", 2.0, self.df), finite, infinite)
 
-    def cdf(self, value):
-        z, half = (array(value) - self.loc) / self.scale, 0.5 * self.df
-        # The tail beyond |z| is I_{nu/(nu+z^2)}(nu/2, 1/2) / 2.
-        tail = 0.5 * array(ew("betainc", half, 0.5, self.df / (self.df + z**2)))
+    def has_moment(self, power):
+        return array(ew("lt", float(power), self.df))
+
+    def _standard_cdf(self, z):
+        # The tail beyond |z| is I_{nu/(nu+z^2)}(nu/2, 1/2) / 2; in the middle, where that argument
+        # is close to 1, its complement I_{z^2/(nu+z^2)}(1/2, nu/2).
+        half, middle = 0.5 * self.df, array(ew("lt", z**2, self.df))
+        a, b = _where(middle, 0.5, half), _where(middle, half, 0.5)
+        x = _where(middle, z**2, self.df) / (self.df + z**2)
+        part = 0.5 * array(ew("betainc", a, b, x))
+        tail = _where(middle, 0.5 - part, part)
         return _where(ew("lt", z, 0.0), tail, 1.0 - tail)
 
-    def quantile(self, p):
-        p = array(p)
-        tail = array(ew("minimum", p, 1.0 - p))
-        x = array(ew("betaincinv", 0.5 * self.df, 0.5, 2.0 * tail))
-        z = array(ew("sqrt", self.df * (1.0 - x) / x))
-        return self.loc + self.scale * _where(ew("lt", p, 0.5), -z, z)
+    def _standard_quantile(self, p):
+        half, tail = 0.5 * self.df, array(ew("minimum", p, 1.0 - p))
+        middle = array(ew("lt", 0.25, tail))
+        a, b = _where(middle, 0.5, half), _where(middle, half, 0.5)
+        x = array(ew("betaincinv", a, b, _where(middle, 1.0 - 2.0 * tail, 2.0 * tail)))
+        ratio = _where(middle, x, 1.0 - x) / _where(middle, 1.0 - x, x)
+        z = array(ew("sqrt", self.df * ratio))
+        return _where(ew("lt", p, 0.5), -z, z)
 
 
-class Laplace(Distribution):
+class Laplace(_Symmetric):
     """Laplace(loc, scale=): density exp(-|x - loc| / scale) / (2 scale)."""
 
     def __init__(self, loc: Any, *, scale: Any):
@@ -183,18 +302,43 @@ class Laplace(Distribution):
     def variance(self):
         return 2.0 * self.scale**2
 
-    def cdf(self, value):
-        z = (array(value) - self.loc) / self.scale
+    def _standard_cdf(self, z):
         tail = 0.5 * array(ew("exp", -ew("abs", z)))
         return _where(ew("lt", z, 0.0), tail, 1.0 - tail)
 
-    def quantile(self, p):
-        p = array(p)
+    def _standard_quantile(self, p):
         tail = array(ew("log", 2.0 * ew("minimum", p, 1.0 - p)))
-        return self.loc + self.scale * _where(ew("lt", p, 0.5), tail, -tail)
+        return _where(ew("lt", p, 0.5), tail, -tail)
+
+    def _standard_log_cdf(self, z):
+        above = ew("log1p", -0.5 * array(ew("exp", -ew("abs", z))))
+        return _where(ew("lt", z, 0.0), z - math.log(2.0), above)
+
+    def log_cdf(self, value):
+        return self._standard_log_cdf((array(value) - self.loc) / self.scale)
+
+    def log_survival(self, value):
+        return self._standard_log_cdf((self.loc - array(value)) / self.scale)
+
+    def quantile_between(self, p, q, lower, upper):
+        # On one side of loc: an exponential cut off at the interval's width, from its inner end.
+        a, b = (array(lower) - self.loc) / self.scale, (array(upper) - self.loc) / self.scale
+        above = a + cut_exponential(p, q, array(b - a))
+        below = b - cut_exponential(q, p, array(b - a))
+        across = (super().quantile_between(p, q, lower, upper) - self.loc) / self.scale
+        one_side = _where(ew("le", 0.0, a), above, below)
+        crosses = ew("and", array(ew("lt", a, 0.0)), array(ew("lt", 0.0, b)))
+        return self.loc + self.scale * _where(crosses, across, one_side)
 
 
-class Cauchy(Distribution):
+def cut_exponential(p: ExprArray, q: ExprArray, width: ExprArray) -> ExprArray:
+    """Quantile at p, q = 1 - p of an exponential with unit rate restricted to [0, width]."""
+    near_zero = ew("log1p", p * array(ew("expm1", -width)))
+    near_width = ew("log", q + p * array(ew("exp", -width)))
+    return -_where(ew("lt", p, 0.5), near_zero, near_width)
+
+
+class Cauchy(_Symmetric):
     """Cauchy(loc, scale=)."""
 
     def __init__(self, loc: Any, *, scale: Any):
@@ -214,15 +358,16 @@ class Cauchy(Distribution):
     def variance(self):
         return self._full(_NAN)
 
-    def cdf(self, value):
+    def has_moment(self, power):
+        return self._full(0.0)
+
+    def _standard_cdf(self, z):
         # arctan2 keeps the lower tail, which 1/2 + arctan(z)/pi would lose to rounding
-        z = (array(value) - self.loc) / self.scale
         return array(ew("arctan2", 1.0, -z)) / math.pi
 
-    def quantile(self, p):
-        p = array(p)
+    def _standard_quantile(self, p):
         tail = 1.0 / array(ew("tan", math.pi * ew("minimum", p, 1.0 - p)))
-        return self.loc + self.scale * _where(ew("lt", p, 0.5), -tail, tail)
+        return _where(ew("lt", p, 0.5), -tail, tail)
 
 
 class _Half(Distribution):
@@ -240,12 +385,6 @@ class _Half(Distribution):
     def sample(self, draws):
         return array(ew("abs", self.full.sample(draws)))
 
-    def cdf(self, value):
-        return _where(ew("lt", value, 0.0), 0.0, 2.0 * self.full.cdf(value) - 1.0)
-
-    def quantile(self, p):
-        return self.full.quantile(0.5 + 0.5 * array(p))
-
 
 class HalfNormal(_Half):
     """HalfNormal(sd=): |X|, X ~ Normal(0, sd=sd)."""
@@ -261,9 +400,25 @@ class HalfNormal(_Half):
     def variance(self):
         return self.sd**2 * (1.0 - 2.0 / math.pi)
 
-    def log_mass(self, lower, upper):
-        lower = array(ew("maximum", lower, 0.0))
-        return math.log(2.0) + self.full.log_mass(lower, upper)
+    def cdf(self, value):
+        return array(ew("erf", ew("maximum", value, 0.0) / (math.sqrt(2.0) * self.sd)))
+
+    def survival(self, value):
+        return array(ew("erfc", ew("maximum", value, 0.0) / (math.sqrt(2.0) * self.sd)))
+
+    def log_survival(self, value):
+        return math.log(2.0) + self.full.log_survival(array(ew("maximum", value, 0.0)))
+
+    def quantile(self, p):  # X^2 / (2 sd^2) ~ Gamma(1/2, 1)
+        return self.sd * ew("sqrt", 2.0 * array(ew("gammaincinv", 0.5, p)))
+
+    def survival_quantile(self, p):
+        return self.sd * ew("sqrt", 2.0 * array(ew("gammainccinv", 0.5, p)))
+
+    def quantile_between(self, p, q, lower, upper):
+        if self.open_sides(lower, upper)[0]:
+            return super().quantile_between(p, q, lower, upper)
+        return self.full.quantile_between(p, q, array(ew("maximum", lower, 0.0)), upper)
 
 
 class HalfCauchy(_Half):
@@ -280,6 +435,23 @@ class HalfCauchy(_Half):
     def variance(self):
         return self._full(_NAN)
 
+    def has_moment(self, power):
+        return self._full(0.0)
+
+    def cdf(self, value):
+        z = array(ew("maximum", value, 0.0)) / self.scale
+        return array(ew("arctan", z)) * (2.0 / math.pi)
+
+    def survival(self, value):
+        z = array(ew("maximum", value, 0.0)) / self.scale
+        return array(ew("arctan2", 1.0, z)) * (2.0 / math.pi)
+
+    def quantile(self, p):
+        return self.scale * ew("tan", 0.5 * math.pi * array(p))
+
+    def survival_quantile(self, p):
+        return self.scale / array(ew("tan", 0.5 * math.pi * array(p)))
+
 
 class Uniform(Distribution):
     """Uniform(lower, upper)."""
@@ -289,9 +461,10 @@ class Uniform(Distribution):
     def __init__(self, lower: Any, upper: Any):
         self._set(lower=lower, upper=upper)
         for a, b in zip(self.lower.ravel(), self.upper.ravel(), strict=True):
-            if a.op == b.op == "const" and not -INFINITY < a.data < b.data < INFINITY:
+            infinite = any(e.op == "const" and math.isinf(e.data) for e in (a, b))
+            if infinite or (a.op == b.op == "const" and not a.data < b.data):
                 raise ModelError(
-                    f"Uniform: lower = {a.data:g} and upper = {b.data:g}",
+                    f"Uniform: lower = {a!r} and upper = {b!r}",
                     fix="give finite bounds with lower < upper; an improper prior is ssm.Flat()",
                     where=self.location,
                 )
@@ -315,8 +488,22 @@ class Uniform(Distribution):
         inside = (array(value) - self.lower) / (self.upper - self.lower)
         return array(ew("minimum", 1.0, ew("maximum", 0.0, inside)))
 
+    def survival(self, value):
+        inside = (self.upper - array(value)) / (self.upper - self.lower)
+        return array(ew("minimum", 1.0, ew("maximum", 0.0, inside)))
+
     def quantile(self, p):
         return self.lower + (self.upper - self.lower) * array(p)
+
+    def survival_quantile(self, p):
+        return self.upper - (self.upper - self.lower) * array(p)
+
+    def log_mass(self, lower, upper):
+        inside = ew("minimum", upper, self.upper) - array(ew("maximum", lower, self.lower))
+        return array(ew("log", ew("maximum", inside, 0.0)) - ew("log", self.upper - self.lower))
+
+    def quantile_between(self, p, q, lower, upper):
+        return q * lower + p * upper
 
 
 class _Positive(Distribution):
@@ -353,8 +540,26 @@ class Exponential(_Positive):
     def cdf(self, value):
         return -ew("expm1", -self._rate() * ew("maximum", value, 0.0))
 
+    def survival(self, value):
+        return array(ew("exp", self.log_survival(value)))
+
+    def log_survival(self, value):
+        return -self._rate() * ew("maximum", value, 0.0)
+
     def quantile(self, p):
         return -ew("log1p", -array(p)) / self._rate()
+
+    def survival_quantile(self, p):
+        return -ew("log", p) / self._rate()
+
+    # Without memory: beyond `lower` it starts anew, whatever the tail.
+    def log_mass(self, lower, upper):
+        lower = array(ew("maximum", lower, 0.0))
+        width = array(upper) - lower
+        return -self._rate() * lower + ew("log", -array(ew("expm1", -self._rate() * width)))
+
+    def quantile_between(self, p, q, lower, upper):
+        return lower + cut_exponential(p, q, self._rate() * (upper - lower)) / self._rate()
 
 
 class Gamma(_Positive):
@@ -386,8 +591,18 @@ class Gamma(_Positive):
     def cdf(self, value):
         return array(ew("gammainc", self.shape_, self._rate() * ew("maximum", value, 0.0)))
 
+    def survival(self, value):
+        return array(ew("gammaincc", self.shape_, self._rate() * ew("maximum", value, 0.0)))
+
     def quantile(self, p):
         return array(ew("gammaincinv", self.shape_, p)) / self._rate()
+
+    def survival_quantile(self, p):
+        return array(ew("gammainccinv", self.shape_, p)) / self._rate()
+
+    def weighted(self, power):
+        rising = math.prod((self.shape_ + k for k in range(power)), start=array(1.0))
+        return rising / self._rate() ** power, Gamma(self.shape_ + power, rate=self._rate())
 
 
 class InverseGamma(_Positive):
@@ -415,11 +630,37 @@ class InverseGamma(_Positive):
         return _where(ew("lt", 2.0, a), finite, _where(ew("lt", 1.0, a), INFINITY, _NAN))
 
     def cdf(self, value):
-        inside = 1.0 - array(ew("gammainc", self.shape_, self.scale / array(value)))
-        return _where(ew("lt", 0.0, value), inside, 0.0)
+        return array(ew("gammaincc", self.shape_, self.scale / array(ew("maximum", value, 0.0))))
+
+    def survival(self, value):
+        return array(ew("gammainc", self.shape_, self.scale / array(ew("maximum", value, 0.0))))
 
     def quantile(self, p):
-        return self.scale / array(ew("gammaincinv", self.shape_, 1.0 - array(p)))
+        return self.scale / array(ew("gammainccinv", self.shape_, p))
+
+    def survival_quantile(self, p):
+        return self.scale / array(ew("gammaincinv", self.shape_, p))
+
+    def has_moment(self, power):
+        return array(ew("lt", float(power), self.shape_))
+
+
+SMALL_SHAPE = 0.1  # below it, gamma draws may be too small for floating point
+
+
+def _lower_end(e: Expr) -> float:
+    """A number as it is; 0, the least that a positive parameter can be, for an expression."""
+    return e.data if e.op == "const" else 0.0
+
+
+def needs_log_gamma(shapes: ExprArray) -> bool:
+    """Whether ratios of gamma draws of these shapes may be 0 / 0."""
+    return min(map(_lower_end, shapes.ravel())) < SMALL_SHAPE
+
+
+def log_gamma_draw(draws: Draws, shape: Expr) -> Expr:
+    """log of a gamma draw of that shape and unit rate: that of shape + 1, times U^(1/shape)."""
+    return apply("log", draws.gamma(shape + 1.0)) + apply("log", draws.uniform()) / shape
 
 
 class Beta(Distribution):
@@ -440,7 +681,10 @@ class Beta(Distribution):
 
     def sample(self, draws):
         def draw(i):
-            first, second = draws.gamma(self.a[i]), draws.gamma(self.b[i])
+            a, b = self.a[i], self.b[i]
+            if needs_log_gamma(array([a, b])):
+                return 1.0 / (1.0 + ew("exp", log_gamma_draw(draws, b) - log_gamma_draw(draws, a)))
+            first, second = draws.gamma(a), draws.gamma(b)
             return first / (first + second)
 
         return _each(self, draw)
@@ -456,8 +700,24 @@ class Beta(Distribution):
         clipped = ew("minimum", 1.0, ew("maximum", 0.0, value))
         return array(ew("betainc", self.a, self.b, clipped))
 
+    def survival(self, value):
+        clipped = array(ew("minimum", 1.0, ew("maximum", 0.0, value)))
+        near_one = ew("betainc", self.b, self.a, 1.0 - clipped)
+        return _where(ew("lt", clipped, 0.5), 1.0 - self.cdf(clipped), near_one)
+
     def quantile(self, p):
         return array(ew("betaincinv", self.a, self.b, p))
+
+    def survival_quantile(self, p):
+        p = array(p)
+        near_one = 1.0 - array(ew("betaincinv", self.b, self.a, p))
+        return _where(ew("lt", p, 0.5), near_one, ew("betaincinv", self.a, self.b, 1.0 - p))
+
+    def weighted(self, power):
+        moment = math.prod(
+            ((self.a + k) / (self.a + self.b + k) for k in range(power)), start=array(1.0)
+        )
+        return moment, Beta(self.a + power, self.b)
 
 
 class Flat(Distribution):

@@ -32,8 +32,15 @@ class _Counts(Distribution):
     def _floor(self, value: Any) -> ExprArray:
         return array(ew("floor", value))
 
+    def _count(self, value: Any) -> ExprArray:
+        """The whole number below, at least 0."""
+        return array(ew("maximum", self._floor(value), 0.0))
+
     def _below_zero(self, value: Any, otherwise: Any) -> ExprArray:
         return _where(ew("lt", value, 0.0), 0.0, otherwise)
+
+    def _one_below_zero(self, value: Any, otherwise: Any) -> ExprArray:
+        return _where(ew("lt", value, 0.0), 1.0, otherwise)
 
 
 class Poisson(_Counts):
@@ -57,11 +64,26 @@ class Poisson(_Counts):
         return self.rate
 
     def cdf(self, value):
-        k = array(ew("maximum", self._floor(value), 0.0))
-        return self._below_zero(value, 1.0 - array(ew("gammainc", k + 1.0, self.rate)))
+        return self._below_zero(value, ew("gammaincc", self._count(value) + 1.0, self.rate))
+
+    def survival(self, value):
+        return self._one_below_zero(value, ew("gammainc", self._count(value) + 1.0, self.rate))
 
     def quantile(self, p):
         return array(ew("poisson_quantile", self.rate, p))
+
+    def sample_above(self, draws, lower):
+        # X >= k where the k-th event of a unit Poisson process comes before `rate`: draw its
+        # time, Gamma(k) cut off there, then the events of the time that is left.
+        def draw(i):
+            k, rate = ew("maximum", lower[i], 1.0), self.rate[i]
+            time = ew("gammaincinv", k, draws.uniform() * ew("gammainc", k, rate))
+            return k + draws.poisson(ew("maximum", rate - time, 0.0))
+
+        return _each(self, draw)
+
+    def weighted(self, power):
+        return self.rate**power, self
 
 
 class NegativeBinomial(_Counts):
@@ -91,12 +113,35 @@ class NegativeBinomial(_Counts):
         return self.mean_ + self.mean_**2 / self.dispersion
 
     def cdf(self, value):
-        k, r = array(ew("maximum", self._floor(value), 0.0)), self.dispersion
+        k, r = self._count(value), self.dispersion
         return self._below_zero(value, ew("betainc", r, k + 1.0, r / (r + self.mean_)))
+
+    def survival(self, value):
+        k, r = self._count(value), self.dispersion
+        return self._one_below_zero(value, ew("betainc", k + 1.0, r, self.mean_ / (r + self.mean_)))
 
     def quantile(self, p):
         r = self.dispersion
         return array(ew("negbinomial_quantile", r, r / (r + self.mean_), p))
+
+    def sample_above(self, draws, lower):
+        # As for Poisson, with the process run at a gamma distributed speed g for the time m / r:
+        # time / (1 + time) of the k-th event ~ Beta(k, r), and g ~ Gamma(r + k, 1 + time) given it.
+        def draw(i):
+            k, r, m = ew("maximum", lower[i], 1.0), self.dispersion[i], self.mean_[i]
+            share = ew("betaincinv", k, r, draws.uniform() * ew("betainc", k, r, m / (r + m)))
+            left = m / r - share / (1.0 - share)
+            speed = draws.gamma(r + k) * (1.0 - share)
+            return k + draws.poisson(speed * ew("maximum", left, 0.0))
+
+        return _each(self, draw)
+
+    def weighted(self, power):
+        # X - k given the weight: shape r + k, the same odds m / r
+        r, factor = self.dispersion, array(1.0)
+        for k in range(power):
+            factor = factor * (r + k) * (self.mean_ / r)
+        return factor, NegativeBinomial(self.mean_ * (r + power) / r, dispersion=r + power)
 
 
 class Binomial(_Counts):
@@ -133,12 +178,35 @@ class Binomial(_Counts):
         return self.n * self.p * (1.0 - self.p)
 
     def cdf(self, value):
-        k = array(ew("maximum", self._floor(value), 0.0))
+        k = self._count(value)
         inside = ew("betainc", ew("maximum", self.n - k, 0.5), k + 1.0, 1.0 - self.p)
         return self._below_zero(value, _where(ew("le", self.n, k), 1.0, inside))
 
+    def survival(self, value):
+        k = self._count(value)
+        inside = ew("betainc", k + 1.0, ew("maximum", self.n - k, 0.5), self.p)
+        return self._one_below_zero(value, _where(ew("le", self.n, k), 0.0, inside))
+
     def quantile(self, p):
         return array(ew("binomial_quantile", self.n, self.p, p))
+
+    def sample_above(self, draws, lower):
+        # X >= k where the k-th smallest of n uniforms, Beta(k, n - k + 1), is below p; the others
+        # that are larger than it are uniform up to 1.
+        def draw(i):
+            k, n, p = ew("maximum", lower[i], 1.0), self.n[i], self.p[i]
+            b = ew("maximum", n - k + 1.0, 1.0)
+            kth = ew("betaincinv", k, b, draws.uniform() * ew("betainc", k, b, p))
+            chance = ew("maximum", p - kth, 0.0) / (1.0 - kth)
+            return k + draws.binomial(ew("maximum", n - k, 0.0), chance)
+
+        return _each(self, draw)
+
+    def weighted(self, power):
+        factor = array(1.0)
+        for k in range(power):
+            factor = factor * ew("maximum", self.n - float(k), 0.0) * self.p
+        return factor, Binomial(ew("maximum", self.n - float(power), 0.0), self.p)
 
 
 class Bernoulli(_Counts):
@@ -167,8 +235,15 @@ class Bernoulli(_Counts):
         below = _where(ew("lt", value, 1.0), 1.0 - self.p, 1.0)
         return self._below_zero(value, below)
 
+    def survival(self, value):
+        above = _where(ew("lt", value, 1.0), self.p, 0.0)
+        return self._one_below_zero(value, above)
+
     def quantile(self, p):
         return _where(ew("le", p, 1.0 - self.p), 0.0, 1.0)
+
+    def weighted(self, power):
+        return Binomial(self._full(1.0), self.p).weighted(power)
 
 
 class Categorical(_Counts):

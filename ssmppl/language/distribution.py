@@ -7,17 +7,21 @@ Poisson, binomial draws).
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import Location, ModelError, UnsupportedOperation
+from ssmppl.errors import Location, ModelError, UnsupportedOperation, nearest_first
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, constant, user_location
 
 INFINITY = math.inf
+LOG_2 = math.log(2.0)
 
 
 @dataclass(frozen=True)
@@ -78,12 +82,20 @@ class Distribution:
     joint = False
     discrete = False
     proper = True
+    by_name = "spread"  # what the keyword-only arguments are called in messages
     parameters: dict[str, ExprArray]
     shape: tuple[int, ...]
     location: Location
 
+    def __init_subclass__(cls) -> None:
+        if "__init__" in cls.__dict__:
+            cls.__init__ = _checking_arguments(cls.__init__)  # type: ignore[method-assign]
+
     def _set(self, **parameters: Any) -> None:
-        """Convert, broadcast (elementwise distributions) and remember the parameters."""
+        """Convert, broadcast (elementwise distributions) and remember the parameters.
+
+        Where a name is also that of a method (mean, shape), it is kept with an underscore.
+        """
         self.location = user_location()
         arrays = {}
         for name, value in parameters.items():
@@ -93,16 +105,23 @@ class Distribution:
                 if isinstance(error, UnsupportedOperation):
                     raise
                 raise ModelError(
-                    f"{type(self).__name__}: {name} is {value!r}, which is no number or symbol",
+                    f"{type(self).__name__}: {_plain_name(name)} is {value!r}, which is no "
+                    "number or symbol",
                     fix="pass numbers, arrays of numbers, or expressions of the function's "
                     "arguments",
                     where=self.location,
                 ) from None
+            if any(e.op == "const" and math.isnan(e.data) for e in arrays[name].ravel()):
+                raise ModelError(
+                    f"{type(self).__name__}: {_plain_name(name)} is nan",
+                    fix="pass numbers, or expressions of the function's arguments",
+                    where=self.location,
+                )
         if not self.joint:
             try:
                 shape = np.broadcast_shapes(*(a.shape for a in arrays.values()))
             except ValueError:
-                shapes = ", ".join(f"{n} {a.shape}" for n, a in arrays.items())
+                shapes = ", ".join(f"{_plain_name(n)} {a.shape}" for n, a in arrays.items())
                 raise ModelError(
                     f"{type(self).__name__}: shapes do not agree: {shapes}",
                     fix="give parameters of one shape, or scalars",
@@ -122,9 +141,9 @@ class Distribution:
             if not inside:
                 brackets = "()" if strict else "[]"
                 raise ModelError(
-                    f"{type(self).__name__}: {name} = {e.data:g} is outside "
+                    f"{type(self).__name__}: {_plain_name(name)} = {e.data:g} is outside "
                     f"{brackets[0]}{low:g}, {high:g}{brackets[1]}",
-                    fix=f"give a {name} inside that range",
+                    fix=f"give a {_plain_name(name)} inside that range",
                     where=self.location,
                 )
 
@@ -142,7 +161,7 @@ class Distribution:
             same = all(e is flat[0] for e in flat)
             return repr(flat[0]) if same else "[" + ", ".join(map(repr, flat)) + "]"
 
-        inside = ", ".join(f"{n}={text(a)}" for n, a in self.parameters.items())
+        inside = ", ".join(f"{_plain_name(n)}={text(a)}" for n, a in self.parameters.items())
         return f"{type(self).__name__}({inside})"
 
     # -- to be defined by each distribution
@@ -174,14 +193,84 @@ class Distribution:
         """Inverse of `cdf`: for discrete distributions the smallest value with cdf >= p."""
         raise AttributeError
 
+    # -- the upper tail, each to full relative accuracy where the distribution says how
+    def survival(self, value: ExprArray) -> ExprArray:
+        """P(X > value), element by element."""
+        return 1.0 - self.cdf(value)
+
+    def survival_quantile(self, p: ExprArray) -> ExprArray:
+        """Inverse of `survival`."""
+        return self.quantile(1.0 - array(p))
+
+    def log_cdf(self, value: ExprArray) -> ExprArray:
+        """Log of `cdf`, where the distribution says how beyond the range of floating point."""
+        return array(elementwise("log", self.cdf(value)))
+
+    def log_survival(self, value: ExprArray) -> ExprArray:
+        """Log of `survival`, likewise."""
+        return array(elementwise("log", self.survival(value)))
+
+    def weighted(self, power: int) -> tuple[ExprArray, Distribution] | None:
+        """(E[X^k], the distribution with density proportional to x^k times this one's), k = power.
+
+        For counts x (x-1) ... (x-k+1) takes the place of x^k, and the distribution is that of
+        X - k. None where it is no distribution of the language.
+        """
+        return None
+
+    def has_moment(self, power: int) -> ExprArray:
+        """Whether the tails are light enough for E|X|^power, as a condition."""
+        return self._full(1.0)
+
     # -- in terms of the above
     def _full(self, value: float) -> ExprArray:
         return array(np.full(self.shape, value))
 
+    def open_sides(self, lower: ExprArray, upper: ExprArray) -> tuple[bool, bool]:
+        """Whether lower (upper) bounds nothing: never inside the support."""
+        support = self.support()
+        return (
+            all(map(_never_above, array(lower).ravel(), support.lower.ravel())),
+            all(map(_never_above, support.upper.ravel(), array(upper).ravel())),
+        )
+
     def log_mass(self, lower: ExprArray, upper: ExprArray) -> ExprArray:
-        """log P(lower <= X <= upper), element by element."""
-        below = self.cdf(array(lower) - 1.0 if self.discrete else lower)
-        return elementwise("log", self.cdf(upper) - below)
+        """log P(lower <= X <= upper), element by element.
+
+        From the tail that the interval lies in, so that a far one is not lost to rounding.
+        """
+        lower, upper = array(lower), array(upper)
+        whole_left, whole_right = self.open_sides(lower, upper)
+        if whole_left:
+            return self.log_cdf(upper)
+        below = lower - 1.0 if self.discrete else lower
+        if whole_right:
+            return self.log_survival(below)
+        cdf_below = self.log_cdf(below)
+        left = log_difference(self.log_cdf(upper), cdf_below)
+        right = log_difference(self.log_survival(below), self.log_survival(upper))
+        return array(elementwise("where", elementwise("lt", cdf_below, -LOG_2), left, right))
+
+    def quantile_between(
+        self, p: ExprArray, q: ExprArray, lower: ExprArray, upper: ExprArray
+    ) -> ExprArray:
+        """Quantile of the distribution restricted to [lower, upper] at p, q = 1 - p."""
+        whole_left, whole_right = self.open_sides(lower, upper)
+        if whole_left:
+            return self.quantile(p * self.cdf(upper))
+        below = lower - 1.0 if self.discrete else lower
+        if whole_right and not self.discrete:  # no discrete distribution has survival_quantile
+            return self.survival_quantile(q * self.survival(below))
+        low = self.cdf(below)
+        left = self.quantile(q * low + p * (1.0 if whole_right else self.cdf(upper)))
+        if self.discrete:
+            return left
+        right = self.survival_quantile(q * self.survival(below) + p * self.survival(upper))
+        return array(elementwise("where", elementwise("lt", low, 0.5), left, right))
+
+    def sample_above(self, draws: Draws, lower: ExprArray) -> ExprArray | None:
+        """A draw given X >= lower, for those that do not invert their upper tail; else None."""
+        return None
 
     def guarded_log_densities(self, value: ExprArray) -> ExprArray:
         """`log_densities`, and -inf outside the support."""
@@ -218,14 +307,62 @@ class Distribution:
         return array(np.sum(array(parts)))[()]
 
 
+def log_difference(a: Any, b: Any) -> ExprArray:
+    """log(exp(a) - exp(b)) for a > b."""
+    return array(a + elementwise("log1p", -array(elementwise("exp", array(b) - a))))
+
+
+def _never_above(a: Expr, b: Expr) -> bool:
+    """Whether a <= b is known without values for symbols."""
+    return a is b or (a.op == b.op == "const" and a.data <= b.data)
+
+
+def _plain_name(name: str) -> str:
+    """A parameter as the user knows it."""
+    return name.rstrip("_")
+
+
+def _checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
+    """`init`, with a ModelError in place of Python's TypeError where the arguments do not fit."""
+    signature = inspect.signature(init)
+    by_name = [p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    positional = [
+        p.name for p in signature.parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD
+    ][1:]
+
+    @functools.wraps(init)
+    def checked(self: Distribution, *args: Any, **kwargs: Any) -> None:
+        try:
+            signature.bind(self, *args, **kwargs)
+        except TypeError as error:
+            name = type(self).__name__
+            given = f"{len(args)} without a name"
+            given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
+            found = f"{name}: {error}; given were {given}"
+            known = [f"{k}=" for k in by_name]
+            *most, last = known or [""]
+            options = f"{', '.join(most)} or {last}" if most else last
+            unknown = [k for k in kwargs if k not in (*positional, *by_name)]
+            if unknown:
+                nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
+                fix = f"the arguments of {name} are {nearest}"
+            elif by_name and len(args) > len(positional):
+                found = f"{name} takes its {self.by_name} by name: {options}"
+                fix = f"write {name}({', '.join([*positional, f'{by_name[0]}=...'])})"
+            else:
+                fix = f"write {name}({', '.join([*positional, *known])})"
+            raise ModelError(found, fix=fix, where=user_location()) from None
+        init(self, *args, **kwargs)
+
+    return checked
+
+
 def isinstance_bound_closed(distribution: Distribution) -> bool:
     """Whether the lower bound itself belongs to the support."""
     return getattr(type(distribution), "closed", False)
 
 
-def one_of(
-    name: str, options: dict[str, Any], where: Location | None = None
-) -> tuple[str, Any]:
+def one_of(name: str, options: dict[str, Any], where: Location | None = None) -> tuple[str, Any]:
     """The one spread that was given; an error naming the options where there is none or several."""
     given = {k: v for k, v in options.items() if v is not None}
     if len(given) != 1:

@@ -23,7 +23,7 @@ from ssmppl.expressions.arrays import (
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.expr import constant
-from ssmppl.language.continuous import LOG_2PI
+from ssmppl.language.continuous import LOG_2PI, log_gamma_draw, needs_log_gamma
 from ssmppl.language.distribution import Distribution, Draws, Support, one_of
 
 
@@ -37,6 +37,13 @@ class _Joint(Distribution):
             raise ModelError(
                 f"{type(self).__name__}: {name} has shape {m.shape}",
                 fix="give a square matrix",
+                where=self.location,
+            )
+        above = [m[i, j] for i in range(len(m)) for j in range(i + 1, len(m))]
+        if name == "cholesky" and any(e is not constant(0.0) for e in above):
+            raise ModelError(
+                f"{type(self).__name__}: cholesky is not lower triangular",
+                fix="give the lower factor L with L L' = covariance, as np.linalg.cholesky does",
                 where=self.location,
             )
         if all(e.op == "const" for e in m.ravel()):
@@ -141,7 +148,11 @@ class Dirichlet(_Joint):
         return array(np.sum((a - 1.0) * ew("log", v)) - norm)
 
     def sample(self, draws):
-        g = array([draws.gamma(a) for a in self.concentration])
+        if not needs_log_gamma(self.concentration):
+            g = array([draws.gamma(a) for a in self.concentration])
+            return array(g / np.sum(g))
+        log_g = array([log_gamma_draw(draws, a) for a in self.concentration])
+        g = array(ew("exp", log_g - np.max(log_g)))
         return array(g / np.sum(g))
 
     def mean(self):
@@ -164,6 +175,12 @@ class _WishartFamily(_Joint):
     def __init__(self, df: Any, *, scale: Any):
         self._set(df=df, scale=scale)
         p = len(self._matrix("scale"))
+        if self.df.ndim:
+            raise ModelError(
+                f"{type(self).__name__}: df has shape {self.df.shape}",
+                fix="give one number of degrees of freedom",
+                where=self.location,
+            )
         self._require("df", p - 1.0)
         self.shape = (p, p)
 

@@ -1,7 +1,7 @@
 """Truncated(dist, lower=, upper=): a distribution restricted to an interval.
 
 The log density is that of the base less log P(lower <= X <= upper); draws invert the base's
-distribution function on the part of (0, 1) that is left.
+distribution function on the part of (0, 1) that is left, from the tail that the interval is in.
 """
 
 from __future__ import annotations
@@ -14,9 +14,18 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.expressions.expr import user_location
-from ssmppl.language.continuous import _each, _where
-from ssmppl.language.continuous import Flat, LogNormal, Normal
+from ssmppl.expressions.evaluate import numbers
+from ssmppl.expressions.expr import symbols_of, user_location
+from ssmppl.language.continuous import (
+    LOG_2PI,
+    Exponential,
+    Flat,
+    Laplace,
+    Normal,
+    Uniform,
+    _each,
+    _where,
+)
 from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
 
@@ -25,6 +34,7 @@ class Truncated(Distribution):
     """Truncated(dist, lower=None, upper=None): bounds are included for discrete distributions."""
 
     closed = True
+    by_name = "bounds"
 
     def __init__(self, dist: Distribution, *, lower: Any = None, upper: Any = None):
         if not isinstance(dist, Distribution) or dist.joint or isinstance(dist, (Dirac, Flat)):
@@ -40,24 +50,49 @@ class Truncated(Distribution):
                 fix="give lower=, upper= or both",
                 where=user_location(),
             )
-        self.base = dist
         self._set(
             lower=-math.inf if lower is None else lower,
             upper=math.inf if upper is None else upper,
             **{f"like_{n}": a for n, a in dist.parameters.items()},
         )
+        if isinstance(dist, Truncated):  # of the innermost, by the tighter bounds
+            self.parameters["lower"] = _tighter("maximum", self.lower, self.like_lower)
+            self.parameters["upper"] = _tighter("minimum", self.upper, self.like_upper)
+            dist = dist.base
+        if dist.discrete:
+            self.parameters["lower"] = array(ew("ceil", self.lower))
+            self.parameters["upper"] = array(ew("floor", self.upper))
+        self.base, self.discrete = dist, dist.discrete
         for a, b in zip(self.lower.ravel(), self.upper.ravel(), strict=True):
-            if a.op == b.op == "const" and not a.data < b.data:
+            if a.op == b.op == "const" and not (
+                a.data < b.data or (dist.discrete and a.data == b.data)
+            ):
                 raise ModelError(
                     f"Truncated: lower = {a.data:g} is not below upper = {b.data:g}",
                     fix="give lower < upper",
                     where=self.location,
                 )
-        self.discrete = dist.discrete
+        self._refuse_empty()
+
+    def _refuse_empty(self) -> None:
+        """Numbers that leave (nearly) nothing of the base."""
+        mass = array(self.base.log_mass(*self._bounds()))
+        known = [e for e in mass.ravel() if not symbols_of(e)]
+        for value in numbers(known):
+            if not math.isfinite(value):
+                raise ModelError(
+                    f"{self!r} leaves no probability, or too little to be computed",
+                    fix="move the bounds to where the distribution lives",
+                    where=self.location,
+                )
 
     def __repr__(self) -> str:
-        bounds = [f"{n}={self.parameters[n].ravel()[0]!r}" for n in ("lower", "upper")]
-        return f"Truncated({self.base!r}, {', '.join(b for b in bounds if 'inf' not in b)})"
+        bounds = [
+            f"{name}={self.parameters[name].ravel()[0]!r}"
+            for name in ("lower", "upper")
+            if not _is_infinite(self.parameters[name])
+        ]
+        return f"Truncated({', '.join([repr(self.base), *bounds])})"
 
     def support(self):
         base = self.base.support()
@@ -72,54 +107,120 @@ class Truncated(Distribution):
     def log_densities(self, value):
         return self.base.log_densities(array(value)) - self.base.log_mass(*self._bounds())
 
-    def log_mass(self, lower, upper):
-        low, high = self._bounds()
-        inside = self.base.log_mass(array(ew("maximum", lower, low)), ew("minimum", upper, high))
-        return inside - self.base.log_mass(low, high)
-
-    def _limits(self) -> tuple[ExprArray, ExprArray]:
-        """The base's distribution function at the bounds."""
+    def _clip(self, value: Any) -> ExprArray:
         lower, upper = self._bounds()
-        return self.base.cdf(lower - 1.0 if self.discrete else lower), self.base.cdf(upper)
+        return array(ew("minimum", upper, ew("maximum", lower, value)))
+
+    def log_mass(self, lower, upper):
+        inside = self.base.log_mass(self._clip(lower), self._clip(upper))
+        return inside - self.base.log_mass(*self._bounds())
+
+    def _share(self, lower: ExprArray, upper: ExprArray) -> ExprArray:
+        part = self.base.log_mass(lower, upper) - self.base.log_mass(*self._bounds())
+        return array(ew("minimum", 1.0, ew("exp", part)))
 
     def cdf(self, value):
-        low, high = self._limits()
-        inside = (self.base.cdf(array(value)) - low) / (high - low)
-        return array(ew("minimum", 1.0, ew("maximum", 0.0, inside)))
+        lower, upper = self._bounds()
+        value = array(ew("floor", value)) if self.discrete else array(value)
+        inside = self._share(lower, array(ew("minimum", upper, value)))
+        below = ew("lt" if self.discrete else "le", value, lower)
+        return _where(below, 0.0, _where(ew("le", upper, value), 1.0, inside))
+
+    def survival(self, value):
+        lower, upper = self._bounds()
+        value = array(ew("floor", value)) if self.discrete else array(value)
+        start = value + 1.0 if self.discrete else value
+        inside = self._share(array(ew("maximum", lower, start)), upper)
+        below = ew("lt" if self.discrete else "le", value, lower)
+        return _where(below, 1.0, _where(ew("le", upper, value), 0.0, inside))
+
+    def _quantile(self, p: ExprArray, q: ExprArray) -> ExprArray:
+        return self._clip(self.base.quantile_between(p, q, *self._bounds()))
 
     def quantile(self, p):
-        lower, upper = self._bounds()
-        if isinstance(self.base, (Normal, LogNormal)):
-            inner = self.base if isinstance(self.base, Normal) else self.base._log
-            log = isinstance(self.base, LogNormal)
-            a, b = (array(ew("log", e)) if log else e for e in (lower, upper))
-            x = _normal_quantile(inner, a, b, array(p))
-            x = array(ew("exp", x)) if log else x
-        else:
-            low, high = self._limits()
-            x = self.base.quantile(low + array(p) * (high - low))
-        return array(ew("minimum", upper, ew("maximum", lower, x)))
+        return self._quantile(array(p), 1.0 - array(p))
+
+    def survival_quantile(self, p):
+        return self._quantile(1.0 - array(p), array(p))
 
     def sample(self, draws):
+        lower, upper = self._bounds()
+        if self.discrete and self.base.open_sides(lower, upper) == (False, True):
+            above = self.base.sample_above(draws, lower)
+            if above is not None:
+                return above
         return self.quantile(_each(self, lambda i: draws.uniform()))
 
-    def _moment(self, power: int) -> ExprArray:
-        """E[X^power] as the integral of the quantile function over (0, 1).
-
-        Gauss-Legendre with 200 nodes: exact to rounding for bounded supports with smooth
-        densities, to about 1e-4 for one unbounded tail.
-        """
-        nodes, weights = np.polynomial.legendre.leggauss(200)
-        total = self._full(0.0)
-        for node, weight in zip(0.5 * (nodes + 1.0), 0.5 * weights, strict=True):
-            total = total + weight * self.quantile(self._full(node)) ** power
-        return total
-
+    # -- moments
     def mean(self):
-        return self._moment(1)
+        return self._moments()[0]
 
     def variance(self):
-        return self._moment(2) - self._moment(1) ** 2
+        return self._moments()[1]
+
+    def _moments(self) -> tuple[ExprArray, ExprArray]:
+        """Mean and variance: in closed form, else by quadrature; infinite where they diverge."""
+        lower, upper = self._bounds()
+        if isinstance(self.base, Normal):
+            return _normal_moments(self.base, lower, upper)
+        if isinstance(self.base, Uniform):
+            return 0.5 * (lower + upper), (upper - lower) ** 2 / 12.0
+        if isinstance(self.base, Exponential):
+            return _exponential_moments(self.base, lower, upper)
+        if self.base.weighted(1) is not None:
+            return self._weighted_moments(lower, upper)
+        mean, variance = self._quadrature()
+        infinite = [_is_infinite(b) for b in (lower, upper)]
+        if any(infinite):
+            limit = math.inf if infinite[1] else -math.inf
+            finite = self.base.has_moment(1)
+            divergent = _where(finite, math.inf, math.nan)
+            mean = _where(finite, mean, limit)
+            variance = _where(self.base.has_moment(2), variance, divergent)
+        return mean, variance
+
+    def _weighted_moments(self, lower: ExprArray, upper: ExprArray) -> tuple[ExprArray, ExprArray]:
+        """From the laws with density x f(x) and x^2 f(x): `Distribution.weighted`."""
+        mass, moments = self.base.log_mass(lower, upper), []
+        for power in (1, 2):
+            factor, law = self.base.weighted(power)
+            shift = float(power) if self.discrete else 0.0
+            moments.append(factor * ew("exp", law.log_mass(lower - shift, upper - shift) - mass))
+        mean, second = moments
+        return mean, second - mean * (mean - 1.0 if self.discrete else mean)
+
+    def _quadrature(self) -> tuple[ExprArray, ExprArray]:
+        """Moments as integrals of the quantile function over (0, 1).
+
+        The double exponential rule of Takahasi and Mori (1974), *Publ. RIMS* 9, which takes the
+        singularities at the ends; in two parts where the density has a kink.
+        """
+        centre, parts = self.quantile(self._full(0.5)), [(0.0, 1.0)]
+        if isinstance(self.base, Laplace):
+            at_kink = self.cdf(self.base.loc)
+            parts = [(0.0, at_kink), (at_kink, 1.0 - at_kink)]
+        first = second = self._full(0.0)
+        for start, width in parts:
+            for p, q, weight in _double_exponential():
+                low = start + width * p
+                high = (1.0 - start - width) + width * q if len(parts) > 1 else q
+                d = self._quantile(self._full(0.0) + low, self._full(0.0) + high) - centre
+                first, second = first + weight * width * d, second + weight * width * d**2
+        return centre + first, second - first**2
+
+
+def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[float, float, float]]:
+    """Nodes p, 1 - p and weights on (0, 1): p = 1 / (1 + exp(-pi sinh t))."""
+    out = []
+    for t in np.arange(-end, end + 0.5 * step, step):
+        s = math.pi * math.sinh(t)
+        p, q = (1.0 / (1.0 + math.exp(-s)), 1.0 / (1.0 + math.exp(s)))
+        out.append((p, q, step * math.pi * math.cosh(t) * p * q))
+    return out
+
+
+def _is_infinite(bound: Any) -> bool:
+    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
 
 
 def _tighter(op: str, a: ExprArray, b: ExprArray) -> ExprArray:
@@ -132,12 +233,51 @@ def _tighter(op: str, a: ExprArray, b: ExprArray) -> ExprArray:
     return array(out)
 
 
-def _normal_quantile(base: Normal, lower: ExprArray, upper: ExprArray, p: ExprArray) -> ExprArray:
-    """Quantile of a truncated Normal, computed in the lower tail (flipped where needed)."""
-    sd = base.sd()
-    a, b = (lower - base.mean_) / sd, (upper - base.mean_) / sd
-    flip = array(ew("lt", 0.0, a))
-    low, high = array(ew("ndtr", _where(flip, -b, a))), array(ew("ndtr", _where(flip, -a, b)))
-    q = _where(flip, 1.0 - p, p)
-    z = array(ew("ndtri", low + q * (high - low)))
-    return base.mean_ + sd * _where(flip, -z, z)
+def _normal_moments(
+    base: Normal, lower: ExprArray, upper: ExprArray
+) -> tuple[ExprArray, ExprArray]:
+    """Johnson, Kotz and Balakrishnan (1994), section 13.10.1, with ratios taken of logs."""
+    sd, mass = base.sd(), base.log_mass(lower, upper)
+    a, b = ((bound - base.mean()) / sd for bound in (lower, upper))
+
+    def ratio(z: ExprArray) -> ExprArray:
+        return array(ew("exp", -0.5 * z**2 - 0.5 * LOG_2PI - mass))
+
+    first = second = array(0.0)
+    if not _is_infinite(lower):
+        first, second = first + ratio(a), second + a * ratio(a)
+    if not _is_infinite(upper):
+        first, second = first - ratio(b), second - b * ratio(b)
+    mean, variance = first, 1.0 + second - first**2
+    if not _is_infinite(lower) and not _is_infinite(upper):
+        # Narrow, where the differences above cancel: Gauss-Legendre over the interval.
+        width, middle = array(b - a), array(0.5 * (a + b))
+        steepness = width * array(ew("maximum", 1.0, ew("abs", middle)))
+        nodes, weights = np.polynomial.legendre.leggauss(12)
+        total = first_sum = second_sum = array(0.0)
+        for node, weight in zip(nodes, weights, strict=True):
+            d = 0.5 * width * node
+            mass_at = weight * array(ew("exp", -d * (middle + 0.5 * d)))
+            total = total + mass_at
+            first_sum = first_sum + mass_at * node
+            second_sum = second_sum + mass_at * node**2
+        offset = first_sum / total
+        spread = (0.5 * width) ** 2 * (second_sum / total - offset**2)
+        offset = 0.5 * width * offset
+        narrow = array(ew("lt", steepness, 1.0))
+        mean = _where(narrow, middle + offset, mean)
+        variance = _where(narrow, spread, variance)
+    return base.mean() + sd * mean, sd**2 * variance
+
+
+def _exponential_moments(
+    base: Exponential, lower: ExprArray, upper: ExprArray
+) -> tuple[ExprArray, ExprArray]:
+    """Without memory: those of an exponential cut off at upper - lower, moved by lower."""
+    scale = base.mean()
+    if _is_infinite(upper):
+        return lower + scale, array(scale**2 + 0.0 * lower)
+    width = (upper - lower) / scale
+    lost = width / ew("expm1", width)
+    variance = 1.0 - lost**2 * array(ew("exp", width))
+    return lower + scale * (1.0 - lost), scale**2 * variance

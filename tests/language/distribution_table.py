@@ -1,0 +1,261 @@
+"""Every distribution of the language at several settings, beside SciPy's of the same law.
+
+`CASES` holds those of scalars, `JOINT_CASES` those of vectors and matrices, `TRUNCATED_CASES`
+truncations. A case keeps class and parameters apart, so that a test may put symbols in place of
+the numbers (`Case.with_symbols`), as the compiled samplers and densities need it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.stats as st
+
+import ssmppl.language.distributions as D
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import Expr, symbol
+
+
+@dataclass(frozen=True)
+class Case:
+    """One distribution at one setting; `reference` is SciPy's frozen law of the same name."""
+
+    cls: type[D.Distribution]
+    parameters: dict[str, Any]
+    reference: Any
+    whole: frozenset[str] = field(default=frozenset())
+
+    @property
+    def id(self) -> str:
+        text = ",".join(f"{k}={v:g}" if np.isscalar(v) else k for k, v in self.parameters.items())
+        return f"{self.cls.__name__}({text})"
+
+    def build(self) -> D.Distribution:
+        """The distribution, its parameters as numbers."""
+        return self.cls(**self.parameters)
+
+    def with_symbols(self) -> tuple[D.Distribution, dict[Expr, float]]:
+        """The distribution with a symbol for each number, and their values."""
+        values: dict[Expr, float] = {}
+        symbolic = {}
+        for name, value in self.parameters.items():
+            plain = np.asarray(value, dtype=float)
+            out = np.empty(plain.shape, dtype=object)
+            for index in np.ndindex(plain.shape):
+                if plain.ndim == 2 and index[1] > index[0] and name == "cholesky":
+                    out[index] = 0.0
+                    continue
+                low = index if plain.ndim < 2 else tuple(sorted(index, reverse=True))
+                out[index] = symbol("parameter", name, low)
+                values[out[index]] = float(plain[index])
+            symbolic[name] = array(out) if plain.ndim else out[()]
+        return self.cls(**symbolic), values
+
+    def points(self) -> np.ndarray:
+        """Values in the support, from the far lower to the far upper tail."""
+        p = np.array([1e-100, 1e-30, 1e-12, 1e-6, 1e-3, 0.05, 0.3, 0.5])
+        with np.errstate(all="ignore"):
+            x = np.concatenate([self.reference.ppf(p), self.reference.isf(p)])
+        low, high = self.reference.support()
+        x = x[np.isfinite(x)]
+        if not self.cls.discrete:
+            x = x[(x > low) & (x < high) & (np.abs(x) < 1e150)]
+            x = x[(x == 0) | (np.abs(x) > 1e-150)]
+        return np.unique(x)
+
+
+def _normal(mean, sd):
+    return st.norm(mean, sd)
+
+
+def _gamma(shape, rate):
+    return st.gamma(shape, scale=1.0 / rate)
+
+
+def _negative_binomial(mean, r):
+    return st.nbinom(r, r / (r + mean))
+
+
+def _categorical(p):
+    return st.rv_discrete(values=(np.arange(len(p)), p))
+
+
+CASES = [
+    Case(D.Normal, {"mean": 0.0, "sd": 1.0}, _normal(0, 1)),
+    Case(D.Normal, {"mean": -3.5, "variance": 1e-8}, _normal(-3.5, 1e-4)),
+    Case(D.Normal, {"mean": 1e3, "precision": 0.04}, _normal(1e3, 5)),
+    Case(D.Normal, {"mean": 2.0, "sd": 1e6}, _normal(2, 1e6)),
+    Case(D.LogNormal, {"mean": 0.0, "sd": 1.0}, st.lognorm(1.0)),
+    Case(D.LogNormal, {"mean": -2.0, "sd": 0.01}, st.lognorm(0.01, scale=math.exp(-2.0))),
+    Case(D.LogNormal, {"mean": 5.0, "sd": 3.0}, st.lognorm(3.0, scale=math.exp(5.0))),
+    Case(D.StudentT, {"df": 4.0, "loc": 0.0, "scale": 1.0}, st.t(4)),
+    Case(D.StudentT, {"df": 1.5, "loc": 3.0, "scale": 0.2}, st.t(1.5, 3.0, 0.2)),
+    Case(D.StudentT, {"df": 0.7, "loc": -1.0, "scale": 10.0}, st.t(0.7, -1.0, 10.0)),
+    Case(D.StudentT, {"df": 60.0, "loc": 0.0, "scale": 2.0}, st.t(60, 0.0, 2.0)),
+    Case(D.Laplace, {"loc": 0.0, "scale": 1.0}, st.laplace()),
+    Case(D.Laplace, {"loc": 4.0, "scale": 0.01}, st.laplace(4.0, 0.01)),
+    Case(D.Laplace, {"loc": -1.0, "scale": 300.0}, st.laplace(-1.0, 300.0)),
+    Case(D.Cauchy, {"loc": 0.0, "scale": 1.0}, st.cauchy()),
+    Case(D.Cauchy, {"loc": -2.0, "scale": 0.1}, st.cauchy(-2.0, 0.1)),
+    Case(D.Cauchy, {"loc": 1.0, "scale": 1e4}, st.cauchy(1.0, 1e4)),
+    # halfnorm.ppf loses its lower tail; chi with one degree of freedom is the same law
+    Case(D.HalfNormal, {"sd": 1.0}, st.chi(1)),
+    Case(D.HalfNormal, {"sd": 1e-3}, st.chi(1, scale=1e-3)),
+    Case(D.HalfNormal, {"sd": 50.0}, st.chi(1, scale=50.0)),
+    Case(D.HalfCauchy, {"scale": 1.0}, st.halfcauchy()),
+    Case(D.HalfCauchy, {"scale": 0.02}, st.halfcauchy(scale=0.02)),
+    Case(D.HalfCauchy, {"scale": 25.0}, st.halfcauchy(scale=25.0)),
+    Case(D.Uniform, {"lower": 0.0, "upper": 1.0}, st.uniform()),
+    Case(D.Uniform, {"lower": -1.0, "upper": 1.0}, st.uniform(-1.0, 2.0)),
+    Case(D.Uniform, {"lower": 100.0, "upper": 100.5}, st.uniform(100.0, 0.5)),
+    Case(D.Exponential, {"rate": 1.0}, st.expon()),
+    Case(D.Exponential, {"rate": 250.0}, st.expon(scale=1 / 250.0)),
+    Case(D.Exponential, {"scale": 40.0}, st.expon(scale=40.0)),
+    Case(D.Gamma, {"shape": 2.5, "rate": 1.0}, _gamma(2.5, 1.0)),
+    Case(D.Gamma, {"shape": 0.2, "rate": 3.0}, _gamma(0.2, 3.0)),
+    Case(D.Gamma, {"shape": 6.25, "scale": 4.0}, _gamma(6.25, 0.25)),
+    Case(D.Gamma, {"shape": 400.0, "rate": 20.0}, _gamma(400.0, 20.0)),
+    Case(D.InverseGamma, {"shape": 3.0, "scale": 2.0}, st.invgamma(3.0, scale=2.0)),
+    Case(D.InverseGamma, {"shape": 0.8, "scale": 0.1}, st.invgamma(0.8, scale=0.1)),
+    Case(D.InverseGamma, {"shape": 1.5, "scale": 5.0}, st.invgamma(1.5, scale=5.0)),
+    Case(D.InverseGamma, {"shape": 60.0, "scale": 59.0}, st.invgamma(60.0, scale=59.0)),
+    Case(D.Beta, {"a": 2.0, "b": 3.0}, st.beta(2, 3)),
+    Case(D.Beta, {"a": 0.5, "b": 0.5}, st.beta(0.5, 0.5)),
+    Case(D.Beta, {"a": 0.05, "b": 4.0}, st.beta(0.05, 4.0)),
+    Case(D.Beta, {"a": 300.0, "b": 20.0}, st.beta(300.0, 20.0)),
+    Case(D.Poisson, {"rate": 4.0}, st.poisson(4.0)),
+    Case(D.Poisson, {"rate": 0.02}, st.poisson(0.02)),
+    Case(D.Poisson, {"rate": 900.0}, st.poisson(900.0)),
+    Case(D.NegativeBinomial, {"mean": 5.0, "dispersion": 2.0}, _negative_binomial(5.0, 2.0)),
+    Case(D.NegativeBinomial, {"mean": 0.3, "dispersion": 0.1}, _negative_binomial(0.3, 0.1)),
+    Case(D.NegativeBinomial, {"mean": 80.0, "dispersion": 30.0}, _negative_binomial(80.0, 30.0)),
+    Case(D.Binomial, {"n": 10.0, "p": 0.3}, st.binom(10, 0.3)),
+    Case(D.Binomial, {"n": 1.0, "p": 0.999}, st.binom(1, 0.999)),
+    Case(D.Binomial, {"n": 5000.0, "p": 0.01}, st.binom(5000, 0.01)),
+    Case(D.Bernoulli, {"p": 0.5}, st.bernoulli(0.5)),
+    Case(D.Bernoulli, {"p": 1e-4}, st.bernoulli(1e-4)),
+    Case(D.Bernoulli, {"p": 0.97}, st.bernoulli(0.97)),
+    Case(D.Categorical, {"p": [0.2, 0.5, 0.3]}, _categorical([0.2, 0.5, 0.3])),
+    Case(D.Categorical, {"p": [0.999, 0.001]}, _categorical([0.999, 0.001])),
+    Case(D.Categorical, {"p": [0.25] * 4}, _categorical([0.25] * 4)),
+]
+
+_A = np.array([[2.0, 0.3, -0.2], [0.3, 1.0, 0.4], [-0.2, 0.4, 0.7]])
+_B = np.array([[1e-6, 2e-4], [2e-4, 5.0]])
+_M = np.array([1.0, -2.0, 0.5])
+
+
+def _inverse_wishart(df, scale):
+    return st.invwishart(df, scale)
+
+
+JOINT_CASES = [
+    Case(D.MvNormal, {"mean": _M, "covariance": _A}, st.multivariate_normal(_M, _A)),
+    Case(D.MvNormal, {"mean": _M, "precision": _A},
+         st.multivariate_normal(_M, np.linalg.inv(_A))),
+    Case(D.MvNormal, {"mean": _M, "cholesky": np.linalg.cholesky(_A)},
+         st.multivariate_normal(_M, _A)),
+    Case(D.MvNormal, {"mean": [0.0, 0.0], "covariance": _B},
+         st.multivariate_normal([0, 0], _B)),
+    Case(D.MvNormal, {"mean": [3.0], "covariance": [[0.25]]},
+         st.multivariate_normal([3.0], [[0.25]])),
+    Case(D.Dirichlet, {"concentration": [1.0, 2.0, 3.5]}, st.dirichlet([1.0, 2.0, 3.5])),
+    Case(D.Dirichlet, {"concentration": [0.3, 0.2]}, st.dirichlet([0.3, 0.2])),
+    Case(D.Dirichlet, {"concentration": [0.05, 0.4, 2.0]}, st.dirichlet([0.05, 0.4, 2.0])),
+    Case(D.Dirichlet, {"concentration": [200.0, 20.0, 2.0, 7.0]},
+         st.dirichlet([200.0, 20.0, 2.0, 7.0])),
+    Case(D.Wishart, {"df": 5.0, "scale": _A}, st.wishart(5.0, _A)),
+    Case(D.Wishart, {"df": 2.5, "scale": _A}, st.wishart(2.5, _A)),
+    Case(D.Wishart, {"df": 3.0, "scale": [[0.5]]}, st.wishart(3.0, [[0.5]])),
+    Case(D.InverseWishart, {"df": 8.0, "scale": _A}, st.invwishart(8.0, _A)),
+    Case(D.InverseWishart, {"df": 4.5, "scale": _A}, st.invwishart(4.5, _A)),
+    Case(D.InverseWishart, {"df": 6.0, "scale": [[0.5]]}, st.invwishart(6.0, [[0.5]])),
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TruncatedCase:
+    """A scalar case restricted to [lower, upper]."""
+
+    base: Case
+    lower: float = -math.inf
+    upper: float = math.inf
+
+    @property
+    def id(self) -> str:
+        return f"{self.base.id}[{self.lower:g},{self.upper:g}]"
+
+    def bounds(self) -> dict[str, float]:
+        """The keywords: only the finite ones."""
+        given = {"lower": self.lower, "upper": self.upper}
+        return {k: v for k, v in given.items() if math.isfinite(v)}
+
+    def build(self) -> D.Distribution:
+        return D.Truncated(self.base.build(), **self.bounds())
+
+    def log_mass(self) -> float:
+        """log P(lower <= X <= upper) from SciPy's tails."""
+        law, below = self.base.reference, self.lower - (1.0 if self.base.cls.discrete else 0.0)
+        if self.upper == math.inf:
+            return float(law.logsf(below))
+        if self.lower == -math.inf:
+            return float(law.logcdf(self.upper))
+        if law.cdf(below) < 0.5:
+            a, b = law.logcdf(self.upper), law.logcdf(below)
+        else:
+            a, b = law.logsf(below), law.logsf(self.upper)
+        return float(a + np.log1p(-np.exp(b - a)))
+
+
+def _truncated(cls, parameters, reference, *intervals) -> list[TruncatedCase]:
+    base = Case(cls, parameters, reference)
+    return [TruncatedCase(base, *interval) for interval in intervals]
+
+
+_INF = math.inf
+TRUNCATED_CASES = [
+    *_truncated(D.Normal, {"mean": 0.0, "sd": 1.0}, _normal(0, 1), (0.0, _INF), (8.0, _INF),
+                (-_INF, -8.0), (-_INF, 3.0), (-1.0, 2.0), (9.0, 9.5), (-9.5, -9.0),
+                (45.0, _INF), (-_INF, -45.0), (45.0, 45.01), (-60.0, 60.0)),
+    *_truncated(D.Normal, {"mean": 5.0, "precision": 4.0}, _normal(5, 0.5), (0.0, _INF),
+                (5.0, 5.001)),
+    *_truncated(D.LogNormal, {"mean": 0.5, "sd": 0.8}, st.lognorm(0.8, scale=math.exp(0.5)),
+                (1.0, _INF), (-_INF, 0.01), (500.0, _INF), (0.5, 3.0), (-1.0, 2.0)),
+    *_truncated(D.StudentT, {"df": 5.0, "loc": 1.0, "scale": 2.0}, st.t(5, 1.0, 2.0),
+                (0.0, _INF), (1e4, _INF), (-_INF, -1e4), (-3.0, 4.0), (200.0, 300.0)),
+    *_truncated(D.StudentT, {"df": 1.5, "loc": 0.0, "scale": 1.0}, st.t(1.5), (1.0, _INF)),
+    *_truncated(D.Gamma, {"shape": 2.5, "rate": 0.5}, _gamma(2.5, 0.5), (1.0, _INF),
+                (-_INF, 0.01), (150.0, _INF), (3.0, 4.0), (200.0, 210.0)),
+    *_truncated(D.Exponential, {"rate": 2.0}, st.expon(scale=0.5), (1.0, _INF), (-_INF, 0.3),
+                (600.0, _INF), (600.0, 600.2), (-1.0, 1.0)),
+    *_truncated(D.Beta, {"a": 2.0, "b": 5.0}, st.beta(2, 5), (0.5, _INF), (-_INF, 1e-6),
+                (0.999, _INF), (0.2, 0.3), (0.99, 0.995)),
+    *_truncated(D.Cauchy, {"loc": 0.0, "scale": 1.0}, st.cauchy(), (0.0, _INF), (1e6, _INF),
+                (-_INF, -1e6), (-2.0, 5.0), (1e6, 2e6)),
+    *_truncated(D.Laplace, {"loc": 1.0, "scale": 0.5}, st.laplace(1.0, 0.5), (0.0, _INF),
+                (30.0, _INF), (-_INF, -30.0), (-1.0, 2.0), (300.0, 301.0), (1.0, 3.0)),
+    *_truncated(D.HalfNormal, {"sd": 2.0}, st.chi(1, scale=2.0), (20.0, _INF), (-_INF, 1e-4),
+                (1.0, 3.0)),
+    *_truncated(D.HalfCauchy, {"scale": 2.0}, st.halfcauchy(scale=2.0), (-_INF, 10.0)),
+    *_truncated(D.InverseGamma, {"shape": 3.0, "scale": 2.0}, st.invgamma(3.0, scale=2.0),
+                (-_INF, 0.05), (50.0, _INF), (0.5, 2.0)),
+    *_truncated(D.Uniform, {"lower": -1.0, "upper": 3.0}, st.uniform(-1.0, 4.0), (0.0, _INF),
+                (-_INF, 0.5), (0.0, 1.0)),
+    *_truncated(D.Poisson, {"rate": 4.0}, st.poisson(4.0), (1.0, _INF), (30.0, _INF),
+                (-_INF, 2.0), (3.0, 6.0), (25.0, 27.0), (30.0, 32.0)),
+    *_truncated(D.Poisson, {"rate": 60.0}, st.poisson(60.0), (-_INF, 10.0)),
+    *_truncated(D.Binomial, {"n": 20.0, "p": 0.3}, st.binom(20, 0.3), (1.0, _INF), (18.0, _INF),
+                (-_INF, 3.0), (5.0, 9.0)),
+    *_truncated(D.NegativeBinomial, {"mean": 5.0, "dispersion": 2.0}, _negative_binomial(5.0, 2.0),
+                (1.0, _INF), (150.0, _INF), (-_INF, 3.0), (2.0, 20.0)),
+]  # fmt: skip
+
+NOT_IN_SCIPY = {"Truncated", "Dirac", "Flat", "HalfFlat"}
+
+
+def scalars(values: Any) -> ExprArray:
+    """Constants of the shape of `values`."""
+    return array(np.asarray(values, dtype=float))
