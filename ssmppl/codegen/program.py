@@ -34,7 +34,7 @@ from ssmppl.language.trace import Trace
 _MODULES = {
     "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
     "special": "lgamma digamma trigamma ndtr log_ndtr ndtri erf erfc",
-    "incomplete": "gammainc gammaincinv betainc betaincinv",
+    "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincinv",
     "random": "normal uniform gamma poisson binomial",
     "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil maximum minimum "
     "power poisson_quantile binomial_quantile negbinomial_quantile cholesky inverse logdet det",

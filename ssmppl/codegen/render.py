@@ -38,6 +38,7 @@ CALLS = {
     "log_ndtr": "log_ndtr", "ndtri": "ndtri", "erf": "erf", "erfc": "erfc",
     "maximum": "maximum", "minimum": "minimum", "arctan2": "arctan2", "logaddexp": "logaddexp",
     "gammainc": "gammainc", "gammaincinv": "gammaincinv", "betainc": "betainc",
+    "gammaincc": "gammaincc", "gammainccinv": "gammainccinv",
     "betaincinv": "betaincinv", "poisson_quantile": "poisson_quantile",
     "binomial_quantile": "binomial_quantile", "negbinomial_quantile": "negbinomial_quantile",
     "pow": "power",

@@ -26,6 +26,7 @@ from ssmppl.expressions.expr import (
     dependent,
     item,
     matrix_op,
+    substitute,
     symbols_of,
     to_text,
     topological,
@@ -35,6 +36,7 @@ Monomial = frozenset  # of (atom: Expr, exponent: float)
 ONE: Monomial = frozenset()
 Terms = dict[Monomial, list[Expr]]  # coefficient as a list of summands
 MAX_TERMS = 600
+_MINUS = constant(-1.0)
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ class _Separator:
             try:
                 if bad is not None:
                     raise bad
-                self.done[node] = self._expand(node)
+                self.done[node] = self._expand_by_cases(node)
             except _NotSeparable as failure:
                 if symbols_of(node) <= self.block:  # a function of the block alone
                     self.done[node] = {frozenset({(node, 1.0)}): [constant(1.0)]}
@@ -137,6 +139,27 @@ class _Separator:
         if root in failures:
             raise failures[root]
         return self.done[root]
+
+    def _expand_by_cases(self, node: Expr) -> Terms:
+        """`_expand`; where that fails, the two cases of a condition under the node apart.
+
+        log(where(c, a, b)) = where(c, log a, log b), and so for every function.
+        """
+        try:
+            return self._expand(node)
+        except _NotSeparable:
+            under = [
+                n
+                for n in topological([node])
+                if n.op == "where" and n in self.involved and n.args[0] not in self.involved
+            ]
+            if not under or under[-1] is node:
+                raise
+            condition = under[-1].args[0]
+            same = [n for n in under if n.args[0] is condition]
+            cases = [substitute([node], {n: n.args[k] for n in same})[0] for k in (1, 2)]
+            self.involved |= dependent(cases, self.block)
+            return self._where(condition, *(self.terms_of(case) for case in cases))
 
     # -- one rule per operation
     def _expand(self, node: Expr) -> Terms:
@@ -261,6 +284,11 @@ class _Separator:
             atoms = {**dict(common), atom: 1.0}
         out: Terms = {ONE: [apply("log", scale)]}
         for atom, e in atoms.items():
+            if atom.op == "det":  # a logarithm's argument is positive
+                logdet = matrix_op("logdet", atom.args, atom.data)
+                self.involved |= dependent([logdet], self.block)
+                out = _add(out, _scale(self.terms_of(logdet), constant(e)))
+                continue
             inner = (
                 self.done[atom.args[0]]
                 if atom.op == "exp" and atom.args[0] in self.done
@@ -321,6 +349,11 @@ class _Separator:
         return core, tuple(entries)
 
     def _logdet(self, node: Expr) -> Terms:
+        original = _inverse_of(node)
+        if original is not None:  # log det A^-1 = -log det A
+            logdet = matrix_op("logdet", original.args, node.data)
+            self.involved |= dependent([logdet], self.block)
+            return _scale(self.terms_of(logdet), _MINUS)
         scale, entries = self._scaled_matrix(node)
         atom = matrix_op("logdet", entries, node.data)
         n = constant(float(node.data))
@@ -329,10 +362,24 @@ class _Separator:
 
     def _matrix_item(self, node: Expr) -> Terms:
         matrix = node.args[0]
+        original = _inverse_of(matrix) if matrix.op == "inverse" else None
+        if original is not None:  # (A^-1)^-1 = A
+            row, column = node.data
+            return self.done[original.args[row * matrix.data + column]]
         scale, entries = self._scaled_matrix(matrix)
         power = -1.0 if matrix.op == "inverse" else 0.5
         atom = item(matrix_op(matrix.op, entries, matrix.data), *node.data)
         return {frozenset({(atom, 1.0)}): [scale**power]}
+
+
+def _inverse_of(node: Expr) -> Expr | None:
+    """The "inverse" node whose entries, in order, are the arguments of a matrix node."""
+    first = node.args[0]
+    if first.op != "item" or first.args[0].op != "inverse" or first.args[0].data != node.data:
+        return None
+    n, source = node.data, first.args[0]
+    whole = [item(source, i, j) for i in range(n) for j in range(n)]
+    return source if all(a is b for a, b in zip(node.args, whole, strict=True)) else None
 
 
 def _total(parts: list[Expr]) -> Expr:

@@ -56,6 +56,12 @@ class ExprArray(np.ndarray):
     def mean(self, axis=None, **kwargs):
         return _mean(self, axis, **kwargs)
 
+    def var(self, axis=None, ddof=0, **kwargs):
+        return _var(self, axis, ddof, **kwargs)
+
+    def std(self, axis=None, ddof=0, **kwargs):
+        return elementwise("sqrt", _var(self, axis, ddof, **kwargs))
+
     def max(self, axis=None, **kwargs):
         return _reduce("maximum", self, axis, **kwargs)
 
@@ -359,7 +365,9 @@ FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     np.inner: lambda a, b: _dot(a, _plain(b).T),
     np.outer: lambda a, b: elementwise("mul", _plain(a).reshape(-1, 1), _plain(b).reshape(1, -1)),
     np.kron: lambda a, b: scalar_or_array(np.kron(_plain(a), _plain(b))),
-    np.einsum: lambda spec, *ops: scalar_or_array(np.einsum(spec, *map(_plain, ops))),
+    np.einsum: lambda spec, *ops, optimize=False: scalar_or_array(
+        np.einsum(spec, *map(_plain, ops))
+    ),
     np.clip: _clip,
     np.trace: _trace,
     np.take: lambda a, index, axis=None: (

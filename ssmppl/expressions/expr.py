@@ -18,7 +18,7 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -46,7 +46,18 @@ _locations: ContextVar[dict[Expr, Location] | None] = ContextVar("locations", de
 _OWN = tuple(
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
     for d in ("expressions", "language")
-) + (os.path.dirname(os.path.abspath(np.__file__)) + os.sep,)
+)
+_OWN += tuple(  # SciPy lies beside NumPy
+    os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(np.__file__))), d) + os.sep
+    for d in ("numpy", "scipy")
+)
+
+
+def _method(op: str) -> Callable[[Expr], Expr]:
+    def method(self: Expr) -> Expr:
+        return apply(op, self)
+
+    return method
 
 
 class Expr:
@@ -201,7 +212,27 @@ class Expr:
             where=user_location(),
         )
 
-    __int__ = __index__ = __complex__ = __float__
+    __complex__ = __float__
+
+    def __index__(self) -> int:
+        raise UnsupportedOperation(
+            "a whole number was asked of a symbol (int(), range(), an index into an array of "
+            "numbers)",
+            fix="to select from numbers, np.sum(np.where(np.arange(len(table)) == k, table, 0)); "
+            "an array of symbols takes a symbol as its first index",
+            where=user_location(),
+        )
+
+    __int__ = __index__
+
+    # np.exp(np.array([x, y])): on its plain arrays of objects NumPy calls the elements' methods.
+    exp, log, log1p, expm1, sqrt = map(_method, ("exp", "log", "log1p", "expm1", "sqrt"))
+    sin, cos, tan, arcsin, arccos, arctan = map(
+        _method, ("sin", "cos", "tan", "arcsin", "arccos", "arctan")
+    )
+    sinh, cosh, tanh, arcsinh, arccosh, arctanh = map(
+        _method, ("sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh")
+    )
 
     def __array_ufunc__(self, ufunc, method, *inputs, **kwargs):
         return _protocol().apply_ufunc(ufunc, method, inputs, kwargs)

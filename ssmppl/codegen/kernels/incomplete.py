@@ -125,10 +125,22 @@ def gammaincc(a, x):
 
 @exact
 def gammaincinv(a, p):
-    """x with P(a, x) = p: Newton's method for log P (or log Q) in log x."""
-    if not (a > 0.0 and 0.0 <= p <= 1.0) or a == _INF:
+    """x with P(a, x) = p."""
+    return _gamma_quantile(a, p, 1.0 - p)
+
+
+@exact
+def gammainccinv(a, q):
+    """x with Q(a, x) = q."""
+    return _gamma_quantile(a, 1.0 - q, q)
+
+
+@exact
+def _gamma_quantile(a, p, q):
+    """x with P(a, x) = p = 1 - q: Newton's method for log P (or log Q) in log x."""
+    if not (a > 0.0 and p >= 0.0 and q >= 0.0) or a == _INF:
         return np.nan
-    if p == 0.0 or p == 1.0:
+    if p == 0.0 or q == 0.0:
         return 0.0 if p == 0.0 else _INF
     # P(a, x) <= x^a / Gamma(a+1): where the bound is p, x is too small, but hardly so if small.
     low = (log(p) + lgamma(a + 1.0)) / a
@@ -136,16 +148,17 @@ def gammaincinv(a, p):
         return 0.0
     high = 709.0
     # Wilson and Hilferty's cube, unless the other guess is the right one.
-    root = 1.0 - 1.0 / (9.0 * a) + ndtri(p) / (3.0 * math.sqrt(a))
+    use_lower = p <= 0.5
+    z = ndtri(p) if use_lower else -ndtri(q)
+    root = 1.0 - 1.0 / (9.0 * a) + z / (3.0 * math.sqrt(a))
     y = low
     if root > 0.0:
         y = max(low, math.log(a) + 3.0 * math.log(root))
-    use_lower = p <= 0.5
-    target = log(p) if use_lower else log1p(-p)
+    target = log(p) if use_lower else log(q)
     for _ in range(200):
         x = exp(y)
         lower, upper = gamma_tails(a, x)
-        too_large = lower > p if use_lower else upper < 1.0 - p
+        too_large = lower > p if use_lower else upper < q
         if too_large:
             high = y
         else:
