@@ -117,16 +117,22 @@ def _from_mapping(data: Mapping[Any, Any], label: str, named: list[str]) -> Sour
     if "time" in columns and "time" not in named:
         source.time = _labels(columns.pop("time"), source)
         return source
-    for name, column in columns.items():  # Series bring an index, which must be the same for all
-        index = getattr(column, "index", None)
-        if not (hasattr(column, "iloc") and _informative(index)):
+    for name, column in columns.items():  # labels of Series and DataArrays, the same for all
+        if hasattr(column, "dims") and "time" in column.dims:
+            columns[name] = column.transpose("time", ...)
+            index, word = column.coords.get("time"), "time"
+        else:
+            index, word = getattr(column, "index", None), "index"
+            if not (hasattr(column, "iloc") and _informative(index)):
+                continue
+        if index is None:
             continue
-        labels = _labels(index, source, "index")
+        labels = _labels(index, source, word)
         if source.time is None:
-            source.time, source.time_name, first = labels, "index", name
+            source.time, source.time_name, first = labels, word, name
         elif not np.array_equal(source.time, labels):
             raise DataError(
-                f"{first!r} and {name!r} are Series with different indices",
+                f"{first!r} and {name!r} label their rows differently ({word})",
                 fix="put them into one DataFrame, pd.DataFrame({...}), which aligns the rows",
                 where=source.place(),
             )
@@ -214,12 +220,11 @@ def _informative(index: Any) -> bool:
 def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
     """Labels of the rows as an array, increasing where they have an order."""
     where = source.place()
-    if getattr(values, "dt", None) is not None:  # a Series of dates
-        values = type(values.index)(values) if hasattr(values, "index") else values
-    if getattr(values, "tz", None) is not None:
-        values = values.tz_convert(None)
-    if hasattr(values, "to_timestamp"):
-        values = values.to_timestamp()
+    dates: Any = getattr(values, "dt", None) if hasattr(values, "iloc") else values
+    if getattr(dates, "tz", None) is not None:
+        values = dates.tz_convert(None)
+    elif hasattr(dates, "to_timestamp"):
+        values = dates.to_timestamp()
     labels = np.asarray(values)
     if labels.ndim != 1:
         raise DataError(

@@ -83,7 +83,11 @@ def _objects(plain: np.ndarray) -> np.ndarray | Fault:
         if _missing(entry):
             out[index] = np.nan
         elif isinstance(entry, (numbers.Real, np.bool_, Decimal)):
-            out[index] = float(entry)
+            try:
+                out[index] = float(entry)
+            except OverflowError:
+                found = f"{short(entry)} is too large for a floating point number"
+                return Fault(index, found, "give it in larger units")
         else:
             text = isinstance(entry, (str, bytes))
             return Fault(

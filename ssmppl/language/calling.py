@@ -21,9 +21,7 @@ from ssmppl.language.model import location_of, outer_values, plain_function
 Law = Callable[..., Any]
 Known = Mapping[str, str]  # name of a quantity -> its role
 # NumPy's messages about object arrays, which np.array makes of symbols
-_OBJECT_ARRAY = re.compile(
-    r"type Expr which has no callable|dtype\('O'\)|^'Expr' object has no att"
-)
+_OBJECT_ARRAY = re.compile(r"has no callable|dtype\('O'\)|^'Expr' object has no attribute")
 _INSTALLED = tuple(
     path for key in ("stdlib", "platstdlib", "purelib", "platlib")
     if (path := sysconfig.get_path(key))
