@@ -133,12 +133,12 @@ def random_parameters(data: CompleteData, rng: np.random.Generator) -> Point:
     return values
 
 
-def random_series(data: CompleteData, rng: np.random.Generator) -> list[Point]:
-    """STEPS rows of symbol -> values, each of shape (POINTS,), consistent with the supports."""
+def random_series(data: CompleteData, rng: np.random.Generator, steps: int = STEPS) -> list[Point]:
+    """Rows of symbol -> values, each of shape (POINTS,), consistent with the supports."""
     trace = data.trace
     parameters = random_parameters(data, rng)
     rows: list[Point] = []
-    for t in range(STEPS):
+    for t in range(steps):
         values = dict(parameters)
         values[symbol("time", "t")] = np.full(POINTS, t + 1.0)
         values[symbol("time_prev", "t")] = np.full(POINTS, float(t))

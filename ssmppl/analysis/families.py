@@ -147,7 +147,7 @@ class NormalGamma:
 
     @property
     def name(self) -> str:
-        inverse = "inverse " if self.power < 0 else ""
+        inverse = "inverse-" if self.power < 0 else ""
         return f"Normal-{inverse}Gamma"
 
     @property

@@ -1,0 +1,78 @@
+"""Draws of every derived update against quadrature of the exact conditional.
+
+The exact conditional is the sum of the guarded densities as written, by the interpreter. Each
+component, and the product of the first two, is compared by a Kolmogorov-Smirnov test at 1e-3
+divided by the number of tests in this file (about 150).
+"""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ssmppl.analysis import check
+from ssmppl.analysis.conjugacy import derive_updates
+from ssmppl.analysis.sufficient import complete_data
+from ssmppl.language.trace import trace
+from tests.analysis.corpus import CORPUS, build
+from tests.analysis.exact import Conditional, kolmogorov_smirnov
+
+LEVEL = 1e-3 / 150
+
+
+def conditionals(model, seed=0):
+    """One random data set and parameter point for each update of a model."""
+    t = trace(model)
+    data = complete_data(t)
+    rng = np.random.default_rng(seed)
+    series = check.random_series(data, rng, steps=8)
+    for update in derive_updates(t):
+        yield next(
+            c
+            for k in range(check.POINTS)
+            if np.isfinite((c := Conditional(data, update, series, k)).log_joint(c.current))
+        )
+
+
+def compare(conditional, n=1500, thin=None, seed=1):
+    """Assert that draws follow the exact conditional; returns how they came about."""
+    rng = np.random.default_rng(seed)
+    if thin is None:
+        thin = 1 if conditional.update.conditional else 8
+    draws, infos = conditional.draws(n, rng, thin)
+    assert np.all(np.isfinite(draws))
+    if conditional.update.family == "joint Normal" and not conditional.update.sampler.truncated:
+        _compare_normal(conditional, draws)
+        return infos
+    values, weights = conditional.grid(draws)
+    tested = [(x, v) for x, v in zip(draws.T, values, strict=True)]
+    if len(values) > 1:
+        tested.append((draws[:, 0] * draws[:, 1], values[0] * values[1]))
+    for sample, points in tested:
+        p = kolmogorov_smirnov(sample, points, weights)
+        assert p > LEVEL, (conditional.update.explanation.title, p, draws.mean(0))
+    return infos
+
+
+def _compare_normal(conditional, draws):
+    """A Normal of many components, whitened by mean and precision from its own log density."""
+    d = draws.shape[1]
+    zero = conditional.log_joint(np.zeros(d))
+    e = np.eye(d)
+
+    def f(v):
+        return conditional.log_joint(v) - zero
+
+    # exact for a quadratic: f(v) = g'v - v'Hv/2
+    h = np.array([[f(e[i]) + f(e[j]) - f(e[i] + e[j]) for j in range(d)] for i in range(d)])
+    g = np.array([0.5 * (f(e[i]) - f(-e[i])) for i in range(d)])
+    z = (draws - np.linalg.solve(h, g)) @ np.linalg.cholesky(h)
+    for column in z.T:
+        assert stats.kstest(column, "norm").pvalue > LEVEL
+    assert stats.kstest((z**2).sum(1), stats.chi2(d).cdf).pvalue > LEVEL
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_draws_follow_the_exact_conditional(name):
+    model, *_ = build(name)
+    for conditional in conditionals(model):
+        compare(conditional)
