@@ -9,7 +9,7 @@ by name, with the nearest that exist.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from ssmppl.expressions.expr import (
     constant,
     item,
     matrix_op,
+    pack,
+    unpack,
     user_location,
 )
 
@@ -45,6 +47,12 @@ class ExprArray(np.ndarray):
         for k in range(len(self) - 2, -1, -1):
             chosen = elementwise("where", apply("eq", first, k), self[(k, *rest)], chosen)
         return chosen
+
+    def __reduce__(self):  # its nodes in one table, shared parts once
+        nodes = [as_expr(e) for e in self.view(np.ndarray).ravel()]
+        table = pack(nodes)
+        place = {node: i for i, node in enumerate(unpack(table))}
+        return _unpack_array, (table, [place[n] for n in nodes], self.shape)
 
     # NumPy's methods, which would bypass the protocols, by the functions of the same name.
     def sum(self, axis=None, **kwargs):
@@ -79,6 +87,11 @@ class ExprArray(np.ndarray):
 
     def cumsum(self, axis=None):
         return _cumsum(self, axis)
+
+
+def _unpack_array(table: list, places: list[int], shape: tuple[int, ...]) -> ExprArray:
+    nodes = unpack(table)
+    return array([nodes[i] for i in places]).reshape(shape)
 
 
 def array(values: Any) -> ExprArray:
@@ -307,7 +320,7 @@ def inverse(a: Any) -> ExprArray:
 
 
 def log_determinant(a: Any) -> Expr:
-    """log |det a|."""
+    """log det a of a positive definite matrix."""
     a = square_matrix(a, "linalg log determinant")
     if _is_diagonal(a):
         return _reduce("add", [apply("log", d) for d in np.diagonal(a)])
@@ -336,8 +349,20 @@ def _copyto(target: Any, source: Any, **kwargs: Any) -> None:
     np.copyto(np.asarray(target).view(np.ndarray), _plain(source))
 
 
-def _slogdet(a: Any) -> Any:
-    return apply("sign", _det(a)), log_determinant(a)
+class Slogdet(NamedTuple):
+    """What np.linalg.slogdet gives."""
+
+    sign: Expr
+    logabsdet: Expr
+
+
+def _slogdet(a: Any) -> Slogdet:
+    a = square_matrix(a, "linalg.slogdet")
+    if _is_diagonal(a):
+        size = _reduce("add", [apply("log", apply("abs", d)) for d in np.diagonal(a)])
+    else:
+        size = log_determinant(a)
+    return Slogdet(apply("sign", _det(a)), size)
 
 
 def _norm(a: Any, ord: Any = None, **unused: Any) -> Any:

@@ -91,8 +91,14 @@ class Expr:
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError("expressions are immutable")
 
-    def __reduce__(self):  # unpickling interns again
-        return Expr, (self.op, self.args, self.data)
+    def __reduce__(self):  # as a flat table, for graphs deeper than Python's recursion limit
+        return unpack_one, (pack([self]),)
+
+    def __copy__(self) -> Expr:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Expr:
+        return self
 
     # -- what NumPy and users ask of a scalar
     shape: tuple[int, ...] = ()
@@ -437,6 +443,29 @@ def topological(roots: Iterable[Expr]) -> list[Expr]:
             stack.append((node, True))
             stack.extend((a, False) for a in reversed(node.args) if a not in seen)
     return order
+
+
+def pack(roots: Iterable[Expr]) -> list[tuple[str, tuple[int, ...], Any]]:
+    """Every node under `roots` as (operation, places of its arguments in this list, data)."""
+    place: dict[Expr, int] = {}
+    table = []
+    for node in topological(roots):
+        place[node] = len(table)
+        table.append((node.op, tuple(place[a] for a in node.args), node.data))
+    return table
+
+
+def unpack(table: list[tuple[str, tuple[int, ...], Any]]) -> list[Expr]:
+    """The nodes of a table made by `pack`, interned."""
+    nodes: list[Expr] = []
+    for op, args, data in table:
+        nodes.append(Expr(op, tuple(nodes[i] for i in args), data))
+    return nodes
+
+
+def unpack_one(table: list[tuple[str, tuple[int, ...], Any]]) -> Expr:
+    """The last node of a table: the root it was made for."""
+    return unpack(table)[-1]
 
 
 def symbols_of(roots: Expr | Iterable[Expr]) -> frozenset[Expr]:
