@@ -12,9 +12,9 @@ import numpy as np
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
-from ssmppl.expressions.expr import Expr, constant, depends_on
+from ssmppl.expressions.expr import Expr, constant, depends_on, symbols_of
 from ssmppl.language.distributions import Dirac, MvNormal, Normal
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.trace import Site, Trace, previous
 
 
 @dataclass(frozen=True)
@@ -159,3 +159,27 @@ def _gaussian_law(
     for site in deterministic(sites):
         mean[[place[s] for s in site.value.ravel()]] = list(array(site.distribution.mean()).ravel())
     return array(mean), array(covariance)
+
+
+def deterministic_memory(trace: Trace) -> int | None:
+    """Steps after which the Dirac components have forgotten their past, given the noisy ones.
+
+    0 where there are none; None where they never do (a position that integrates a velocity).
+    """
+    sites = deterministic(list(trace.transition.values()))
+    value = {
+        s: e
+        for site in sites
+        for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True)
+    }
+    prev = {previous(s): s for s in trace.state_symbols}
+    feeds = {
+        s: {prev[p] for p in symbols_of(e) if p in prev} for s, e in value.items()
+    }
+    depth: dict[Expr, int] = {}
+    for _ in range(len(value) + 1):
+        for s, sources in feeds.items():
+            inner = [q for q in sources if q in value]
+            if all(q in depth for q in inner):
+                depth[s] = max((depth[q] for q in inner), default=0) + (1 if sources else 0)
+    return max(depth.values(), default=0) if len(depth) == len(value) else None

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssmppl.analysis.density import Term
+from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.proposals import Proposal
-from ssmppl.codegen.module import Layout, Section, Target
+from ssmppl.analysis.structure import deterministic
+from ssmppl.codegen.module import Layout, Section, Target, time_sum
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
@@ -65,6 +66,29 @@ def filter_kit(layout: Layout, proposal: Proposal) -> Section:
     return section
 
 
+def conditional_passes(trace: Trace, layout: Layout, section: Section, plain: Proposal) -> None:
+    """What conditional SMC needs on top of a filter: densities of joining the reference."""
+    value = {s: e for site in deterministic(list(trace.transition.values()))
+             for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(),
+                             strict=True)}  # fmt: skip
+    given = {s: f"reference[{layout.column(s)}]" for s in trace.state_symbols}
+    joined = {s: value.get(s, s) for s in trace.state_symbols}
+    section.particle_pass(
+        "connect", "The reference's noisy components, with what follows from them and x_{t-1}.",
+        "theta, c, s, states_prev, reference, states", _state_targets(layout, joined),
+        scalars=given,
+    )  # fmt: skip
+    noisy = [t for t in terms(trace, "transition") if t.site.value.ravel()[0] not in value]
+    section.particle_pass(
+        "weigh_connected", "log f(x_t | x_{t-1}).", WEIGH, weight_targets(noisy),
+        accumulate="log_w",
+    )  # fmt: skip
+    section.particle_pass(
+        "weigh_observed", "log g(y_t | x_t).", WEIGH_INITIAL, weight_targets(plain.weight),
+        accumulate="log_w",
+    )  # fmt: skip
+
+
 def observation_draws(trace: Trace) -> list[Expr]:
     """A draw of every observed component given x_t, in the trace's order."""
     out: list[Expr] = []
@@ -118,3 +142,30 @@ def _predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
              for f in (d.mean(), d.variance(), below, strictly)]  # fmt: skip
     first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}
     return [tuple(f.ravel()[first[s]] for f in forms) for s in site.components]
+
+
+def log_joint_function(trace: Trace, layout: Layout, missing: Missing) -> str:
+    """`log_joint(theta, y, seen, u, trajectory, total)`: log p(x, y | theta) without the prior.
+
+    Deterministic components are set to what follows from the noisy ones, so that this is the
+    density of the noisy components and the observations.
+    """
+    parts, fixed = {}, {}
+    for role in ("initial", "transition", "observation"):
+        sites = {"initial": trace.initial, "transition": trace.transition}.get(role, {})
+        known = deterministic(list(sites.values()))
+        skipped = {s.name for s in known}
+        total = constant(0.0)
+        for t in terms(trace, role, missing):
+            if t.site.name not in skipped:
+                total = total + t.guarded()
+        parts[role] = [total]
+        fixed[role] = [
+            pair
+            for site in known
+            for pair in zip(
+                site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True
+            )
+        ]
+    doc = "log p(x, y | theta); deterministic components of x are set on the way."
+    return time_sum(layout, "log_joint", doc, parts, 1, fixed)

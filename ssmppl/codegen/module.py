@@ -63,7 +63,9 @@ class Layout:
         column = self.index[("observation" if base == "seen" else base, (name, index))]
         if base == "parameter":
             return f"theta[{column}]"
-        array = {"observation": "y", "seen": "seen", "input": "u", "state": "trajectory"}[base]
+        array = {"observation": "y_data", "seen": "seen_data", "input": "u_data"}.get(
+            base, "trajectory"
+        )
         at = f"max({row} - 1, 0)" if kind.endswith("_prev") else row
         return f"{array}[{at}, {column}]"
 
@@ -206,7 +208,7 @@ class Section:
     def finish(self) -> str:
         """The functions with `prepare` and `step`, which compute `c` and `s`."""
         step = self._straight(
-            "step", "theta, c, y, seen, u, t, s", "What depends on theta and time.", self.s, "s"
+            "step", "theta, c, y_data, seen_data, u_data, t, s", "What depends on theta and time.", self.s, "s"
         )
         prepare = self._straight("prepare", "theta, c", "What depends on theta alone.", self.c, "c")
         return "\n\n".join([prepare, step, *self.functions])
@@ -269,21 +271,25 @@ def scalar_function(
 
 
 def time_sum(
-    layout: Layout, name: str, doc: str, parts: dict[str, Sequence[Expr]], size: int
-) -> str:
+    layout: Layout, name: str, doc: str, parts: dict[str, Sequence[Expr]], size: int,
+    fixed: dict[str, list[tuple[Expr, Expr]]] | None = None,
+) -> str:  # fmt: skip
     """A function that adds expressions up over a trajectory.
 
     parts : for "prior", "initial", "transition" and "observation" the summands of total[0], ...,
         total[size - 1]; rows 1..T count for the observation, 2..T for the transition.
+    fixed : role -> (state component, value) pairs to be set in the trajectory first.
     """
     reserved = Names()
     lines = [
-        f"@exact\ndef {name}(theta, y, seen, u, trajectory, total):",
+        f"@exact\ndef {name}(theta, y_data, seen_data, u_data, trajectory, total):",
         f'    """{doc}"""',
     ]
     head: list[str] = []
     names: dict[Expr, str] = {}
+    fixed = fixed or {}
     roots = [e for es in parts.values() for e in es]
+    roots += [e for pairs in fixed.values() for _, e in pairs]
     level = depends(roots, level_of)
     outer = {n: True for n, lv in level.items() if lv == THETA}
     used = topological_until(roots, outer)
@@ -304,11 +310,26 @@ def time_sum(
     body: list[str] = []
     for role, condition in (("initial", "t == 0"), ("transition", "t > 0"), ("observation", "")):
         indent = "            " if condition else "        "
-        block = _sum_block(layout, parts.get(role, ()), names, reserved, indent)
+        block = _fix_block(layout, fixed.get(role, []), names, reserved, indent)
+        block += _sum_block(layout, parts.get(role, ()), names, reserved, indent)
         if block:
             body += [*([f"        if {condition}:"] if condition else []), *block]
-    loop = ["    for t in range(y.shape[0]):", *body] if body else []
+    loop = ["    for t in range(y_data.shape[0]):", *body] if body else []
     return "\n".join([*lines, *head, *zero, *prior, *loop]) + "\n"
+
+
+def _fix_block(
+    layout: Layout, pairs: list[tuple[Expr, Expr]], names: dict[Expr, str], reserved: Names,
+    indent: str,
+) -> list[str]:  # fmt: skip
+    own, inner, head = dict(names), Names(reserved.taken), []
+    for node in topological_until([e for _, e in pairs], own):
+        if node.op == "symbol" and node not in own:
+            own[node] = inner.fresh(symbol_name(node))
+            head.append(f"{indent}{own[node]} = {layout.element(node)}")
+    writer = Writer(own, inner, layout.trace.locations, indent)
+    writer.assign([(layout.element(s), e) for s, e in pairs])
+    return [*head, *writer.lines] if pairs else []
 
 
 def _sum_block(

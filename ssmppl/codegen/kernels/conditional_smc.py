@@ -1,0 +1,225 @@
+"""Conditional SMC with ancestor sampling: the kernel of PGAS, over a model's generated functions.
+
+Algorithm 3 of Lindsten, Jordan and Schön (2014), "Particle Gibbs with ancestor sampling" (in Schön
+et al. 2015, algorithm 7): particle N follows the reference trajectory; its ancestor is drawn anew at
+every step with probability proportional to w_{t-1} f(x'_t | x_{t-1}). The other ancestors are drawn
+given that one by conditional systematic resampling (Chopin and Singh 2015), which has the same
+marginals as independent draws, so the kernel leaves p(x_{1:T} | y_{1:T}, theta) invariant for every
+N >= 2.
+
+Deterministic (Dirac) components of the reference are those that follow from its noisy components
+and the new ancestor. Where they forget the ancestor within `horizon` steps, the weights take the
+densities of these steps in (section 7.1 there); where they never do, `horizon` is -1 and no
+ancestor is sampled: particle Gibbs as in Andrieu, Doucet and Holenstein (2010).
+
+Notation: N particles, T steps; x : (D, N); reference, trajectory : (T, D); w : (N,).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ssmppl.codegen.kernels.flags import exact
+from ssmppl.codegen.kernels.particle_filter import (
+    APPROXIMATE,
+    NO_LOOK_AHEAD,
+    add,
+    any_finite,
+    gather,
+    mix,
+    second_stage,
+    take_log,
+)
+from ssmppl.codegen.kernels.random import fill_normal, fill_uniform, uniform
+from ssmppl.codegen.kernels.resampling import (
+    PADDING,
+    SYSTEMATIC,
+    conditional_systematic,
+    resample,
+)
+from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise
+
+
+@exact
+def draw_index(w, u):
+    """Index j with probability w[j], from one uniform; never one of weight zero."""
+    total, last = 0.0, -1
+    for j in range(w.size):
+        if w[j] > 0.0:
+            total += w[j]
+            last = j
+            if u < total:
+                return j
+    return last
+
+
+@exact
+def conditional_smc(
+    prepare, step, draw_initial, weigh_initial, draw, weigh, look_ahead,
+    connect, weigh_connected, weigh_observed, sizes, ahead, horizon,
+    theta, y, seen, u, particles, rng, reference, trajectory, statistics,
+):  # fmt: skip
+    """One sweep from `reference` to `trajectory`; returns (status, t).
+
+    statistics : (2,), written: the share of steps at which the trajectory changed, and the mean
+    effective sample size as a share of N.
+    """
+    n_steps, n, d = y.shape[0], particles, reference.shape[1]
+    c, s, s_later = np.empty(sizes[0]), np.empty(sizes[1]), np.empty(sizes[1])
+    history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
+    x_prev, joined, joined_next = np.empty((d, n)), np.empty((d, n)), np.empty((d, n))
+    normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
+    log_v, log_base, part = np.empty(n), np.empty(n), np.empty(n)
+    w, p = np.empty(n), np.empty(n)
+    ancestors = np.empty(n + PADDING, dtype=np.int32)
+    last, ess_total = n - 1, 0.0
+    prepare(theta, c)
+    for t in range(n_steps):
+        step(theta, c, y, seen, u, t, s)
+        x = history[t]
+        if t == 0:
+            fill_normal(rng, normals)
+            fill_uniform(rng, uniforms)
+            draw_initial(theta, c, s, x, normals, uniforms, rng)
+            for k in range(d):
+                x[k, last] = reference[0, k]
+            weigh_initial(theta, c, s, x, log_v)
+        else:
+            x_before = history[t - 1]
+            # the ancestor of the reference
+            keep = last
+            if horizon >= 0:
+                take_log(w, log_base)
+                connect(theta, c, s, x_before, reference[t], joined)
+                weigh_connected(theta, c, s, x_before, joined, log_v)
+                add(log_v, log_base)
+                if horizon > 0:
+                    weigh_observed(theta, c, s, joined, part)
+                    add(log_v, part)
+                for ahead_by in range(1, min(horizon, n_steps - 1 - t) + 1):
+                    step(theta, c, y, seen, u, t + ahead_by, s_later)
+                    connect(theta, c, s_later, joined, reference[t + ahead_by], joined_next)
+                    weigh_connected(theta, c, s_later, joined, joined_next, part)
+                    add(log_v, part)
+                    weigh_observed(theta, c, s_later, joined_next, part)
+                    add(log_v, part)
+                    joined, joined_next = joined_next, joined
+                _, _, status = normalise(log_v, p)
+                if status != OK:
+                    return status, t
+                keep = draw_index(p, uniform(rng))
+            # all others, given that one
+            if ahead != NO_LOOK_AHEAD:
+                look_ahead(theta, c, s, x_before, log_v)
+                take_log(w, log_base)
+                add(log_v, log_base)
+                _, _, status = normalise(log_v, p)
+                if status == NAN and any_finite(log_v):
+                    return status, t
+                if status != OK:
+                    p[:] = w
+                elif ahead == APPROXIMATE:
+                    mix(p, w)
+            else:
+                p[:] = w
+            conditional_systematic(rng, p, keep, ancestors)
+            gather(x_before, ancestors, x_prev)
+            fill_normal(rng, normals)
+            fill_uniform(rng, uniforms)
+            draw(theta, c, s, x_prev, x, normals, uniforms, rng)
+            connect(theta, c, s, x_prev, reference[t], joined)
+            for k in range(d):
+                x[k, last] = joined[k, last]
+            weigh(theta, c, s, x_prev, x, log_v)
+            if ahead != NO_LOOK_AHEAD:
+                second_stage(w, p, ancestors, log_base)
+                add(log_v, log_base)
+            ancestry[t] = ancestors[:n]
+        _, ess, status = normalise(log_v, w)
+        if status == NAN and not any_finite(log_v):
+            status = ALL_ZERO
+        if status != OK:
+            return status, t
+        ess_total += ess
+    k = draw_index(w, uniform(rng))
+    changed = 0
+    for back in range(n_steps):
+        t = n_steps - 1 - back
+        different = False
+        for m in range(d):
+            trajectory[t, m] = history[t, m, k]
+            different = different or trajectory[t, m] != reference[t, m]
+        changed += 1 if different else 0
+        if t > 0:
+            k = ancestry[t, k]
+    statistics[0] = changed / n_steps
+    statistics[1] = ess_total / (n_steps * n)
+    return OK, n_steps
+
+
+@exact
+def filtered_path(
+    prepare, step, draw_initial, weigh_initial, draw, weigh, look_ahead, sizes, ahead,
+    theta, y, seen, u, particles, rng, trajectory,
+):  # fmt: skip
+    """A particle filter that keeps one ancestral path; returns (status, t, log Z).
+
+    What PMMH needs (Andrieu, Doucet and Holenstein 2010, section 2.4.2): the likelihood estimate
+    and, drawn by the final weights, a path of the same run. Systematic resampling at every step.
+    """
+    n_steps, n, d = y.shape[0], particles, trajectory.shape[1]
+    c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
+    x_prev = np.empty((d, n))
+    normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
+    log_v, log_base, w, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    ancestors = np.empty(n + PADDING, dtype=np.int32)
+    log_z = 0.0
+    prepare(theta, c)
+    for t in range(n_steps):
+        step(theta, c, y, seen, u, t, s)
+        x = history[t]
+        if t > 0:
+            p[:] = w
+            if ahead != NO_LOOK_AHEAD:
+                look_ahead(theta, c, s, history[t - 1], log_v)
+                take_log(w, log_base)
+                add(log_v, log_base)
+                _, _, status = normalise(log_v, p)
+                if status == NAN and any_finite(log_v):
+                    return status, t, -np.inf
+                if status != OK:
+                    p[:] = w
+                elif ahead == APPROXIMATE:
+                    mix(p, w)
+            resample(SYSTEMATIC, rng, p, ancestors)
+            gather(history[t - 1], ancestors, x_prev)
+            ancestry[t] = ancestors[:n]
+        fill_normal(rng, normals)
+        fill_uniform(rng, uniforms)
+        if t == 0:
+            draw_initial(theta, c, s, x, normals, uniforms, rng)
+            weigh_initial(theta, c, s, x, log_v)
+        else:
+            draw(theta, c, s, x_prev, x, normals, uniforms, rng)
+            weigh(theta, c, s, x_prev, x, log_v)
+        if t > 0 and ahead != NO_LOOK_AHEAD:
+            second_stage(w, p, ancestors, log_base)
+            add(log_v, log_base)
+            log_z += math.log(n)  # the second-stage weights hold 1 / N already
+        log_sum, _, status = normalise(log_v, w)
+        if status == NAN and not any_finite(log_v):
+            status = ALL_ZERO
+        if status != OK:
+            return status, t, -np.inf
+        log_z += log_sum - math.log(n)
+    k = draw_index(w, uniform(rng))
+    for back in range(n_steps):
+        t = n_steps - 1 - back
+        for m in range(d):
+            trajectory[t, m] = history[t, m, k]
+        if t > 0:
+            k = ancestry[t, k]
+    return OK, n_steps, log_z

@@ -1,0 +1,87 @@
+"""A generated module while it is written: its parts, the names they import, the header."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Callable
+from typing import Any
+
+from ssmppl.codegen.kernels import particle_filter as kernels
+from ssmppl.codegen.module import Layout, Section
+from ssmppl.codegen.render import CALLS, DRAWS, MATRIX_CALLS
+from ssmppl.codegen.specialise import specialise
+
+MODULES = {
+    "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
+    "special": "lgamma digamma trigamma ndtr log_ndtr ndtri erf erfc",
+    "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincinv",
+    "random": "normal uniform gamma poisson binomial",
+    "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil maximum minimum "
+    "power poisson_quantile binomial_quantile negbinomial_quantile cholesky inverse logdet det",
+    "flags": "exact kernel",
+}
+
+
+
+class ModuleText:
+    """The parts of a generated module, in order, and the names that they import."""
+
+    def __init__(self, layout: Layout):
+        self.n_states = len(layout.trace.state_symbols)
+        self.parts: list[str] = []
+        self.imports: dict[str, str] = {}
+
+    def add(self, title: str, section: Section) -> None:
+        """A section's own functions, under a title."""
+        self.parts += [heading(title), section.finish()]
+
+    def add_function(self, title: str, text: str) -> None:
+        """A single entry point."""
+        self.parts += [heading(title), text.replace("@exact", "@entry", 1)]
+
+    def algorithm(
+        self, function: Callable[..., Any], name: str, section: Section, decorator: str,
+        bound: dict[str, str] | None = None,
+    ) -> None:  # fmt: skip
+        """A kernel with the section's functions for its parameters of the same names."""
+        counts = (len(section.c), len(section.s), self.n_states, section.normals, section.uniforms)
+        parameters = inspect.signature(getattr(function, "py_func", function)).parameters
+        roles = [p for p in parameters if f"def {section.name(p)}(" in "\n".join(section.functions)]
+        names = {role: section.name(role) for role in ["prepare", "step", *roles]}
+        names |= {"sizes": f"({', '.join(map(str, counts))})", **(bound or {})}
+        made = specialise(function, name, {k: v for k, v in names.items() if k in parameters})
+        self.parts.append(made.text.replace("@exact", f"@{decorator}", 1))
+        self.imports |= made.imports
+        for value in names.values():
+            if value in vars(kernels):
+                self.imports[value] = kernels.__name__
+
+    def finish(self, introduction: list[str]) -> str:
+        """The whole module, with these lines for its docstring."""
+        lines = ['"""' + introduction[0], *introduction[1:], '"""', ""]
+        lines += ["import math", "from math import inf, nan", "", "import numba"]
+        lines += ["import numpy as np", ""]
+        words = set(re.findall(r"\w+", "\n".join(self.parts)))
+        imports = dict(self.imports)
+        for file, names in MODULES.items():
+            package = f"ssmppl.codegen.kernels.{file}"
+            imports |= {n: package for n in names.split() if n in words and n not in imports}
+        for package in sorted(set(imports.values())):
+            names = ", ".join(sorted(n for n, home in imports.items() if home == package))
+            wrapped = textwrap.fill(names, 92, initial_indent="    ", subsequent_indent="    ")
+            lines.append(f"from {package} import (\n{wrapped},\n)")
+        lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]
+        return "\n".join(lines) + "\n\n".join(self.parts)
+
+
+def heading(title: str) -> str:
+    """A comment line across the page, and the title under it."""
+    wrapped = "\n".join(f"# {line}" for line in textwrap.wrap(title, 94))
+    return f"# {'-' * 96}\n{wrapped}"
+
+
+def known_spellings() -> set[str]:
+    """Every function that generated text may call, for the test that all have an import."""
+    return {*CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values()} - {"abs"}

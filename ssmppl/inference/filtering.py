@@ -1,0 +1,226 @@
+"""Runs of the particle filter: the likelihood, and everything else that a filter tells.
+
+Algorithm 2 of Schön et al. (2015); see `codegen/kernels/particle_filter.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
+from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
+from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.errors import ArgumentError, Location, SamplingError, listing
+from ssmppl.inference.problem import Problem
+
+SCHEMES = {
+    "systematic": SYSTEMATIC,
+    "stratified": STRATIFIED,
+    "residual": RESIDUAL,
+    "multinomial": MULTINOMIAL,
+}
+_NOTHING = np.empty(0)
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """How a particle filter runs.
+
+    particles : N. proposal : name of a derived proposal. scheme : code of the resampling scheme.
+    ess_threshold : resample when the effective sample size is below this share of N; 1: always.
+    """
+
+    particles: int
+    proposal: str
+    scheme: int = SYSTEMATIC
+    ess_threshold: float = 1.0
+
+
+def filter_settings(
+    particles: Any, proposal: str, resampling: str, ess_threshold: float
+) -> FilterSettings:
+    """The settings of a call, checked.
+
+    Raises
+    ------
+    ArgumentError : naming the argument, its value and the valid options.
+    """
+    if resampling not in SCHEMES:
+        raise ArgumentError(
+            f"resampling={resampling!r} is unknown",
+            fix=f"use one of: {listing(str(resampling), SCHEMES)}",
+        )
+    check_count("particles", particles, 1)
+    if not 0.0 <= ess_threshold <= 1.0:
+        raise ArgumentError(
+            f"ess_threshold={ess_threshold!r} is no share of the particles",
+            fix="give a number from 0 (never resample) to 1 (always)",
+        )
+    return FilterSettings(int(particles), proposal, SCHEMES[resampling], float(ess_threshold))
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    """Refuse what is no whole number of at least `least`."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < least:
+        raise ArgumentError(
+            f"{name}={value!r}", fix=f"give a whole number of at least {least}"
+        )
+
+
+def random_state(seed: Any, *path: int) -> np.ndarray:
+    """State of the kernels' generator for a seed and a place in the work (chain, repeat, ...)."""
+    if isinstance(seed, np.random.SeedSequence):
+        base = seed
+    else:
+        try:
+            base = np.random.SeedSequence(seed)
+        except (TypeError, ValueError):
+            raise ArgumentError(
+                f"seed={seed!r}", fix="give a whole number, or None for a random one"
+            ) from None
+    return new_state(
+        np.random.SeedSequence(base.entropy, spawn_key=(*base.spawn_key, *path))
+    )
+
+
+def log_likelihood_estimate(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray
+) -> float:
+    """One estimate of log p(y | theta), summed over the experiments; -inf where it is zero.
+
+    Raises
+    ------
+    SamplingError : the weights are NaN or infinite for some particles only.
+    """
+    run = problem.program.entry(f"filter_{settings.proposal}")
+    d, k = len(problem.trace.state_symbols), len(problem.trace.observation_symbols)
+    total = 0.0
+    for experiment in problem.experiments:
+        increments, ess = np.empty(experiment.steps), np.empty(experiment.steps)
+        status, t = run(
+            theta, experiment.y, experiment.seen, experiment.u, settings.particles,
+            settings.scheme, settings.ess_threshold, rng, increments, ess, _NOTHING,
+            np.empty((0, d)), np.empty((0, d, d)), np.empty((0, 0, d)), np.empty((0, 4, k)),
+        )  # fmt: skip
+        if status == ALL_ZERO:
+            return -np.inf
+        if status != OK:
+            raise failure(problem, theta, status, t, experiment)
+        total += float(increments.sum())
+    return total
+
+
+def repeated_estimates(
+    problem: Problem,
+    theta: np.ndarray,
+    settings: FilterSettings,
+    seed: np.random.SeedSequence,
+    repeats: range,
+) -> np.ndarray:
+    """Independent estimates, one for each number in `repeats`; the same whatever the split."""
+    return np.array(
+        [
+            log_likelihood_estimate(problem, theta, settings, random_state(seed, r))
+            for r in repeats
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """What one run of the filter tells about one experiment (T steps, D states, K channels).
+
+    log_increments, ess : (T,). mean : (T, D). covariance : (T, D, D). quantiles : (T, P, D).
+    prediction : (T, 4, K): mean, variance, P(Y <= y) and P(Y < y) of the one-step prediction.
+    """
+
+    log_increments: np.ndarray
+    ess: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    quantiles: np.ndarray
+    prediction: np.ndarray
+
+
+def full_run(
+    problem: Problem,
+    experiment: Experiment,
+    theta: np.ndarray,
+    settings: FilterSettings,
+    rng: np.ndarray,
+    probabilities: np.ndarray,
+) -> FilterRun:
+    """Run the filter and keep its moments, quantiles and predictions.
+
+    Raises
+    ------
+    SamplingError : all weights vanish, or are NaN; names the step, the user's line, the parameters.
+    """
+    d, k = len(problem.trace.state_symbols), len(problem.trace.observation_symbols)
+    steps, p = experiment.steps, len(probabilities)
+    out = FilterRun(
+        np.empty(steps), np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)),
+        np.empty((steps, p, d)), np.empty((steps, 4, k)),
+    )  # fmt: skip
+    status, t = problem.program.entry(f"filter_predict_{settings.proposal}")(
+        theta, experiment.y, experiment.seen, experiment.u, settings.particles, settings.scheme,
+        settings.ess_threshold, rng, out.log_increments, out.ess, probabilities,
+        out.mean, out.covariance, out.quantiles, out.prediction,
+    )  # fmt: skip
+    if status != OK:
+        raise failure(problem, theta, status, t, experiment)
+    return out
+
+
+_WHAT = {
+    ALL_ZERO: "all weights are zero",
+    NAN: "a weight is nan",
+    INFINITE: "a weight is infinite",
+}
+
+
+def failure(
+    problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
+) -> SamplingError:
+    """The error of a run that stopped at step t (from 0)."""
+    label = "" if experiment.time is None else f" (time {experiment.time[t]})"
+    row = ", ".join(
+        f"{name} = {np.array2string(np.asarray(values[t]), precision=6)}"
+        for name, values in experiment.observed.items()
+    )
+    parameters = ", ".join(
+        f"{n} = {np.array2string(np.asarray(v), precision=6)}"
+        for n, v in unpack_parameters(problem.trace, theta).items()
+    )
+    site = next(iter(problem.trace.observations.values()))
+    where: Location = site.distribution.location
+    fix = {
+        ALL_ZERO: "no particle can have produced this row under these parameters: check the row "
+        "for an outlier, give the observation heavier tails, or use more particles",
+    }.get(status, "some parameter, state or input leads outside the domain of an operation")
+    return SamplingError(
+        f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "
+        f"parameters: {parameters}",
+        fix=fix,
+        where=where,
+    )
+
+
+def estimates_task(
+    problem: Problem,
+    theta: np.ndarray,
+    settings: FilterSettings,
+    seed: np.random.SeedSequence,
+) -> partial:
+    """A function of a range of repeats, to be run by an executor."""
+    return partial(repeated_estimates, problem, theta, settings, seed)
+
+
+Parameters = Mapping[str, Any]

@@ -1,0 +1,39 @@
+"""Draws from the prior, and what must hold for them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate, numpy_draws
+from ssmppl.expressions.expr import Expr
+from ssmppl.language.distributions import Draws
+from ssmppl.language.trace import Trace
+
+
+def draw_prior(trace: Trace, rng: np.random.Generator, draws: int) -> np.ndarray:
+    """(draws, P) independent draws of theta, parents before children.
+
+    Raises
+    ------
+    ArgumentError : some prior is improper.
+    """
+    values: dict[Expr, np.ndarray] = {}
+    source = numpy_draws(rng, (draws,))
+    for site in trace.parameters.values():
+        d = site.distribution
+        if not d.proper:
+            raise ArgumentError(
+                f"the prior of {site.name!r} is {type(d).__name__}, which is improper: nothing "
+                "can be drawn from it",
+                fix=f"give {site.name!r} a proper prior, or its value by parameters=",
+            )
+        sample = evaluate(array(d.sample(Draws(site.name))), values, source)
+        flat = np.broadcast_to(
+            sample.reshape(site.value.size, -1), (site.value.size, draws)
+        )  # a sampler without randomness has no axis of draws
+        for i, s in enumerate(site.value.ravel()):
+            values.setdefault(s, flat[i])
+    symbols = trace.parameter_symbols
+    return np.stack([values[s] for s in symbols], axis=-1) if symbols else np.empty((draws, 0))

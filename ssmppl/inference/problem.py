@@ -1,0 +1,71 @@
+"""A model bound to data and compiled: what every algorithm starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals import Proposal
+from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.data import Experiment, bind
+from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
+from ssmppl.language.model import Model
+from ssmppl.language.trace import Trace, trace
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The traced model, its data sets and its generated program."""
+
+    trace: Trace
+    experiments: tuple[Experiment, ...]
+    program: Program
+
+    def proposal(self, name: str) -> Proposal:
+        """A derived proposal.
+
+        Raises
+        ------
+        ArgumentError : no proposal has this name, or it could not be derived; gives the reason.
+        """
+        found = self.program.proposals.get(name)
+        if found is None:
+            raise ArgumentError(
+                f"proposal={name!r} is not known for this model",
+                fix=f"use one of: {listing(name, ['auto', 'kalman', *self.program.proposals])}",
+            )
+        if isinstance(found, NotApplicable):
+            raise ArgumentError(
+                f"proposal={name!r} does not apply: {found}",
+                fix='use proposal="auto" or "bootstrap"',
+            )
+        return found
+
+
+def missing_of(experiments: Sequence[Experiment]) -> Missing:
+    """What the data lack, as far as the generated code depends on it."""
+    none = all(bool(np.all(e.seen == 1.0)) for e in experiments)
+    partial: frozenset[str] = frozenset()
+    return Missing(none, partial.union(*(e.partial for e in experiments)))
+
+
+def pose(model: Model, data: Any) -> Problem:
+    """Trace the model, bind the data and compile.
+
+    Raises
+    ------
+    ModelError, DataError : naming the place, what was found and the fix.
+    """
+    traced = trace(model)
+    if not traced.observations:
+        raise ModelError(
+            f"model {traced.name!r} has no @observation function: there is nothing to condition on",
+            fix="declare the law of y_t with @model.observation",
+            where=model.location,
+        )
+    experiments = tuple(bind(traced, data))
+    return Problem(traced, experiments, compile_trace(traced, missing_of(experiments)))

@@ -1,0 +1,132 @@
+"""Choice of the particle filter's proposal by a pilot: the least variance of log Z per second.
+
+The cost of a step is counted from the expressions that the generated code evaluates, not timed,
+so that the choice, and with it every result, is the same wherever and whenever a seed is run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.structure import linear_gaussian
+from ssmppl.codegen.module import PARTICLE, level_of
+from ssmppl.codegen.render import depends
+from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.expressions.expr import Expr, topological
+from ssmppl.inference.filtering import FilterSettings, repeated_estimates
+from ssmppl.inference.problem import Problem
+
+# Nanoseconds per particle, from timings of single passes; what they weigh matters, not the unit.
+COST = {"exp": 1.0, "log": 1.0, "log1p": 1.5, "expm1": 1.5, "sin": 1.3, "cos": 1.3, "tanh": 2.0,
+        "div": 0.7, "sqrt": 1.0, "pow": 8.0, "logaddexp": 3.5, "where": 0.3}  # fmt: skip
+SLOW = 30.0  # what is no vectorised pass: special functions, factorisations, scalar draws
+CHEAP = 0.15
+STEP = 2.6  # normalise, resample, gather
+NORMAL, UNIFORM = 1.5, 0.6
+LOOK_AHEAD = 4.0  # one more normalisation and the second-stage weights
+PILOT_PARTICLES, PILOT_REPEATS, PILOT_STEPS = 100, 24, 400
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen proposal and the figures behind it: name -> (sd of log Z, ns per particle)."""
+
+    name: str
+    figures: dict[str, tuple[float, float]]
+
+    def __str__(self) -> str:
+        if not self.figures:
+            return self.name
+        rows = ", ".join(f"{n}: sd {s:.2f}, {c:.0f} ns" for n, (s, c) in self.figures.items())
+        return f"{self.name} (pilot sd of log Z and cost per particle: {rows})"
+
+
+def cost(proposal: Proposal) -> float:
+    """Estimated nanoseconds per particle and step."""
+    passes = [list(proposal.draw.values()), [t.guarded() for t in proposal.weight]]
+    extra = 0.0
+    if proposal.look_ahead is not None:
+        passes.append([proposal.look_ahead])
+        extra = LOOK_AHEAD
+    return STEP + extra + sum(_pass_cost(p) for p in passes)
+
+
+def _pass_cost(roots: list[Expr]) -> float:
+    level = depends(roots, level_of)
+    total = 0.0
+    for node in topological(roots):
+        if level[node] != PARTICLE or node.op == "symbol":
+            continue
+        if node.op == "random":
+            total += {"normal": NORMAL, "uniform": UNIFORM}.get(node.data[0], SLOW)
+        elif node.op in COST:
+            total += COST[node.op]
+        elif node.op in ("add", "sub", "mul", "neg", "lt", "le", "eq", "ne", "and", "or", "abs",
+                         "maximum", "minimum", "floor", "item"):  # fmt: skip
+            total += CHEAP
+        else:
+            total += SLOW
+    return total
+
+
+_choices: dict[tuple, Choice] = {}
+
+
+def choose(problem: Problem, theta: np.ndarray, kalman: bool = True) -> Choice:
+    """Kalman where the model is linear Gaussian, the user's proposal where there is one, else the
+    winner of a pilot at theta; remembered for each program and data."""
+    if kalman and not isinstance(linear_gaussian(problem.trace), NotApplicable):
+        return Choice("kalman", {})
+    if "user" in problem.program.proposals:
+        return Choice("user", {})
+    candidates = {
+        n: p for n, p in problem.program.proposals.items() if not isinstance(p, NotApplicable)
+    }
+    if len(candidates) == 1:
+        return Choice("bootstrap", {})
+    key = (problem.program.path, _digest(problem), theta.tobytes())
+    if key not in _choices:
+        _choices[key] = _pilot(problem, theta, candidates)
+    return _choices[key]
+
+
+def _digest(problem: Problem) -> bytes:
+    digest = hashlib.sha256()
+    for e in problem.experiments:
+        for a in (e.y, e.seen, e.u):
+            digest.update(a.tobytes())
+    return digest.digest()
+
+
+def _pilot(problem: Problem, theta: np.ndarray, candidates: dict[str, Proposal]) -> Choice:
+    figures = {}
+    shortened = _beginning(problem)
+    for name, proposal in candidates.items():
+        settings = FilterSettings(PILOT_PARTICLES, name)
+        seed = np.random.SeedSequence(20150)
+        try:
+            log_z = repeated_estimates(shortened, theta, settings, seed, range(PILOT_REPEATS))
+        except SamplingError:
+            continue
+        finite = np.isfinite(log_z)
+        sd = float(np.std(log_z[finite], ddof=1)) if finite.mean() > 0.9 else float("inf")
+        figures[name] = (sd, cost(proposal))
+    score = {n: s**2 * c for n, (s, c) in figures.items() if np.isfinite(s)}
+    best = min(score, key=lambda n: score[n]) if score else "bootstrap"
+    return Choice(best, figures)
+
+
+def _beginning(problem: Problem) -> Problem:
+    """The problem with its first rows only: enough to compare proposals."""
+    short = tuple(
+        replace(
+            e, y=e.y[:PILOT_STEPS], seen=e.seen[:PILOT_STEPS], u=e.u[:PILOT_STEPS],
+            steps=min(e.steps, PILOT_STEPS),
+        )
+        for e in problem.experiments[:3]
+    )  # fmt: skip
+    return replace(problem, experiments=short)

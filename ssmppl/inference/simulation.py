@@ -1,0 +1,103 @@
+"""The verb `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.program import compile_trace
+from ssmppl.data import (
+    bind_inputs,
+    check_parameters,
+    unpack_observations,
+    unpack_parameters,
+    unpack_states,
+)
+from ssmppl.expressions.expr import topological
+from ssmppl.inference.filtering import check_count, random_state
+from ssmppl.inference.prior import draw_prior
+from ssmppl.language.model import Model
+from ssmppl.language.trace import Trace, trace
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def simulate(
+    model: Model,
+    parameters: Mapping[str, Any] | None = None,
+    *,
+    steps: int | None = None,
+    inputs: Any = None,
+    draws: int = 1,
+    seed: int | None = None,
+) -> xr.Dataset:
+    """Simulate states and observations.
+
+    Parameters
+    ----------
+    parameters : value of each parameter; None draws them from the prior, anew for each draw.
+    steps : number T of time steps; may be left out where `inputs` tell it.
+    inputs : mapping of arrays, DataFrame or Dataset with the model's inputs.
+    draws : number of independent simulations.
+    seed : the same seed gives the same numbers.
+
+    Returns
+    -------
+    Dataset with the states and observations, dims (draw, time, ...), and, where they were drawn
+    from the prior, the parameters, dims (draw, ...).
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError : what is wrong with model, inputs or call, and the fix.
+    """
+    traced = trace(model)
+    u, steps, time = bind_inputs(traced, inputs, steps)
+    check_count("draws", draws, 1)
+    root = np.random.SeedSequence(seed)
+    program = compile_trace(traced, Missing(none=True))
+    rng = random_state(root)
+    if parameters is not None:
+        theta = check_parameters(traced, parameters)[None]
+    elif traced.parameters:
+        theta = draw_prior(traced, np.random.default_rng(root), draws)
+    else:
+        theta = np.empty((1, 0))
+    d, k = len(traced.state_symbols), len(traced.observation_symbols)
+    states, observations = np.empty((draws, steps, d)), np.empty((draws, steps, k))
+    feedback = feeds_back(traced)
+    side_by_side = draws if len(theta) == 1 and not feedback else 1
+    y, seen = np.zeros((steps, k)), np.ones((steps, k))
+    for first in range(0, draws, side_by_side):
+        x, out = np.empty((steps, d, side_by_side)), np.empty((steps, k, side_by_side))
+        row = theta[min(first, len(theta) - 1)]
+        program.entry("simulate")(row, y, seen, u, rng, x, out, feedback)
+        states[first : first + side_by_side] = np.moveaxis(x, 2, 0)
+        observations[first : first + side_by_side] = np.moveaxis(out, 2, 0)
+    variables = {**unpack_states(traced, states), **unpack_observations(traced, observations)}
+    over_time = set(variables)
+    if parameters is None and traced.parameters:
+        variables |= unpack_parameters(traced, theta)
+    return to_dataset(
+        variables,
+        over_time=over_time,
+        time=time,
+        attrs={"model": traced.name, "seed": str(root.entropy)},
+    )
+
+
+def feeds_back(traced: Trace) -> bool:
+    """Whether some transition names an observation."""
+    laws = [
+        p
+        for site in traced.transition.values()
+        for a in site.distribution.parameters.values()
+        for p in a.ravel()
+    ]
+    return any(
+        n.op == "symbol" and n.data[0] == "observation_prev" for n in topological(laws)
+    )
