@@ -173,6 +173,9 @@ class _Separator:
             return self._matrix_item(node)
         if op == "logdet":
             return self._logdet(node)
+        if op == "det" and (found := self._common_factor(node)) is not None:
+            power = frozenset((a, round(e * node.data, 12)) for a, e in found[0])
+            return {power: [matrix_op("det", found[1], node.data)]}
         if op == "add":
             return _add(parts[0], parts[1])
         if op == "sub":
@@ -348,7 +351,28 @@ class _Separator:
             entries.append(monomial_expr(m))
         return core, tuple(entries)
 
+    def _common_factor(self, node: Expr) -> tuple[Monomial, list[Expr]] | None:
+        """The matrix under `node` as one function of the block times entries free of it."""
+        common, entries = None, []
+        for a in node.args:
+            terms = _finish(self.done[a]) if a in self.done else {}
+            if not terms and a in self.done:  # an entry that is zero
+                entries.append(constant(0.0))
+                continue
+            if len(terms) != 1:
+                return None
+            ((m, c),) = terms.items()
+            common = m if common is None else common
+            if m != common:
+                return None
+            entries.append(c)
+        return None if common is None else (common, entries)
+
     def _logdet(self, node: Expr) -> Terms:
+        if (found := self._common_factor(node)) is not None:
+            common, free = found
+            scaled = _scale(self._log({common: [constant(1.0)]}, node), constant(float(node.data)))
+            return _add(scaled, {ONE: [matrix_op("logdet", free, node.data)]})
         original = _inverse_of(node)
         if original is not None:  # log det A^-1 = -log det A
             logdet = matrix_op("logdet", original.args, node.data)
@@ -362,12 +386,16 @@ class _Separator:
 
     def _matrix_item(self, node: Expr) -> Terms:
         matrix = node.args[0]
+        power = -1.0 if matrix.op == "inverse" else 0.5
+        if (found := self._common_factor(matrix)) is not None:
+            common, free = found
+            factor = frozenset((a, round(e * power, 12)) for a, e in common)
+            return {factor: [item(matrix_op(matrix.op, free, matrix.data), *node.data)]}
         original = _inverse_of(matrix) if matrix.op == "inverse" else None
         if original is not None:  # (A^-1)^-1 = A
             row, column = node.data
             return self.done[original.args[row * matrix.data + column]]
         scale, entries = self._scaled_matrix(matrix)
-        power = -1.0 if matrix.op == "inverse" else 0.5
         atom = item(matrix_op(matrix.op, entries, matrix.data), *node.data)
         return {frozenset({(atom, 1.0)}): [scale**power]}
 
