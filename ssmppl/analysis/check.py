@@ -20,7 +20,8 @@ import numpy as np
 
 from ssmppl.analysis.families import lower_half
 from ssmppl.analysis.sufficient import ROLES, CompleteData
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import Location, NotApplicable
+from ssmppl.expressions.algebra import Separation, separate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.trace import Site, previous, seen, symbol, symbols
@@ -33,6 +34,7 @@ NEEDED = 5
 STEPS = 4
 TOLERANCE = 1e-8
 _ATTEMPTS = 4
+_HINT = ": roots and logarithms of products are split as if each factor were positive"
 Point = dict[Expr, np.ndarray]
 
 
@@ -58,17 +60,17 @@ def verify(data: CompleteData, update: Update, seed: int = 1) -> NotApplicable |
             q2, size2 = log_q(update, totals[:, k], there[:, k])
             if not np.isfinite(q1 - q2):
                 return NotApplicable(
-                    f"the {update.family} update of {names} has no density where the model has one",
-                    update.where,
+                    f"the {update.family} update of {names} has no density where the model has "
+                    f"one{_HINT}",
+                    _culprit(data, update, series, changed) or update.where,
                 )
             size = np.abs(first[:, k]).sum() + np.abs(second[:, k]).sum()
             error = abs((q2 - q1) - expected)
             if error > TOLERANCE * (1.0 + size + size1 + size2):
                 return NotApplicable(
                     f"the {update.family} update of {names} disagrees with the model's log density "
-                    f"by {error:.3g} at a random point (a root or logarithm of a product that is "
-                    "not positive?)",
-                    update.where,
+                    f"by {error:.3g} at a random point{_HINT}",
+                    _culprit(data, update, series, changed) or update.where,
                 )
             compared += 1
         if compared >= NEEDED:
@@ -89,6 +91,24 @@ def joint(data: CompleteData, update: Update, series: list[Point]) -> np.ndarray
         if _counts(factor.role, t)
     ]
     return np.array(rows).reshape(-1, POINTS)
+
+
+def _culprit(
+    data: CompleteData, update: Update, series: list[Point], changed: Point
+) -> Location | None:
+    """Where the first factor stands that differs from its own separated form."""
+    for factor in data.holding(update.components):
+        form = separate(factor.density, update.components)
+        if not isinstance(form, Separation):
+            return factor.where
+        pair = [factor.density, form.assemble()]
+        for values in series[1:]:
+            (a, b), (c, d) = evaluate(pair, values), evaluate(pair, {**values, **changed})
+            wrong = np.abs((a - c) - (b - d)) > TOLERANCE * (1.0 + np.abs(a) + np.abs(c))
+            missing = np.isfinite(a - c) & ~np.isfinite(b - d)
+            if np.any(wrong | missing):
+                return factor.where
+    return None
 
 
 def _counts(role: str, t: int) -> bool:

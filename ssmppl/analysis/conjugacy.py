@@ -134,7 +134,7 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
             )
         notes.append(str(update.where))
     if isinstance(update.conditional, NormalGamma):
-        notes.append("separate updates where the precision H is not positive definite")
+        notes.append("separate updates where the precision H or the rate is not positive")
     elif isinstance(update.conditional, Normal):
         notes.append("slice steps where the precision H is not positive definite")
     return notes
@@ -157,14 +157,14 @@ def _slice(
 ) -> Update:
     """Slice steps on the exact conditional; through the statistics where it separates."""
     kind = kind_of(search.site(unit[0]))
-    form = separate_block(search.data, unit) if use_statistics else why
-    separated = isinstance(form, BlockForm)
+    separated = separate_block(search.data, unit) if use_statistics else why
+    form = separated if isinstance(separated, BlockForm) else None
     how = {
         "real": "a slice step on its exact conditional",
         "simplex": "slice steps on its log ratios, on their exact conditional",
         "matrix": "slice steps on its Cholesky factor (log diagonal), on the exact conditional",
     }[kind]
-    cost = "through its statistics" if separated else "each evaluation a pass over the data"
+    cost = "through its statistics" if form else "each evaluation a pass over the data"
     family, law = "slice", f"{how}, {cost}"
     if degenerate(search.data, unit) is not None:
         family, law = "none", "no update given the states: integrate them out (PMMH), or fix it"
@@ -172,18 +172,18 @@ def _slice(
         block=(unit[0].data[1],),
         components=unit,
         family=family,
-        functions=form.functions if separated else (),
-        coefficients=form.coefficients if separated else dict.fromkeys(ROLES, ()),
+        functions=form.functions if form else (),
+        coefficients=form.coefficients if form else dict.fromkeys(ROLES, ()),
         correction=(),
         bounds=tuple(search.bound[c] for c in unit),
         explanation=Explanation(
             joined(unit),
             law,
-            describe.statistics(form) if separated else (),
+            describe.statistics(form) if form else (),
             (f"because {why.reason}", *([str(why.where)] if why.where else [])),
         ),
         reason=why.reason,
         where=why.where,
-        needs_log_joint=not separated and family == "slice",
+        needs_log_joint=form is None and family == "slice",
         kind=kind,
     )

@@ -67,10 +67,8 @@ def _part(role: str, coefficient: Expr) -> list[str]:
         return []
     count = {"transition": "(T - 1)", "observation": "T"}.get(role)
     if coefficient.op == "const":
-        number = f"{coefficient.data:.6g}"
-        if count is None:
-            return [number]
-        return [{"1": count, "-1": f"-{count}"}.get(number, f"{number}*{count}")]
+        value = coefficient.data
+        return [f"{value:.6g}" if count is None else _times(value, count)]
     number, text = tidy(coefficient)
     if role == "initial":
         text = f"[{text}]_1"

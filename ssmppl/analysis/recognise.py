@@ -18,7 +18,7 @@ from ssmppl.analysis.families import (
     Wishart,
     lower_half,
 )
-from ssmppl.expressions.algebra import Monomial, separate
+from ssmppl.expressions.algebra import Monomial, Separation, separate
 from ssmppl.expressions.expr import Expr, apply, item, matrix_op
 
 
@@ -45,8 +45,9 @@ def match_scalar(component: Expr, monomials: Sequence[Monomial], positive: bool)
 
 
 def _log_complement(component: Expr) -> Monomial:
-    terms = separate(apply("log", 1.0 - component), [component]).terms
-    return next(iter(terms))
+    """log(1 - p), as `separate` writes it."""
+    form = separate(apply("log", 1.0 - component), [component])
+    return next(iter(form.terms)) if isinstance(form, Separation) else frozenset()
 
 
 def match_normal(components: Sequence[Expr], monomials: Sequence[Monomial]) -> Normal | None:

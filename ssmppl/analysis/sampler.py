@@ -99,6 +99,7 @@ class Sampler:
     ) -> Values | None:
         """A draw of the conjugate part; None where it is improper."""
         family = self.update.conditional
+        assert family is not None
         if self.truncated and isinstance(family, (Gamma, Normal, Beta)) and len(limits) == 1:
             value = truncated_draw(family, c, *limits[0], rng)
             return None if value is None else (value,)
@@ -213,6 +214,7 @@ class Sampler:
     ) -> float:
         """v from its law given theta, if that is a proper Gamma; else as it was."""
         family = self.update.conditional
+        assert isinstance(family, NormalGamma)
         shape, rate = family.given([*c, 0.0], np.array(values[:-1]))
         gamma = Gamma(family.power, 0, 1)
         v = truncated_draw(gamma, [shape * family.power - 1.0, -rate], *limits, rng)
@@ -292,14 +294,13 @@ def truncated_draw(
         return None
     k = family.power
     if low <= 0.0 and high == math.inf:
-        g = rng.standard_gamma(shape) / rate
+        g: float | None = rng.standard_gamma(shape) / rate
     else:
-        ends = [_to_power(max(low, 0.0), k), _to_power(high, k)]
-        ends.sort()
+        first, last = sorted((_to_power(max(low, 0.0), k), _to_power(high, k)))
         g = _between(
             lambda x: sp.gammainc(shape, rate * x), lambda x: sp.gammaincc(shape, rate * x),
             lambda p: sp.gammaincinv(shape, p) / rate, lambda p: sp.gammainccinv(shape, p) / rate,
-            *ends, rng,
+            first, last, rng,
         )  # fmt: skip
     if g is None or not 0.0 < g < math.inf:
         return None
@@ -312,7 +313,15 @@ def _to_power(x: float, k: float) -> float:
     return x**k if x < math.inf else (math.inf if k > 0 else 0.0)
 
 
-def _between(cdf, survival, quantile, survival_quantile, low, high, rng) -> float | None:
+def _between(
+    cdf: Callable[[float], float],
+    survival: Callable[[float], float],
+    quantile: Callable[[float], float],
+    survival_quantile: Callable[[float], float],
+    low: float,
+    high: float,
+    rng: np.random.Generator,
+) -> float | None:
     """Inversion in whichever tail keeps the digits; None where the mass underflows."""
     below, above = float(cdf(low)), float(cdf(high))
     if below > 0.5:

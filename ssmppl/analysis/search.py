@@ -99,7 +99,8 @@ class Search:
     def _outside(self, form: BlockForm, used: frozenset[int]) -> NotApplicable:
         """The reason naming the functions that no family holds, and the lines they stem from."""
         names = joined(form.components)
-        growing, others = [], []
+        growing: list[int] = []
+        others: list[int] = []
         for i, m in enumerate(form.monomials):
             if i not in used:
                 grows = form.roles(m) & {"transition", "observation"}

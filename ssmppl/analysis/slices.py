@@ -140,7 +140,7 @@ def sweep_simplex(
         weights = np.exp(full - full.max())
         return weights / weights.sum()
 
-    def at(z: list[float]) -> float:
+    def at(z: Sequence[float]) -> float:
         p = probabilities(np.array(z))
         if not np.all(p > 0.0):
             return -math.inf
@@ -167,7 +167,7 @@ def sweep_matrix(
             root[i, j] = math.exp(x) if i == j else x
         return root @ root.T, np.diagonal(root)
 
-    def at(z: list[float]) -> float:
+    def at(z: Sequence[float]) -> float:
         if any(abs(x) > 300.0 for (i, j), x in zip(cells, z, strict=True) if i == j):
             return -math.inf
         value, diagonal = matrix(z)

@@ -164,9 +164,9 @@ def separate_block(trace: Trace | CompleteData, block: Iterable[Expr]) -> BlockF
     wanted = frozenset(components)
     sums_by_role: dict[str, dict[Monomial, Expr]] = {role: {} for role in ROLES}
     origins: dict[Monomial, list[Factor]] = {}
-    refusal = degenerate(data, components) or restricted(data, components)
-    if refusal is not None:
-        return refusal
+    for refusal in (degenerate(data, components), restricted(data, components)):
+        if refusal is not None:
+            return refusal
     for factor in data.holding(components):
         form = separate(factor.density, wanted)
         if not isinstance(form, Separation):
