@@ -152,7 +152,7 @@ class Binomial(_Counts):
         self._require("n", 0.0, strict=False)
         self._require("p", 0.0, 1.0, strict=False)
         for e in self.n.ravel():
-            if e.op == "const" and e.data != int(e.data):
+            if e.op == "const" and not e.data.is_integer():
                 raise ModelError(
                     f"Binomial: n = {e.data:g} is no whole number",
                     fix="give a whole number of trials",

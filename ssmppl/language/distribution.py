@@ -319,7 +319,7 @@ def _never_above(a: Expr, b: Expr) -> bool:
 
 def _plain_name(name: str) -> str:
     """A parameter as the user knows it."""
-    return name.rstrip("_")
+    return name.removeprefix("like_").rstrip("_")
 
 
 def _checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
