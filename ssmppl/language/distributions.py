@@ -1,21 +1,6 @@
 """All distributions of the language, by name."""
 
-from ssmppl.language.continuous import (
-    Beta,
-    Cauchy,
-    Exponential,
-    Flat,
-    Gamma,
-    HalfCauchy,
-    HalfFlat,
-    HalfNormal,
-    InverseGamma,
-    Laplace,
-    LogNormal,
-    Normal,
-    StudentT,
-    Uniform,
-)
+from ssmppl.language.continuous import Flat, HalfFlat, LogNormal, Normal, Uniform
 from ssmppl.language.discrete import (
     Bernoulli,
     Binomial,
@@ -26,6 +11,8 @@ from ssmppl.language.discrete import (
 )
 from ssmppl.language.distribution import Distribution, Draws, Support
 from ssmppl.language.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
+from ssmppl.language.positive import Beta, Exponential, Gamma, InverseGamma
+from ssmppl.language.symmetric import Cauchy, HalfCauchy, HalfNormal, Laplace, StudentT
 from ssmppl.language.truncated import Truncated
 
 DISTRIBUTIONS: dict[str, type[Distribution]] = {

@@ -23,8 +23,9 @@ from ssmppl.expressions.arrays import (
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.expr import constant
-from ssmppl.language.continuous import LOG_2PI, log_gamma_draw, needs_log_gamma
+from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Draws, Support, one_of
+from ssmppl.language.positive import log_gamma_draw, needs_log_gamma
 
 
 class _Joint(Distribution):

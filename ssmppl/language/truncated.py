@@ -16,18 +16,11 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
-from ssmppl.language.continuous import (
-    LOG_2PI,
-    Exponential,
-    Flat,
-    Laplace,
-    Normal,
-    Uniform,
-    _each,
-    _where,
-)
+from ssmppl.language.continuous import LOG_2PI, Flat, Normal, Uniform, _each, _where
 from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
+from ssmppl.language.positive import Exponential
+from ssmppl.language.symmetric import Laplace
 
 
 class Truncated(Distribution):

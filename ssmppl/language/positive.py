@@ -1,0 +1,236 @@
+"""Exponential, Gamma, InverseGamma and Beta, elementwise of arrays.
+
+Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 1995),
+"Continuous univariate distributions", volumes 1 and 2, in the parametrisations named in each class.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import Expr, apply
+from ssmppl.language.continuous import _NAN, _each, _where
+from ssmppl.language.distribution import (
+    INFINITY,
+    Distribution,
+    Draws,
+    Support,
+    one_of,
+)
+from ssmppl.language.symmetric import cut_exponential
+
+SMALL_SHAPE = 0.1  # below it, gamma draws may be too small for floating point
+
+
+class _Positive(Distribution):
+    def support(self):
+        return Support("interval", self._full(0.0), self._full(INFINITY))
+
+
+class Exponential(_Positive):
+    """Exponential(rate= | scale=); a bare argument is the rate."""
+
+    closed = True
+
+    def __init__(self, rate: Any = None, *, scale: Any = None):
+        self.spread, value = one_of("Exponential", {"rate": rate, "scale": scale})
+        self._set(**{self.spread: value})
+        self._require(self.spread, 0.0)
+
+    def _rate(self) -> ExprArray:
+        s = self.parameters[self.spread]
+        return s if self.spread == "rate" else 1.0 / s
+
+    def log_densities(self, value):
+        return ew("log", self._rate()) - self._rate() * array(value)
+
+    def sample(self, draws):
+        return -_each(self, lambda i: ew("log", draws.uniform())) / self._rate()
+
+    def mean(self):
+        return 1.0 / self._rate()
+
+    def variance(self):
+        return 1.0 / self._rate() ** 2
+
+    def cdf(self, value):
+        return -ew("expm1", -self._rate() * ew("maximum", value, 0.0))
+
+    def survival(self, value):
+        return array(ew("exp", self.log_survival(value)))
+
+    def log_survival(self, value):
+        return -self._rate() * ew("maximum", value, 0.0)
+
+    def quantile(self, p):
+        return -ew("log1p", -array(p)) / self._rate()
+
+    def survival_quantile(self, p):
+        return -ew("log", p) / self._rate()
+
+    # Without memory: beyond `lower` it starts anew, whatever the tail.
+    def log_mass(self, lower, upper):
+        lower = array(ew("maximum", lower, 0.0))
+        width = array(upper) - lower
+        return -self._rate() * lower + ew("log", -array(ew("expm1", -self._rate() * width)))
+
+    def quantile_between(self, p, q, lower, upper):
+        return lower + cut_exponential(p, q, self._rate() * (upper - lower)) / self._rate()
+
+
+class Gamma(_Positive):
+    """Gamma(shape, rate= | scale=)."""
+
+    def __init__(self, shape: Any, *, rate: Any = None, scale: Any = None):
+        self.spread, value = one_of("Gamma", {"rate": rate, "scale": scale})
+        self._set(**{"shape_": shape, self.spread: value})
+        self._require("shape_", 0.0)
+        self._require(self.spread, 0.0)
+
+    def _rate(self) -> ExprArray:
+        s = self.parameters[self.spread]
+        return s if self.spread == "rate" else 1.0 / s
+
+    def log_densities(self, value):
+        a, b, v = self.shape_, self._rate(), array(value)
+        return a * ew("log", b) + (a - 1.0) * ew("log", v) - b * v - ew("gammaln", a)
+
+    def sample(self, draws):
+        return _each(self, lambda i: draws.gamma(self.shape_[i])) / self._rate()
+
+    def mean(self):
+        return self.shape_ / self._rate()
+
+    def variance(self):
+        return self.shape_ / self._rate() ** 2
+
+    def cdf(self, value):
+        return array(ew("gammainc", self.shape_, self._rate() * ew("maximum", value, 0.0)))
+
+    def survival(self, value):
+        return array(ew("gammaincc", self.shape_, self._rate() * ew("maximum", value, 0.0)))
+
+    def quantile(self, p):
+        return array(ew("gammaincinv", self.shape_, p)) / self._rate()
+
+    def survival_quantile(self, p):
+        return array(ew("gammainccinv", self.shape_, p)) / self._rate()
+
+    def weighted(self, power):
+        rising = math.prod((self.shape_ + k for k in range(power)), start=array(1.0))
+        return rising / self._rate() ** power, Gamma(self.shape_ + power, rate=self._rate())
+
+
+class InverseGamma(_Positive):
+    """InverseGamma(shape, scale=): 1 / X for X ~ Gamma(shape, rate=scale)."""
+
+    def __init__(self, shape: Any, *, scale: Any):
+        self._set(shape_=shape, scale=scale)
+        self._require("shape_", 0.0)
+        self._require("scale", 0.0)
+
+    def log_densities(self, value):
+        a, b, v = self.shape_, self.scale, array(value)
+        return a * ew("log", b) - (a + 1.0) * ew("log", v) - b / v - ew("gammaln", a)
+
+    def sample(self, draws):
+        return self.scale / _each(self, lambda i: draws.gamma(self.shape_[i]))
+
+    def mean(self):
+        a = self.shape_
+        return _where(ew("lt", 1.0, a), self.scale / (a - 1.0), INFINITY)
+
+    def variance(self):
+        a = self.shape_
+        finite = self.scale**2 / ((a - 1.0) ** 2 * (a - 2.0))
+        return _where(ew("lt", 2.0, a), finite, _where(ew("lt", 1.0, a), INFINITY, _NAN))
+
+    def cdf(self, value):
+        return array(ew("gammaincc", self.shape_, self.scale / array(ew("maximum", value, 0.0))))
+
+    def survival(self, value):
+        return array(ew("gammainc", self.shape_, self.scale / array(ew("maximum", value, 0.0))))
+
+    def quantile(self, p):
+        return self.scale / array(ew("gammainccinv", self.shape_, p))
+
+    def survival_quantile(self, p):
+        return self.scale / array(ew("gammaincinv", self.shape_, p))
+
+    def has_moment(self, power):
+        return array(ew("lt", float(power), self.shape_))
+
+
+def _lower_end(e: Expr) -> float:
+    """A number as it is; 0, the least that a positive parameter can be, for an expression."""
+    return e.data if e.op == "const" else 0.0
+
+
+def needs_log_gamma(shapes: ExprArray) -> bool:
+    """Whether ratios of gamma draws of these shapes may be 0 / 0."""
+    return min(map(_lower_end, shapes.ravel())) < SMALL_SHAPE
+
+
+def log_gamma_draw(draws: Draws, shape: Expr) -> Expr:
+    """log of a gamma draw of that shape and unit rate: that of shape + 1, times U^(1/shape)."""
+    return apply("log", draws.gamma(shape + 1.0)) + apply("log", draws.uniform()) / shape
+
+
+class Beta(Distribution):
+    """Beta(a, b)."""
+
+    def __init__(self, a: Any, b: Any):
+        self._set(a=a, b=b)
+        self._require("a", 0.0)
+        self._require("b", 0.0)
+
+    def support(self):
+        return Support("interval", self._full(0.0), self._full(1.0))
+
+    def log_densities(self, value):
+        a, b, v = self.a, self.b, array(value)
+        norm = ew("gammaln", a) + ew("gammaln", b) - ew("gammaln", a + b)
+        return (a - 1.0) * ew("log", v) + (b - 1.0) * ew("log1p", -v) - norm
+
+    def sample(self, draws):
+        def draw(i):
+            a, b = self.a[i], self.b[i]
+            if needs_log_gamma(array([a, b])):
+                return 1.0 / (1.0 + ew("exp", log_gamma_draw(draws, b) - log_gamma_draw(draws, a)))
+            first, second = draws.gamma(a), draws.gamma(b)
+            return first / (first + second)
+
+        return _each(self, draw)
+
+    def mean(self):
+        return self.a / (self.a + self.b)
+
+    def variance(self):
+        n = self.a + self.b
+        return self.a * self.b / (n**2 * (n + 1.0))
+
+    def cdf(self, value):
+        clipped = ew("minimum", 1.0, ew("maximum", 0.0, value))
+        return array(ew("betainc", self.a, self.b, clipped))
+
+    def survival(self, value):
+        clipped = array(ew("minimum", 1.0, ew("maximum", 0.0, value)))
+        near_one = ew("betainc", self.b, self.a, 1.0 - clipped)
+        return _where(ew("lt", clipped, 0.5), 1.0 - self.cdf(clipped), near_one)
+
+    def quantile(self, p):
+        return array(ew("betaincinv", self.a, self.b, p))
+
+    def survival_quantile(self, p):
+        p = array(p)
+        near_one = 1.0 - array(ew("betaincinv", self.b, self.a, p))
+        return _where(ew("lt", p, 0.5), near_one, ew("betaincinv", self.a, self.b, 1.0 - p))
+
+    def weighted(self, power):
+        moment = math.prod(
+            ((self.a + k) / (self.a + self.b + k) for k in range(power)), start=array(1.0)
+        )
+        return moment, Beta(self.a + power, self.b)
