@@ -159,7 +159,8 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     start = _split(list(trace.initial.values()))
     same = set(start.gaussian.symbols) == set(move.gaussian.symbols)
     if same:
-        order = [start.gaussian.symbols.index(s) for s in move.gaussian.symbols]
+        place = {s: i for i, s in enumerate(start.gaussian.symbols)}  # no .index: == is symbolic
+        order = [place[s] for s in move.gaussian.symbols]
         start = replace(start, gaussian=_reorder(start.gaussian, order))
         initial_draw, initial_predictive = law(start)
         site = sites[0]
@@ -324,7 +325,7 @@ def _curved(
     full = written_cholesky(array(precision + w))
     last = full[n - 1, n - 1]
     concave = apply("eq", last, last)  # nan where the matrix is not positive definite
-    diagonal = np.diag(array(np.maximum(np.diagonal(w.view(np.ndarray)), 0.0)))
+    diagonal = np.diag(array(np.maximum(array(np.diagonal(w.view(np.ndarray))), 0.0)))
     safe = written_cholesky(array(precision + diagonal))
     return array(np.where(concave, full, safe)), g
 

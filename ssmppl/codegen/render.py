@@ -7,6 +7,7 @@ used, and each statement ends in the user's file and line.
 
 from __future__ import annotations
 
+import builtins
 import keyword
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -48,9 +49,8 @@ MATRIX_CALLS = {"cholesky": "cholesky", "inverse": "inverse", "logdet": "logdet"
 DRAWS = {"normal": "normal", "uniform": "uniform", "gamma": "gamma", "poisson": "poisson",
          "binomial": "binomial"}  # fmt: skip
 RESERVED = frozenset(
-    [*CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values(), *keyword.kwlist, *dir(__builtins__)]
-    + "theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng log_w out "
-    "inf nan reference look trajectory total entry kernel np prev".split()
+    [*CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values(), *keyword.kwlist, *dir(builtins)]
+    + ["theta", "c", "s", "i", "n", "t", "y_data", "seen_data", "u_data", "states", "states_prev", "normals", "uniforms", "rng", "log_w", "out", "inf", "nan", "reference", "look", "trajectory", "total", "entry", "kernel", "np", "prev"]
 )
 MAX_INLINE = 60  # characters; a longer single-use subexpression gets a line of its own
 

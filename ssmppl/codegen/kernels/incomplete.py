@@ -92,9 +92,9 @@ def _gamma_small(a, x):
 @exact
 def gamma_tails(a, x):
     """(P, Q): lower and upper regularised incomplete gamma function, each to full accuracy."""
-    if not (a > 0.0 and x >= 0.0) or a == _INF:
+    if not (a > 0.0 and x >= 0.0) or (a == _INF and x == _INF):
         return np.nan, np.nan
-    if x == 0.0:
+    if x == 0.0 or a == _INF:
         return 0.0, 1.0
     if x == _INF:
         return 1.0, 0.0

@@ -170,22 +170,27 @@ def cholesky(entries, n):
 
 @exact
 def _eliminate(a, b):
-    """Gauss-Jordan with partial pivoting on (a | b) in place; returns det a, 0 if singular."""
-    n, determinant = a.shape[0], 1.0
+    """Gauss-Jordan with partial pivoting on (a | b) in place; returns (sign, log |det a|).
+
+    Where a is singular: (0, -inf), and elimination stops there.
+    """
+    n, sign, log_size = a.shape[0], 1.0, 0.0
     for j in range(n):
         pivot = j
         for i in range(j + 1, n):
             if abs(a[i, j]) > abs(a[pivot, j]):
                 pivot = i
         if not abs(a[pivot, j]) > 0.0:
-            return 0.0 * a[pivot, j]
+            return 0.0 * a[pivot, j], -math.inf + a[pivot, j]
         if pivot != j:
-            determinant = -determinant
+            sign = -sign
             for k in range(n):
                 a[j, k], a[pivot, k] = a[pivot, k], a[j, k]
             for k in range(b.shape[1]):
                 b[j, k], b[pivot, k] = b[pivot, k], b[j, k]
-        determinant *= a[j, j]
+        if a[j, j] < 0.0:
+            sign = -sign
+        log_size += math.log(abs(a[j, j]))
         scale = 1.0 / a[j, j]
         for i in range(n):
             if i != j and a[i, j] != 0.0:
@@ -194,28 +199,32 @@ def _eliminate(a, b):
                     a[i, k] -= factor * a[j, k]
                 for k in range(b.shape[1]):
                     b[i, k] -= factor * b[j, k]
-    return determinant
+    return sign, log_size
 
 
 @exact
 def inverse(entries, n):
     """Inverse; nan where the matrix is singular."""
     a, b = _matrix(entries, n), np.eye(n)
-    determinant = _eliminate(a, b)
+    sign, _ = _eliminate(a, b)
     for i in range(n):
         for j in range(n):
-            b[i, j] = b[i, j] / a[i, i] if determinant != 0.0 else math.nan
+            b[i, j] = b[i, j] / a[i, i] if abs(sign) == 1.0 else math.nan
     return b
 
 
 @exact
 def det(entries, n):
-    """Determinant."""
-    return _eliminate(_matrix(entries, n), np.empty((n, 0)))
+    """Determinant: the product of the pivots, with the sign of their permutation."""
+    a = _matrix(entries, n)
+    sign, _ = _eliminate(a, np.empty((n, 0)))
+    size = abs(sign)
+    for j in range(n):
+        size *= abs(a[j, j])
+    return math.copysign(size, sign)
 
 
 @exact
 def logdet(entries, n):
-    """log |det|; -inf where the matrix is singular."""
-    d = abs(_eliminate(_matrix(entries, n), np.empty((n, 0))))
-    return math.log(d) if d > 0.0 else (-math.inf if d == 0.0 else math.nan)
+    """log |det|, a sum over the pivots, so that no product can underflow; -inf where singular."""
+    return _eliminate(_matrix(entries, n), np.empty((n, 0)))[1]

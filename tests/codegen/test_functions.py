@@ -1,0 +1,180 @@
+"""Every generated function computes what the interpreter computes, for a corpus of models."""
+
+import numpy as np
+import pytest
+
+from ssmppl.analysis.density import Missing, terms
+from ssmppl.analysis.proposals import bootstrap
+from ssmppl.codegen.kits import observation_draws
+from ssmppl.codegen.program import compile_trace
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.language.distributions import Dirac, MvNormal
+from ssmppl.language.trace import trace
+from tests.codegen.harness import (
+    PARTICLES,
+    ROOM,
+    STAND_INS,
+    STEPS,
+    Numbers,
+    noise_of,
+    plain,
+    stand_in,
+)
+from tests.codegen.models import MODELS, build
+
+CASES = [(name, gaps) for name in MODELS for gaps in (False, True)]
+
+
+def missing_of(traced, gaps):
+    partial = {s.name for s in traced.observations.values() if isinstance(s.distribution, MvNormal)}
+    return Missing(False, frozenset(partial)) if gaps else Missing(none=True)
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda c: f"{c[0]}-{'gaps' if c[1] else 'all'}")
+def case(request):
+    name, gaps = request.param
+    traced = trace(build(name))
+    program = compile_trace(traced, missing_of(traced, gaps))
+    return program, Numbers(traced, np.random.default_rng(5), gaps)
+
+
+def close(found, expected, what):
+    expected = np.broadcast_to(expected, np.shape(found))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11, err_msg=what)
+
+
+class Generated:
+    """The functions of one section at one time step."""
+
+    def __init__(self, program, numbers, suffix, t):
+        self.program, self.numbers, self.suffix = program, numbers, suffix
+        self.c, self.s = np.full(ROOM, np.nan), np.full(ROOM, np.nan)
+        self.call("prepare", numbers.theta, self.c)
+        self.call(
+            "step", numbers.theta, self.c, numbers.y, numbers.seen, numbers.u, t, self.s
+        )  # fmt: skip
+
+    def call(self, role, *args):
+        return plain(self.program.entry(f"{role}_{self.suffix}"), **STAND_INS)(*args)
+
+    def pass_(self, role, *args):
+        return self.call(role, self.numbers.theta, self.c, self.s, *args)
+
+
+def check_draw(generated, role, draws, t, rng):
+    """A pass that moves particles against the draws' expressions."""
+    numbers, order = generated.numbers, generated.numbers.traced.state_symbols
+    roots = [draws[s] for s in order]
+    normals, uniforms, noise = noise_of(roots, rng)
+    out = np.full((len(order), PARTICLES), np.nan)
+    before = [] if role == "draw_initial" else [numbers.states[t - 1]]
+    generated.pass_(role, *before, out, normals, uniforms, None)
+    expected = evaluate(roots, {**numbers.values(t), **noise}, stand_in)
+    for k, e in enumerate(expected):
+        close(out[k], e, f"{generated.suffix} {role} {order[k]!r} t={t}")
+
+
+def check_weight(generated, role, weight, t):
+    numbers = generated.numbers
+    log_w = np.full(PARTICLES, np.nan)
+    before = [] if role == "weigh_initial" else [numbers.states[t - 1]]
+    generated.pass_(role, *before, numbers.states[t], log_w)
+    expected = sum(evaluate([w.guarded() for w in weight], numbers.values(t)), 0.0)
+    close(log_w, expected, f"{generated.suffix} {role} t={t}")
+
+
+def test_particle_filters(case):
+    program, numbers = case
+    rng = np.random.default_rng(6)
+    for name, p in program.proposals.items():
+        if isinstance(p, NotApplicable):
+            continue
+        for t in range(STEPS):
+            generated = Generated(program, numbers, name, t)
+            if t == 0:
+                check_draw(generated, "draw_initial", p.initial_draw, t, rng)
+                check_weight(generated, "weigh_initial", p.initial_weight, t)
+                continue
+            check_draw(generated, "draw", p.draw, t, rng)
+            check_weight(generated, "weigh", p.weight, t)
+            if p.look_ahead is not None:
+                log_v = np.full(PARTICLES, np.nan)
+                generated.pass_("look_ahead", numbers.states[t - 1], log_v)
+                expected = evaluate(p.look_ahead, numbers.values(t))
+                close(log_v, expected, f"{name} look_ahead t={t}")
+
+
+def test_simulation_and_prediction(case):
+    program, numbers = case
+    traced, rng = program.trace, np.random.default_rng(7)
+    plain_proposal = bootstrap(traced, program.missing)
+    for t in range(STEPS):
+        generated = Generated(program, numbers, "simulate", t)
+        role, draws = ("draw", plain_proposal.draw) if t else (
+            "draw_initial", plain_proposal.initial_draw)  # fmt: skip
+        check_draw(generated, role, draws, t, rng)
+        roots = observation_draws(traced)
+        normals, uniforms, noise = noise_of(roots, rng)
+        out = np.full((len(roots), PARTICLES), np.nan)
+        generated.pass_("observe", numbers.states[t], out, normals, uniforms, None)
+        for k, e in enumerate(evaluate(roots, {**numbers.values(t), **noise}, stand_in)):
+            close(out[k], e, f"observe {k} t={t}")
+        generated = Generated(program, numbers, "predict", t)
+        check_draw(generated, role, draws, t, rng)
+        moments = np.full((4 * len(roots), PARTICLES), -7.0)
+        generated.pass_("moments", numbers.states[t], moments)
+        assert not (moments == -7.0).any()
+        check_moments(moments, traced, numbers, t)
+
+
+def check_moments(moments, traced, numbers, t):
+    k = 0
+    for site in traced.observations.values():
+        d, n = site.distribution, len(site.components)
+        place = {s: i for i, s in enumerate(site.value.ravel())}
+        first = [place[s] for s in site.components]
+        for row, form in enumerate((d.mean(), d.variance())):
+            flat = np.broadcast_to(np.asarray(form, dtype=object), site.shape).ravel()
+            for j, i in enumerate(first):
+                expected = evaluate(flat[i], numbers.values(t))
+                close(moments[4 * (k + j) + row], expected, f"{site.name} moment {row}")
+        for j in range(n):
+            below, strictly = moments[4 * (k + j) + 2], moments[4 * (k + j) + 3]
+            assert np.all((strictly <= below) | np.isnan(below))
+            if d.discrete:
+                assert np.all((below >= 0) & (below <= 1 + 1e-12))
+        k += n
+
+
+def test_log_joint(case):
+    """The complete-data log density of one particle's trajectory."""
+    program, numbers = case
+    traced = program.trace
+    trajectory = np.ascontiguousarray(numbers.states[:, :, 2])
+    numbers_one = numbers.values
+    total = np.zeros(8)
+    plain(program.entry("log_joint"))(
+        numbers.theta, numbers.y, numbers.seen, numbers.u, trajectory, total
+    )
+
+    def at(t, role):
+        # one particle only: its own past, in place of everybody's
+        values = {
+            s: (v[2] if isinstance(v, np.ndarray) and v.shape == (PARTICLES,) else v)
+            for s, v in numbers_one(t).items()
+        }
+        found = [
+            e
+            for e in terms(traced, role, program.missing)
+            if not isinstance(e.site.distribution, Dirac)
+        ]
+        return sum(evaluate([e.guarded() for e in found], values), 0.0)
+
+    expected = at(0, "initial")
+    expected += sum(at(t, "transition") for t in range(1, STEPS))
+    expected += sum(at(t, "observation") for t in range(STEPS))
+    assert total[0] == pytest.approx(expected, rel=1e-10)
+    if traced.parameters:
+        found = plain(program.entry("log_prior"))(numbers.theta)
+        assert found == pytest.approx(at(0, "prior"), rel=1e-10)
