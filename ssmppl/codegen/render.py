@@ -48,10 +48,12 @@ MATRIX_CALLS = {"cholesky": "cholesky", "inverse": "inverse", "logdet": "logdet"
 # Scalar sources of randomness; normals and uniforms come from buffers filled in bulk.
 DRAWS = {"normal": "normal", "uniform": "uniform", "gamma": "gamma", "poisson": "poisson",
          "binomial": "binomial"}  # fmt: skip
-RESERVED = frozenset(
-    [*CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values(), *keyword.kwlist, *dir(builtins)]
-    + ["theta", "c", "s", "i", "n", "t", "y_data", "seen_data", "u_data", "states", "states_prev", "normals", "uniforms", "rng", "log_w", "out", "inf", "nan", "reference", "look", "trajectory", "total", "entry", "kernel", "np", "prev"]
-)
+_OWN_NAMES = """theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng
+    log_w out inf nan reference look trajectory total entry kernel np prev"""
+RESERVED = frozenset([
+    *CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values(), *keyword.kwlist, *dir(builtins),
+    *_OWN_NAMES.split(),
+])  # fmt: skip
 MAX_INLINE = 60  # characters; a longer single-use subexpression gets a line of its own
 
 
