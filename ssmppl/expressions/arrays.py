@@ -9,7 +9,7 @@ by name, with the nearest that exist.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from ssmppl.expressions.expr import (
     unpack,
     user_location,
 )
+
+
+def _any_operator(self: Any, other: Any) -> Any: ...
 
 
 class ExprArray(np.ndarray):
@@ -48,6 +51,11 @@ class ExprArray(np.ndarray):
             chosen = elementwise("where", apply("eq", first, k), self[(k, *rest)], chosen)
         return chosen
 
+    if TYPE_CHECKING:  # one node where there are no dimensions, else an array
+        __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _any_operator  # type: ignore[assignment]
+        __truediv__ = __rtruediv__ = __pow__ = __rpow__ = __matmul__ = _any_operator  # type: ignore[assignment]
+        __rmatmul__ = __lt__ = __le__ = __gt__ = __ge__ = _any_operator  # type: ignore[assignment]
+
     def __reduce__(self):  # its nodes in one table, shared parts once
         nodes = [as_expr(e) for e in self.view(np.ndarray).ravel()]
         table = pack(nodes)
@@ -55,43 +63,43 @@ class ExprArray(np.ndarray):
         return _unpack_array, (table, [place[n] for n in nodes], self.shape)
 
     # NumPy's methods, which would bypass the protocols, by the functions of the same name.
-    def sum(self, axis=None, **kwargs):
+    def sum(self, axis=None, **kwargs):  # type: ignore[override]
         return _reduce("add", self, axis, **kwargs)
 
-    def prod(self, axis=None, **kwargs):
+    def prod(self, axis=None, **kwargs):  # type: ignore[override]
         return _reduce("mul", self, axis, **kwargs)
 
-    def mean(self, axis=None, **kwargs):
+    def mean(self, axis=None, **kwargs):  # type: ignore[override]
         return _mean(self, axis, **kwargs)
 
-    def var(self, axis=None, ddof=0, **kwargs):
+    def var(self, axis=None, ddof=0, **kwargs):  # type: ignore[override]
         return _var(self, axis, ddof, **kwargs)
 
-    def std(self, axis=None, ddof=0, **kwargs):
+    def std(self, axis=None, ddof=0, **kwargs):  # type: ignore[override]
         return elementwise("sqrt", _var(self, axis, ddof, **kwargs))
 
-    def max(self, axis=None, **kwargs):
+    def max(self, axis=None, **kwargs):  # type: ignore[override]
         return _reduce("maximum", self, axis, **kwargs)
 
-    def min(self, axis=None, **kwargs):
+    def min(self, axis=None, **kwargs):  # type: ignore[override]
         return _reduce("minimum", self, axis, **kwargs)
 
-    def dot(self, other):
+    def dot(self, other):  # type: ignore[override]
         return _dot(self, other)
 
-    def clip(self, lower=None, upper=None):
+    def clip(self, lower=None, upper=None):  # type: ignore[override]
         return _clip(self, lower, upper)
 
-    def trace(self):
+    def trace(self):  # type: ignore[override]
         return _trace(self)
 
-    def cumsum(self, axis=None):
+    def cumsum(self, axis=None):  # type: ignore[override]
         return _cumsum(self, axis)
 
 
 def _unpack_array(table: list, places: list[int], shape: tuple[int, ...]) -> ExprArray:
     nodes = unpack(table)
-    return array([nodes[i] for i in places]).reshape(shape)
+    return array(array([nodes[i] for i in places]).reshape(shape))
 
 
 def array(values: Any) -> ExprArray:
@@ -167,7 +175,7 @@ _DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "wher
 }  # fmt: skip
 
 
-def apply_ufunc(ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
+def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
     """A NumPy ufunc on symbols: called, reduced (np.add.reduce) or as an outer product."""
     name = ufunc.__name__
     if any(v is not None for k, v in kwargs.items() if k in ("out", "where")):
@@ -197,7 +205,7 @@ def apply_ufunc(ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
     return elementwise(op, *inputs)
 
 
-def _refuse(what: str, fix: str) -> None:
+def _refuse(what: str, fix: str) -> NoReturn:
     raise UnsupportedOperation(f"{what} has no meaning on symbols", fix=fix, where=user_location())
 
 
@@ -295,7 +303,7 @@ def _matrix(op: str, a: Any) -> ExprArray:
                   for i in range(n)])  # fmt: skip
 
 
-def _is_diagonal(a: np.ndarray) -> bool:
+def _is_diagonal(a: Any) -> bool:
     return all(
         a[i] == 0 if not isinstance(a[i], Expr) else a[i].op == "const" and a[i].data == 0
         for i in np.ndindex(a.shape)

@@ -136,7 +136,8 @@ def _is_zero(node: Expr) -> bool:
 
 def _entries(node: Expr, tangent: dict[Expr, Expr]) -> ExprArray:
     zero = constant(0.0)
-    return array([tangent.get(a, zero) for a in node.args]).reshape(node.data, node.data)
+    flat = array([tangent.get(a, zero) for a in node.args])
+    return array(flat.reshape(node.data, node.data))
 
 
 def _inverse_of(node: Expr) -> ExprArray:
@@ -150,7 +151,7 @@ def _matrix_tangent(node: Expr, tangent: dict[Expr, Expr]) -> ExprArray:
         x = array(item)
         return -(x @ d @ x)
     # d L = L Phi(L^-1 dA L^-T), Phi: lower half with halved diagonal; dA symmetric from its lower
-    lower = array(np.where(np.tri(n, dtype=bool), item, constant(0.0)))
+    lower = array(np.tril(array(item)))
     symmetric = array(np.tril(d) + np.tril(d, -1).T)
     inv = lower_inverse(lower)
     middle = inv @ symmetric @ inv.T

@@ -272,11 +272,11 @@ def as_expr(value: Any) -> Expr:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         return as_expr(value.item())
     if isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating)):
-        return constant(value)
+        return constant(float(value))
     raise TypeError(f"no expression can be made of {value!r} of type {type(value).__name__}")
 
 
-def _binary(op: str, a: Any, b: Any):
+def _binary(op: str, a: Any, b: Any) -> Any:
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return NotImplemented
     try:
@@ -391,7 +391,7 @@ def _simplify_where(c, a, b):
     return a if a is b else None
 
 
-_SIMPLIFY = {
+_SIMPLIFY: dict[str, Callable[..., Expr | None]] = {
     "add": _simplify_add,
     "sub": _simplify_sub,
     "mul": _simplify_mul,
@@ -402,7 +402,7 @@ _SIMPLIFY = {
     "where": _simplify_where,
 }
 # Constants are folded with NumPy's arithmetic, which is the meaning of these operations.
-_FOLD = {
+_FOLD: dict[str, Callable[..., Any]] = {
     **{name: getattr(np, name) for name in UNARY if hasattr(np, name)},
     "neg": operator.neg, "abs": abs, "add": operator.add, "sub": operator.sub,
     "mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod,
@@ -448,7 +448,7 @@ def topological(roots: Iterable[Expr]) -> list[Expr]:
 def pack(roots: Iterable[Expr]) -> list[tuple[str, tuple[int, ...], Any]]:
     """Every node under `roots` as (operation, places of its arguments in this list, data)."""
     place: dict[Expr, int] = {}
-    table = []
+    table: list[tuple[str, tuple[int, ...], Any]] = []
     for node in topological(roots):
         place[node] = len(table)
         table.append((node.op, tuple(place[a] for a in node.args), node.data))

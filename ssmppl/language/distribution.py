@@ -279,10 +279,11 @@ class Distribution:
         if support.kind not in ("interval", "integers"):
             return density
         out = np.empty(density.shape, dtype=object)
-        lower, upper, v = (
+        wide: list[Any] = [
             np.broadcast_to(array(a).view(np.ndarray), density.shape)
             for a in (support.lower, support.upper, value)
-        )
+        ]
+        lower, upper, v = wide
         for i in np.ndindex(density.shape):
             inside = constant(1.0)
             if not (lower[i].op == "const" and lower[i].data == -INFINITY):

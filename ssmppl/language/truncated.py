@@ -28,6 +28,7 @@ class Truncated(Distribution):
 
     closed = True
     by_name = "bounds"
+    base: Distribution
 
     def __init__(self, dist: Distribution, *, lower: Any = None, upper: Any = None):
         if not isinstance(dist, Distribution) or dist.joint or isinstance(dist, (Dirac, Flat)):
@@ -176,7 +177,9 @@ class Truncated(Distribution):
         """From the laws with density x f(x) and x^2 f(x): `Distribution.weighted`."""
         mass, moments = self.base.log_mass(lower, upper), []
         for power in (1, 2):
-            factor, law = self.base.weighted(power)
+            weighted = self.base.weighted(power)
+            assert weighted is not None
+            factor, law = weighted
             shift = float(power) if self.discrete else 0.0
             moments.append(factor * ew("exp", law.log_mass(lower - shift, upper - shift) - mass))
         mean, second = moments
