@@ -1,3 +1,88 @@
-"""A probabilistic-programming language for state space models."""
+"""A probabilistic-programming language for state space models.
+
+Declare priors, initial law, transition and observation as decorated functions of a `Model`; the
+verbs below derive and compile the rest.
+"""
+
+from ssmppl.errors import ArgumentError, DataError, ModelError, SamplingError, SSMError
+from ssmppl.inference.explain import compile, explain
+from ssmppl.inference.filters import kalman_filter, particle_filter
+from ssmppl.inference.likelihood import log_likelihood
+from ssmppl.inference.methods import PGAS, PMMH
+from ssmppl.inference.sample import sample
+from ssmppl.inference.simulation import simulate
+from ssmppl.language.distributions import (
+    Bernoulli,
+    Beta,
+    Binomial,
+    Categorical,
+    Cauchy,
+    Dirac,
+    Dirichlet,
+    Exponential,
+    Flat,
+    Gamma,
+    HalfCauchy,
+    HalfFlat,
+    HalfNormal,
+    InverseGamma,
+    InverseWishart,
+    Laplace,
+    LogNormal,
+    MvNormal,
+    NegativeBinomial,
+    Normal,
+    Poisson,
+    StudentT,
+    Truncated,
+    Uniform,
+    Wishart,
+)
+from ssmppl.language.model import Model
+from ssmppl.results import summary
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "PGAS",
+    "PMMH",
+    "ArgumentError",
+    "Bernoulli",
+    "Beta",
+    "Binomial",
+    "Categorical",
+    "Cauchy",
+    "DataError",
+    "Dirac",
+    "Dirichlet",
+    "Exponential",
+    "Flat",
+    "Gamma",
+    "HalfCauchy",
+    "HalfFlat",
+    "HalfNormal",
+    "InverseGamma",
+    "InverseWishart",
+    "Laplace",
+    "LogNormal",
+    "Model",
+    "ModelError",
+    "MvNormal",
+    "NegativeBinomial",
+    "Normal",
+    "Poisson",
+    "SSMError",
+    "SamplingError",
+    "StudentT",
+    "Truncated",
+    "Uniform",
+    "Wishart",
+    "compile",
+    "explain",
+    "kalman_filter",
+    "log_likelihood",
+    "particle_filter",
+    "sample",
+    "simulate",
+    "summary",
+]

@@ -15,11 +15,19 @@ from ssmppl.analysis.families import (
     Wishart,
 )
 from ssmppl.analysis.sufficient import BlockForm
-from ssmppl.expressions.algebra import Separation, separate
-from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_of, to_text
+from ssmppl.expressions.algebra import Separation, separate, split_constant
+from ssmppl.expressions.expr import (
+    Expr,
+    constant,
+    substitute,
+    symbol,
+    symbols_of,
+    to_text,
+    topological,
+)
 
 MAX_LENGTH = 100
-MAX_STATISTICS = 40
+MAX_STATISTICS = 12
 
 
 @dataclass(frozen=True)
@@ -62,46 +70,129 @@ def _sum(parts: list[str]) -> str:
 
 
 def _part(role: str, coefficient: Expr) -> list[str]:
-    """A summand of a statistic as text; none where it is zero."""
-    if coefficient.op == "const" and coefficient.data == 0.0:
+    """The summands of a statistic as text; none where it is zero."""
+    number, core = split_constant(coefficient)
+    if core.op in ("add", "sub") and (role == "prior" or _measured(core.args[0])):
+        sign = -1.0 if core.op == "sub" else 1.0
+        parts = [constant(number) * core.args[0], constant(sign * number) * core.args[1]]
+        return [text for e in parts for text in _part(role, e)]
+    measured = _measured(core) if role == "observation" else None
+    if measured is not None:
+        names, inner = measured
+        more, core = split_constant(inner)
+        number *= more
+        index, count = f"{{t: {names} measured}}", f"#{{t: {names} measured}}"
+    else:
+        index = {"transition": "{t=2}^T", "observation": "{t=1}^T"}.get(role, "")
+        count = {"transition": "(T - 1)", "observation": "T"}.get(role, "")
+    if number == 0.0:
         return []
-    count = {"transition": "(T - 1)", "observation": "T"}.get(role)
-    if coefficient.op == "const":
-        value = coefficient.data
-        return [f"{value:.6g}" if count is None else _times(value, count)]
-    number, text = tidy(coefficient)
+    if core.op == "const":
+        return [_times(number, count) if count else f"{number:.6g}"]
+    condition = _indicator(core)
+    if condition is not None:
+        text = f"1{{{', '.join(condition)}}}"
+    else:
+        factor, text = tidy(core)
+        number *= factor
+        if index or role == "initial" or " + " in text or " - " in text:
+            text = f"[{text}]"
     if role == "initial":
-        text = f"[{text}]_1"
-    elif count is not None:
-        text = f"sum_{'{t=2}^T' if role == 'transition' else '{t=1}^T'} [{text}]"
+        text = f"{text}_1"
+    elif index:
+        text = f"sum_{index} {text}"
     return [_times(number, text)]
+
+
+def _measured(core: Expr) -> tuple[str, Expr] | None:
+    """(components, a) of a summand where(measured, a, 0)."""
+    if core.op != "where" or not _is_number(core.args[2], 0.0):
+        return None
+    symbols = symbols_of(core.args[0])
+    if {s.data[0] for s in symbols} != {"seen"}:
+        return None
+    return ", ".join(sorted(map(to_text, symbols))), core.args[1]
+
+
+def _indicator(core: Expr) -> list[str] | None:
+    """The conditions under which this is 1, else 0."""
+    if core.op != "where":
+        return None
+    condition, a, b = core.args
+    if _is_number(b, 0.0):
+        inner = [] if _is_number(a, 1.0) else _indicator(a)
+        return None if inner is None else [to_text(condition), *inner]
+    if _is_number(a, 0.0) and condition.op == "eq":
+        inner = [] if _is_number(b, 1.0) else _indicator(b)
+        opposite = Expr("ne", condition.args)
+        return None if inner is None else [to_text(opposite), *inner]
+    return None
+
+
+def _is_number(e: Expr, value: float) -> bool:
+    return e.op == "const" and e.data == value
+
+
+_ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
 
 
 def tidy(coefficient: Expr) -> tuple[float, str]:
     """A coefficient as number times text, a polynomial in its lowest terms.
 
-    For reading only: what is computed stays as it was written, which rounds better.
+    For reading only: what is computed stays as it was written, which rounds better. Functions are
+    taken for symbols, named by their text.
     """
-    symbols = symbols_of(coefficient)
-    form = separate(coefficient, symbols)
+    while coefficient.op == "where" and _vanishes_anyway(coefficient):
+        coefficient = coefficient.args[2]
+    opaque = {
+        n: symbol("parameter", to_text(n))
+        for n in topological([coefficient])
+        if n.op not in _ARITHMETIC and not _whole_power(n)
+    }
+    (plain,) = substitute([coefficient], opaque)
+    form = separate(plain, symbols_of(plain))
+    number, core = split_constant(coefficient)
+    written = (number, to_text(core))
     if isinstance(form, Separation) and 0 < len(form.terms) <= 4:
-        whole = all(
-            atom.op == "symbol" and e == int(e) and e > 0 for m in form.terms for atom, e in m
-        )
-        if whole:
-            pairs = form.items()
-            numbers = [c.data for _, c in pairs if c.op == "const"]
-            if len(numbers) == len(pairs):
-                scale = numbers[0] if all(abs(n) == abs(numbers[0]) for n in numbers) else 1.0
-                total = constant(0.0)
-                for (function, _), n in zip(pairs, numbers, strict=True):
-                    total = total + constant(n / scale) * function
+        pairs = form.items()
+        if all(c.op == "const" for _, c in pairs) and all(e == int(e) for _, e in _atoms(form)):
+            numbers = [c.data for _, c in pairs]
+            scale = numbers[0] if all(abs(n) == abs(numbers[0]) for n in numbers) else 1.0
+            total = constant(0.0)
+            for (function, _), n in zip(pairs, numbers, strict=True):
+                total = total + constant(n / scale) * function
+            if _sums(total) <= _sums(core):  # (y - x)**2 rather than its three terms
                 return scale, shorten(to_text(total))
-    if coefficient.op == "mul" and coefficient.args[0].op == "const":
-        return coefficient.args[0].data, shorten(to_text(coefficient.args[1]))
-    if coefficient.op == "neg":
-        return -1.0, shorten(to_text(coefficient.args[0]))
-    return 1.0, shorten(to_text(coefficient))
+    return number, shorten(written[1])
+
+
+def _sums(e: Expr) -> int:
+    """How many sums are written in an expression."""
+    total = dict.fromkeys(topological([e]), 0)
+    for n in topological([e]):
+        total[n] = sum(total[a] for a in n.args) + (n.op in ("add", "sub"))
+    return total[e]
+
+
+def _vanishes_anyway(node: Expr) -> bool:
+    """where(a == 0, 0, a), which is a."""
+    condition, zero, value = node.args
+    return (
+        _is_number(zero, 0.0)
+        and condition.op == "eq"
+        and condition.args[0] is value
+        and _is_number(condition.args[1], 0.0)
+    )
+
+
+def _whole_power(node: Expr) -> bool:
+    if node.op == "div":
+        return node.args[1].op in ("const", "symbol")
+    return node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0
+
+
+def _atoms(form: Separation) -> list[tuple[Expr, float]]:
+    return [pair for m in form.terms for pair in m]
 
 
 def shorten(text: str, length: int = MAX_LENGTH) -> str:
@@ -173,11 +264,10 @@ def conditional(family: Family, form: BlockForm) -> str:
 
 
 def _variate(name: str, power: float) -> str:
-    if power == 1.0:
-        return f"{name} ~ Gamma"
-    if power == -1.0:
-        return f"{name} ~ inverse Gamma (1/{name} ~ Gamma)"
-    return f"{name}**{power:g} ~ Gamma"
+    base = name if abs(power) == 1.0 else f"{name}**{abs(power):g}"
+    if power > 0.0:
+        return f"{base} ~ Gamma"
+    return f"{base} ~ inverse Gamma"
 
 
 def _linear(form: BlockForm, i: int, factor: float, plus: float) -> str:

@@ -43,9 +43,10 @@ class Gamma:
 
     @property
     def name(self) -> str:
-        return {1.0: "Gamma", -1.0: "inverse Gamma"}.get(
-            self.power, f"Gamma of the power {self.power:g}"
-        )
+        law = "Gamma" if self.power > 0 else "inverse Gamma"
+        size = abs(self.power)
+        suffix = {1.0: "", 2.0: " of the square"}.get(size, f" of the power {size:g}")
+        return law + suffix
 
     @property
     def used(self) -> frozenset[int]:

@@ -26,7 +26,7 @@ from ssmppl.analysis.families import Beta, Gamma, Normal, NormalGamma, Values
 from ssmppl.analysis.pythontext import DOMAIN, python_function, python_sum
 from ssmppl.analysis.slices import sweep_matrix, sweep_real, sweep_simplex
 from ssmppl.errors import SamplingError
-from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.expressions.expr import Expr, symbols_of, to_text
 
 if TYPE_CHECKING:
     from ssmppl.analysis.update import Update
@@ -192,6 +192,15 @@ class Sampler:
                 return self.log_density(v, c)
 
         values = current.tolist()
+        if not at(values) > -math.inf:
+            named = ", ".join(
+                f"{to_text(s)} = {x:.6g}" for s, x in zip(update.components, values, strict=True)
+            )
+            raise SamplingError(
+                f"the conditional density is zero at the current value: {named}",
+                fix="start inside the support; given these states no value near is possible",
+                where=update.where,
+            )
         if update.kind == "simplex":
             new = sweep_simplex(at, values, rng)
         elif update.kind == "matrix":
@@ -241,6 +250,15 @@ def _inside(v: Sequence[float], limits: Sequence[tuple[float, float]]) -> bool:
 def _constant_bounds(bounds: tuple[Expr, Expr]) -> tuple[float, float] | None:
     low, high = bounds
     return (low.data, high.data) if low.op == high.op == "const" else None
+
+
+def _enclosing(bounds: tuple[Expr, Expr]) -> tuple[float, float]:
+    """The bounds that are numbers; infinite where one depends on other parameters."""
+    low, high = bounds
+    return (
+        low.data if low.op == "const" else -math.inf,
+        high.data if high.op == "const" else math.inf,
+    )
 
 
 def _open_bounds(bounds: tuple[Expr, Expr]) -> tuple[list[Expr], Callable]:

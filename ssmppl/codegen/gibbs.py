@@ -26,7 +26,7 @@ def compile_updates(trace: Trace, updates: Sequence[Update]) -> ModuleType:
         if not update.functions or update.needs_log_joint:
             continue
         parts = {
-            role: summands for role, summands in update.coefficients.items() if any(
+            role: summands for role, summands in update.coefficients.items() if role != "prior" and any(
                 not (e.op == "const" and e.data == 0.0) for e in summands
             )
         }  # fmt: skip

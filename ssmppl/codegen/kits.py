@@ -9,11 +9,13 @@ import numpy as np
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import deterministic
-from ssmppl.codegen.module import Layout, Section, Target, time_sum
+from ssmppl.codegen.module import Layout, Section, Target, scalar_function, time_sum
+from ssmppl.codegen.render import Names, Writer
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace
+from ssmppl.language.transforms import transforms
 
 DRAW_INITIAL = "theta, c, s, states, normals, uniforms, rng"
 DRAW = "theta, c, s, states_prev, states, normals, uniforms, rng"
@@ -169,3 +171,32 @@ def log_joint_function(trace: Trace, layout: Layout, missing: Missing) -> str:
         ]
     doc = "log p(x, y | theta); deterministic components of x are set on the way."
     return time_sum(layout, "log_joint", doc, parts, 1, fixed)
+
+
+def parameter_functions(trace: Trace, layout: Layout) -> str:
+    """`constrain(z, free, theta)` and `log_prior(theta)`."""
+    names = Names(["z", "free", "log_jacobian", "total"])
+    known = {s: f"theta[{i}]" for i, s in enumerate(trace.parameter_symbols)}
+    lines = [
+        "@entry\ndef constrain(z, free, theta):",
+        '    """Write the free parameters into theta from the unconstrained z; log Jacobian."""',
+        "    log_jacobian = 0.0",
+    ]
+    at = 0
+    for k, t in enumerate(transforms(trace)):
+        own = known | {s: f"z[{at + i}]" for i, s in enumerate(t.free)}
+        at += len(t.free)
+        writer = Writer(own, names, trace.locations, " " * 8)
+        targets = [(known[c], v) for c, v in zip(t.components, t.values, strict=True)]
+        writer.assign([("log_jacobian", t.log_jacobian)], "+=")
+        writer.assign(targets)
+        lines += [f"    if free[{k}]:  # {t.site.name}", *writer.lines]
+    lines += ["    return log_jacobian", ""]
+    total = constant(0.0)
+    for t in terms(trace, "prior"):
+        total = total + t.log_density
+    prior = scalar_function(
+        layout, "log_prior", "theta", "Log prior density; -inf outside the support.",
+        [("total", total)], returns="total",
+    )  # fmt: skip
+    return "\n".join(lines) + "\n\n" + prior.replace("@exact", "@entry", 1)

@@ -26,6 +26,7 @@ from ssmppl.codegen.kits import (
     conditional_passes,
     filter_kit,
     log_joint_function,
+    parameter_functions,
     prediction_kit,
     simulation_kit,
 )
@@ -47,6 +48,9 @@ class Program:
     proposals: dict[str, Proposal | NotApplicable]
     text: str
     module: ModuleType = field(repr=False)
+
+    def __reduce__(self):  # another process generates the module again, or finds it in its cache
+        return compile_trace, (self.trace, self.missing)
 
     def source(self) -> str:
         """The generated Python module, commented with the user's lines."""
@@ -99,6 +103,8 @@ def _write(
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
     out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
+    if trace.parameters:
+        out.add_function("parameters", parameter_functions(trace, layout))
     return out.finish(_introduction(trace, proposals))
 
 

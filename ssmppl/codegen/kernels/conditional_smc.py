@@ -162,7 +162,7 @@ def conditional_smc(
 @exact
 def filtered_path(
     prepare, step, draw_initial, weigh_initial, draw, weigh, look_ahead, sizes, ahead,
-    theta, y, seen, u, particles, rng, trajectory,
+    theta, y, seen, u, particles, rng, trajectory, log_increment,
 ):  # fmt: skip
     """A particle filter that keeps one ancestral path; returns (status, t, log Z).
 
@@ -176,7 +176,7 @@ def filtered_path(
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     log_v, log_base, w, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     ancestors = np.empty(n + PADDING, dtype=np.int32)
-    log_z = 0.0
+    log_increment[:] = 0.0
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
@@ -208,13 +208,13 @@ def filtered_path(
         if t > 0 and ahead != NO_LOOK_AHEAD:
             second_stage(w, p, ancestors, log_base)
             add(log_v, log_base)
-            log_z += math.log(n)  # the second-stage weights hold 1 / N already
+            log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
         log_sum, _, status = normalise(log_v, w)
         if status == NAN and not any_finite(log_v):
             status = ALL_ZERO
         if status != OK:
             return status, t, -np.inf
-        log_z += log_sum - math.log(n)
+        log_increment[t] += log_sum - math.log(n)
     k = draw_index(w, uniform(rng))
     for back in range(n_steps):
         t = n_steps - 1 - back
@@ -222,4 +222,4 @@ def filtered_path(
             trajectory[t, m] = history[t, m, k]
         if t > 0:
             k = ancestry[t, k]
-    return OK, n_steps, log_z
+    return OK, n_steps, log_increment.sum()

@@ -1,0 +1,167 @@
+"""The verbs `explain` and `compile`: what was derived from a model, and why."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from typing import Any
+
+from ssmppl.analysis.conjugacy import Update, derive_updates
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
+from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.data import bind
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.problem import missing_of
+from ssmppl.language.model import Model
+from ssmppl.language.trace import Site, Trace, trace
+
+PROPOSAL_TITLES = {"user": "yours", "guided": "guided", "auxiliary": "auxiliary"}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that was derived from a model; `print` it, or show it in a notebook.
+
+    structure : the model as a linear Gaussian one, or why it is not.
+    proposals : by name, how particles move, or why that could not be derived.
+    updates : the Gibbs updates of the parameters, in the order in which they are made.
+    memory : see `structure.deterministic_memory`.
+    """
+
+    trace: Trace
+    structure: LinearGaussian | NotApplicable
+    proposals: dict[str, Proposal | NotApplicable]
+    updates: tuple[Update, ...]
+    memory: int | None
+    data: str = ""
+
+    def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
+        """(title, rows of (what, how)) for each part of the plan."""
+        t = self.trace
+        laws = [(s.name, f"~ {s.distribution!r}") for s in t.parameters.values()]
+        model = [
+            *((f"{_label(s)}", f"~ {s.distribution!r}") for s in t.initial.values()),
+            *((f"{_label(s)}", f"~ {s.distribution!r}") for s in t.transition.values()),
+            *((f"{_label(s)}", f"~ {s.distribution!r}") for s in t.observations.values()),
+        ]
+        out = [("Priors", laws), ("Laws", model)]
+        if t.inputs:
+            out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
+                                   for n, s in t.inputs.items()]))  # fmt: skip
+        if self.data:
+            out.append(("Data", [("bound", self.data)]))
+        out.append(("Structure", self._structure()))
+        out.append(("Particle filter", [self._proposal(n, p) for n, p in self.proposals.items()]))
+        out.append(("Trajectories", [("PGAS", self._trajectories())]))
+        if self.updates:
+            out.append(("Parameters given the states", [_update(u) for u in self.updates]))
+        return [(title, rows) for title, rows in out if rows]
+
+    def _structure(self) -> list[tuple[str, str]]:
+        if isinstance(self.structure, NotApplicable):
+            return [("nonlinear", f"not linear Gaussian: {self.structure}")]
+        return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
+                 "used only where they are asked for")]  # fmt: skip
+
+    def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
+        if isinstance(proposal, NotApplicable):
+            return name, f"not derived: {proposal}"
+        return name, proposal.explanation
+
+    def _trajectories(self) -> str:
+        if self.memory is None:
+            return (
+                "conditional SMC without ancestor sampling: a deterministic component never "
+                "forgets its past, so a path cannot be joined to another ancestor; take more "
+                "particles, or PMMH"
+            )
+        if self.memory == 0:
+            return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
+        return (
+            "conditional SMC with ancestor sampling, over the noisy components: deterministic "
+            f"ones forget their past in {self.memory} step{'s' * (self.memory > 1)}, whose "
+            "densities enter the ancestor weights"
+        )
+
+    def __str__(self) -> str:
+        lines = [f"{self.trace.name}", "=" * len(self.trace.name)]
+        for title, rows in self.sections():
+            lines += ["", title, "-" * len(title)]
+            width = max(len(what) for what, _ in rows)
+            for what, how in rows:
+                first, *rest = how.split("\n")
+                lines.append(f"{what:<{width}}  {first}".rstrip())
+                lines += [f"{'':<{width}}  {line}".rstrip() for line in rest]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        parts = [f"<h4>{html.escape(self.trace.name)}</h4>"]
+        for title, rows in self.sections():
+            cells = "".join(
+                f"<tr><td style='text-align:left;vertical-align:top'><code>{html.escape(a)}</code>"
+                f"</td><td style='text-align:left;white-space:pre-wrap'>{html.escape(b)}</td></tr>"
+                for a, b in rows
+            )
+            parts.append(f"<b>{html.escape(title)}</b><table>{cells}</table>")
+        return "".join(parts)
+
+
+def _label(site: Site) -> str:
+    return site.name
+
+
+def _update(update: Update) -> tuple[str, str]:
+    title, _, law = str(update.explanation).partition(": ")
+    return title, law
+
+
+def explain(model: Model, data: Any = None) -> Plan:
+    """What is derived from the model, and why: structure, proposals, one update per parameter.
+
+    Parameters
+    ----------
+    data : checks that they fit, and takes account of what is missing in them.
+
+    Returns
+    -------
+    Plan : `print` it; it renders as tables in a notebook.
+
+    Raises
+    ------
+    ModelError, DataError : what is wrong, where, and the fix.
+    """
+    traced = trace(model)
+    missing, bound = Missing(none=True), ""
+    if data is not None:
+        experiments = bind(traced, data)
+        missing = missing_of(experiments)
+        gaps = sum(int((e.seen == 0).sum()) for e in experiments)
+        bound = ", ".join(f"{e.steps} rows" for e in experiments)
+        bound += f", {gaps} missing" if gaps else ", none missing"
+    program = compile_trace(traced, missing)
+    return Plan(
+        traced,
+        linear_gaussian(traced),
+        program.proposals,
+        tuple(derive_updates(traced, (), missing)),
+        deterministic_memory(traced),
+        bound,
+    )
+
+
+def compile(model: Model, data: Any = None) -> Program:
+    """The generated program: `.source()` is its text, `.path` its file.
+
+    With data, the variant that deals with what is missing in them; else the one for complete data.
+
+    Raises
+    ------
+    ModelError, DataError : what is wrong, where, and the fix.
+    """
+    traced = trace(model)
+    missing = Missing(none=True) if data is None else missing_of(bind(traced, data))
+    return compile_trace(traced, missing)

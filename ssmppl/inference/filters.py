@@ -1,0 +1,193 @@
+"""The verbs `particle_filter` and `kalman_filter`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
+from ssmppl.errors import ArgumentError
+from ssmppl.inference import kalman
+from ssmppl.inference.filtering import FilterRun, check_count, full_run, random_state
+from ssmppl.inference.likelihood import settle
+from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.proposal_choice import choose
+from ssmppl.inference.runner import run_tasks
+from ssmppl.language.model import Model
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def particle_filter(
+    model: Model,
+    data: Any,
+    parameters: Mapping[str, Any],
+    *,
+    particles: int = 1000,
+    repeats: int = 1,
+    proposal: str = "auto",
+    resampling: str = "systematic",
+    ess_threshold: float = 1.0,
+    quantiles: tuple[float, ...] = LEVELS,
+    seed: int | None = None,
+    executor: Executor | None = None,
+) -> xr.Dataset | list[xr.Dataset]:
+    """Run the particle filter and tell what it found; arguments as in `log_likelihood`.
+
+    Returns
+    -------
+    Dataset with dims `draw` (one per repeat) and `time`; a list of them for several experiments:
+
+    ====================  ==========================================================
+    <state>               filter means E[x_t | y_1:t], (draw, time, ...)
+    <state>_sd            filter standard deviations
+    covariance            of the stacked state components, (draw, time, state, state_)
+    <state>_quantile      filter quantiles, last dim `quantile`
+    <y>_predicted, _predicted_sd    moments of y_t given y_1:t-1
+    <y>_pit               P(Y_t <= y_t | y_1:t-1), randomised for discrete channels; NaN where
+                          missing or undefined
+    ess                   effective sample size (Kong, Liu and Wong 1994)
+    log_likelihood_increment        log p(y_t | y_1:t-1)
+    ====================  ==========================================================
+
+    Raises
+    ------
+    SamplingError : all weights vanish at some step; names the step, the row and the parameters.
+    """
+    problem = pose(model, data)
+    theta = check_parameters(problem.trace, parameters)
+    check_count("repeats", repeats, 1)
+    if proposal == "auto":
+        proposal = choose(problem, theta, kalman=False).name
+    settings = settle(problem, theta, particles, proposal, resampling, ess_threshold)
+    if settings.proposal == "kalman":
+        raise ArgumentError(
+            'particle_filter with proposal="kalman"', fix="call ssm.kalman_filter instead"
+        )
+    levels = _levels(quantiles)
+    root = np.random.SeedSequence(seed)
+
+    def one(repeat: int) -> list[FilterRun]:
+        return [
+            full_run(problem, e, theta, settings, random_state(root, repeat, i), levels)
+            for i, e in enumerate(problem.experiments)
+        ]
+
+    runs = run_tasks(one, list(range(repeats)), executor=executor)
+    attrs = {
+        "model": problem.trace.name, "particles": particles, "proposal": settings.proposal,
+        "resampling": resampling, "ess_threshold": ess_threshold, "seed": str(root.entropy),
+    }  # fmt: skip
+    datasets = [
+        _dataset(problem, e, [run[i] for run in runs], levels, attrs, root)
+        for i, e in enumerate(problem.experiments)
+    ]
+    return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _dataset(
+    problem: Problem, experiment: Experiment, runs: list[FilterRun], levels: np.ndarray,
+    attrs: dict[str, Any], root: np.random.SeedSequence,
+) -> xr.Dataset:  # fmt: skip
+    trace = problem.trace
+    mean = np.stack([r.mean for r in runs])
+    covariance = np.stack([r.covariance for r in runs])
+    variables: dict[str, np.ndarray] = dict(unpack_states(trace, mean))
+    sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
+    variables |= {f"{n}_sd": v for n, v in unpack_states(trace, sd).items()}
+    variables["covariance"] = covariance
+    dims = {"covariance": ["time", "state", "state_"]}
+    coords: dict[str, Any] = {"state": [repr(s) for s in trace.state_symbols]}
+    coords["state_"] = coords["state"]
+    if len(levels):
+        spread = np.moveaxis(np.stack([r.quantiles for r in runs]), 2, 0)
+        by_name = [unpack_states(trace, q) for q in spread]
+        for name in by_name[0]:
+            variables[f"{name}_quantile"] = np.stack([q[name] for q in by_name], axis=-1)
+            own = [f"{name}_dim_{i}" for i in range(by_name[0][name].ndim - 2)]
+            dims[f"{name}_quantile"] = ["time", *own, "quantile"]
+        coords["quantile"] = levels
+    prediction = np.stack([r.prediction for r in runs])
+    variables |= _predictions(problem, experiment, prediction, root)
+    variables["ess"] = np.stack([r.ess for r in runs])
+    variables["log_likelihood_increment"] = np.stack([r.log_increments for r in runs])
+    return to_dataset(variables, time=experiment.time, dims=dims, coords=coords, attrs=attrs)
+
+
+def _predictions(
+    problem: Problem, experiment: Experiment, prediction: np.ndarray, root: np.random.SeedSequence
+) -> dict[str, np.ndarray]:
+    """Predictive moments and PIT values by channel, from (draw, T, 4, K)."""
+    trace = problem.trace
+    rng = np.random.default_rng(
+        np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 2**31))
+    )
+    below, strictly = prediction[:, :, 2], prediction[:, :, 3]
+    # randomised PIT (Czado, Gneiting and Held 2009): uniform between P(Y < y) and P(Y <= y)
+    pit = strictly + rng.uniform(size=below.shape) * (below - strictly)
+    pit = np.where(experiment.seen > 0, pit, np.nan)
+    parts = {"predicted": prediction[:, :, 0], "predicted_sd": np.sqrt(prediction[:, :, 1])}
+    parts["pit"] = pit
+    return {
+        f"{name}_{what}": values
+        for what, array in parts.items()
+        for name, values in unpack_observations(trace, array).items()
+    }
+
+
+def _levels(quantiles: tuple[float, ...]) -> np.ndarray:
+    levels = np.asarray(sorted(quantiles), dtype=float)
+    if levels.ndim != 1 or np.any((levels <= 0) | (levels >= 1)):
+        raise ArgumentError(f"quantiles={quantiles!r}", fix="give levels between 0 and 1")
+    return levels
+
+
+def kalman_filter(
+    model: Model,
+    data: Any,
+    parameters: Mapping[str, Any],
+    *,
+    quantiles: tuple[float, ...] = LEVELS,
+) -> xr.Dataset | list[xr.Dataset]:
+    """Run the exact filter of a linear Gaussian model (Kalman 1960).
+
+    Returns
+    -------
+    Dataset as of `particle_filter`, with one `draw` and without `ess`; everything is exact.
+
+    Raises
+    ------
+    ArgumentError : the model is not linear and Gaussian; gives the reason and the user's line.
+    """
+    problem = pose(model, data)
+    theta = check_parameters(problem.trace, parameters)
+    settle(problem, theta, 1, "kalman")
+    levels = _levels(quantiles)
+    attrs = {"model": problem.trace.name, "proposal": "kalman"}
+    root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
+    datasets = []
+    for e in problem.experiments:
+        run = _as_run(kalman.kalman_filter(problem.trace, e, theta), e, levels)
+        datasets.append(_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess"))
+    return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> FilterRun:
+    """Exact moments in the form of a particle filter's."""
+    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    quantiles = exact.mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
+    variance = np.diagonal(exact.observation_covariance, axis1=1, axis2=2)
+    below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
+    prediction = np.stack([exact.observation_mean, variance, below, below], axis=1)
+    return FilterRun(
+        exact.log_increments, np.full(e.steps, np.nan), exact.mean, exact.covariance, quantiles,
+        prediction,
+    )  # fmt: skip

@@ -1,0 +1,251 @@
+"""What runs before the chains: a mode of the posterior, the scale round it, dispersed starts.
+
+The log likelihood is estimated with common random numbers, so that it is one fixed (if ragged)
+function, and climbed on the unconstrained scale by Nelder and Mead's simplex, which takes no
+derivatives. The result only starts and scales chains; nothing depends on its accuracy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ssmppl.data import unpack_parameters
+from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.filtering import (
+    FilterSettings,
+    log_likelihood_estimate,
+    random_state,
+    repeated_estimates,
+)
+from ssmppl.inference.problem import Problem
+from ssmppl.language.transforms import transforms, unconstrain
+
+PILOT_PARTICLES = 200
+TRIES = 200  # random points looked at for one with a finite likelihood
+TUNING_REPEATS = 40
+SCALE_REPEATS = 8
+FALL = 8.0  # how far log p falls where its scale is measured
+MOST_PARTICLES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Space:
+    """The free parameters on their unconstrained scale.
+
+    theta : (P,) values of all parameters; the fixed ones stay as they are here.
+    free : (sites,) which parameters are free. where : indices of their numbers in the full z.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    z: np.ndarray
+    free: np.ndarray
+    where: np.ndarray
+
+    def parameters(self, z_free: np.ndarray) -> tuple[np.ndarray, float]:
+        """(theta, log prior + log Jacobian) at unconstrained values of the free parameters."""
+        z, theta = self.z.copy(), self.theta.copy()
+        z[self.where] = z_free
+        program = self.problem.program
+        log_jacobian = program.entry("constrain")(z, self.free, theta)
+        log_prior = program.entry("log_prior")(theta) + log_jacobian
+        if not np.all(np.isfinite(theta)) or np.isnan(log_prior):
+            return theta, -np.inf
+        return theta, float(log_prior)
+
+
+def space_of(problem: Problem, fixed: dict[str, np.ndarray], start: dict[str, np.ndarray]) -> Space:
+    """The unconstrained space, at moderate values of the parameters where `start` gives none."""
+    trace = problem.trace
+    values: dict[str, np.ndarray] = {}
+    known: dict[Expr, float] = {}
+    for site in trace.parameters.values():
+        value = fixed.get(site.name, start.get(site.name))
+        if value is None:
+            value = _moderate(site, known)
+        values[site.name] = np.asarray(value, dtype=float)
+        known.update(zip(site.value.ravel(), values[site.name].ravel(), strict=True))
+    theta = np.array([known[s] for s in trace.parameter_symbols])
+    z = unconstrain(trace, theta, values)
+    free = np.array([name not in fixed for name in trace.parameters], dtype=bool)
+    sizes = [len(t.free) for t in transforms(trace)]
+    where = np.flatnonzero(np.repeat(free, sizes))
+    return Space(problem, theta, z, free, where)
+
+
+def _moderate(site, known: dict[Expr, float]) -> np.ndarray:
+    """A value inside the support: the prior's mean where it has one, else an ordinary number."""
+    d = site.distribution
+    mean = np.broadcast_to(evaluate(array(d.mean()), known), site.shape).astype(float)
+    support = d.support()
+    if support.kind == "positive definite":
+        usable = bool(np.all(np.isfinite(mean))) and bool(np.all(np.linalg.eigvalsh(mean) > 0))
+        return mean if usable else np.eye(site.shape[0])
+    lower = np.broadcast_to(evaluate(array(support.lower), known), site.shape)
+    upper = np.broadcast_to(evaluate(array(support.upper), known), site.shape)
+    half_way = np.where(
+        np.isfinite(lower) & np.isfinite(upper), 0.5 * (lower + upper),
+        np.where(np.isfinite(lower), lower + 1.0, np.where(np.isfinite(upper), upper - 1.0, 0.0)),
+    )  # fmt: skip
+    inside = np.isfinite(mean) & (mean > lower) & (mean < upper) & (np.abs(mean) < 1e6)
+    return np.where(inside, mean, half_way)
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """A mode z (free,), the scale (free,) on which log p falls by about one half, log p there."""
+
+    z: np.ndarray
+    scale: np.ndarray
+    log_density: float
+
+
+def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "bootstrap") -> Pilot:
+    """Climb the estimated log posterior from the space's own point.
+
+    Raises
+    ------
+    ArgumentError : the likelihood is zero at every point that was tried.
+    """
+    settings = FilterSettings(PILOT_PARTICLES, proposal)
+    stream = random_state(seed)
+
+    def log_density(z: np.ndarray) -> float:
+        theta, log_prior = space.parameters(z)
+        if log_prior == -np.inf:
+            return -np.inf
+        try:
+            value = log_likelihood_estimate(space.problem, theta, settings, stream.copy())
+        except SamplingError:
+            return -np.inf
+        return value + log_prior
+
+    z = space.z[space.where]
+    if not len(z):
+        return Pilot(z, z, log_density(z))
+    z = _finite_point(z, log_density, np.random.default_rng(seed))
+    best, value = z, log_density(z)
+    size = 1.0
+    for _ in range(4):  # restarts, as a simplex may collapse early on a ragged function
+        simplex = np.vstack([best, best + size * np.eye(len(z))])
+        found = minimize(
+            lambda v: min(-log_density(v), 1e300), best, method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": 80 * len(z), "fatol": 0.1,
+                     "xatol": 1e-3},
+        )  # fmt: skip
+        gain = -found.fun - value
+        if gain > 0:
+            best, value = found.x, -float(found.fun)
+        if gain < 1.0:
+            break
+        size = 0.5
+
+    def averaged(v: np.ndarray) -> float:
+        theta, log_prior = space.parameters(v)
+        if log_prior == -np.inf:
+            return -np.inf
+        try:
+            log_z = repeated_estimates(space.problem, theta, settings, seed, range(SCALE_REPEATS))
+        except SamplingError:
+            return -np.inf
+        return float(np.logaddexp.reduce(log_z) - np.log(len(log_z))) + log_prior
+
+    return Pilot(best, _scale(best, averaged), value)
+
+
+def _finite_point(z: np.ndarray, log_density: Callable[[np.ndarray], float], rng: np.random.Generator) -> np.ndarray:
+    for attempt in range(TRIES):
+        point = z if attempt == 0 else z + (1.0 + attempt / 40.0) * rng.standard_normal(len(z))
+        if log_density(point) > -np.inf:
+            return point
+    raise ArgumentError(
+        f"the likelihood is zero at each of {TRIES} points tried for a start",
+        fix="give start={name: value} near plausible values, or check the data for rows that the "
+        "model cannot produce",
+    )
+
+
+def _scale(z: np.ndarray, log_density: Callable[[np.ndarray], float]) -> np.ndarray:
+    """Per coordinate the standard deviation of a Gaussian that falls as log p does.
+
+    Measured where log p has fallen by several units, as the estimates are noisy.
+    """
+    out, top = np.empty(len(z)), log_density(z)
+    for i, unit in enumerate(np.eye(len(z))):
+        step, drop = 1e-3, 0.0
+        while step < 30.0:
+            drop = top - 0.5 * (log_density(z + step * unit) + log_density(z - step * unit))
+            if not drop < FALL:  # -inf beyond counts as a fall
+                break
+            step *= 1.5
+        out[i] = step / np.sqrt(2.0 * (drop if FALL <= drop < 4.0 * FALL else FALL))
+    return np.clip(out, 1e-4, 5.0)
+
+
+def dispersed(
+    space: Space, pilot: Pilot, chains: int, seed: np.random.SeedSequence, proposal: str
+) -> list[np.ndarray]:
+    """A start for each chain, three scales about the mode, with a finite likelihood."""
+    settings = FilterSettings(PILOT_PARTICLES, proposal)
+    starts = []
+    for chain in range(chains):
+        child = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 7, chain))
+        rng = np.random.default_rng(child)
+        point, spread = pilot.z, 3.0
+        for _ in range(TRIES):
+            trial = pilot.z + spread * pilot.scale * rng.standard_normal(len(pilot.z))
+            theta, log_prior = space.parameters(trial)
+            spread *= 0.97
+            if log_prior == -np.inf:
+                continue
+            try:
+                value = log_likelihood_estimate(
+                    space.problem, theta, settings, random_state(child)
+                )
+            except SamplingError:
+                continue
+            if value > -np.inf:
+                point = trial
+                break
+        starts.append(point)
+    return starts
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """The number of particles and the standard deviation of log Z that it gives."""
+
+    particles: int
+    sd: float
+
+
+def tune_particles(
+    problem: Problem, theta: np.ndarray, proposal: str, target: float, seed: np.random.SeedSequence
+) -> Tuning:
+    """N at which log Z has about the target's standard deviation: var(log Z) falls as 1 / N."""
+    particles, sd = 50, np.inf
+    for _ in range(8):
+        settings = FilterSettings(particles, proposal)
+        log_z = repeated_estimates(problem, theta, settings, seed, range(TUNING_REPEATS))
+        finite = log_z[np.isfinite(log_z)]
+        sd = float(np.std(finite, ddof=1)) if len(finite) > 0.9 * TUNING_REPEATS else np.inf
+        if 0.8 * target <= sd <= 1.15 * target or (sd < target and particles <= 50):
+            break
+        factor = np.clip((sd / target) ** 2, 0.3, 8.0) if np.isfinite(sd) else 8.0
+        particles = int(np.clip(round(particles * factor), 10, MOST_PARTICLES))
+        if particles >= MOST_PARTICLES:
+            break
+    return Tuning(particles, sd)
+
+
+def at(space: Space, theta: np.ndarray) -> Space:
+    """The same space with other values of the parameters to stand on."""
+    values = unpack_parameters(space.problem.trace, theta)
+    return replace(space, theta=theta, z=unconstrain(space.problem.trace, theta, values))

@@ -1,0 +1,274 @@
+"""The verb `sample`: chains from the posterior, as ArviZ InferenceData."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.data import check_values, unpack_parameters, unpack_states
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference import pgas, pmmh
+from ssmppl.inference.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.methods import PGAS, PMMH, Method
+from ssmppl.inference.pilot import (
+    Pilot,
+    Space,
+    dispersed,
+    find_mode,
+    space_of,
+    tune_particles,
+)
+from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.proposal_choice import choose
+from ssmppl.inference.runner import Block, ChainDraws, run_chains, stack
+from ssmppl.language.model import Model
+from ssmppl.results import to_inference_data
+
+PGAS_PARTICLES = 25
+PGAS_PARTICLES_WITHOUT_ANCESTORS = 200
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """A method made ready: how a block of draws is made, where chains start, what to report."""
+
+    step_block: Callable[[Any, int], tuple[Any, Block]]
+    states: list[Any]
+    report: dict[str, Any]
+
+
+def sample(
+    model: Model,
+    data: Any,
+    method: Method | None = None,
+    *,
+    draws: int = 1000,
+    warmup: int = 1000,
+    chains: int = 4,
+    start: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    thin: int = 1,
+    states: bool = True,
+    seed: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Any:
+    """Draw from p(theta, x_{1:T} | y_{1:T}).
+
+    Parameters
+    ----------
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    method : `ssm.PMMH(...)` or `ssm.PGAS(...)`; None: PGAS, which is told in the attributes.
+    draws, warmup, chains : kept draws and dropped ones of each chain. PMMH adapts during warmup.
+    start : parameter values near which to begin; the chains are dispersed round a mode found from
+        there.
+    fixed : parameters held at these values.
+    thin : keep every thin-th draw.
+    states : whether to keep the trajectories.
+    seed : the same seed gives the same draws, whatever the executor.
+    executor : any `concurrent.futures.Executor`; None: a thread for each chain, up to the cores.
+
+    Returns
+    -------
+    InferenceData (ArviZ 0.x) or DataTree (ArviZ 1.x), groups:
+
+    * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
+    * sample_stats: lp, acceptance_rate, and log_likelihood (PMMH: the estimate at the draw) or
+      update_rate and ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
+    * log_likelihood (PMMH): log p(y_t | y_1:t-1, theta), for leave-future-out scores; az.loo on
+      it is not valid, because the rows are not exchangeable;
+    * observed_data, constant_data (inputs).
+
+    Attributes name method, settings, seed, versions, the plan, and the time taken.
+    Ctrl-C returns what was drawn, with the attribute `interrupted`.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    """
+    began = time.perf_counter()
+    for name, value, least in (("draws", draws, 1), ("warmup", warmup, 0), ("chains", chains, 1),
+                               ("thin", thin, 1)):  # fmt: skip
+        check_count(name, value, least)
+    problem = pose(model, data)
+    held = check_values(problem.trace, fixed, argument="fixed")
+    near = check_values(problem.trace, start, argument="start")
+    chosen = PGAS() if method is None else method
+    if not isinstance(chosen, (PMMH, PGAS)):
+        raise ArgumentError(
+            f"method={method!r} is no method of sampling",
+            fix="use ssm.PMMH(...), ssm.PGAS(...) or None",
+        )
+    root = np.random.SeedSequence(seed)
+    space = space_of(problem, held, near)
+    prepare = _prepare_pmmh if isinstance(chosen, PMMH) else _prepare_pgas
+    sampler = prepare(problem, space, chosen, held, chains, warmup, thin, root)
+    result = run_chains(
+        sampler.step_block, sampler.states, draws, warmup, executor=executor, progress=progress,
+        title=type(chosen).__name__,
+    )  # fmt: skip
+    attrs = {
+        "model": problem.trace.name,
+        "method": type(chosen).__name__,
+        "method_chosen": "by the user" if method is not None else "automatically",
+        **sampler.report,
+        "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
+        "interrupted": any(c.interrupted for c in result),
+        "seconds": time.perf_counter() - began,
+    }  # fmt: skip
+    return _to_arviz(problem, result, held, states, attrs)
+
+
+def _streams(root: np.random.SeedSequence, chain: int) -> tuple[np.random.Generator, np.ndarray]:
+    """The random numbers of a chain: for the parameters, and for the kernels."""
+    from_root = [*root.spawn_key, 1, chain]
+    seed = np.random.SeedSequence(root.entropy, spawn_key=from_root)
+    own, kernels = seed.spawn(2)
+    return np.random.default_rng(own), random_state(kernels)
+
+
+def _prepare_pmmh(
+    problem: Problem, space: Space, method: PMMH, held: dict[str, np.ndarray], chains: int,
+    warmup: int, thin: int, root: np.random.SeedSequence,
+) -> Sampler:  # fmt: skip
+    if method.particles is not None:
+        check_count("particles", method.particles, 1)
+    pilot = find_mode(space, root)
+    theta, _ = space.parameters(pilot.z)
+    choice = choose(problem, theta, kalman=False) if method.proposal == "auto" else None
+    proposal = choice.name if choice else method.proposal
+    problem.proposal(proposal)
+    particles, tuned = method.particles, None
+    if particles is None:
+        tuned = tune_particles(problem, theta, proposal, method.target_sd, root)
+        particles = tuned.particles
+    settings = FilterSettings(int(particles), proposal)
+    d = len(pilot.z)
+    target = method.target_acceptance or (0.25 if d <= 1 else 0.2 if d == 2 else 0.15)
+    states = []
+    for chain, z in enumerate(dispersed(space, pilot, chains, root, "bootstrap")):
+        generator, stream = _streams(root, chain)
+        states.append(pmmh.start_chain(space, z, pilot.scale, settings, generator, stream))
+    report = {
+        "particles": settings.particles,
+        "proposal": str(choice or proposal),
+        "settings": asdict(method),
+        "pilot_mode": _by_name(problem, theta),
+    }
+    if tuned is not None:
+        report["pilot_sd_of_log_likelihood"] = tuned.sd
+    step = partial(pmmh.pmmh_block, space, settings, warmup, target, thin)
+    return Sampler(step, states, report)
+
+
+def _prepare_pgas(
+    problem: Problem, space: Space, method: PGAS, held: dict[str, np.ndarray], chains: int,
+    warmup: int, thin: int, root: np.random.SeedSequence,
+) -> Sampler:  # fmt: skip
+    memory = deterministic_memory(problem.trace)
+    usual = PGAS_PARTICLES if memory is not None else PGAS_PARTICLES_WITHOUT_ANCESTORS
+    particles = usual if method.particles is None else method.particles
+    check_count("particles", particles, 2)
+    proposal = method.proposal
+    if proposal == "auto":
+        proposal = pgas_proposal(problem)
+    problem.proposal(proposal)
+    settings = FilterSettings(int(particles), proposal)
+    sweeper = pgas.Sweeper(problem, pgas.plan_updates(problem, held), settings)
+    if space.where.size:
+        pilot = find_mode(space, root)
+    else:
+        pilot = Pilot(np.empty(0), np.empty(0), 0.0)
+    states = []
+    for chain, z in enumerate(dispersed(space, pilot, chains, root, "bootstrap")):
+        generator, stream = _streams(root, chain)
+        theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
+        states.append(pgas.start_chain(sweeper, theta, generator, stream))
+    report = {
+        "particles": settings.particles,
+        "proposal": proposal,
+        "settings": asdict(method),
+        "ancestor_sampling": memory is not None,
+        "plan": "\n".join(str(u.explanation) for u in sweeper.updates),
+        "pilot_mode": _by_name(problem, space.parameters(pilot.z)[0]) if len(pilot.z) else {},
+    }
+    step = partial(pgas.pgas_block, sweeper, thin, 1)
+    return Sampler(step, states, report)
+
+
+def pgas_proposal(problem: Problem) -> str:
+    """The user's, else the locally optimal one where it is exact, else the transition."""
+    proposals = problem.program.proposals
+    if "user" in proposals:
+        return "user"
+    auxiliary = proposals.get("auxiliary")
+    if auxiliary is None or isinstance(auxiliary, NotApplicable):
+        return "bootstrap"
+    return "auxiliary" if auxiliary.exact_look_ahead else "bootstrap"
+
+
+def _by_name(problem: Problem, theta: np.ndarray) -> dict[str, Any]:
+    return {n: v.tolist() for n, v in unpack_parameters(problem.trace, theta).items()}
+
+
+def _to_arviz(
+    problem: Problem, result: list[ChainDraws[Any]], held: dict[str, np.ndarray], states: bool,
+    attrs: dict[str, Any],
+) -> Any:  # fmt: skip
+    drawn, stats = stack(result)
+    trace = problem.trace
+    posterior = {
+        n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held
+    }
+    several = len(problem.experiments) > 1
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
+    over_time: list[str] = []
+    observed: dict[str, np.ndarray] = {}
+    inputs: dict[str, np.ndarray] = {}
+    log_likelihood: dict[str, np.ndarray] = {}
+    for i, e in enumerate(problem.experiments):
+        mark = f"_{i + 1}" if several else ""
+        axis = [f"time{mark}"]
+        if several:
+            coords[axis[0]] = np.arange(1, e.steps + 1) if e.time is None else e.time
+
+        def own(
+            values: Mapping[str, np.ndarray], mark: str = mark, axis: list[str] = axis,
+            leading: int = 1,
+        ) -> dict[str, np.ndarray]:  # fmt: skip
+            named = {f"{n}{mark}": v for n, v in values.items()}
+            if mark:
+                for n, v in named.items():
+                    rest = [f"{n}_dim_{k}" for k in range(v.ndim - leading)]
+                    dims[n] = [*axis, *rest]
+            return named
+
+        if states:
+            paths = own(unpack_states(trace, drawn[f"path_{i}"]), leading=3)
+            posterior |= paths
+            over_time += list(paths) if not several else []
+        observed |= own(e.observed)
+        inputs |= own(e.inputs)
+        if f"increment_{i}" in drawn:
+            log_likelihood |= own({"y": drawn[f"increment_{i}"]}, leading=3)
+    return to_inference_data(
+        posterior=posterior,
+        sample_stats=stats,
+        observed_data=observed,
+        constant_data=inputs or None,
+        log_likelihood=log_likelihood or None,
+        over_time=over_time,
+        time=None if several else problem.experiments[0].time,
+        dims=dims,
+        coords=coords,
+        attrs=attrs,
+    )
+
