@@ -85,7 +85,6 @@ class _Separator:
         self.involved = dependent(roots, self.block)
         self.sums: dict[Expr, Terms] = {}
         self.done: dict[Expr, Terms] = {}
-        self.roots = roots
 
     def terms_of(self, root: Expr) -> Terms:
         failures: dict[Expr, _NotSeparable] = {}
@@ -341,8 +340,9 @@ class _Separator:
     def _logdet(self, node: Expr) -> Terms:
         if (found := self._common_factor(node)) is not None:
             common, free = found
-            scaled = scaled(self._log({common: [constant(1.0)]}, node), constant(float(node.data)))
-            return added(scaled, {ONE: [matrix_op("logdet", free, node.data)]})
+            logs = self._log({common: [constant(1.0)]}, node)
+            logs = scaled(logs, constant(float(node.data)))
+            return added(logs, {ONE: [matrix_op("logdet", free, node.data)]})
         original = _inverse_of(node)
         if original is not None:  # log det A^-1 = -log det A
             logdet = matrix_op("logdet", original.args, node.data)

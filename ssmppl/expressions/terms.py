@@ -21,13 +21,12 @@ def monomial_expr(monomial: Monomial) -> Expr:
 
 
 def gathered(terms: Terms) -> dict[Monomial, Expr]:
+    """Coefficients as one expression each; without those that are, or cancel to, zero."""
     out = {}
     for monomial, parts in terms.items():
         parts = [p for p in parts if not (p.op == "const" and p.data == 0.0)]
         if parts and not (len(parts) > 1 and _cancels(parts)):
-            total = parts[0]
-            for p in parts[1:]:
-                total = total + p
+            total = summed(parts)
             if not (total.op == "const" and total.data == 0.0):
                 out[monomial] = total
     return out
@@ -48,6 +47,7 @@ def _cancels(parts: list[Expr]) -> bool:
 
 
 def summed(parts: list[Expr]) -> Expr:
+    """The sum of a coefficient's summands."""
     total = parts[0]
     for p in parts[1:]:
         total = total + p
@@ -55,6 +55,7 @@ def summed(parts: list[Expr]) -> Expr:
 
 
 def added(a: Terms, b: Terms) -> Terms:
+    """a + b."""
     out = {m: list(c) for m, c in a.items()}
     for m, c in b.items():
         out.setdefault(m, []).extend(c)
@@ -62,6 +63,7 @@ def added(a: Terms, b: Terms) -> Terms:
 
 
 def scaled(a: Terms, factor: Expr) -> Terms:
+    """a times a factor free of the block."""
     return {m: [factor * p for p in c] for m, c in a.items()}
 
 

@@ -282,7 +282,7 @@ def roundabout(m):
     laws(m, prior, transition)
 
 
-@expects((("s",), "Gamma of the power -2"))
+@expects((("s",), "inverse Gamma of the square"))
 def uniform_sd(m):
     def prior():
         return {"s": Uniform(0.1, 3)}
@@ -293,7 +293,7 @@ def uniform_sd(m):
     laws(m, prior, transition)
 
 
-@expects((("s",), "Gamma of the power -2"), corrections=["s**2"])
+@expects((("s",), "inverse Gamma of the square"), corrections=["s**2"])
 def half_normal_sd(m):
     def prior():
         return {"s": HalfNormal(sd=1)}
@@ -304,7 +304,7 @@ def half_normal_sd(m):
     laws(m, prior, transition)
 
 
-@expects((("s",), "Gamma of the power -2"), corrections=["log(1 + s**2)"])
+@expects((("s",), "inverse Gamma of the square"), corrections=["log(1 + s**2)"])
 def half_cauchy_sd(m):
     def prior():
         return {"s": HalfCauchy(scale=1)}

@@ -36,7 +36,7 @@ class Conditional:
 
         def log_joint(v):
             try:
-                value = function(list(v))[0]
+                value = function(np.asarray(v).tolist())[0]
             except DOMAIN:
                 return -np.inf
             return value if value == value else -np.inf

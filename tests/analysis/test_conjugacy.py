@@ -1,8 +1,12 @@
 """The updates derived for a corpus of models: families, blocks, corrections."""
 
+from dataclasses import replace
+
 import pytest
 
+from ssmppl.analysis.check import verify
 from ssmppl.analysis.conjugacy import derive_updates
+from ssmppl.analysis.sufficient import complete_data
 from ssmppl.expressions.expr import to_text
 from ssmppl.language.trace import trace
 from tests.analysis.corpus import CORPUS, build
@@ -17,3 +21,50 @@ def test_corpus(name):
     assert found == expected, "\n".join(str(u.explanation) for u in updates)
     outside = [to_text(u.functions[j]) for u in updates for j in u.correction]
     assert outside == list(corrections)
+
+
+def test_the_check_notices_a_wrong_statistic():
+    model, *_ = build("varves")
+    data = complete_data(trace(model))
+    (update,) = derive_updates(data.trace)
+    assert verify(data, update) is None
+    for role, factor in (("prior", 1.01), ("initial", 0.999), ("transition", 1.0001)):
+        changed = tuple(factor * c for c in update.coefficients[role])
+        wrong = replace(update, coefficients={**update.coefficients, role: changed})
+        failure = verify(data, wrong)
+        assert failure is not None, role
+        assert "disagrees" in failure.reason
+
+
+def test_the_check_notices_a_wrong_family():
+    model, *_ = build("shared_precision")
+    data = complete_data(trace(model))
+    (update,) = derive_updates(data.trace)
+    swapped = replace(update.conditional, log=update.conditional.pow, pow=update.conditional.log)
+    failure = verify(data, replace(update, conditional=swapped))
+    assert failure is not None
+    assert "disagrees" in failure.reason
+
+
+def test_fixed_parameters_have_no_update():
+    model, *_ = build("intercept")
+    updates = derive_updates(trace(model), fixed={"q", "c"})
+    assert [(u.block, u.family) for u in updates] == [(("a",), "Normal")]
+
+
+def test_precision_is_drawn_alone_when_its_partner_is_fixed():
+    model, *_ = build("varves")
+    (update,) = derive_updates(trace(model), fixed=["phi"])
+    assert (update.block, update.family, update.correction) == (("tau",), "Gamma", ())
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_explanations_have_every_part(name):
+    model, *_ = build(name)
+    for update in derive_updates(trace(model)):
+        explanation = update.explanation
+        assert explanation.title
+        assert explanation.conditional
+        assert update.needs_log_joint or explanation.statistics
+        assert update.where is not None
+        assert all(len(line) < 700 for line in str(explanation).splitlines())
