@@ -165,13 +165,13 @@ def _slice(
         "matrix": "slice steps on its Cholesky factor (log diagonal), on the exact conditional",
     }[kind]
     cost = "through its statistics" if form else "each evaluation a pass over the data"
-    family, law = "slice", f"{how}, {cost}"
+    law = f"{how}, {cost}"
     if degenerate(search.data, unit) is not None:
-        family, law = "none", "no update given the states: integrate them out (PMMH), or fix it"
+        law = f"{how}, given the noisy states alone, from which the deterministic ones follow anew"
     return Update(
         block=(unit[0].data[1],),
         components=unit,
-        family=family,
+        family="slice",
         functions=form.functions if form else (),
         coefficients=form.coefficients if form else dict.fromkeys(ROLES, ()),
         correction=(),
@@ -184,6 +184,6 @@ def _slice(
         ),
         reason=why.reason,
         where=why.where,
-        needs_log_joint=form is None and family == "slice",
+        needs_log_joint=form is None,
         kind=kind,
     )

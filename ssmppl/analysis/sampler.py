@@ -115,8 +115,6 @@ class Sampler:
     ) -> tuple[np.ndarray, DrawInfo]:
         update = self.update
         limits = self.limits(rest)
-        if update.family == "none":
-            raise SamplingError(update.reason, fix="use PMMH, or fixed=", where=update.where)
         if update.conditional is None:
             return self.slices(totals, current, limits, rng, log_joint, 0)
         c = totals.tolist()

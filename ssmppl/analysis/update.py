@@ -20,13 +20,14 @@ class Update:
     """One Gibbs update: a block of parameter components and how it is drawn given all else.
 
     block : names of the parameters; components : the symbols that are drawn, in this order.
-    family : "Normal-Gamma", "Gamma", ..., "slice"; "none" where the block cannot be updated.
+    family : "Normal-Gamma", "Gamma", ..., or "slice".
     functions : the s_i of log p(block | rest) = const + sum_i C_i s_i.
     coefficients : role -> summands of the C_i: C = prior + initial + sum_t transition
         + sum_t observation. The initial ones are summed over experiments.
     correction : positions of the functions outside the family's span.
     bounds : (lower, upper) of each component, expressions of other parameters.
-    needs_log_joint : not separable, so each evaluation takes the whole log joint density.
+    needs_log_joint : not separable, so each evaluation takes the whole log joint density; where a
+        deterministic state depends on the block, that of the noisy states and the observations.
     reason, where : why nothing better applies, and the user's line.
     """
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from types import ModuleType
 
@@ -66,16 +66,8 @@ class Sweeper:
 
 
 def plan_updates(problem: Problem, fixed: Mapping[str, np.ndarray]) -> tuple[Update, ...]:
-    """The updates of the parameters that are not fixed.
-
-    A parameter of a deterministic law has no update given the whole trajectory; given the noisy
-    components alone, from which the others follow, it has: a slice step on that density.
-    """
-    updates = derive_updates(problem.trace, tuple(fixed), problem.program.missing)
-    return tuple(
-        replace(u, family="slice", needs_log_joint=True) if u.family == "none" else u
-        for u in updates
-    )
+    """The updates of the parameters that are not fixed."""
+    return tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
 
 
 class ThetaValues(Mapping[Expr, float]):

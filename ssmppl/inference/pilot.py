@@ -90,12 +90,16 @@ def _moderate(site, known: dict[Expr, float]) -> np.ndarray:
         return mean if usable else np.eye(site.shape[0])
     lower = np.broadcast_to(evaluate(array(support.lower), known), site.shape)
     upper = np.broadcast_to(evaluate(array(support.upper), known), site.shape)
-    half_way = np.where(
-        np.isfinite(lower) & np.isfinite(upper), 0.5 * (lower + upper),
-        np.where(np.isfinite(lower), lower + 1.0, np.where(np.isfinite(upper), upper - 1.0, 0.0)),
-    )  # fmt: skip
+    half_way = np.array([_between(a, b) for a, b in zip(lower.flat, upper.flat, strict=True)])
+    half_way = half_way.reshape(site.shape)
     inside = np.isfinite(mean) & (mean > lower) & (mean < upper) & (np.abs(mean) < 1e6)
     return np.where(inside, mean, half_way)
+
+
+def _between(lower: float, upper: float) -> float:
+    if np.isfinite(lower):
+        return 0.5 * (lower + upper) if np.isfinite(upper) else lower + 1.0
+    return upper - 1.0 if np.isfinite(upper) else 0.0
 
 
 @dataclass(frozen=True)

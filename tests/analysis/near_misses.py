@@ -265,7 +265,7 @@ def negative_precision(m):
     laws(m, normal_prior, transition)
 
 
-@refused("a", "none", "Dirac(a * x)", "Dirac", "determines")
+@refused("a", "slice", "Dirac(a * x)", "Dirac", "determines")
 def deterministic(m):
     def initial():
         return {"x": Normal(0, sd=1), "z": Normal(0, sd=1)}
