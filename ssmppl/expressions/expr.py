@@ -84,7 +84,7 @@ class Expr:
                 object.__setattr__(node, "data", data)
                 _interned[key] = node
         places = _locations.get()
-        if places is not None and op != "const" and node not in places:
+        if places is not None and args and node not in places:  # symbols are not written there
             places[node] = user_location()
         return node
 

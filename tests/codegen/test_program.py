@@ -1,0 +1,162 @@
+"""The generated module as text, and its cache on disk."""
+
+import ast
+import os
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen import cache
+from ssmppl.codegen.program import compile_trace
+from ssmppl.language.trace import trace
+from tests.codegen.models import MODELS, build
+
+ROOT = Path(__file__).parents[2]
+
+
+# -- text
+@pytest.mark.parametrize("name", MODELS)
+def test_text(name):
+    traced = trace(build(name))
+    program = compile_trace(traced)
+    text = program.source()
+    compile(text, str(program.path), "exec")
+    again = compile_trace(trace(build(name))).source()  # traced from another line: no difference
+    same = text == program.path.read_text() == again
+    assert same  # not compared in the assert itself: pytest would take minutes over the difference
+    lines = {int(n) for n in re.findall(r"# models\.py:(\d+)$", text, re.MULTILINE)}
+    source = (ROOT / "tests/codegen/models.py").read_text().splitlines()
+    start = MODELS[name].__code__.co_firstlineno
+    assert lines, "no line of the user's is named"
+    assert all(start < n < start + 40 for n in lines)
+    assert all(source[n - 1].strip() for n in lines)
+    for role in ("initial", "transition"):
+        (place,) = traced.functions[role]
+        assert f"models.py:{place.line} {role}" in text  # the header
+
+
+def test_names_are_the_users():
+    text = compile_trace(trace(build("varves"))).source()
+    assert re.search(r"= phi \* x_prevs\[i\]|phi \* x_prevs\[i\]", text)
+    assert re.search(r"^ +tau = theta\[1\]$", text, re.MULTILINE)
+    assert re.search(r"^def (\w+)\(", text, re.MULTILINE)
+    for role in ("prepare", "step", "draw_initial", "draw", "weigh", "look_ahead"):
+        assert f"def {role}_auxiliary(" in text
+
+
+def test_no_name_is_bound_twice_to_different_things():
+    """Arguments of a generated function are never assigned to."""
+    for name in MODELS:
+        for function in ast.parse(compile_trace(trace(build(name))).source()).body:
+            if not isinstance(function, ast.FunctionDef):
+                continue
+            if not re.match(r"prepare|step|draw|weigh|look|moments|observe|connect|log_",
+                            function.name):  # fmt: skip
+                continue
+            arguments = {a.arg for a in function.args.args}
+            assigned = {
+                t.id
+                for node in ast.walk(function)
+                if isinstance(node, ast.Assign)
+                for t in node.targets
+                if isinstance(t, ast.Name)
+            }
+            assert not arguments & assigned, (name, function.name)
+
+
+def test_settings_make_modules_of_their_own():
+    traced = trace(build("varves"))
+    complete = compile_trace(traced, Missing(none=True))
+    gappy = compile_trace(traced, Missing())
+    assert complete.path != gappy.path
+    assert "seen" not in complete.source().split("def step_auxiliary")[1].split("def ")[0].split(
+        "):", 1
+    )[1]  # fmt: skip
+
+
+def test_the_digest_knows_text_kernels_and_versions(monkeypatch):
+    assert cache.digest_of("a") != cache.digest_of("b")
+    before = cache.digest_of("a")
+    monkeypatch.setattr(cache, "_environment", lambda: b"other kernels")
+    assert cache.digest_of("a") != before
+
+
+# -- cache on disk, always in processes of their own
+SCRIPT = """
+import numpy as np, sys
+from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.kernels.random import new_state
+from ssmppl.language.trace import trace
+from tests.codegen.models import build
+program = compile_trace(trace(build("linear_scalar")))
+run = program.entry("simulate")
+y = np.zeros((3, 1))
+out = np.empty((3, 1, 2)), np.empty((3, 1, 2))
+run(np.array([0.5, 1.0, 1.0]), y, y + 1, np.zeros((3, 0)), new_state(np.random.SeedSequence(1)),
+    *out, False)
+stats = run.stats
+print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()), out[1].sum(), program.path)
+"""
+
+
+def start(folder, script=SCRIPT, **more):
+    env = {**os.environ, "SSMPPL_CACHE": str(folder), "PYTHONPATH": str(ROOT), **more}
+    env.pop("NUMBA_CACHE_DIR", None)
+    return subprocess.Popen(
+        [sys.executable, "-c", script], env=env, cwd=ROOT, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def finish(process):
+    """(cache hits, cache misses, sum of what was simulated, path of the module)."""
+    out, error = process.communicate(timeout=200)
+    assert process.returncode == 0, error
+    hits, misses, total, path = out.split()
+    return int(hits), int(misses), float(total), Path(path)
+
+
+def test_two_processes_at_once_then_a_third(tmp_path):
+    both = [finish(p) for p in [start(tmp_path), start(tmp_path)]]
+    assert both[0][2:] == both[1][2:]
+    path = both[0][3]
+    assert path.parent == tmp_path / "ssmppl"
+    assert not list(path.parent.glob("*.tmp"))
+    assert finish(start(tmp_path)) == (1, 0, *both[0][2:])  # nothing is compiled again
+    text = path.read_text()
+    for spoilt in ("raise SystemExit('edited')\n", "", text + "\nentry = None\n"):
+        path.write_text(spoilt)
+        assert finish(start(tmp_path))[2:] == both[0][2:]
+        restored = path.read_text() == text
+        assert restored
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
+def test_a_folder_that_cannot_be_written(tmp_path):
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    assert finish(start(folder))[3].parent.parent != folder
+
+
+def test_a_file_where_the_folder_should_be(tmp_path):
+    """As unwritable as a folder can be, for root too."""
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    _, misses, _, path = finish(start(blocked))
+    assert misses == 1
+    assert tmp_path not in path.parents
+
+
+def test_runs_without_compiling(tmp_path):
+    """NUMBA_DISABLE_JIT=1 gives the same numbers, for debugging."""
+    script = SCRIPT.replace("stats = run.stats", "class stats: cache_hits = cache_misses = {}")
+    script = script.replace("3, 1, 2", "3, 1, 1")
+    compiled = finish(start(tmp_path, SCRIPT.replace("3, 1, 2", "3, 1, 1")))
+    debugged = finish(start(tmp_path, script, NUMBA_DISABLE_JIT="1"))
+    assert debugged[2] == pytest.approx(compiled[2], rel=1e-12)
