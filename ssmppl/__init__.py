@@ -39,6 +39,7 @@ from ssmppl.language.distributions import (
     Wishart,
 )
 from ssmppl.language.model import Model
+from ssmppl.language.primitive import primitive
 from ssmppl.results import summary
 
 __version__ = "0.1.0"
@@ -82,6 +83,7 @@ __all__ = [
     "kalman_filter",
     "log_likelihood",
     "particle_filter",
+    "primitive",
     "sample",
     "simulate",
     "summary",

@@ -12,6 +12,7 @@ from ssmppl.codegen.kernels import particle_filter as kernels
 from ssmppl.codegen.module import Layout, Section
 from ssmppl.codegen.render import CALLS, DRAWS, MATRIX_CALLS
 from ssmppl.codegen.specialise import specialise
+from ssmppl.language.primitive import REGISTRY
 
 MODULES = {
     "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
@@ -72,6 +73,10 @@ class ModuleText:
             names = ", ".join(sorted(n for n, home in imports.items() if home == package))
             wrapped = textwrap.fill(names, 92, initial_indent="    ", subsequent_indent="    ")
             lines.append(f"from {package} import (\n{wrapped},\n)")
+        called = sorted(words & set(REGISTRY))  # the user's primitives
+        if called:
+            lines += ["from ssmppl.language.primitive import REGISTRY", ""]
+            lines += [f'{name} = REGISTRY["{name}"]' for name in called]
         lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]
         return "\n".join(lines) + "\n\n".join(self.parts)
 

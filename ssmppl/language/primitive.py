@@ -1,0 +1,138 @@
+"""Opaque functions of numbers that a model may call: `@ssm.primitive`.
+
+A primitive is compiled by Numba and called once per particle. It has no symbolic form, so nothing
+is derived through it: no gradients, no conjugate updates, the bootstrap proposal.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import types
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+from ssmppl.errors import ModelError
+from ssmppl.expressions.arrays import ExprArray, array, scalar_or_array
+from ssmppl.expressions.expr import Expr
+from ssmppl.language.model import location_of
+
+REGISTRY: dict[str, Callable[..., Any]] = {}  # unique name -> compiled function
+
+
+class Primitive:
+    """A compiled function of floats to one float; calls on symbols become nodes."""
+
+    def __init__(self, function: Callable[..., float]):
+        self.function = function
+        self.location = location_of(function)
+        self.arguments = _arguments(function)
+        self.compiled = _compile(function, len(self.arguments))
+        self.name = f"{function.__name__}_{_digest(function)}"
+        self.__name__, self.__doc__ = function.__name__, function.__doc__
+        REGISTRY[self.name] = self.compiled
+
+    def __call__(self, *values: Any) -> Any:
+        if len(values) != len(self.arguments):
+            raise ModelError(
+                f"the primitive {self.__name__} takes {len(self.arguments)} arguments "
+                f"({', '.join(self.arguments)}), {len(values)} given",
+                fix="pass each by position",
+                where=self.location,
+            )
+        if not any(_symbolic(v) for v in values):
+            return self.function(*values)
+        arrays = np.broadcast_arrays(*(array(v).view(np.ndarray) for v in values))
+        out = np.empty(arrays[0].shape, dtype=object)
+        for i in np.ndindex(out.shape):
+            out[i] = Expr("call", tuple(a[i] for a in arrays), self)
+        return scalar_or_array(out)
+
+    def __reduce__(self):  # by the function, which the other process imports
+        return Primitive, (self.function,)
+
+    def __repr__(self) -> str:
+        return f"<primitive {self.__name__}>"
+
+
+def primitive(function: Callable[..., float]) -> Primitive:
+    """Make a function of numbers callable inside a model's laws.
+
+    Parameters
+    ----------
+    function : takes floats by position and returns a float; Numba must be able to compile it.
+
+    Raises
+    ------
+    ModelError : Numba cannot compile it; names the function, its line and Numba's reason.
+
+    Examples
+    --------
+    >>> import ssmppl as ssm
+    >>> @ssm.primitive
+    ... def friction(v):
+    ...     return 0.1 if v > 0.0 else -0.1
+    """
+    if not inspect.isfunction(function):
+        raise ModelError(
+            f"@ssm.primitive stands on {function!r}, which is no function",
+            fix="write @ssm.primitive (without parentheses) on the line above a def",
+        )
+    return Primitive(function)
+
+
+def _symbolic(value: Any) -> bool:
+    return isinstance(value, (Expr, ExprArray)) or (
+        isinstance(value, np.ndarray) and value.dtype == object
+    )
+
+
+def _arguments(function: Callable[..., float]) -> list[str]:
+    parameters = inspect.signature(function).parameters.values()
+    plain = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    if any(p.kind not in plain for p in parameters):
+        raise ModelError(
+            f"the primitive {function.__name__} takes *arguments or keywords",
+            fix="give it a fixed number of plain arguments",
+            where=location_of(function),
+        )
+    return [p.name for p in parameters]
+
+
+def _compile(function: Callable[..., float], n: int) -> Callable[..., Any]:
+    compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    try:
+        compiled.compile((numba.float64,) * n)
+    except numba.core.errors.NumbaError as error:
+        reason = str(error).strip().splitlines()
+        raise ModelError(
+            f"Numba cannot compile the primitive {function.__name__}: "
+            + " ".join(line.strip() for line in reason[:6]),
+            fix="use plain arithmetic, math.* or np.* on floats inside it, and return a float",
+            where=location_of(function),
+        ) from None
+    result = compiled.overloads[(numba.float64,) * n].signature.return_type
+    if not isinstance(result, (numba.types.Float, numba.types.Integer, numba.types.Boolean)):
+        raise ModelError(
+            f"the primitive {function.__name__} returns {result}",
+            fix="return one number; write a primitive for each component of a vector",
+            where=location_of(function),
+        )
+    return compiled
+
+
+def _digest(function: Callable[..., float]) -> str:
+    """Changes with the function's code and with the numbers that it takes from outside."""
+    outside = inspect.getclosurevars(function)
+    values = {**outside.globals, **outside.nonlocals}
+    plain = {k: repr(v) for k, v in values.items() if not isinstance(v, types.ModuleType)}
+    text = repr((_code(function.__code__), sorted(plain.items())))
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def _code(code: types.CodeType) -> tuple:
+    constants = [c for c in code.co_consts if not isinstance(c, types.CodeType)]
+    return code.co_code, repr(constants), code.co_names

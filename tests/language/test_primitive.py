@@ -1,0 +1,123 @@
+"""Opaque functions of numbers inside a model."""
+
+import inspect
+import math
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import symbol
+from ssmppl.language.trace import trace
+
+LEVEL = 0.25
+
+
+@ssm.primitive
+def friction(v, strength):
+    return -strength if v > LEVEL else strength * math.tanh(v)
+
+
+def written(v, strength):
+    """The same in the language."""
+    return np.where(v > LEVEL, -strength, strength * np.tanh(v))
+
+
+def build(law):
+    model = ssm.Model("friction")
+
+    @model.prior
+    def prior():
+        return {"k": ssm.Gamma(2, rate=10), "q": ssm.Gamma(20, rate=1)}
+
+    @model.initial
+    def initial():
+        return {"v": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(v, k, q):
+        return {"v": ssm.Normal(0.9 * v + law(v, k), precision=q)}
+
+    @model.observation
+    def observation(v):
+        return {"y": ssm.Normal(v, sd=0.3)}
+
+    return model
+
+
+def test_numbers_and_symbols():
+    v = symbol("state", "v")
+    values = np.array([-1.0, 0.1, 2.0])
+    assert friction(2.0, 0.5) == -0.5
+    node = friction(v, 0.5)
+    np.testing.assert_allclose(
+        evaluate(node, {v: values}), [friction(x, 0.5) for x in values], rtol=1e-15
+    )
+    assert friction(np.stack([v, 2 * v]), 0.5).shape == (2,)
+
+
+def test_same_numbers_as_the_law_written_out():
+    y = {"y": np.sin(np.arange(40) / 4.0)}
+    parameters = {"k": 0.3, "q": 30.0}
+    opaque, plain = (
+        ssm.log_likelihood(
+            build(law), y, parameters, proposal="bootstrap", repeats=3, particles=200, seed=4
+        )
+        for law in (friction, written)
+    )
+    np.testing.assert_allclose(opaque, plain, rtol=1e-10)
+
+
+def test_what_can_still_be_derived():
+    plan = ssm.explain(build(friction))
+    updates = {u.block: u for u in plan.updates}
+    assert updates[("q",)].family == "Gamma"
+    assert updates[("k",)].family == "slice" and updates[("k",)].needs_log_joint
+    assert isinstance(plan.structure, NotApplicable)
+
+
+def test_a_changed_constant_changes_the_generated_module():
+    def make(level):
+        def f(v):
+            return v * level
+
+        return ssm.primitive(f)
+
+    assert make(1.0).name != make(2.0).name
+    assert make(1.0).name == make(1.0).name
+
+
+def test_bad_primitives():
+    with pytest.raises(ssm.ModelError, match="cannot compile") as error:
+
+        @ssm.primitive
+        def opens_a_file(v):
+            return open(v)
+
+    assert __file__ in str(error.value)
+    with pytest.raises(ssm.ModelError, match="no function"):
+        ssm.primitive(3.0)
+    with pytest.raises(ssm.ModelError, match="returns"):
+
+        @ssm.primitive
+        def pair(v):
+            return (v, v)
+
+    with pytest.raises(ssm.ModelError, match="arguments"):
+
+        @ssm.primitive
+        def many(*v):
+            return 0.0
+
+    with pytest.raises(ssm.ModelError, match="takes 2 arguments"):
+        friction(1.0)
+
+
+def test_wrong_number_of_arguments_in_a_law_names_the_place():
+    model = build(lambda v, k: friction(v))
+    with pytest.raises(ssm.ModelError, match="takes 2 arguments") as error:
+        trace(model)
+    assert "test_primitive.py" in str(error.value)
+    assert inspect.getsource(friction.function).splitlines()[1].strip() in str(error.value)
