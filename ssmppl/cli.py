@@ -1,0 +1,307 @@
+"""The command line: `ssmppl demo`, `explain`, `simulate` and `sample`.
+
+Results go to standard output, and what a run shows while it goes on to standard error. Faults of
+the user's are printed without a traceback, exit code 1; a wrong command line has exit code 2.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+import ssmppl as ssm
+from ssmppl import demo as varves_demo
+from ssmppl.errors import SSMError
+from ssmppl.modelfile import load_model, parse_assignments, read_csv
+from ssmppl.results import save
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ASSIGNMENTS = ("--parameters", "-p", "--fixed", "--start")
+
+
+class Commands(click.Group):
+    """Turns errors on purpose into messages, and Ctrl-C into a sentence."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except SSMError as error:
+            raise click.ClickException(_message(error)) from error
+        except KeyboardInterrupt:
+            click.echo("Interrupted before there was anything to keep: nothing written.", err=True)
+            ctx.exit(130)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)  # as they stand here: in the order of use
+
+
+class Command(click.Command):
+    """A command whose name=value options take all that follow: `--fixed a=1 b=2`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        spread: list[str] = []
+        option = ""
+        for arg in args:
+            if arg in ASSIGNMENTS:
+                option = arg
+            elif option and spread[-1] != option and re.match(r"[A-Za-z_]\w*\s*=", arg):
+                spread.append(option)
+            elif option and spread[-1] != option:
+                option = ""
+            spread.append(arg)
+        return super().parse_args(ctx, spread)
+
+
+def _message(error: SSMError) -> str:
+    return "\n".join([f"{type(error).__name__}\n{error}", *getattr(error, "__notes__", ())])
+
+
+SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+MODEL = click.argument("model", metavar="MODEL.py")
+SEED = click.option("--seed", type=int, help="The same seed gives the same numbers.")
+CSV = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+
+def _output(default: str, what: str) -> Callable[..., Any]:
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Path(dir_okay=False, writable=True, path_type=Path),
+        callback=_folder_exists,
+        help=f"{what} [default: {default}]",
+    )
+
+
+def _folder_exists(ctx: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
+    """Found out before an hour of sampling, not after."""
+    if path is not None and not path.parent.is_dir():
+        raise click.BadParameter(f"the folder {path.parent} does not exist.")
+    return path
+
+
+@click.group(cls=Commands, context_settings=SETTINGS)
+@click.version_option(ssm.__version__, prog_name="ssmppl")
+def main() -> None:
+    """Inference in state space models, from four Python functions.
+
+    A model is a Python file that holds one ssmppl.Model, declared by decorated functions; where
+    there are several, file.py:name says which one. Data are CSV files with the names of the
+    observations and inputs in their first line. For a first look, run
+
+        ssmppl demo
+
+    and for a model of your own
+
+    \b
+        ssmppl explain model.py
+        ssmppl sample model.py data.csv -o posterior.nc
+    """
+
+
+@main.command(cls=Command)
+@click.option(
+    "--draws", type=click.IntRange(4), default=1500, show_default=True,
+    help="Kept draws of each of the four chains.",
+)  # fmt: skip
+@click.option("--seed", type=int, default=1, show_default=True, help="Of all random numbers.")
+@_output("ice_varves.nc", "File for the draws; those of PMMH go to one beside it.")
+def demo(draws: int, seed: int, output: Path | None) -> None:
+    """The ice varves: from the model to its posterior, in less than a minute.
+
+    Prints what is derived from the model, samples its posterior by two methods, PGAS and PMMH, and
+    compares both with the exact posterior, which quadrature gives for this model. The draws are
+    written to netCDF files that ArviZ reads.
+
+    \b
+        ssmppl demo --draws 500 --output varves.nc
+    """
+    varves_demo.run(draws, seed, output or Path("ice_varves.nc"))
+
+
+@main.command(cls=Command)
+@MODEL
+@click.argument("data", nargs=-1, type=CSV, metavar="[DATA.csv]...")
+@click.option("--source", is_flag=True, help="Print the generated program instead.")
+def explain(model: str, data: tuple[Path, ...], source: bool) -> None:
+    """What is derived from MODEL.py, and why.
+
+    The structure of the model, how particles are proposed, and one update for each parameter, with
+    the reason where something could not be derived. With data, it is checked that they fit, and
+    what is missing in them is taken into account.
+
+    \b
+        ssmppl explain model.py
+        ssmppl explain model.py data.csv
+    """
+    loaded = load_model(model)
+    read = _data(data) if data else None
+    click.echo(ssm.compile(loaded, read).source() if source else ssm.explain(loaded, read))
+
+
+@main.command(cls=Command)
+@MODEL
+@click.option("--steps", type=int, help="Number of time steps; the inputs, if any, tell it too.")
+@click.option(
+    "-p", "--parameters", multiple=True, metavar="NAME=VALUE...",
+    help="The parameters; without, they are drawn from the prior.",
+)  # fmt: skip
+@click.option("--inputs", type=CSV, help="CSV file with the inputs of the model.")
+@click.option("--draws", type=int, default=1, show_default=True, help="Number of simulations.")
+@SEED
+@_output("the name of the model file, with .csv", "File for the simulation.")
+def simulate(
+    model: str,
+    steps: int | None,
+    parameters: tuple[str, ...],
+    inputs: Path | None,
+    draws: int,
+    seed: int | None,
+    output: Path | None,
+) -> None:
+    """Simulate states and observations of MODEL.py.
+
+    Writes a CSV file with one row for each time step: states, observations, inputs, and the
+    parameters if they were drawn from the prior. Vectors take a column for each component: x_0,
+    x_1, ... Several simulations stand below each other, numbered by the column draw. The file of a
+    single one is what explain and sample take as data.
+
+    \b
+        ssmppl simulate model.py --steps 200 --parameters phi=0.9 tau=40 --seed 1 -o series.csv
+        ssmppl simulate model.py --inputs torque.csv -p 'beta=[1, 2]' -o series.csv
+    """
+    loaded = load_model(model)
+    given = read_csv(inputs) if inputs else None
+    dataset = ssm.simulate(
+        loaded,
+        parse_assignments(parameters, "--parameters") if parameters else None,
+        steps=steps,
+        inputs=given,
+        draws=draws,
+        seed=seed,
+    )
+    table = _wide(dataset)
+    if given is not None:
+        for name in (n for n in given.columns if n not in table.columns):
+            table[name] = list(given[name]) * draws
+    target = output or Path(_stem(model) + ".csv")
+    table.to_csv(target, index=False)
+    click.echo(f"Wrote {len(table)} rows to {target}: {', '.join(table.columns)}")
+
+
+@main.command(cls=Command)
+@MODEL
+@click.argument("data", nargs=-1, required=True, type=CSV, metavar="DATA.csv...")
+@click.option(
+    "--method", type=click.Choice(["pgas", "pmmh"], case_sensitive=False),
+    help="Particle Gibbs, or particle Metropolis-Hastings [default: chosen by the model].",
+)  # fmt: skip
+@click.option("--particles", type=int, help="Number of particles [default: tuned].")
+@click.option("--draws", type=int, default=1000, show_default=True, help="Kept draws of a chain.")
+@click.option("--warmup", type=int, default=1000, show_default=True, help="Dropped ones before.")
+@click.option("--chains", type=int, default=4, show_default=True, help="Number of chains.")
+@click.option("--thin", type=int, default=1, show_default=True, help="Keep every thin-th draw.")
+@SEED
+@click.option("--fixed", multiple=True, metavar="NAME=VALUE...", help="Parameters held fixed.")
+@click.option("--start", multiple=True, metavar="NAME=VALUE...", help="Values to start near.")
+@click.option("--states/--no-states", default=True, help="Whether to keep the states.")
+@_output("the name of the data file, with .nc", "netCDF file for the draws.")
+def sample(
+    model: str,
+    data: tuple[Path, ...],
+    method: str | None,
+    particles: int | None,
+    draws: int,
+    warmup: int,
+    chains: int,
+    thin: int,
+    seed: int | None,
+    fixed: tuple[str, ...],
+    start: tuple[str, ...],
+    states: bool,
+    output: Path | None,
+) -> None:
+    """Sample the posterior of MODEL.py given DATA.csv.
+
+    Prints a table of the parameters and writes all draws to a netCDF file, which
+    arviz.from_netcdf reads. A column time, or a first column without a name, labels the rows; an
+    empty cell is a missing observation. Several CSV files are several experiments of one system.
+    Ctrl-C ends sampling early, and what was drawn is kept.
+
+    \b
+        ssmppl sample model.py data.csv -o posterior.nc
+        ssmppl sample model.py day1.csv day2.csv --method pmmh --fixed mass=1.2 --seed 1
+    """
+    if particles is not None and method is None:
+        raise click.UsageError("--particles needs --method pgas or --method pmmh.")
+    methods = {"pgas": ssm.PGAS, "pmmh": ssm.PMMH}
+    loaded, read = load_model(model), _data(data)
+    idata = ssm.sample(
+        loaded,
+        read,
+        methods[method.lower()](particles=particles) if method else None,
+        draws=draws,
+        warmup=warmup,
+        chains=chains,
+        thin=thin,
+        states=states,
+        seed=seed,
+        fixed=parse_assignments(fixed, "--fixed"),
+        start=parse_assignments(start, "--start"),
+    )
+    target = output or Path(data[0].stem + ".nc")
+    save(idata, target)
+    posterior = idata["posterior"]
+    attrs, kept = posterior.attrs, posterior.sizes["draw"]
+    if attrs["interrupted"]:
+        click.echo(f"Interrupted: {kept} of {draws} draws of each chain are kept.", err=True)
+    click.echo(
+        f"{attrs['model']} by {attrs['method']} (chosen {attrs['method_chosen']}): "
+        f"{attrs['particles']} particles, {chains} chains of {kept} draws, "
+        f"{attrs['seconds']:.1f} s\n"
+    )
+    click.echo(_rounded(ssm.summary(idata)))
+    click.echo(f"\nWrote {target}")
+
+
+def _data(paths: tuple[Path, ...]) -> pd.DataFrame | list[pd.DataFrame]:
+    tables = [read_csv(path) for path in paths]
+    return tables[0] if len(tables) == 1 else tables
+
+
+def _stem(model: str) -> str:
+    return Path(model.rpartition(".py")[0] or model).stem
+
+
+def _wide(dataset: Any) -> pd.DataFrame:
+    """A Dataset of simulations as a table, (draw, time) its rows and scalars its columns."""
+    import pandas as pd
+
+    draws, steps = dataset.sizes["draw"], dataset.sizes["time"]
+    columns: dict[str, Any] = {}
+    if draws > 1:
+        columns["draw"] = np.repeat(np.arange(1, draws + 1), steps)
+    columns["time"] = np.tile(dataset["time"].values, draws)
+    for name, variable in dataset.data_vars.items():
+        values = variable.values
+        if "time" not in variable.dims:
+            values = np.repeat(values[:, None], steps, axis=1)
+        values = values.reshape(draws * steps, *values.shape[2:])
+        for index in np.ndindex(*values.shape[1:]):
+            columns["_".join(map(str, (name, *index)))] = values[(slice(None), *index)]
+    return pd.DataFrame(columns)
+
+
+def _rounded(table: pd.DataFrame) -> str:
+    """The summary with four digits, effective sample sizes whole."""
+    if table.empty:
+        return "There are no parameters to summarise: all are fixed, or the model has none."
+    whole = {name: "{:.0f}".format for name in table.columns if name.startswith("ess")}
+    others = {name: "{:.4g}".format for name in table.columns if name not in whole}
+    return table.to_string(formatters={**whole, **others, "r_hat": "{:.3f}".format})

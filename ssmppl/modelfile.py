@@ -1,0 +1,184 @@
+"""What the command line is given, read: model files, CSV files, and values of parameters.
+
+Every fault is one of the user's files or words, and is raised as an error that shows the place.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+from collections.abc import Iterable
+from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.util import module_from_spec
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from ssmppl.errors import ArgumentError, DataError, Location, ModelError, SSMError, listing
+from ssmppl.language.model import Model
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["load_model", "parse_assignments", "read_csv"]
+
+
+def load_model(spec: str) -> Model:
+    """The model in a Python file, `file.py`, or the one called `name` there, `file.py:name`.
+
+    Raises
+    ------
+    ModelError : there is no such file, it raises, or it does not hold just one such model.
+    """
+    path, name = _split(spec)
+    models = {key: value for key, value in vars(_execute(path)).items() if isinstance(value, Model)}
+    if name:
+        if name not in models:
+            raise ModelError(
+                f"{path} holds no model called {name!r}",
+                fix=f"its models are: {listing(name, models)}",
+            )
+        return models[name]
+    distinct = {id(model): (key, model) for key, model in models.items()}
+    if not distinct:
+        raise ModelError(
+            f"{path} holds no model",
+            fix='assign one to a variable of the file: model = ssm.Model("my model")',
+        )
+    if len(distinct) > 1:
+        lines = [f"    {path}:{key}    {model!r}" for key, model in distinct.values()]
+        raise ModelError(
+            "\n".join([f"{path} holds {len(distinct)} models", *lines]),
+            fix=f"say which one, as in {path}:{next(iter(models))}",
+        )
+    return next(iter(distinct.values()))[1]
+
+
+def _split(spec: str) -> tuple[Path, str]:
+    file, colon, name = spec.rpartition(":")
+    if colon and name.isidentifier() and not Path(spec).exists():
+        path = Path(file)
+    else:
+        path, name = Path(spec), ""
+    if path.is_dir() or not path.exists():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        near = sorted(str(p) for p in path.parent.glob("*.py")) if path.parent.is_dir() else []
+        raise ModelError(
+            f"the model file {path} {what}",
+            fix=f"Python files there: {listing(str(path), near)}",
+        )
+    return path, name
+
+
+def _execute(path: Path) -> ModuleType:
+    """The module of a file, whose folder is searched for what it imports, as Python would."""
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    name = f"model_file_{path.stem}"
+    loader = SourceFileLoader(name, str(path.resolve()))  # whatever the file's suffix
+    module = module_from_spec(ModuleSpec(name, loader, origin=loader.path))
+    module.__file__ = loader.path
+    sys.modules[name] = module  # so that what it defines can be pickled
+    try:
+        loader.exec_module(module)
+    except SSMError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ModelError(
+            f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
+            fix="the file has to run from top to end; what shall not run here goes below "
+            'if __name__ == "__main__":',
+            where=_place(error, path),
+        ) from error
+    return module
+
+
+def _place(error: BaseException, path: Path) -> Location:
+    """The line of the user's that raised: the innermost one in files of the model's folder."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return Location(error.filename, error.lineno or 1)
+    folder = str(path.resolve().parent)
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(folder)]
+    if not frames:
+        return Location(str(path), 1)
+    last = frames[-1]
+    function = "" if last.name == "<module>" else last.name
+    return Location(last.filename, last.lineno or 1, function)
+
+
+def read_csv(path: Path) -> pd.DataFrame:
+    """A CSV file as a table; a first column without a name labels the rows, and so does `time`.
+
+    Labels that are dates become dates. An empty cell is a missing value.
+
+    Raises
+    ------
+    DataError : the file is no table.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(path, skipinitialspace=True)
+    except (ValueError, UnicodeDecodeError, OSError) as error:  # pandas' own derive from ValueError
+        raise DataError(
+            f"{path} cannot be read as a CSV file: {str(error).strip()}",
+            fix="give a text file with the names of its columns in the first line, values "
+            "separated by commas",
+        ) from error
+    table.columns = table.columns.map(lambda name: str(name).strip())
+    first = table.columns[0] if len(table.columns) else ""
+    label = first if first.startswith("Unnamed:") or first == "" else "time"
+    if label in table.columns and table[label].dtype.kind not in "iuf":
+        table[label] = _dates(table[label])
+    if label != "time" and label in table.columns:
+        table = table.set_index(label).rename_axis("time")
+    return table
+
+
+def _dates(labels: pd.Series) -> pd.Series:
+    import pandas as pd
+
+    try:
+        return pd.to_datetime(labels, format="ISO8601")
+    except (ValueError, TypeError):
+        return labels  # text, then
+
+
+def parse_assignments(texts: Iterable[str], option: str) -> dict[str, Any]:
+    """`name=value` for each of `texts`; a value is a number, or a list of lists of them.
+
+    Raises
+    ------
+    ArgumentError : one is written otherwise, or a name stands twice.
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals or not name.isidentifier():
+            raise ArgumentError(
+                f"{option} {text!r} is not of the form name=value",
+                fix=f"write {option} phi=0.95, or {option} 'beta=[1, 2]' for a vector",
+            )
+        if name in values:
+            raise ArgumentError(f"{option} gives {name!r} twice", fix="give it once")
+        values[name] = _value(value, name, option)
+    return values
+
+
+def _value(text: str, name: str, option: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        value = None
+    if not isinstance(value, list):
+        raise ArgumentError(
+            f"{option} {name}={text}: {text!r} is no number",
+            fix=f"write a number, {name}=0.5, or a list of numbers, '{name}=[0.5, 1]'",
+        )
+    return value
