@@ -107,7 +107,7 @@ def main() -> None:
 
 @main.command(cls=Command)
 @click.option(
-    "--draws", type=click.IntRange(4), default=1500, show_default=True,
+    "--draws", type=click.IntRange(4), default=1000, show_default=True,
     help="Kept draws of each of the four chains.",
 )  # fmt: skip
 @click.option("--seed", type=int, default=1, show_default=True, help="Of all random numbers.")
