@@ -14,17 +14,23 @@ from ssmppl.language.trace import Site, Trace
 
 
 def check_parameters(
-    trace: Trace, parameters: Mapping[str, Any] | None, fixed: Mapping[str, Any] | None = None
+    trace: Trace,
+    parameters: Mapping[str, Any] | None,
+    fixed: Mapping[str, Any] | None = None,
+    support: bool = True,
 ) -> np.ndarray:
     """theta, float64 (P,), over `trace.parameter_symbols`.
+
+    support=False leaves out the check against the priors' supports: a likelihood is a function of
+    the parameters wherever it can be evaluated.
 
     Raises
     ------
     ArgumentError : a name is unknown, missing or given twice; a value has the wrong shape, is not
         finite, or lies outside the support of the parameter's prior.
     """
-    given = check_values(trace, parameters, argument="parameters")
-    for name, value in check_values(trace, fixed, argument="fixed").items():
+    given = check_values(trace, parameters, argument="parameters", support=support)
+    for name, value in check_values(trace, fixed, argument="fixed", support=support).items():
         if name in given and not np.array_equal(given[name], value):
             raise ArgumentError(
                 f"parameter {name!r} is {short(given[name].tolist())} in parameters and "
@@ -40,12 +46,16 @@ def check_parameters(
             fix="give every parameter of the model a value: "
             f"{{{', '.join(f'{n!r}: ...' for n in trace.parameters)}}}",
         )
-    _check_supports(trace, given, "parameters")
+    if support:
+        _check_supports(trace, given, "parameters")
     return pack(trace.parameters.values(), given)
 
 
 def check_values(
-    trace: Trace, values: Mapping[str, Any] | None, argument: str = "fixed"
+    trace: Trace,
+    values: Mapping[str, Any] | None,
+    argument: str = "fixed",
+    support: bool = True,
 ) -> dict[str, np.ndarray]:
     """Values of some of the parameters (`fixed`, `start`), each float64 of the site's shape.
 
@@ -70,7 +80,8 @@ def check_values(
                 fix=f"the parameters of the model are: {listing(str(name), trace.parameters)}",
             )
         out[name] = _value(site, value, argument)
-    _check_supports(trace, out, argument)
+    if support:
+        _check_supports(trace, out, argument)
     return out
 
 

@@ -74,20 +74,19 @@ def check_count(name: str, value: Any, least: int) -> None:
         )
 
 
-def random_state(seed: Any, *path: int) -> np.ndarray:
-    """State of the kernels' generator for a seed and a place in the work (chain, repeat, ...)."""
-    if isinstance(seed, np.random.SeedSequence):
-        base = seed
-    else:
-        try:
-            base = np.random.SeedSequence(seed)
-        except (TypeError, ValueError):
-            raise ArgumentError(
-                f"seed={seed!r}", fix="give a whole number, or None for a random one"
-            ) from None
-    return new_state(
-        np.random.SeedSequence(base.entropy, spawn_key=(*base.spawn_key, *path))
-    )
+def seed_sequence(seed: Any) -> np.random.SeedSequence:
+    """The root of a call's random numbers."""
+    try:
+        return np.random.SeedSequence(seed)
+    except (TypeError, ValueError):
+        raise ArgumentError(
+            f"seed={seed!r}", fix="give a whole number of at least 0, or None for a random one"
+        ) from None
+
+
+def random_state(root: np.random.SeedSequence, *path: int) -> np.ndarray:
+    """State of the kernels' generator at a place in the work (chain, repeat, experiment, ...)."""
+    return new_state(np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *path)))
 
 
 def log_likelihood_estimate(

@@ -12,7 +12,13 @@ from scipy.special import ndtr, ndtri
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
 from ssmppl.inference import kalman
-from ssmppl.inference.filtering import FilterRun, check_count, full_run, random_state
+from ssmppl.inference.filtering import (
+    FilterRun,
+    check_count,
+    full_run,
+    random_state,
+    seed_sequence,
+)
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.proposal_choice import choose
@@ -73,7 +79,7 @@ def particle_filter(
             'particle_filter with proposal="kalman"', fix="call ssm.kalman_filter instead"
         )
     levels = _levels(quantiles)
-    root = np.random.SeedSequence(seed)
+    root = seed_sequence(seed)
 
     def one(repeat: int) -> list[FilterRun]:
         return [

@@ -16,6 +16,7 @@ from ssmppl.inference.filtering import (
     check_count,
     estimates_task,
     filter_settings,
+    seed_sequence,
 )
 from ssmppl.inference.kalman import kalman_log_likelihood
 from ssmppl.inference.problem import Problem, pose
@@ -66,13 +67,13 @@ def log_likelihood(
     SamplingError : weights are NaN for some particles, naming the step and the user's line.
     """
     problem = pose(model, data)
-    theta = check_parameters(problem.trace, parameters)
+    theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
     settings = settle(problem, theta, particles, proposal, resampling, ess_threshold)
     if settings.proposal == "kalman":
         exact = kalman_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
-    task = estimates_task(problem, theta, settings, np.random.SeedSequence(seed))
+    task = estimates_task(problem, theta, settings, seed_sequence(seed))
     pieces = [r for r in np.array_split(np.arange(repeats), min(TASKS, repeats)) if len(r)]
     ranges = [range(int(p[0]), int(p[-1]) + 1) for p in pieces]
     return np.concatenate(run_tasks(task, ranges, executor=executor))

@@ -15,7 +15,12 @@ from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference import pgas, pmmh
-from ssmppl.inference.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.filtering import (
+    FilterSettings,
+    check_count,
+    random_state,
+    seed_sequence,
+)
 from ssmppl.inference.methods import PGAS, PMMH, Method
 from ssmppl.inference.pilot import (
     Pilot,
@@ -106,7 +111,7 @@ def sample(
             f"method={method!r} is no method of sampling",
             fix="use ssm.PMMH(...), ssm.PGAS(...) or None",
         )
-    root = np.random.SeedSequence(seed)
+    root = seed_sequence(seed)
     space = space_of(problem, held, near)
     prepare = _prepare_pmmh if isinstance(chosen, PMMH) else _prepare_pgas
     sampler = prepare(problem, space, chosen, held, chains, warmup, thin, root)

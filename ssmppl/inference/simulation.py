@@ -16,8 +16,13 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
+from ssmppl.errors import SamplingError
 from ssmppl.expressions.expr import topological
-from ssmppl.inference.filtering import check_count, random_state
+from ssmppl.inference.filtering import (
+    check_count,
+    random_state,
+    seed_sequence,
+)
 from ssmppl.inference.prior import draw_prior
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
@@ -58,7 +63,7 @@ def simulate(
     traced = trace(model)
     u, steps, time = bind_inputs(traced, inputs, steps)
     check_count("draws", draws, 1)
-    root = np.random.SeedSequence(seed)
+    root = seed_sequence(seed)
     program = compile_trace(traced, Missing(none=True))
     rng = random_state(root)
     if parameters is not None:
@@ -78,6 +83,7 @@ def simulate(
         program.entry("simulate")(row, y, seen, u, rng, x, out, feedback)
         states[first : first + side_by_side] = np.moveaxis(x, 2, 0)
         observations[first : first + side_by_side] = np.moveaxis(out, 2, 0)
+    _check_finite(traced, states, observations)
     variables = {**unpack_states(traced, states), **unpack_observations(traced, observations)}
     over_time = set(variables)
     if parameters is None and traced.parameters:
@@ -88,6 +94,30 @@ def simulate(
         time=time,
         attrs={"model": traced.name, "seed": str(root.entropy)},
     )
+
+
+def _check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) -> None:
+    """Refuse draws that are nan: some law left its domain.
+
+    Raises
+    ------
+    SamplingError : naming the first such step, the quantity and its law's line.
+    """
+    parts = ((states, traced.state_symbols, traced.transition),
+             (observations, traced.observation_symbols, traced.observations))  # fmt: skip
+    for values, symbols, sites in parts:
+        bad = np.argwhere(np.isnan(values))
+        if len(bad):
+            draw, t, k = bad[np.argmin(bad[:, 1])]
+            site = (traced.initial if t == 0 and sites is traced.transition else sites)[
+                symbols[k].data[1]
+            ]
+            raise SamplingError(
+                f"{symbols[k]!r} is nan at t={t + 1} of draw {draw + 1}",
+                fix="a parameter of its law leaves its range there (a negative spread, the log "
+                "of a negative number, ...): check the values, or bound them by np.maximum",
+                where=site.distribution.location,
+            )
 
 
 def feeds_back(traced: Trace) -> bool:

@@ -1,0 +1,195 @@
+"""The verbs round the likelihood: arguments, limits, errors at run time."""
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl import datasets
+
+varves = ssm.Model("ice varves")
+
+
+@varves.prior
+def prior():
+    return {"phi": ssm.Uniform(-1, 1), "tau": ssm.Gamma(0.01, rate=0.01)}
+
+
+@varves.initial
+def initial(phi, tau):
+    return {"x": ssm.Normal(0, precision=(1 - phi**2) * tau)}
+
+
+@varves.transition
+def transition(x, phi, tau):
+    return {"x": ssm.Normal(phi * x, precision=tau)}
+
+
+@varves.observation
+def observation(x):
+    return {"y": ssm.Gamma(6.25, rate=0.256 * np.exp(-x))}
+
+
+DATA = {"y": datasets.ice_varves()[:60]}
+AT = {"phi": 0.95, "tau": 50.0}
+
+
+@pytest.mark.parametrize("proposal", ["bootstrap", "guided", "auxiliary"])
+def test_minus_infinity_where_nothing_is_finite(proposal):
+    for parameters in ({"phi": 1.5, "tau": 50.0}, {"phi": 0.9, "tau": -1.0}):
+        values = ssm.log_likelihood(varves, DATA, parameters, proposal=proposal, repeats=3, seed=1)
+        assert values.shape == (3,) and values.dtype == np.float64
+        assert np.all(values == -np.inf)
+
+
+def test_the_same_seed_gives_the_same_numbers():
+    one, two = (ssm.log_likelihood(varves, DATA, AT, repeats=5, seed=7) for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+    assert len(set(one)) == 5
+    more = ssm.log_likelihood(varves, DATA, AT, repeats=11, seed=7)
+    np.testing.assert_array_equal(one, more[:5])
+
+
+@pytest.mark.parametrize(
+    "arguments, fragments",
+    [
+        ({"proposal": "gided"}, ["'gided'", "guided"]),
+        ({"proposal": "kalman"}, ["linear Gaussian", "y is Gamma", __file__]),
+        ({"resampling": "sistematic"}, ["sistematic", "systematic"]),
+        ({"particles": 0}, ["particles=0", "at least 1"]),
+        ({"particles": 10.5}, ["particles=10.5"]),
+        ({"repeats": 0}, ["repeats=0"]),
+        ({"ess_threshold": 1.5}, ["ess_threshold=1.5", "from 0"]),
+        ({"seed": "a"}, ["seed='a'"]),
+    ],
+)
+def test_bad_arguments(arguments, fragments):
+    with pytest.raises(ssm.ArgumentError) as error:
+        ssm.log_likelihood(varves, DATA, AT, **arguments)
+    for fragment in fragments:
+        assert fragment in str(error.value)
+
+
+uniform = ssm.Model("bounded")
+
+
+@uniform.initial
+def start():
+    return {"x": ssm.Normal(0, sd=1)}
+
+
+@uniform.transition
+def move(x):
+    return {"x": ssm.Normal(x, sd=1)}
+
+
+@uniform.observation
+def see(x):
+    return {"y": ssm.Uniform(x - 1, x + 1)}
+
+
+def test_vanishing_weights_name_the_step_the_row_and_the_line():
+    y = np.zeros(20)
+    y[12] = 1e4
+    values = ssm.log_likelihood(uniform, {"y": y}, {}, particles=50, repeats=2, seed=1)
+    assert np.all(values == -np.inf)
+    with pytest.raises(ssm.SamplingError) as error:
+        ssm.particle_filter(uniform, {"y": y}, {}, particles=50, seed=1)
+    for fragment in ("t=13", "10000", "all weights are zero", "Uniform(x - 1, x + 1)", __file__):
+        assert fragment in str(error.value)
+
+
+broken = ssm.Model("leaves its domain")
+
+
+@broken.prior
+def scale():
+    return {"s": ssm.Gamma(1, rate=1)}
+
+
+@broken.initial
+def begin():
+    return {"x": ssm.Normal(0, sd=1)}
+
+
+@broken.transition
+def go(x, s):
+    return {"x": ssm.Normal(np.log(x + 1.5), sd=s)}
+
+
+@broken.observation
+def look(x):
+    return {"y": ssm.Normal(x, sd=1)}
+
+
+def test_nan_for_some_particles_is_an_error_not_a_silent_drop():
+    data = {"y": np.zeros(30)}
+    with pytest.raises(ssm.SamplingError, match="weight is nan at t="):
+        ssm.log_likelihood(broken, data, {"s": 1.0}, proposal="bootstrap", seed=1)
+    with pytest.raises(ssm.SamplingError, match="nan at t=") as error:
+        ssm.simulate(broken, {"s": 1.0}, steps=50, draws=20, seed=1)
+    assert __file__ in str(error.value)
+
+
+def test_simulate_shapes_and_prior_draws():
+    own = ssm.Model("vector", inputs=("u",))
+
+    @own.prior
+    def prior():
+        return {"a": ssm.Normal(np.zeros(2), sd=1), "q": ssm.Gamma(2, rate=1)}
+
+    @own.initial
+    def initial(q):
+        return {"x": ssm.Normal(np.zeros(2), precision=q)}
+
+    @own.transition
+    def transition(x, u, a):
+        return {"x": ssm.Normal(0.5 * x + a * u, sd=1)}
+
+    @own.observation
+    def observation(x):
+        return {"y": ssm.MvNormal(x, covariance=np.eye(2)), "z": ssm.Poisson(np.exp(x[0]))}
+
+    inputs = {"u": np.arange(7.0)}
+    out = ssm.simulate(own, inputs=inputs, draws=3, seed=2)
+    assert out["x"].shape == out["y"].shape == (3, 7, 2)
+    assert out["z"].shape == (3, 7) and out["a"].shape == (3, 2) and out["q"].shape == (3,)
+    assert list(out["time"].values) == list(range(1, 8))
+    again = ssm.simulate(own, inputs=inputs, draws=3, seed=2)
+    np.testing.assert_array_equal(out["y"], again["y"])
+
+
+def test_improper_priors_cannot_be_simulated_from():
+    flat = ssm.Model("flat")
+
+    @flat.prior
+    def prior():
+        return {"m": ssm.Flat(), "s": ssm.HalfFlat()}
+
+    @flat.initial
+    def initial(m, s):
+        return {"x": ssm.Normal(m, sd=s)}
+
+    @flat.transition
+    def transition(x):
+        return {"x": ssm.Normal(x, sd=1)}
+
+    @flat.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1)}
+
+    with pytest.raises(ssm.ArgumentError, match="improper"):
+        ssm.simulate(flat, steps=5)
+    out = ssm.simulate(flat, {"m": 0.0, "s": 1.0}, steps=5)
+    assert out["y"].shape == (1, 5)
+
+
+def test_filter_datasets():
+    out = ssm.particle_filter(varves, DATA, AT, particles=200, repeats=2, seed=1)
+    assert out["x"].dims == ("draw", "time")
+    assert out["covariance"].dims == ("draw", "time", "state", "state_")
+    assert out["x_quantile"].dims == ("draw", "time", "quantile")
+    assert np.all(np.diff(out["x_quantile"].values, axis=-1) >= 0)
+    np.testing.assert_allclose(out["x_sd"] ** 2, out["covariance"][..., 0, 0])
+    assert np.all((out["y_pit"] > 0) & (out["y_pit"] < 1))
+    total = out["log_likelihood_increment"].sum("time").values
+    assert np.all(np.isfinite(total)) and np.all(out["ess"] <= 200)
