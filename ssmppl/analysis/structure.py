@@ -80,15 +80,26 @@ def affine_observation(
         if not isinstance(site.distribution, (Normal, MvNormal)):
             kind = type(site.distribution).__name__
             return NotApplicable(f"{site.name} is {kind}", site.distribution.location)
+        reason = _not_affine(site, "observation", states)
+        if reason is not None:
+            return reason
     block = gaussian_block(sites)
     form = affine(block.mean, states)
     if isinstance(form, NotApplicable):
-        where = sites[0].distribution.location
-        return NotApplicable(f"the mean of the observation: {form.reason}", where)
-    if any(depends_on(e, states) for e in block.covariance.ravel()):
-        where = sites[0].distribution.location
-        return NotApplicable("the spread of the observation depends on the state", where)
+        return form
     return AffineObservation(block.symbols, form[0], form[1], block.covariance)
+
+
+def _not_affine(site: Site, role: str, states: Sequence[Expr]) -> NotApplicable | None:
+    """Why a Gaussian or deterministic law is not affine in `states` with a spread free of them."""
+    d = site.distribution
+    form = affine(array(d.mean()).ravel(), states)
+    if isinstance(form, NotApplicable):
+        return NotApplicable(f"the mean of the {role} of {site.name}: {form.reason}", d.location)
+    if any(depends_on(e, states) for e in gaussian_block([site]).covariance.ravel()):
+        reason = f"the spread of the {role} of {site.name} depends on the state"
+        return NotApplicable(reason, d.location)
+    return None
 
 
 @dataclass(frozen=True)
@@ -118,13 +129,14 @@ def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
         if isinstance(means, NotApplicable):
             return means
         laws.append((means, covariance))
+    for site in trace.transition.values():
+        reason = _not_affine(site, "transition", prev)
+        if reason is not None:
+            return reason
     (m, p), (mean, q) = laws
-    where = next(iter(trace.transition.values())).distribution.location
     form = affine(mean, prev)
     if isinstance(form, NotApplicable):
-        return NotApplicable(f"the transition: {form.reason}", where)
-    if any(depends_on(e, prev) for e in q.ravel()):
-        return NotApplicable("the spread of the transition depends on the state", where)
+        return form
     if not trace.observations:
         return NotApplicable("there is no observation")
     observation = affine_observation(list(trace.observations.values()), states)
@@ -173,9 +185,7 @@ def deterministic_memory(trace: Trace) -> int | None:
         for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True)
     }
     prev = {previous(s): s for s in trace.state_symbols}
-    feeds = {
-        s: {prev[p] for p in symbols_of(e) if p in prev} for s, e in value.items()
-    }
+    feeds = {s: {prev[p] for p in symbols_of(e) if p in prev} for s, e in value.items()}
     depth: dict[Expr, int] = {}
     for _ in range(len(value) + 1):
         for s, sources in feeds.items():

@@ -154,7 +154,8 @@ class Writer:
         if op in INFIX:
             sign, level = INFIX[op]
             left = self._part(args[0], level if level != _COMPARE else level + 1)
-            right = self._part(args[1], level + (sign in ("-", "/", "%") or level == _COMPARE))
+            # a + (b - c) keeps its parentheses: without them it rounds otherwise
+            right = self._part(args[1], level + (level not in (_AND, _OR)))
             return f"{left} {sign} {right}", level
         if op == "neg":
             return f"-{self._part(args[0], _SIGN)}", _SIGN

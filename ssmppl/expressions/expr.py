@@ -547,7 +547,8 @@ def to_text(root: Expr) -> str:
             sign, level = _INFIX[node.op]
             (a, la), (b, lb) = parts
             left = f"({a})" if la < level or (node.op == "pow" and la == level) else a
-            right = f"({b})" if lb < level or (lb == level and sign not in "+*") else b
+            tight = sign not in "+*" or node.args[1].op == "mod"
+            right = f"({b})" if lb < level or (lb == level and tight) else b
             done[node] = (f"{left}{sign}{right}" if level > 1 else f"{left} {sign} {right}", level)
         elif node.op == "neg":
             a, level = parts[0]
