@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import difflib
 import linecache
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -32,6 +33,12 @@ class Location:
     def text(self) -> str:
         """The source line itself, stripped; empty where the file is not at hand."""
         return linecache.getline(self.file, self.line).strip()
+
+    @property
+    def short(self) -> str:
+        """`varves.py:12: <the line>`, for reading rather than for finding."""
+        place = f"{os.path.basename(self.file)}:{self.line}"
+        return f"{place}: {self.text}" if self.text else place
 
     def __str__(self) -> str:
         inside = f" in {self.function}()" if self.function else ""

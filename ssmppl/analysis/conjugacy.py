@@ -132,7 +132,7 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
                 f"corrected for {text} by a Metropolis step, as it has no known upper bound, and "
                 f"a slice sweep: {update.reason}"
             )
-        notes.append(str(update.where))
+        notes.append(update.where.short)
     if isinstance(update.conditional, NormalGamma):
         notes.append("separate updates where the precision H or the rate is not positive")
     elif isinstance(update.conditional, Normal):
@@ -180,7 +180,7 @@ def _slice(
             joined(unit),
             law,
             describe.statistics(form) if form else (),
-            (f"because {why.reason}", *([str(why.where)] if why.where else [])),
+            (f"because {why.reason}", *([why.where.short] if why.where else [])),
         ),
         reason=why.reason,
         where=why.where,

@@ -392,5 +392,5 @@ def _user(trace: Trace, missing: Missing) -> Proposal:
         name="user",
         draw=draw,
         weight=(*base.weight, *ratio),
-        explanation=f"@proposal of {next(iter(trace.proposal.values())).where}",
+        explanation=f"as written: {next(iter(trace.proposal.values())).where.short}",
     )

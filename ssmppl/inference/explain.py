@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
 
-PROPOSAL_TITLES = {"user": "yours", "guided": "guided", "auxiliary": "auxiliary"}
+PAGE = 100  # columns
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,12 @@ class Plan:
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(title, rows of (what, how)) for each part of the plan."""
         t = self.trace
-        laws = [(s.name, f"~ {s.distribution!r}") for s in t.parameters.values()]
-        model = [
-            *((f"{_label(s)}", f"~ {s.distribution!r}") for s in t.initial.values()),
-            *((f"{_label(s)}", f"~ {s.distribution!r}") for s in t.transition.values()),
-            *((f"{_label(s)}", f"~ {s.distribution!r}") for s in t.observations.values()),
+        out = [
+            ("Priors", _laws(t.parameters)),
+            ("Initial law, t = 1", _laws(t.initial)),
+            ("Transition, x_prev to x", _laws(t.transition)),
+            ("Observation", _laws(t.observations)),
         ]
-        out = [("Priors", laws), ("Laws", model)]
         if t.inputs:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
@@ -61,13 +61,13 @@ class Plan:
 
     def _structure(self) -> list[tuple[str, str]]:
         if isinstance(self.structure, NotApplicable):
-            return [("nonlinear", f"not linear Gaussian: {self.structure}")]
+            return [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
                  "used only where they are asked for")]  # fmt: skip
 
     def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
         if isinstance(proposal, NotApplicable):
-            return name, f"not derived: {proposal}"
+            return name, f"not derived: {_reason(proposal)}"
         return name, proposal.explanation
 
     def _trajectories(self) -> str:
@@ -91,7 +91,7 @@ class Plan:
             lines += ["", title, "-" * len(title)]
             width = max(len(what) for what, _ in rows)
             for what, how in rows:
-                first, *rest = how.split("\n")
+                first, *rest = [w for line in how.split("\n") for w in _wrapped(line, width)]
                 lines.append(f"{what:<{width}}  {first}".rstrip())
                 lines += [f"{'':<{width}}  {line}".rstrip() for line in rest]
         return "\n".join(lines)
@@ -110,8 +110,22 @@ class Plan:
         return "".join(parts)
 
 
-def _label(site: Site) -> str:
-    return site.name
+def _reason(found: NotApplicable) -> str:
+    return found.reason + (f"\n{found.where.short}" if found.where else "")
+
+
+def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
+    return [(s.name, f"~ {s.distribution!r}") for s in sites.values()]
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    """A line folded to the page, its continuation indented a little further."""
+    indent = " " * (len(line) - len(line.lstrip()))
+    room = max(PAGE - width - 2, 40)
+    return textwrap.wrap(
+        line, room, subsequent_indent=indent + "  ", break_long_words=False,
+        break_on_hyphens=False, drop_whitespace=True,
+    ) or [""]  # fmt: skip
 
 
 def _update(update: Update) -> tuple[str, str]:
