@@ -4,7 +4,7 @@
 #   make demo       the ice varves, from the model to its posterior
 #   make test       format, lint, types, tests
 #   make slow       the long statistical checks
-#   make examples   run every file under examples/
+#   make examples   run what is under examples/
 #   make docs       the documentation, notebooks executed, warnings are errors
 #   make bench      speed against plain C and other packages
 #   make format     put the code into shape
@@ -57,9 +57,13 @@ slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n $(WORKERS) -m slow || test $$? -eq 5
 
 examples: $(VENV)/.installed-run
-	@set -e; for file in $(sort $(wildcard examples/*.py)); do \
+	@mkdir -p build
+	@set -e; for file in $(sort $(wildcard examples/*/run.py)); do \
 	    echo "== $$file"; $(BIN)/python $$file; \
 	done
+	$(BIN)/ssmppl explain examples/heating/model.py examples/heating/data.csv
+	$(BIN)/ssmppl sample examples/heating/model.py examples/heating/data.csv --draws 500 --seed 1 \
+	    -o build/heating.nc
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -T -W --keep-going -b html docs docs/_build/html
