@@ -51,6 +51,8 @@ class Space:
 
     def parameters(self, z_free: np.ndarray) -> tuple[np.ndarray, float]:
         """(theta, log prior + log Jacobian) at unconstrained values of the free parameters."""
+        if not self.problem.trace.parameters:
+            return self.theta, 0.0
         z, theta = self.z.copy(), self.theta.copy()
         z[self.where] = z_free
         program = self.problem.program
