@@ -16,7 +16,7 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl import demo as varves_demo
-from ssmppl.errors import SSMError
+from ssmppl.errors import DataError, SSMError
 from ssmppl.modelfile import load_model, parse_assignments, read_csv
 from ssmppl.results import save
 
@@ -241,10 +241,10 @@ def sample(
     if particles is not None and method is None:
         raise click.UsageError("--particles needs --method pgas or --method pmmh.")
     methods = {"pgas": ssm.PGAS, "pmmh": ssm.PMMH}
-    loaded, read = load_model(model), _data(data)
+    loaded = load_model(model)
     idata = ssm.sample(
         loaded,
-        read,
+        _data(data),
         methods[method.lower()](particles=particles) if method else None,
         draws=draws,
         warmup=warmup,
@@ -271,7 +271,16 @@ def sample(
 
 
 def _data(paths: tuple[Path, ...]) -> pd.DataFrame | list[pd.DataFrame]:
-    tables = [read_csv(path) for path in paths]
+    tables = []
+    for path in paths:
+        table = read_csv(path)
+        if "draw" in table.columns and table["draw"].nunique() > 1:
+            raise DataError(
+                f"{path} holds {table['draw'].nunique()} simulations, numbered by the column "
+                "'draw'",
+                fix="give a file with one of them, or one file for each experiment",
+            )
+        tables.append(table)
     return tables[0] if len(tables) == 1 else tables
 
 
