@@ -52,17 +52,17 @@ def particle_filter(
     -------
     Dataset with dims `draw` (one per repeat) and `time`; a list of them for several experiments:
 
-    ====================  ==========================================================
-    <state>               filter means E[x_t | y_1:t], (draw, time, ...)
-    <state>_sd            filter standard deviations
-    covariance            of the stacked state components, (draw, time, state, state_)
-    <state>_quantile      filter quantiles, last dim `quantile`
-    <y>_predicted, _predicted_sd    moments of y_t given y_1:t-1
-    <y>_pit               P(Y_t <= y_t | y_1:t-1), randomised for discrete channels; NaN where
-                          missing or undefined
-    ess                   effective sample size (Kong, Liu and Wong 1994)
-    log_likelihood_increment        log p(y_t | y_1:t-1)
-    ====================  ==========================================================
+    ================================ ============================================================
+    <state>                          filter means E[x_t given y_1:t], (draw, time, ...)
+    <state>_sd                       filter standard deviations
+    covariance                       of the stacked state components, (draw, time, state, state_)
+    <state>_quantile                 filter quantiles, last dim `quantile`
+    <y>_predicted, <y>_predicted_sd  moments of y_t given y_1:t-1
+    <y>_pit                          P(Y_t <= y_t given y_1:t-1), randomised for discrete channels;
+                                     NaN where missing or undefined
+    ess                              effective sample size (Kong, Liu and Wong 1994)
+    log_likelihood_increment         log p(y_t given y_1:t-1)
+    ================================ ============================================================
 
     Raises
     ------

@@ -10,9 +10,12 @@ class PMMH:
     """Particle Metropolis-Hastings: a random walk on the parameters with an unbiased estimate of
     the likelihood (Andrieu, Doucet and Holenstein 2010; Schön et al. 2015, algorithm 4).
 
+    Parameters
+    ----------
     particles : N; None tunes it in a pilot to a standard deviation of log Z of about `target_sd`
         (Doucet et al. 2015; Sherlock et al. 2015).
     proposal : the particle filter's proposal, as in `log_likelihood`.
+    target_sd : of the estimate of the log-likelihood, which the pilot aims at.
     target_acceptance : what the covariance of the random walk adapts to during warmup (Vihola
         2012); None: 0.25 for one parameter, less for more.
     """
@@ -28,6 +31,8 @@ class PGAS:
     """Particle Gibbs with ancestor sampling (Lindsten, Jordan and Schön 2014; Schön et al. 2015,
     algorithm 7), with the Gibbs updates that were derived for the parameters.
 
+    Parameters
+    ----------
     particles : N of the conditional particle filter, at least 2; None: 25, or 200 where ancestors
         cannot be sampled.
     proposal : "auto", "bootstrap", "guided", "auxiliary" or "user".

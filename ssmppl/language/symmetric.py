@@ -96,7 +96,7 @@ class StudentT(_Symmetric):
 
 
 class Laplace(_Symmetric):
-    """Laplace(loc, scale=): density exp(-|x - loc| / scale) / (2 scale)."""
+    """Laplace(loc, scale=): density ``exp(-|x - loc| / scale) / (2 scale)``."""
 
     def __init__(self, loc: Any, *, scale: Any):
         self._set(loc=loc, scale=scale)
@@ -199,7 +199,7 @@ class _Half(Distribution):
 
 
 class HalfNormal(_Half):
-    """HalfNormal(sd=): |X|, X ~ Normal(0, sd=sd)."""
+    """HalfNormal(sd=): ``|X|`` for X ~ Normal(0, sd=sd)."""
 
     def __init__(self, *, sd: Any):
         self._set(sd=sd)
@@ -234,7 +234,7 @@ class HalfNormal(_Half):
 
 
 class HalfCauchy(_Half):
-    """HalfCauchy(scale=): |X|, X ~ Cauchy(0, scale=scale)."""
+    """HalfCauchy(scale=): ``|X|`` for X ~ Cauchy(0, scale=scale)."""
 
     def __init__(self, *, scale: Any):
         self._set(scale=scale)
