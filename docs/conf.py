@@ -14,6 +14,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
+    "sphinx_mathjax_offline",  # the pages ask nobody else for anything
 ]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 
@@ -31,6 +32,9 @@ autosummary_generate = True
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
 
-
+nb_code_prompt_show = "Show the code"
+nb_code_prompt_hide = "Hide the code"
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["ssmppl.css"]
 html_title = f"ssmppl {release}"
