@@ -105,6 +105,8 @@ class Section:
         rows : state arrays among the arguments whose rows targets write to.
         """
         scalars = scalars or {}
+        if accumulate:
+            targets = [_summed(group) for group in _grouped(targets)]
         roots = [t.expression for t in targets] + [t.guard for t in targets if t.guard is not None]
         level = depends(roots, level_of)
         for node in scalars:
@@ -192,13 +194,7 @@ class Section:
         inner = Names(reserved.taken)
         writer = Writer(dict(names), inner, self.layout.trace.locations, indent + "    ")
         operator = "+=" if accumulate and not first else "="
-        if accumulate:
-            total = group[0].expression
-            for t in group[1:]:
-                total = total + t.expression
-            writer.assign([(group[0].text, total)], operator)
-        else:
-            writer.assign([(t.text, t.expression) for t in group])
+        writer.assign([(t.text, t.expression) for t in group], operator)
         lines = [] if guard is None else [f"    if {names[guard]} != 0.0:"]
         lines += [f"{indent}for i in range(n):", *writer.lines]
         if guard is not None and first and accumulate:
@@ -208,8 +204,9 @@ class Section:
     def finish(self) -> str:
         """The functions with `prepare` and `step`, which compute `c` and `s`."""
         step = self._straight(
-            "step", "theta, c, y_data, seen_data, u_data, t, s", "What depends on theta and time.", self.s, "s"
-        )
+            "step", "theta, c, y_data, seen_data, u_data, t, s",
+            "What depends on theta and time.", self.s, "s",
+        )  # fmt: skip
         prepare = self._straight("prepare", "theta, c", "What depends on theta alone.", self.c, "c")
         return "\n\n".join([prepare, step, *self.functions])
 
@@ -250,6 +247,14 @@ def _grouped(targets: Sequence[Target]) -> list[list[Target]]:
     for t in targets:
         groups.setdefault(t.guard, []).append(t)
     return sorted(groups.values(), key=lambda g: g[0].guard is not None)
+
+
+def _summed(group: Sequence[Target]) -> Target:
+    """Targets that add up in one place, as one."""
+    total = group[0].expression
+    for t in group[1:]:
+        total = total + t.expression
+    return Target(group[0].text, total, group[0].guard)
 
 
 def scalar_function(

@@ -20,7 +20,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import BINARY, MATRIX_OPS, TERNARY, UNARY, apply, item, matrix_op
 from ssmppl.language.model import Model
 from ssmppl.language.trace import trace
-from tests.codegen.harness import plain
+from tests.codegen.harness import plain, run_plainly
 
 
 def small_model():
@@ -144,9 +144,9 @@ def function_of(roots, decorated=False):
         [(f"out[{i}]", r) for i, r in enumerate(roots)],
         {s: f"x[{k}]" for k, s in enumerate(TRACE.state_symbols)},
     )  # fmt: skip
-    space = dict(NAMESPACE)
     if not decorated:
-        space["exact"] = lambda f: f
+        return run_plainly(text, NAMESPACE)["f"], text
+    space = dict(NAMESPACE)
     exec(compile(text, "<generated>", "exec"), space)
     return space["f"], text
 
@@ -187,8 +187,7 @@ def test_passes_over_particles_are_the_interpreter(kernels_table, roots, guard, 
     targets = [Target("log_w[i]", roots[0]), Target("log_w[i]", roots[1], guard)]
     section.particle_pass("weigh", "Random.", "theta, c, s, states, log_w", targets,
                           accumulate="log_w")  # fmt: skip
-    space = NAMESPACE | {"exact": lambda f: f, "kernel": lambda f: f}
-    exec(compile(section.finish(), "<generated>", "exec"), space)
+    space = run_plainly(section.finish(), NAMESPACE)
     c, s, log_w = np.full(60, np.nan), np.full(60, np.nan), np.zeros(3)
     plain(space["prepare_test"])(theta, c)
     plain(space["step_test"])(theta, c, np.zeros((1, 2)), np.ones((1, 2)), u, 0, s)

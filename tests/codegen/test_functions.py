@@ -8,6 +8,7 @@ from ssmppl.analysis.proposals import bootstrap
 from ssmppl.codegen.kits import observation_draws
 from ssmppl.codegen.program import compile_trace
 from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.distributions import Dirac, MvNormal
 from ssmppl.language.trace import trace
@@ -103,6 +104,36 @@ def test_particle_filters(case):
                 generated.pass_("look_ahead", numbers.states[t - 1], log_v)
                 expected = evaluate(p.look_ahead, numbers.values(t))
                 close(log_v, expected, f"{name} look_ahead t={t}")
+
+
+def test_joining_a_reference(case):
+    """What conditional SMC adds to a filter: f and g apart, and x_t with its noisy part given."""
+    program, numbers = case
+    traced, t = program.trace, 2
+    noisy = [s for s in traced.transition.values() if not isinstance(s.distribution, Dirac)]
+    moved = [e for e in terms(traced, "transition") if e.site in noisy]
+    reference = np.ascontiguousarray(numbers.states[t, :, 3])
+    for name, p in program.proposals.items():
+        if isinstance(p, NotApplicable):
+            continue
+        generated = Generated(program, numbers, name, t)
+        check_weight(generated, "weigh_connected", moved, t)
+        log_w = np.full(PARTICLES, np.nan)
+        generated.pass_("weigh_observed", numbers.states[t], log_w)
+        observed = bootstrap(traced, program.missing).weight
+        expected = sum(evaluate([w.guarded() for w in observed], numbers.values(t)), 0.0)
+        close(log_w, expected, f"{name} weigh_observed")
+        joined = np.full(numbers.states[t].shape, np.nan)
+        generated.pass_("connect", numbers.states[t - 1], reference, joined)
+        known = numbers.values(t)
+        for k, s in enumerate(traced.state_symbols):
+            site = traced.transition[s.data[1]]
+            expected = reference[k]
+            if site not in noisy:
+                place = {v: i for i, v in enumerate(site.value.ravel())}
+                mean = array(site.distribution.mean()).ravel()[place[s]]
+                expected = evaluate(mean, known)
+            close(joined[k], expected, f"{name} connect {s!r}")
 
 
 def test_simulation_and_prediction(case):
