@@ -14,7 +14,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
-    "sphinx_mathjax_offline",  # the pages ask nobody else for anything
+    "sphinx-mathjax-offline",  # the pages ask nobody else for anything
 ]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 

@@ -50,19 +50,18 @@ def particle_filter(
 
     Returns
     -------
-    Dataset with dims `draw` (one per repeat) and `time`; a list of them for several experiments:
+    Dataset, or a list of them for several experiments
+        Dims `draw` (one per repeat) and `time`. Variables, for states x and channels y:
 
-    ================================ ============================================================
-    <state>                          filter means E[x_t given y_1:t], (draw, time, ...)
-    <state>_sd                       filter standard deviations
-    covariance                       of the stacked state components, (draw, time, state, state_)
-    <state>_quantile                 filter quantiles, last dim `quantile`
-    <y>_predicted, <y>_predicted_sd  moments of y_t given y_1:t-1
-    <y>_pit                          P(Y_t <= y_t given y_1:t-1), randomised for discrete channels;
-                                     NaN where missing or undefined
-    ess                              effective sample size (Kong, Liu and Wong 1994)
-    log_likelihood_increment         log p(y_t given y_1:t-1)
-    ================================ ============================================================
+        * ``x``, ``x_sd``: filter means E[x_t given y_1:t] and standard deviations,
+          (draw, time, ...);
+        * ``x_quantile``: filter quantiles, last dim `quantile`;
+        * ``covariance``: of the stacked state components, (draw, time, state, state_);
+        * ``y_predicted``, ``y_predicted_sd``: moments of y_t given y_1:t-1;
+        * ``y_pit``: P(Y_t <= y_t given y_1:t-1), randomised for discrete channels; NaN where
+          missing or undefined;
+        * ``ess``: effective sample size (Kong, Liu and Wong 1994);
+        * ``log_likelihood_increment``: log p(y_t given y_1:t-1).
 
     Raises
     ------
