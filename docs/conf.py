@@ -1,5 +1,6 @@
 """Sphinx configuration; built by `make docs`, with warnings as errors."""
 
+import re
 from importlib.metadata import version as installed_version
 
 project = "ssmppl"
@@ -38,3 +39,23 @@ html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["ssmppl.css"]
 html_title = f"ssmppl {release}"
+
+
+def spread_items(app, what, name, obj, options, lines):
+    """Turn `name : text`, as docstrings here have it, into numpydoc's name above indented text."""
+    out, section = [], ""
+    for number, line in enumerate(lines):
+        if line and set(line) == {"-"}:
+            section = lines[number - 1]
+        item = re.match(r"([\w*][\w*, ]*) : (.+)", line) if section else None
+        if number + 1 < len(lines) and re.fullmatch("-{3,}", lines[number + 1]):
+            section = ""
+        if item and section in ("Parameters", "Returns", "Raises", "Attributes"):
+            out += [item[1], "    " + item[2]]
+        else:
+            out.append(line)
+    lines[:] = out
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", spread_items, priority=100)  # before numpydoc

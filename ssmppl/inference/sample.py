@@ -69,6 +69,7 @@ def sample(
 
     Parameters
     ----------
+    model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     method : `ssm.PMMH(...)` or `ssm.PGAS(...)`; None: PGAS, which is told in the attributes.
     draws, warmup, chains : kept draws and dropped ones of each chain. PMMH adapts during warmup.
@@ -79,20 +80,22 @@ def sample(
     states : whether to keep the trajectories.
     seed : the same seed gives the same draws, whatever the executor.
     executor : any `concurrent.futures.Executor`; None: a thread for each chain, up to the cores.
+    progress : whether to show a progress bar, on stderr.
 
     Returns
     -------
-    InferenceData (ArviZ 0.x) or DataTree (ArviZ 1.x), groups:
+    InferenceData (ArviZ 0.x) or DataTree (ArviZ 1.x)
+        Groups:
 
-    * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
-    * sample_stats: lp, acceptance_rate, and log_likelihood (PMMH: the estimate at the draw) or
-      update_rate and ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
-    * log_likelihood (PMMH): log p(y_t | y_1:t-1, theta), for leave-future-out scores; az.loo on
-      it is not valid, because the rows are not exchangeable;
-    * observed_data, constant_data (inputs).
+        * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
+        * sample_stats: lp, acceptance_rate, and log_likelihood (PMMH: the estimate at the draw) or
+          update_rate and ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
+        * log_likelihood (PMMH): log p(y_t | y_1:t-1, theta), for leave-future-out scores; az.loo on
+          it is not valid, because the rows are not exchangeable;
+        * observed_data, constant_data (inputs).
 
-    Attributes name method, settings, seed, versions, the plan, and the time taken.
-    Ctrl-C returns what was drawn, with the attribute `interrupted`.
+        Attributes name method, settings, seed, versions, the plan, and the time taken.
+        Ctrl-C returns what was drawn, with the attribute `interrupted`.
 
     Raises
     ------
