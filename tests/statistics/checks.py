@@ -76,8 +76,11 @@ def assert_within(found: dict[str, float], limit: float = MCSE) -> None:
     assert abs(found[worst]) <= limit, f"{worst} lies {found[worst]:+.2f} MCSE off; all: {found}"
 
 
-def assert_moments(draws, mean, sd, label="") -> None:
-    """Draws (chain, draw, ...) have these means and sds (...), Bonferroni over all at `LEVEL`."""
+def assert_moments(draws, mean, sd, label="", tables=1) -> None:
+    """Draws (chain, draw, ...) have these means and sds (...).
+
+    Bonferroni at `LEVEL` over all of them, and over the `tables` tests of this kind.
+    """
     draws = np.asarray(draws, float)
     flat = draws.reshape(*draws.shape[:2], -1)
     means, sds = np.ravel(mean), np.ravel(sd)
@@ -87,6 +90,6 @@ def assert_moments(draws, mean, sd, label="") -> None:
             assert np.all(flat[:, :, i] == means[i])
             continue
         z += deviations(flat[:, :, i], mean=means[i], sd=sds[i]).values()
-    limit = float(stats.norm.isf(LEVEL / (2 * len(z))))
+    limit = float(stats.norm.isf(LEVEL / (2 * len(z) * tables)))
     print(f"{label}: {len(z)} moments, largest deviation {np.max(np.abs(z)):.2f} of {limit:.2f}")
     assert np.max(np.abs(z)) <= limit, (label, np.round(z, 1))

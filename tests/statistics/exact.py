@@ -23,9 +23,8 @@ class DenseGaussian:
         mean[0], cov[0, :, 0] = m, P
         for t in range(1, T):
             mean[t] = A @ mean[t - 1] + b[t]
-            for s in range(t):
-                cov[t, :, s] = A @ cov[t - 1, :, s]
-                cov[s, :, t] = cov[t, :, s].T
+            cov[t, :, :t] = np.tensordot(A, cov[t - 1, :, :t], axes=1)
+            cov[:t, :, t] = np.moveaxis(cov[t, :, :t], 0, -1)
             cov[t, :, t] = A @ cov[t - 1, :, t - 1] @ A.T + Q
         K = y.shape[1]
         seen = ~np.isnan(y).ravel()
@@ -69,12 +68,12 @@ def varve_log_likelihood(y, phi, tau, points=600):
 class GridPosterior:
     """The posterior of one scalar parameter on a grid, from log likelihood plus log prior."""
 
-    def __init__(self, log_density, lower, upper, points=401):
-        self.x, h = np.linspace(lower, upper, points, retstep=True)
+    def __init__(self, log_density, lower, upper, points=101):
+        self.x = np.linspace(lower, upper, points)
         log_p = np.array([log_density(v) for v in self.x])
         self.weight = np.exp(log_p - log_p.max())
         edges = max(self.weight[0], self.weight[-1])
-        assert edges < 1e-8, f"the grid cuts the posterior off at {edges:.1e} of its height"
+        assert edges < 1e-7, f"the grid cuts the posterior off at {edges:.1e} of its height"
         self.weight /= self.weight.sum()
         self.mean = float(self.weight @ self.x)
         self.sd = float(np.sqrt(self.weight @ (self.x - self.mean) ** 2))

@@ -1,0 +1,36 @@
+"""Simulation-based calibration of PGAS and PMMH; see `sbc.py`, which also makes the docs' table."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from .checks import LEVEL
+from .sbc import BINS, KEPT, STUDIES, calibrate, histogram, uniform_p
+
+QUANTITIES = sum(len(study.ranked) for study in STUDIES.values())
+
+
+def test_statistic_knows_uniform_from_not():
+    rng = np.random.default_rng(3)
+    ranks = rng.integers(0, KEPT + 1, 20_000)
+    assert histogram(ranks).sum() == len(ranks)
+    assert len(histogram(ranks)) == BINS
+    assert uniform_p(ranks) > LEVEL
+    narrow = np.floor((KEPT + 1) * rng.beta(0.8, 0.8, 400)).astype(int)
+    assert uniform_p(narrow) < uniform_p(ranks)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STUDIES)
+def test_ranks_are_uniform(name):
+    """Every parameter, and the state in the middle, over 240 data sets from the prior."""
+    study = STUDIES[name]
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
+        ranks, thin = calibrate(study, 240, executor)
+    found = {q: uniform_p(column) for q, column in zip(study.ranked, ranks.T, strict=True)}
+    print(f"{name}, thinned by {thin}: " + ", ".join(f"{q}: p={p:.3f}" for q, p in found.items()))
+    assert min(found.values()) > LEVEL / QUANTITIES, found

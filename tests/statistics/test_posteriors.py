@@ -1,0 +1,153 @@
+"""Posteriors by PGAS and PMMH against quadrature, in Monte Carlo standard errors.
+
+The exact values stand in tests/reference. The long runs meet all of: within 4 standard errors,
+these below 5% of the posterior standard deviation, R-hat below 1.01. The short ones check the same
+agreement, with the standard errors that they have.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
+
+from . import models
+from .checks import (
+    assert_within,
+    deviations,
+    influence_of_correlation,
+    mcse_mean,
+    seed_of,
+)
+from .exact import DenseGaussian, GridPosterior
+
+
+def draw(label, model, data, method, draws, warmup=500, **options):
+    """Four chains, their summary printed; returns (posterior, summary)."""
+    idata = ssm.sample(
+        model, data, method, draws=draws, warmup=warmup, states=False, progress=False,
+        seed=seed_of(label), **options,
+    )  # fmt: skip
+    summary = ssm.summary(idata)
+    print(f"{label}, {idata['posterior'].attrs['seconds']:.1f} s\n{summary.to_string()}")
+    return idata["posterior"], summary
+
+
+def assert_long_enough(summary):
+    """What makes agreement worth something: small errors, and chains that agree."""
+    assert (summary["mcse_mean"] < 0.05 * summary["sd"]).all(), summary.to_string()
+    assert (summary["r_hat"] < 1.01).all(), summary.to_string()
+
+
+def varve_deviations(posterior, exact) -> dict[str, float]:
+    out = {}
+    for name in ("phi", "tau"):
+        mean, sd = exact["posterior_mean"][name], exact["posterior_sd"][name]
+        found = deviations(posterior[name].values, mean=mean, sd=sd)
+        out |= {f"{what} of {name}": v for what, v in found.items()}
+    phi, tau = posterior["phi"].values, posterior["tau"].values
+    r = np.corrcoef(phi.ravel(), tau.ravel())[0, 1]
+    error = mcse_mean(influence_of_correlation(phi, tau))
+    return out | {"correlation": (r - exact["posterior_correlation"]) / error}
+
+
+VARVE_RUNS = [
+    pytest.param("PGAS", ssm.PGAS(), 2_000, 200, False, id="PGAS"),
+    pytest.param("PMMH", ssm.PMMH(particles=800, proposal="bootstrap"), 1_200, 500, False,
+                 id="PMMH"),
+    pytest.param("PGAS", ssm.PGAS(), 20_000, 500, True, id="PGAS-long", marks=pytest.mark.slow),
+    pytest.param("PMMH", ssm.PMMH(), 10_000, 1_000, True, id="PMMH-long", marks=pytest.mark.slow),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "method", "draws", "warmup", "long"), VARVE_RUNS)
+def test_varves(exact_values, name, method, draws, warmup, long):
+    label = f"varves {name} {draws}"
+    posterior, summary = draw(label, models.varves, {"y": ice_varves()}, method, draws, warmup)
+    if long:
+        assert_long_enough(summary)
+    assert_within(varve_deviations(posterior, exact_values["ice_varves"]))
+
+
+LGSS = {"main text": (lgss_main_text, 0.5), "appendix": (lgss_appendix, 1.0)}
+LGSS_METHODS = [
+    *(ssm.PGAS(particles=n, proposal=p) for p in ("bootstrap", "auxiliary") for n in (2, 5, 20)),
+    ssm.PMMH(),
+    ssm.PMMH(particles=100, proposal="bootstrap"),
+]
+
+
+@pytest.mark.parametrize("draws", [2_000, pytest.param(25_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", LGSS_METHODS, ids=str)
+@pytest.mark.parametrize("series", LGSS)
+def test_lgss(exact_values, series, method, draws):
+    """theta with its vague Gamma prior; c is known. Mean, sd and the quantiles' levels."""
+    load, c = LGSS[series]
+    exact = exact_values[f"lgss_{series.replace(' ', '_')}"]
+    posterior, summary = draw(
+        f"lgss {series} {method} {draws}", models.lgss, {"y": load()}, method, draws,
+        fixed={"c": c},
+    )  # fmt: skip
+    if draws > 10_000:
+        assert_long_enough(summary)
+    theta = posterior["theta"].values
+    assert_within(
+        deviations(
+            theta, exact["posterior_mean"], exact["posterior_sd"], exact["posterior_quantiles"]
+        )
+    )
+
+
+# --- several experiments -------------------------------------------------------------------------
+
+
+@cache
+def experiments():
+    """Three series of one system, of different lengths, one with gaps."""
+    out = []
+    for i, steps in enumerate((30, 12, 45)):
+        d = ssm.simulate(
+            models.lgss, {"theta": 2.0, "c": 1.0}, steps=steps, seed=seed_of("experiments", i)
+        )
+        y = d["y"].values[0].copy()
+        if i == 1:
+            y[[0, 5, 6]] = np.nan
+        out.append({"y": y})
+    return out
+
+
+def joint_log_likelihood(theta, c):
+    matrices = models.lgss_matrices(theta, c)
+    return sum(DenseGaussian(e["y"], **matrices).log_likelihood for e in experiments())
+
+
+def test_likelihood_of_several_experiments_is_their_product():
+    parameters = {"theta": 1.3, "c": 1.0}
+    exact = joint_log_likelihood(**parameters)
+    kalman = ssm.log_likelihood(models.lgss, experiments(), parameters, proposal="kalman")
+    assert kalman[0] == pytest.approx(exact, abs=1e-8)
+    log_z = ssm.log_likelihood(
+        models.lgss, experiments(), parameters, particles=300, repeats=500,
+        proposal="auxiliary", seed=seed_of("several experiments"),
+    )  # fmt: skip
+    ratio = np.exp(log_z - exact)
+    assert abs(ratio.mean() - 1) <= 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
+
+
+@pytest.mark.parametrize(
+    "method", [ssm.PGAS(particles=10), ssm.PMMH(particles=50, proposal="guided")], ids=str
+)
+def test_posterior_of_several_experiments(method):
+    def log_density(log_theta):  # Gamma(0.01, rate 0.01), on the scale of log theta
+        theta = np.exp(log_theta)
+        return 0.01 * log_theta - 0.01 * theta + joint_log_likelihood(theta, 1.0)
+
+    exact = GridPosterior(log_density, -1.5, 3.0)
+    posterior, _ = draw(
+        f"experiments {method}", models.lgss, experiments(), method, 4000, fixed={"c": 1.0}
+    )
+    assert_within(deviations(np.log(posterior["theta"].values), exact.mean, exact.sd))
