@@ -524,6 +524,44 @@ def object_array():
     return declare(transition=transition)
 
 
+@bad("logaddexp", "np.stack([a, b])")
+def function_of_an_object_array():
+    def transition(x):
+        mean = np.logaddexp(np.array([x, 2 * x]), 0.0)  # HERE
+        return {"x": ssm.Normal(mean[0], sd=1)}
+
+    return declare(transition=transition)
+
+
+@bad("maximum", "np.stack([...]) and not by np.array", error=UnsupportedOperation)
+def maximum_of_an_object_array():
+    def transition(x):
+        mean = np.maximum(np.array([x, 2 * x]), 0.0)  # HERE
+        return {"x": ssm.Normal(mean[0], sd=1)}
+
+    return declare(transition=transition)
+
+
+@bad("IndexError", "np.choose(k, table) is table[k]")
+def numbers_indexed_by_a_symbol():
+    table = np.array([[0.9, 0.1], [0.2, 0.8]])
+
+    def transition(x):
+        return {"x": ssm.Categorical(table[x])}  # HERE
+
+    return declare(initial=lambda: {"x": ssm.Categorical([0.5, 0.5])}, transition=transition)
+
+
+@bad("a whole number was asked of a symbol", "np.choose(k, table)", error=UnsupportedOperation)
+def numbers_taken_by_a_symbol():
+    table = np.array([[0.9, 0.1], [0.2, 0.8]])
+
+    def transition(x):
+        return {"x": ssm.Categorical(np.take(table, x, axis=0))}  # HERE
+
+    return declare(initial=lambda: {"x": ssm.Categorical([0.5, 0.5])}, transition=transition)
+
+
 @bad("@ of shapes (2, 2) and (3,)", "inner dimensions", error=UnsupportedOperation)
 def shapes_in_a_product():
     def transition(x):

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.errors import Location
-from ssmppl.expressions.arrays import ExprArray, array, inverse, log_determinant
+from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, apply, constant
+from ssmppl.expressions.linear import inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.trace import Site, Trace, seen

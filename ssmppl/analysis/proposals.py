@@ -22,9 +22,10 @@ import numpy as np
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
 from ssmppl.analysis.structure import GaussianBlock, affine_observation, gaussian_block
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.arrays import ExprArray, array, cholesky, inverse, log_determinant
+from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
 from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, topological
+from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Site, Trace, seen

@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from ssmppl.errors import SSMError
-from ssmppl.expressions.arrays import ExprArray, array, inverse
+from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, apply, constant, dependent, topological
+from ssmppl.expressions.linear import inverse
 
 Partial = Callable[..., Sequence[Expr | float | None]]
 _ROOT_2PI = math.sqrt(2.0 * math.pi)

@@ -14,14 +14,17 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import Location, ModelError, SSMError
-from ssmppl.expressions.expr import topological
+from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
 from ssmppl.language.model import location_of, outer_values, plain_function
 
 Law = Callable[..., Any]
 Known = Mapping[str, str]  # name of a quantity -> its role
 # NumPy's messages about object arrays, which np.array makes of symbols
-_OBJECT_ARRAY = re.compile(r"has no callable|dtype\('O'\)|^'Expr' object has no attribute")
+_OBJECT_ARRAY = re.compile(
+    r"has no callable|dtype\('O'\)|^'Expr' object has no attribute"
+    r"|not supported for the input types"
+)
 _INSTALLED = tuple(
     path for key in ("stdlib", "platstdlib", "purelib", "platlib")
     if (path := sysconfig.get_path(key))
@@ -160,6 +163,8 @@ def _wrapped(
     elif _OBJECT_ARRAY.search(str(error)):
         fix = "np.array([...]) of symbols is a plain object array to NumPy: build vectors by "
         fix += "np.stack([a, b]) and matrices by np.block([[a, b], [c, d]])"
+    elif isinstance(error, IndexError) and "only integers, slices" in str(error):
+        fix = f"if the index is a symbol: {INDEX_BY_SYMBOL}"
     elif isinstance(error, AttributeError) and (attribute := _ssm_attribute(error)):
         fix = attribute
     return ModelError(found, fix=fix, where=where)

@@ -13,16 +13,11 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ModelError
-from ssmppl.expressions.arrays import (
-    ExprArray,
-    array,
-    cholesky,
-    inverse,
-    log_determinant,
-)
+from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.expr import constant
+from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Draws, Support, one_of
 from ssmppl.language.positive import log_gamma_draw, needs_log_gamma

@@ -125,6 +125,21 @@ CODE = {
     "entry by a symbol": lambda A, k: A[(k, 1) if isinstance(k, Expr) else (int(k), 1)],
     "take": lambda v: np.take(v, [2, 0]),
     "take by a symbol": lambda v, k: np.take(v, k if isinstance(k, Expr) else int(k)),
+    "take by a symbol along an axis": lambda A, k: np.take(
+        A, k if isinstance(k, Expr) else int(k), axis=1
+    ),
+    "take by a symbol from all": lambda A, k: np.take(A, k if isinstance(k, Expr) else int(k)),
+    "choose": lambda k: np.choose(k if isinstance(k, Expr) else int(k), C[0]),
+    "choose a row of numbers": lambda k: np.choose(k if isinstance(k, Expr) else int(k), C),
+    "choose an entry of numbers": lambda k: np.choose(
+        k if isinstance(k, Expr) else int(k), np.choose(k if isinstance(k, Expr) else int(k), C)
+    ),
+    "choose from a list": lambda x, y, v, k: np.choose(
+        k if isinstance(k, Expr) else int(k), [x, 2.0, v]
+    ),
+    "choose by several": lambda v, w: np.choose(
+        (v > 0) if isinstance(v, ExprArray) else (v > 0).astype(int), [w, C[1]]
+    ),
     "table of numbers": lambda k: np.sum(np.where(np.arange(3) == k, C[0], 0.0)),
     "cumsum": lambda v, A: np.cumsum(v) + np.cumsum(A, axis=1)[0] + v.cumsum(),
     "kron": lambda A, v: np.kron(A, v[:2]),

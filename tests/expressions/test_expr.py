@@ -69,7 +69,7 @@ def test_pickling_and_copying_intern_again():
 
 
 def test_nodes_are_freed():
-    from ssmppl.expressions.expr import _interned
+    from ssmppl.expressions.node import _interned
 
     gc.collect()
     before = len(_interned)
@@ -243,6 +243,14 @@ def _compare_object_array():
     return np.array([X, Y]) > 0
 
 
+def _maximum_of_an_object_array():
+    return np.maximum(np.array([X, Y]), 0.0)
+
+
+def _choose_from_nothing():
+    return np.choose(X, [])
+
+
 def _wrong_shapes():
     return V @ array(np.eye(2))
 
@@ -269,10 +277,12 @@ def _while():
 REFUSED = {
     _if: "np.where", _and: "&", _chain: "&", _float: "np.exp", _math: "np.exp",
     _fft: "supported are", _in_place: "a + b", _assign: "np.stack", _out: "a + b",
-    _where_keyword: "a + b", _min: "np.minimum", _range: "np.arange", _int: "np.arange",
+    _where_keyword: "a + b", _min: "np.minimum", _range: "np.choose", _int: "np.choose",
     _as_floats: "np.stack", _astype: "np.stack", _one_argument_where: "both branches",
-    _sort: "supported are", _slice: "np.arange", _take_from_numbers: "np.arange",
-    _compare_object_array: "np.stack", _wrong_shapes: "dimensions agree",
+    _sort: "supported are", _slice: "np.choose", _take_from_numbers: "np.choose",
+    _compare_object_array: "np.stack",
+    _maximum_of_an_object_array: "np.stack", _choose_from_nothing: "one element",
+    _wrong_shapes: "dimensions agree",
     _not_square: "one square matrix", _unknown_ufunc: "supported are",
     _scipy_function: "NumPy's function", _while: "np.where",
 }  # fmt: skip

@@ -1,0 +1,46 @@
+"""Expressions as a person writes them."""
+
+from __future__ import annotations
+
+from ssmppl.expressions.graph import topological
+from ssmppl.expressions.node import Expr, behaviour
+
+_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "pow": ("**", 4)}
+_INFIX |= {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "mod": ("%", 2)}
+
+
+def symbol_text(node: Expr) -> str:
+    """The name of a symbol as a person writes it: `x`, `x_prev`, `beta[2]`."""
+    kind, name, index = node.data
+    suffix = "_prev" if kind.endswith("_prev") else ""
+    return name + suffix + (f"[{', '.join(map(str, index))}]" if index else "")
+
+
+def to_text(root: Expr) -> str:
+    """The expression as a person writes it."""
+    done: dict[Expr, tuple[str, int]] = {}
+    for node in topological([root]):
+        parts = [done[a] for a in node.args]
+        if node.op == "const":
+            done[node] = (f"{node.data:.10g}", 9 if node.data >= 0 else 1)
+        elif node.op == "symbol":
+            done[node] = (symbol_text(node), 9)
+        elif node.op in _INFIX:
+            sign, level = _INFIX[node.op]
+            (a, la), (b, lb) = parts
+            left = f"({a})" if la < level or (node.op == "pow" and la == level) else a
+            tight = sign not in "+*" or node.args[1].op == "mod"
+            right = f"({b})" if lb < level or (lb == level and tight) else b
+            done[node] = (f"{left}{sign}{right}" if level > 1 else f"{left} {sign} {right}", level)
+        elif node.op == "neg":
+            a, level = parts[0]
+            done[node] = (f"-({a})" if level < 2 else f"-{a}", 1)
+        elif node.op == "item":
+            done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
+        else:
+            name = node.data[0] if node.op == "random" else node.op
+            done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)
+    return done[root][0]
+
+
+behaviour["text"] = to_text

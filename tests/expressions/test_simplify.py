@@ -1,0 +1,49 @@
+"""The table of simplifications: every rule is used, and means what its left-hand side means."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, apply, constant, symbol
+from ssmppl.expressions.simplify import RULES
+
+X, Y = symbol("state", "x"), symbol("state", "y")
+AT = {X: np.array([0.7, 1.3, 2.9]), Y: np.array([1.9, 0.4, 0.8])}
+NUMBERS = [constant(v) for v in (0.0, 1.0, -1.0, 0.5, 2.5)]
+SYMBOLIC = [X, Y, -X, 2.5 * X, 2.5 / Y, np.exp(X), X + Y]
+CONDITIONS = [constant(1.0), constant(0.0), X < Y]
+
+
+def arguments(op):
+    """Arguments as `apply` hands them to the rules: not all of them numbers."""
+    first = CONDITIONS if op == "where" else NUMBERS + SYMBOLIC
+    count = {"log": 1, "neg": 1, "where": 3}.get(op, 2)
+    for args in itertools.product(first, *[NUMBERS + SYMBOLIC] * (count - 1)):
+        if any(a.op != "const" for a in args):
+            yield args
+
+
+@pytest.mark.parametrize(
+    ("op", "rule"), [(op, rule) for op, rules in RULES.items() for rule in rules],
+    ids=[rule[0] for rules in RULES.values() for rule in rules],
+)  # fmt: skip
+def test_rules_keep_the_meaning(op, rule):
+    _, applies, result = rule
+    used = [args for args in arguments(op) if applies(*args)]
+    assert used
+    for args in used:
+        with np.errstate(all="ignore"):
+            plain = np.broadcast_to(evaluate(Expr(op, args), AT), 3)
+            simple = np.broadcast_to(evaluate(result(*args), AT), 3)
+        real = np.isfinite(plain)  # 0 / 0, and the logarithm of a negative number, have no meaning
+        np.testing.assert_allclose(simple[real], plain[real], rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("op", RULES)
+def test_simplifying_again_changes_nothing(op):
+    for args in arguments(op):
+        once = apply(op, *args)
+        if once.op in RULES:
+            assert apply(once.op, *once.args) is once
