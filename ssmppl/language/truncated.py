@@ -23,6 +23,9 @@ from ssmppl.language.positive import Exponential
 from ssmppl.language.symmetric import Laplace
 
 
+MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
+
+
 class Truncated(Distribution):
     """Truncated(dist, lower=None, upper=None): bounds are included for discrete distributions."""
 
@@ -129,10 +132,42 @@ class Truncated(Distribution):
         return _where(below, 1.0, _where(ew("le", upper, value), 0.0, inside))
 
     def _quantile(self, p: ExprArray, q: ExprArray) -> ExprArray:
+        width = self._width()
+        if width is not None:
+            return self._counted(width, p)
         return self._clip(self.base.quantile_between(p, q, *self._bounds()))
 
     def quantile(self, p):
         return self._quantile(array(p), 1.0 - array(p))
+
+    def _counted(self, width: int, p: ExprArray) -> ExprArray:
+        """lower + how many of the values before the last have a distribution function below p.
+
+        From the probabilities themselves, which no tail is too far for.
+        """
+        lower, _ = self._bounds()
+        log_p = [array(self.base.log_densities(lower + float(k))) for k in range(width + 1)]
+        top = log_p[0]
+        for other in log_p[1:]:
+            top = array(ew("maximum", top, other))
+        parts = [array(ew("exp", one - top)) for one in log_p]
+        total = parts[0]
+        for part in parts[1:]:
+            total = total + part
+        below, out = self._full(0.0), lower
+        for part in parts[:-1]:
+            below = below + part
+            out = out + _where(ew("lt", below, p * total), 1.0, 0.0)
+        return array(out)
+
+    def _width(self) -> int | None:
+        """upper - lower for a discrete law between a few numbers, else None."""
+        bounds = [a.ravel() for a in self._bounds()]
+        if not self.discrete or any(e.op != "const" for a in bounds for e in a):
+            return None
+        widths = {b.data - a.data for a, b in zip(*bounds, strict=True)}
+        width = widths.pop()
+        return int(width) if not widths and width <= MOST_COUNTED else None
 
     def survival_quantile(self, p):
         return self._quantile(1.0 - array(p), array(p))

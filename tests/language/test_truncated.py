@@ -106,12 +106,14 @@ def _upper_tail_is_lost(case):
 
 @cases
 def test_the_sampler_follows_the_law(case):
-    if _upper_tail_is_lost(case) and math.isfinite(case.upper):
-        pytest.xfail("two bounds in the far upper tail of a discrete distribution")
     d = case.build()
     x_grid, w, density = grid(case)
     cumulative = np.cumsum(w * density)
-    for made, values in [(d, {}), symbolic(case)]:
+    forms = [(d, {})]
+    if not (_upper_tail_is_lost(case) and math.isfinite(case.upper)):
+        # beyond the 1e-12 upper tail, two bounds are resolved where they are numbers only
+        forms.append(symbolic(case))
+    for made, values in forms:
         n = 4000
         sample = array(made.sample(Draws("x")))[()]
         x = evaluate(sample, values, numpy_draws(np.random.default_rng(7), (n,)))
