@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from graphs import TABLE, X, Y, Z, programs, run
+from tests.expressions.graphs import TABLE, X, Y, Z, programs, run
 from hypothesis import given, settings
 from hypothesis import strategies as some
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import scipy.stats as st
-from distribution_table import CASES, JOINT_CASES, NOT_IN_SCIPY, Case
+from tests.language.distribution_table import CASES, JOINT_CASES, NOT_IN_SCIPY, Case
 
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import scipy.stats as st
-from distribution_table import TRUNCATED_CASES
+from tests.language.distribution_table import TRUNCATED_CASES
 
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError
