@@ -19,6 +19,7 @@ import linecache
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,9 @@ class SSMError(Exception):
             lines.append(f"Fix: {fix}")
         super().__init__("\n".join(lines))
 
-    def __reduce__(self):  # exceptions cross process borders when an Executor runs chains
+    def __reduce__(
+        self,
+    ) -> tuple[Any, ...]:  # exceptions cross process borders when an Executor runs chains
         return _rebuild, (type(self), self.found, self.fix, self.where)
 
 

@@ -132,7 +132,8 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
                 f"corrected for {text} by a Metropolis step, as it has no known upper bound, and "
                 f"a slice sweep: {update.reason}"
             )
-        notes.append(update.where.short)
+        if update.where is not None:
+            notes.append(update.where.short)
     if isinstance(update.conditional, NormalGamma):
         notes.append("separate updates where the precision H or the rate is not positive")
     elif isinstance(update.conditional, Normal):

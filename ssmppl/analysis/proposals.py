@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -294,9 +295,7 @@ def _newton(
     }
     log_fit = _log_normal(array(list(block.symbols)) - x, factor)
     log_f = _log_transition(array(list(block.symbols)) - block.mean, block.covariance, precision)
-    log_q = apply(
-        "logaddexp", math.log1p(-DEFENSIVE) + log_fit, math.log(DEFENSIVE) + log_f
-    )
+    log_q = apply("logaddexp", math.log1p(-DEFENSIVE) + log_fit, math.log(DEFENSIVE) + log_f)
     at_mode = dict(zip(block.symbols, x, strict=True))
     (g_mode,) = substitute([total], at_mode)
     look_ahead = (
@@ -325,7 +324,7 @@ def _curved(
         return array([[apply("sqrt", (precision + w)[0, 0])]]), g
     full = written_cholesky(array(precision + w))
     last = full[n - 1, n - 1]
-    concave = apply("eq", last, last)  # nan where the matrix is not positive definite
+    concave: Any = apply("eq", last, last)  # nan where the matrix is not positive definite
     diagonal = np.diag(array(np.maximum(array(np.diagonal(w.view(np.ndarray))), 0.0)))
     safe = written_cholesky(array(precision + diagonal))
     return array(np.where(concave, full, safe)), g
@@ -381,9 +380,7 @@ def _user(trace: Trace, missing: Missing) -> Proposal:
             draw[s] = e if measured is None else apply("where", measured, e, draw[s])
             own.add(s)
         correction = correction - site.distribution.log_density(site.value)
-    transition = [
-        t for t in terms(trace, "transition") if set(t.site.value.ravel()) & own
-    ]
+    transition = [t for t in terms(trace, "transition") if set(t.site.value.ravel()) & own]
     site = transition[0].site
     ratio = tuple(
         [replace(t, guard=measured) for t in transition] + [Term(site, correction, measured)]

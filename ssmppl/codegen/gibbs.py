@@ -26,10 +26,10 @@ def compile_updates(trace: Trace, updates: Sequence[Update]) -> ModuleType:
         if not update.functions or update.needs_log_joint:
             continue
         parts = {
-            role: summands for role, summands in update.coefficients.items() if role != "prior" and any(
-                not (e.op == "const" and e.data == 0.0) for e in summands
-            )
-        }  # fmt: skip
+            role: summands
+            for role, summands in update.coefficients.items()
+            if role != "prior" and not all(e.op == "const" and e.data == 0.0 for e in summands)
+        }
         functions = ", ".join(map(repr, update.functions))
         doc = f"What multiplies {functions} in the log density of {', '.join(update.block)}."
         text = time_sum(layout, statistics_name(update), doc, parts, len(update.functions))

@@ -193,8 +193,8 @@ def parameter_functions(trace: Trace, layout: Layout) -> str:
         lines += [f"    if free[{k}]:  # {t.site.name}", *writer.lines]
     lines += ["    return log_jacobian", ""]
     total = constant(0.0)
-    for t in terms(trace, "prior"):
-        total = total + t.log_density
+    for term in terms(trace, "prior"):
+        total = total + term.log_density
     prior = scalar_function(
         layout, "log_prior", "theta", "Log prior density; -inf outside the support.",
         [("total", total)], returns="total",

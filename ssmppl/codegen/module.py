@@ -7,7 +7,7 @@ the loop over particles. A `Section` is one algorithm's functions over one pair 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ssmppl.codegen.render import Names, Writer, comment, depends, symbol_name, topological_until
@@ -276,7 +276,7 @@ def scalar_function(
 
 
 def time_sum(
-    layout: Layout, name: str, doc: str, parts: dict[str, Sequence[Expr]], size: int,
+    layout: Layout, name: str, doc: str, parts: Mapping[str, Sequence[Expr]], size: int,
     fixed: dict[str, list[tuple[Expr, Expr]]] | None = None,
 ) -> str:  # fmt: skip
     """A function that adds expressions up over a trajectory.
@@ -340,9 +340,7 @@ def _fix_block(
 def _sum_block(
     layout: Layout, summands: Sequence[Expr], names: dict[Expr, str], reserved: Names, indent: str
 ) -> list[str]:
-    pairs = [
-        (k, e) for k, e in enumerate(summands) if not (e.op == "const" and e.data == 0.0)
-    ]
+    pairs = [(k, e) for k, e in enumerate(summands) if not (e.op == "const" and e.data == 0.0)]
     own, inner, head = dict(names), Names(reserved.taken), []
     for node in topological_until([e for _, e in pairs], own):
         if node.op == "symbol" and node not in own:

@@ -58,7 +58,7 @@ def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]
     for row, first, last, text in sorted(edits, reverse=True):
         line = lines[row - 1]
         rest = line[last:]
-        lines[row - 1] = line[:first] + (text if text else "") + (rest if text else rest.lstrip(" "))
+        lines[row - 1] = line[:first] + (text + rest if text else rest.lstrip(" "))
     kept = [li for li in lines if li.strip() or li == ""]
     text = "\n".join(li.rstrip() for li in kept) + "\n"
     return Specialised(text.replace("(\n    \n", "(\n"), imports)

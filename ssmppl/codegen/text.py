@@ -19,11 +19,11 @@ MODULES = {
     "special": "lgamma digamma trigamma ndtr log_ndtr ndtri erf erfc",
     "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincinv",
     "random": "normal uniform gamma poisson binomial",
-    "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil maximum minimum "
-    "power poisson_quantile binomial_quantile negbinomial_quantile cholesky inverse logdet det",
+    "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil "
+    "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile cholesky "
+    "inverse logdet det",
     "flags": "exact kernel",
 }
-
 
 
 class ModuleText:

@@ -69,9 +69,7 @@ def check_count(name: str, value: Any, least: int) -> None:
     """Refuse what is no whole number of at least `least`."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or value < least:
-        raise ArgumentError(
-            f"{name}={value!r}", fix=f"give a whole number of at least {least}"
-        )
+        raise ArgumentError(f"{name}={value!r}", fix=f"give a whole number of at least {least}")
 
 
 def seed_sequence(seed: Any) -> np.random.SeedSequence:
@@ -125,10 +123,7 @@ def repeated_estimates(
 ) -> np.ndarray:
     """Independent estimates, one for each number in `repeats`; the same whatever the split."""
     return np.array(
-        [
-            log_likelihood_estimate(problem, theta, settings, random_state(seed, r))
-            for r in repeats
-        ]
+        [log_likelihood_estimate(problem, theta, settings, random_state(seed, r)) for r in repeats]
     )
 
 

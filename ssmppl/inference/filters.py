@@ -56,7 +56,7 @@ def particle_filter(
         * ``x``, ``x_sd``: filter means E[x_t given y_1:t] and standard deviations,
           (draw, time, ...);
         * ``x_quantile``: filter quantiles, last dim `quantile`;
-        * ``covariance``: of the stacked state components, (draw, time, state, state_);
+        * ``covariance``: of the stacked state components, ``(draw, time, state, state_)``;
         * ``y_predicted``, ``y_predicted_sd``: moments of y_t given y_1:t-1;
         * ``y_pit``: P(Y_t <= y_t given y_1:t-1), randomised for discrete channels; NaN where
           missing or undefined;

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.inference.filtering import (
     FilterSettings,
     check_count,

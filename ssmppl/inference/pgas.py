@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from types import ModuleType
 
 import numpy as np
@@ -112,9 +112,7 @@ def start_chain(
         path = np.empty((e.steps, len(problem.trace.state_symbols)))
         particles, status, t = max(200, sweeper.settings.particles), -1, 0
         while status != OK and particles <= 200_000:
-            status, t, _ = run(
-                theta, e.y, e.seen, e.u, particles, stream, path, np.empty(e.steps)
-            )
+            status, t, _ = run(theta, e.y, e.seen, e.u, particles, stream, path, np.empty(e.steps))
             particles *= 8
         if status != OK:
             raise failure(problem, theta, status, t, e)
@@ -160,9 +158,7 @@ def _trajectories(
     figures = np.zeros(2)
     for i, e in enumerate(problem.experiments):
         new, own = np.empty_like(paths[i]), np.empty(2)
-        status, t = run(
-            theta, e.y, e.seen, e.u, settings.particles, stream, paths[i], new, own
-        )
+        status, t = run(theta, e.y, e.seen, e.u, settings.particles, stream, paths[i], new, own)
         if status != OK:
             raise failure(problem, theta, status, t, e)
         paths[i] = new
@@ -180,10 +176,8 @@ def _parameters(
         rest = ThetaValues(sweeper.index, theta)
         totals = _totals(sweeper, k, theta, paths)
         if update.needs_log_joint:
-            values, info = draw(
-                update, totals, theta[where], rest, generator,
-                lambda v, where=where: _with(sweeper, theta, where, v, paths),
-            )  # fmt: skip
+            density = partial(_with, sweeper, theta, where, paths=paths)
+            values, info = draw(update, totals, theta[where], rest, generator, density)
             theta[where] = values
             log_joint(sweeper, theta, paths)  # sets what is deterministic in the trajectories
         else:
@@ -202,9 +196,7 @@ def _with(
     return log_joint(sweeper, trial, paths)
 
 
-def _totals(
-    sweeper: Sweeper, k: int, theta: np.ndarray, paths: list[np.ndarray]
-) -> np.ndarray:
+def _totals(sweeper: Sweeper, k: int, theta: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
     """The statistics C_i of update k: the prior once, the rest summed over experiments."""
     update = sweeper.updates[k]
     if update.needs_log_joint:

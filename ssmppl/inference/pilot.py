@@ -25,6 +25,7 @@ from ssmppl.inference.filtering import (
     repeated_estimates,
 )
 from ssmppl.inference.problem import Problem
+from ssmppl.language.trace import Site
 from ssmppl.language.transforms import transforms, unconstrain
 
 PILOT_PARTICLES = 200
@@ -82,7 +83,7 @@ def space_of(problem: Problem, fixed: dict[str, np.ndarray], start: dict[str, np
     return Space(problem, theta, z, free, where)
 
 
-def _moderate(site, known: dict[Expr, float]) -> np.ndarray:
+def _moderate(site: Site, known: dict[Expr, float]) -> np.ndarray:
     """A value inside the support: the prior's mean where it has one, else an ordinary number."""
     d = site.distribution
     mean = np.broadcast_to(evaluate(array(d.mean()), known), site.shape).astype(float)
@@ -166,7 +167,9 @@ def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "boots
     return Pilot(best, _scale(best, averaged), value)
 
 
-def _finite_point(z: np.ndarray, log_density: Callable[[np.ndarray], float], rng: np.random.Generator) -> np.ndarray:
+def _finite_point(
+    z: np.ndarray, log_density: Callable[[np.ndarray], float], rng: np.random.Generator
+) -> np.ndarray:
     for attempt in range(TRIES):
         point = z if attempt == 0 else z + (1.0 + attempt / 40.0) * rng.standard_normal(len(z))
         if log_density(point) > -np.inf:
@@ -212,9 +215,7 @@ def dispersed(
             if log_prior == -np.inf:
                 continue
             try:
-                value = log_likelihood_estimate(
-                    space.problem, theta, settings, random_state(child)
-                )
+                value = log_likelihood_estimate(space.problem, theta, settings, random_state(child))
             except SamplingError:
                 continue
             if value > -np.inf:

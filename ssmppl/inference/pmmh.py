@@ -50,9 +50,7 @@ def run_filters(
     for e in problem.experiments:
         path = np.empty((e.steps, len(problem.trace.state_symbols)))
         increment = np.empty(e.steps)
-        status, t, log_z = run(
-            theta, e.y, e.seen, e.u, settings.particles, stream, path, increment
-        )
+        status, t, log_z = run(theta, e.y, e.seen, e.u, settings.particles, stream, path, increment)
         if status == ALL_ZERO:
             return -np.inf, (), ()
         if status != OK:
@@ -70,7 +68,9 @@ def start_chain(
     """A chain at z, with a walk of the usual length for the given scales."""
     theta, log_density = space.parameters(z)
     stream = stream.copy()
-    log_likelihood, paths, increments = -np.inf, (), ()
+    log_likelihood = -np.inf
+    paths: tuple[np.ndarray, ...] = ()
+    increments: tuple[np.ndarray, ...] = ()
     for _ in range(50):
         log_likelihood, paths, increments = run_filters(space, theta, settings, stream)
         if log_likelihood > -np.inf:
@@ -95,7 +95,7 @@ def pmmh_block(
     state = replace(
         state, generator=copy.deepcopy(state.generator), stream=state.stream.copy(),
     )  # fmt: skip
-    draws: dict[str, list[np.ndarray]] = {"theta": [], "log_likelihood": [], "lp": []}
+    draws: dict[str, list[np.ndarray | float]] = {"theta": [], "log_likelihood": [], "lp": []}
     draws["acceptance_rate"] = []
     for i in range(len(space.problem.experiments)):
         draws[f"path_{i}"], draws[f"increment_{i}"] = [], []
@@ -105,9 +105,9 @@ def pmmh_block(
             state, rate = _iterate(space, settings, warmup, target, state)
             accepted += rate / iterations
         draws["theta"].append(state.theta)
-        draws["log_likelihood"].append(np.float64(state.log_likelihood))
-        draws["lp"].append(np.float64(state.log_likelihood + state.log_density))
-        draws["acceptance_rate"].append(np.float64(accepted))
+        draws["log_likelihood"].append(float(state.log_likelihood))
+        draws["lp"].append(float(state.log_likelihood + state.log_density))
+        draws["acceptance_rate"].append(accepted)
         for i, (path, increment) in enumerate(zip(state.paths, state.increments, strict=True)):
             draws[f"path_{i}"].append(path)
             draws[f"increment_{i}"].append(increment)
@@ -126,7 +126,9 @@ def _iterate(
     z = state.z + state.factor @ direction
     theta, log_density = space.parameters(z)
     probability = 0.0
-    log_likelihood, paths, increments = -np.inf, (), ()
+    log_likelihood = -np.inf
+    paths: tuple[np.ndarray, ...] = ()
+    increments: tuple[np.ndarray, ...] = ()
     if log_density > -np.inf:
         log_likelihood, paths, increments = run_filters(space, theta, settings, state.stream)
         change = log_likelihood + log_density - state.log_likelihood - state.log_density
@@ -144,9 +146,7 @@ def _iterate(
     return replace(state, factor=factor, iteration=state.iteration + 1), float(accept)
 
 
-def _adapt(
-    factor: np.ndarray, direction: np.ndarray, excess: float, iteration: int
-) -> np.ndarray:
+def _adapt(factor: np.ndarray, direction: np.ndarray, excess: float, iteration: int) -> np.ndarray:
     """S S' <- S (I + gain * excess * u u' / |u|^2) S' (Vihola 2012, equation 1)."""
     d = len(direction)
     gain = min(1.0, d * (iteration + 1.0) ** -ADAPTATION_POWER)

@@ -116,8 +116,10 @@ def sample(
         )
     root = seed_sequence(seed)
     space = space_of(problem, held, near)
-    prepare = _prepare_pmmh if isinstance(chosen, PMMH) else _prepare_pgas
-    sampler = prepare(problem, space, chosen, held, chains, warmup, thin, root)
+    if isinstance(chosen, PMMH):
+        sampler = _prepare_pmmh(problem, space, chosen, held, chains, warmup, thin, root)
+    else:
+        sampler = _prepare_pgas(problem, space, chosen, held, chains, warmup, thin, root)
     result = run_chains(
         sampler.step_block, sampler.states, draws, warmup, executor=executor, progress=progress,
         title=type(chosen).__name__,
@@ -232,9 +234,7 @@ def _to_arviz(
 ) -> Any:  # fmt: skip
     drawn, stats = stack(result)
     trace = problem.trace
-    posterior = {
-        n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held
-    }
+    posterior = {n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held}
     several = len(problem.experiments) > 1
     dims: dict[str, list[str]] = {}
     coords: dict[str, Any] = {}
@@ -279,4 +279,3 @@ def _to_arviz(
         coords=coords,
         attrs=attrs,
     )
-

@@ -128,6 +128,4 @@ def feeds_back(traced: Trace) -> bool:
         for a in site.distribution.parameters.values()
         for p in a.ravel()
     ]
-    return any(
-        n.op == "symbol" and n.data[0] == "observation_prev" for n in topological(laws)
-    )
+    return any(n.op == "symbol" and n.data[0] == "observation_prev" for n in topological(laws))

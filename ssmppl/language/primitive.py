@@ -45,7 +45,7 @@ class Primitive:
             )
         if not any(_symbolic(v) for v in values):
             return self.function(*values)
-        arrays = np.broadcast_arrays(*(array(v).view(np.ndarray) for v in values))
+        arrays: Any = np.broadcast_arrays(*(array(v).view(np.ndarray) for v in values))
         out = np.empty(arrays[0].shape, dtype=object)
         for i in np.ndindex(out.shape):
             out[i] = Expr("call", tuple(a[i] for a in arrays), self)
@@ -114,7 +114,8 @@ def _compile(function: Callable[..., float], n: int) -> Callable[..., Any]:
             fix="use plain arithmetic, math.* or np.* on floats inside it, and return a float",
             where=location_of(function),
         ) from None
-    result = compiled.overloads[(numba.float64,) * n].signature.return_type
+    overloads: Any = compiled.overloads
+    result = overloads[(numba.float64,) * n].signature.return_type
     if not isinstance(result, (numba.types.Float, numba.types.Integer, numba.types.Boolean)):
         raise ModelError(
             f"the primitive {function.__name__} returns {result}",

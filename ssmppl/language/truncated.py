@@ -22,7 +22,6 @@ from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.positive import Exponential
 from ssmppl.language.symmetric import Laplace
 
-
 MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
 
 

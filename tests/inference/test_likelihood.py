@@ -37,7 +37,8 @@ AT = {"phi": 0.95, "tau": 50.0}
 def test_minus_infinity_where_nothing_is_finite(proposal):
     for parameters in ({"phi": 1.5, "tau": 50.0}, {"phi": 0.9, "tau": -1.0}):
         values = ssm.log_likelihood(varves, DATA, parameters, proposal=proposal, repeats=3, seed=1)
-        assert values.shape == (3,) and values.dtype == np.float64
+        assert values.shape == (3,)
+        assert values.dtype == np.float64
         assert np.all(values == -np.inf)
 
 
@@ -50,7 +51,7 @@ def test_the_same_seed_gives_the_same_numbers():
 
 
 @pytest.mark.parametrize(
-    "arguments, fragments",
+    ("arguments", "fragments"),
     [
         ({"proposal": "gided"}, ["'gided'", "guided"]),
         ({"proposal": "kalman"}, ["linear Gaussian", "y is Gamma", __file__]),
@@ -152,7 +153,9 @@ def test_simulate_shapes_and_prior_draws():
     inputs = {"u": np.arange(7.0)}
     out = ssm.simulate(own, inputs=inputs, draws=3, seed=2)
     assert out["x"].shape == out["y"].shape == (3, 7, 2)
-    assert out["z"].shape == (3, 7) and out["a"].shape == (3, 2) and out["q"].shape == (3,)
+    assert out["z"].shape == (3, 7)
+    assert out["a"].shape == (3, 2)
+    assert out["q"].shape == (3,)
     assert list(out["time"].values) == list(range(1, 8))
     again = ssm.simulate(own, inputs=inputs, draws=3, seed=2)
     np.testing.assert_array_equal(out["y"], again["y"])
@@ -192,4 +195,5 @@ def test_filter_datasets():
     np.testing.assert_allclose(out["x_sd"] ** 2, out["covariance"][..., 0, 0])
     assert np.all((out["y_pit"] > 0) & (out["y_pit"] < 1))
     total = out["log_likelihood_increment"].sum("time").values
-    assert np.all(np.isfinite(total)) and np.all(out["ess"] <= 200)
+    assert np.all(np.isfinite(total))
+    assert np.all(out["ess"] <= 200)

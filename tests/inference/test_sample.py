@@ -49,15 +49,19 @@ SHORT = {"draws": 20, "warmup": 10, "chains": 2, "progress": False}
 def test_groups_and_shapes(method):
     idata = ssm.sample(walk, DATA, method, seed=3, **SHORT)
     posterior = idata["posterior"]
-    assert posterior["b"].shape == (2, 20) and posterior["x"].shape == (2, 20, 40, 2)
+    assert posterior["b"].shape == (2, 20)
+    assert posterior["x"].shape == (2, 20, 40, 2)
     assert posterior["x"].dims == ("chain", "draw", "time", "x_dim_0")
     assert idata["observed_data"]["y"].shape == (40, 2)
     assert idata["constant_data"]["u"].shape == (40,)
     assert np.all(np.isfinite(idata["sample_stats"]["lp"]))
-    assert np.all(posterior["q"] > 0) and np.all((posterior["p"] > 0) & (posterior["p"] < 1))
+    assert np.all(posterior["q"] > 0)
+    assert np.all((posterior["p"] > 0) & (posterior["p"] < 1))
     attrs = posterior.attrs
-    assert attrs["method"] == type(method).__name__ and attrs["seed"] == "3"
-    assert attrs["interrupted"] == 0 and attrs["seconds"] > 0
+    assert attrs["method"] == type(method).__name__
+    assert attrs["seed"] == "3"
+    assert attrs["interrupted"] == 0
+    assert attrs["seconds"] > 0
     if isinstance(method, ssm.PMMH):
         per_step = idata["log_likelihood"]["y"].sum("time")
         np.testing.assert_allclose(per_step, idata["sample_stats"]["log_likelihood"], rtol=1e-9)
@@ -79,9 +83,7 @@ def test_fixed_parameters_and_no_states(method):
         walk, DATA, method, fixed={"b": 1.0}, start={"q": 0.4}, states=False, seed=1, **SHORT
     )
     assert set(idata["posterior"].data_vars) == {"q", "p"}
-    idata = ssm.sample(
-        walk, DATA, method, fixed={"b": 1.0, "q": 0.3, "p": 0.5}, seed=1, **SHORT
-    )
+    idata = ssm.sample(walk, DATA, method, fixed={"b": 1.0, "q": 0.3, "p": 0.5}, seed=1, **SHORT)
     assert set(idata["posterior"].data_vars) == {"x"}
 
 
@@ -113,7 +115,7 @@ def test_a_model_without_parameters():
 
 
 @pytest.mark.parametrize(
-    "arguments, fragments",
+    ("arguments", "fragments"),
     [
         ({"method": "pgas"}, ["'pgas'", "ssm.PGAS"]),
         ({"method": ssm.PGAS(particles=1)}, ["particles=1", "at least 2"]),

@@ -1,11 +1,11 @@
 """Conditional SMC with ancestor sampling: the kernel of PGAS, over a model's generated functions.
 
 Algorithm 3 of Lindsten, Jordan and Schön (2014), "Particle Gibbs with ancestor sampling" (in Schön
-et al. 2015, algorithm 7): particle N follows the reference trajectory; its ancestor is drawn anew at
-every step with probability proportional to w_{t-1} f(x'_t | x_{t-1}). The other ancestors are drawn
-given that one by conditional systematic resampling (Chopin and Singh 2015), which has the same
-marginals as independent draws, so the kernel leaves p(x_{1:T} | y_{1:T}, theta) invariant for every
-N >= 2.
+et al. 2015, algorithm 7): particle N follows the reference trajectory; its ancestor is drawn anew
+at every step with probability proportional to w_{t-1} f(x'_t | x_{t-1}). The other ancestors are
+drawn given that one by conditional systematic resampling (Chopin and Singh 2015), which has the
+same marginals as independent draws, so the kernel leaves p(x_{1:T} | y_{1:T}, theta) invariant for
+every N >= 2.
 
 Deterministic (Dirac) components of the reference are those that follow from its noisy components
 and the new ancestor. Where they forget the ancestor within `horizon` steps, the weights take the
