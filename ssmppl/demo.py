@@ -44,8 +44,8 @@ def observation(x):
 # log tau), the likelihood at each by a point-mass filter on a fine grid of x.
 EXACT = {"phi": (0.950254, 0.016627), "tau": (46.1955, 12.129)}
 
-# One sweep of PGAS costs a fraction of one step of PMMH, and moves less: it is thinned by so much.
-PGAS_THIN = 5
+# Iterations for each kept draw. One of PGAS costs a fraction of one of PMMH, and moves less.
+PGAS_THIN, PMMH_THIN = 5, 2
 
 
 def run(draws: int, seed: int | None, output: Path) -> None:
@@ -63,7 +63,7 @@ def run(draws: int, seed: int | None, output: Path) -> None:
 
     files = {"PGAS": output, "PMMH": output.with_name(f"{output.stem}_pmmh{output.suffix}")}
     results = {}
-    for method, thin in ((ssm.PGAS(), PGAS_THIN), (ssm.PMMH(), 1)):
+    for method, thin in ((ssm.PGAS(), PGAS_THIN), (ssm.PMMH(), PMMH_THIN)):
         name = type(method).__name__
         results[name] = _sample(method, draws=draws, warmup=draws // 2, thin=thin, seed=seed)
         save(results[name], files[name])
