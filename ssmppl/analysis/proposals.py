@@ -4,7 +4,8 @@ A `Proposal` says how a particle moves and what it weighs, as expressions:
 
 * `draw` gives x_t from x_{t-1} and random draws, `initial_draw` gives x_1;
 * `weight` are the terms of log [ f(x_t | x_{t-1}) g(y_t | x_t) / q(x_t | x_{t-1}, y_t) ];
-* `look_ahead` approximates log p(y_t | x_{t-1}), the auxiliary weight of Pitt and Shephard (1999).
+* `look_ahead` approximates log p(y_t | x_{t-1}), the auxiliary weight of Pitt and Shephard (1999);
+* `fit` are subexpressions of these, functions of x_{t-1} and y_t, that are computed once.
 
 Tiers, best first (Doucet, Godsill and Andrieu 2000, section II): the locally optimal proposal of
 a Gaussian transition with an observation affine in the state; a Laplace approximation to it
@@ -14,13 +15,12 @@ with the transition); the transition itself (bootstrap).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
+from ssmppl.analysis.laplace import NEWTON_STEPS, gaussian_fit
 from ssmppl.analysis.structure import GaussianBlock, affine_observation, gaussian_block
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
@@ -31,9 +31,8 @@ from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Site, Trace, seen
 
-NEWTON_STEPS = 3
-LONGEST_STEP = 2.0  # in standard deviations of the transition
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
+LARGEST_EXPONENT = 700.0  # of q / f, out of any particle's reach
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,7 @@ class Proposal:
     weight: tuple[Term, ...]
     look_ahead: Expr | None = None
     exact_look_ahead: bool = False
+    fit: tuple[Expr, ...] = ()
     explanation: str = ""
 
 
@@ -250,18 +250,16 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         return NotApplicable(f"the observation is not twice differentiable: {error.found}", where)
     if all(e.op == "const" and e.data == 0.0 for e in curvature.ravel()):
         return NotApplicable("the observation has no curvature in the state", where)
-    draw, log_q, look_ahead = _newton(move, total, slope, curvature)
-    transition = tuple(
-        t for t in terms(trace, "transition") if not set(t.site.value.ravel()) & set(move.others)
-    )
-    correction = Term(observed[0].site, -log_q, None)
+    draw, fit, log_ratio, look_ahead = _newton(move, total, slope, curvature)
+    correction = Term(observed[0].site, -log_ratio, None)
     return Proposal(
         "guided",
         _draws(list(trace.initial.values())),
         tuple(observed),
         draw,
-        (*observed, *transition, correction),
+        (*observed, correction),
         None if move.random else look_ahead,
+        fit=fit,
         explanation="Laplace: particles are drawn from a Gaussian fitted to "
         "f(x_t | x_{t-1}) g(y_t | x_t) by "
         f"{NEWTON_STEPS} Newton steps each, mixed with {DEFENSIVE:.0%} of the transition",
@@ -270,20 +268,13 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
 
 def _newton(
     move: _Split, total: Expr, slope: ExprArray, curvature: ExprArray
-) -> tuple[dict[Expr, Expr], Expr, Expr]:
-    """(draw, log q(x_t | x_{t-1}, y_t), log of the Laplace approximation to p(y_t | x_{t-1}))."""
+) -> tuple[dict[Expr, Expr], tuple[Expr, ...], Expr, Expr]:
+    """(draw, fit, log (q / f)(x_t | x_{t-1}, y_t), log of Laplace's approximation to
+    p(y_t | x_{t-1})) of a few Newton steps from the mean of the transition."""
     block, n = move.gaussian, len(move.gaussian)
     precision = inverse(block.covariance)
     spread = array([apply("sqrt", block.covariance[i, i]) for i in range(n)])
-    x = block.mean
-    for _ in range(NEWTON_STEPS):
-        factor, g = _curved(block, x, slope, curvature, precision)
-        pull = g - precision @ (x - block.mean)
-        root = lower_inverse(factor)
-        step = array(root.T @ (root @ pull))
-        limit = LONGEST_STEP * spread
-        x = array(x + np.minimum(np.maximum(step, -limit), limit))
-    factor, _ = _curved(block, x, slope, curvature, precision)
+    x, factor = gaussian_fit(block, slope, curvature, precision)
     draws = Draws("laplace")
     z = array([draws.normal() for _ in range(n)])
     from_fit = x + lower_inverse(factor).T @ z
@@ -293,69 +284,24 @@ def _newton(
         s: apply("where", defend, b, a)
         for s, a, b in zip(block.symbols, from_fit, from_transition, strict=True)
     }
-    log_fit = _log_normal(array(list(block.symbols)) - x, factor)
-    log_f = _log_transition(array(list(block.symbols)) - block.mean, block.covariance, precision)
-    log_q = apply("logaddexp", math.log1p(-DEFENSIVE) + log_fit, math.log(DEFENSIVE) + log_f)
+    own = array(list(block.symbols))
+    from_mean = array(own - block.mean)
+    distance = 0.5 * (from_mean @ precision @ from_mean - np.sum(array(factor.T @ (own - x)) ** 2))
+    # how much narrower the fit is than the transition: the ratio of the roots of determinants
+    narrower = spread[0] if n == 1 else apply("exp", 0.5 * log_determinant(block.covariance))
+    for i in range(n):
+        narrower = narrower * factor[i, i]
+    ratio = narrower * apply("exp", apply("minimum", distance, LARGEST_EXPONENT))
+    log_ratio = apply("log", DEFENSIVE + (1.0 - DEFENSIVE) * ratio)
     at_mode = dict(zip(block.symbols, x, strict=True))
     (g_mode,) = substitute([total], at_mode)
-    look_ahead = (
-        g_mode
-        + _log_transition(array(x - block.mean), block.covariance, precision)
-        - _log_normal(array([constant(0.0)] * n), factor)
-    )
+    to_mode = array(x - block.mean)
+    look_ahead = g_mode - 0.5 * (to_mode @ precision @ to_mode) - apply("log", narrower)
     ahead = move.insert({look_ahead: look_ahead})[look_ahead]
-    return {**move.others, **move.insert(chosen)}, log_q, ahead
-
-
-def _curved(
-    block: GaussianBlock,
-    x: ExprArray,
-    slope: ExprArray,
-    curvature: ExprArray,
-    precision: ExprArray,
-) -> tuple[ExprArray, ExprArray]:
-    """Cholesky factor of the fitted precision at x, and the slope of the log density there."""
-    n = len(block)
-    at = dict(zip(block.symbols, x, strict=True))
-    flat = substitute([*slope, *curvature.ravel()], at)
-    g, w = array(flat[:n]), -array(flat[n:]).reshape(n, n)
-    if n == 1:
-        w = array(np.maximum(w, 0.0))
-        return array([[apply("sqrt", (precision + w)[0, 0])]]), g
-    full = written_cholesky(array(precision + w))
-    last = full[n - 1, n - 1]
-    concave: Any = apply("eq", last, last)  # nan where the matrix is not positive definite
-    diagonal = np.diag(array(np.maximum(array(np.diagonal(w.view(np.ndarray))), 0.0)))
-    safe = written_cholesky(array(precision + diagonal))
-    return array(np.where(concave, full, safe)), g
-
-
-def written_cholesky(a: ExprArray) -> ExprArray:
-    """Cholesky factor written out in scalars (nan where a is not positive definite)."""
-    n, zero = len(a), constant(0.0)
-    out = np.empty((n, n), dtype=object)
-    out[...] = [[zero] * n] * n
-    for j in range(n):
-        total = a[j, j]
-        for k in range(j):
-            total = total - out[j, k] ** 2
-        out[j, j] = apply("sqrt", total)
-        for i in range(j + 1, n):
-            total = a[i, j]
-            for k in range(j):
-                total = total - out[i, k] * out[j, k]
-            out[i, j] = total / out[j, j]
-    return array(out)
-
-
-def _log_normal(d: ExprArray, factor: ExprArray) -> Expr:
-    """Log density at distance d from the mean, precision factor @ factor.T."""
-    log_root = np.sum(array([apply("log", factor[i, i]) for i in range(len(d))]))
-    return log_root - 0.5 * np.sum(array(factor.T @ d) ** 2) - 0.5 * len(d) * LOG_2PI
-
-
-def _log_transition(d: ExprArray, covariance: ExprArray, precision: ExprArray) -> Expr:
-    return -0.5 * (len(d) * LOG_2PI + log_determinant(covariance) + d @ precision @ d)
+    fit = (*x, *(factor[i, j] for i in range(n) for j in range(i + 1)))
+    if depends_on(look_ahead, list(move.others)):  # the fit is no function of x_{t-1} alone
+        fit = ()
+    return {**move.others, **move.insert(chosen)}, fit, log_ratio, ahead
 
 
 # -- the user's own

@@ -9,8 +9,16 @@ import numpy as np
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import deterministic
-from ssmppl.codegen.module import Layout, Section, Target, scalar_function, time_sum
-from ssmppl.codegen.render import Names, Writer
+from ssmppl.codegen.module import (
+    PARTICLE,
+    Layout,
+    Section,
+    Target,
+    level_of,
+    scalar_function,
+    time_sum,
+)
+from ssmppl.codegen.render import Names, Writer, depends
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
@@ -20,8 +28,11 @@ from ssmppl.language.transforms import transforms
 DRAW_INITIAL = "theta, c, s, states, normals, uniforms, rng"
 DRAW = "theta, c, s, states_prev, states, normals, uniforms, rng"
 WEIGH_INITIAL = "theta, c, s, states, log_w"
-WEIGH = "theta, c, s, states_prev, states, log_w"
-LOOK_AHEAD = "theta, c, s, states_prev, log_w"
+WEIGH_CONNECTED = "theta, c, s, states_prev, states, log_w"
+FIT = "theta, c, s, states_prev, fits"
+LOOK_AHEAD = "theta, c, s, states_prev, fits, log_w"
+FITTED_DRAW = "theta, c, s, states_prev, fits, states, normals, uniforms, rng"
+WEIGH = "theta, c, s, states_prev, fits, states, log_w"
 OBSERVE = "theta, c, s, states, out, normals, uniforms, rng"
 
 
@@ -36,14 +47,16 @@ def weight_targets(weight: Sequence[Term]) -> list[Target]:
     return found or [Target("log_w[i]", constant(0.0))]
 
 
-def moves(section: Section, initial: dict[Expr, Expr], draw: dict[Expr, Expr]) -> None:
+def moves(
+    section: Section, initial: dict[Expr, Expr], draw: dict[Expr, Expr], arguments: str = DRAW
+) -> None:
     """`draw_initial` and `draw`: how particles are born and move."""
     section.particle_pass(
         "draw_initial", "Draw x_1 for each particle.", DRAW_INITIAL,
         _state_targets(section.layout, initial),
     )  # fmt: skip
     section.particle_pass(
-        "draw", "Draw x_t given x_{t-1} for each particle.", DRAW,
+        "draw", "Draw x_t given x_{t-1} for each particle.", arguments,
         _state_targets(section.layout, draw),
     )  # fmt: skip
 
@@ -51,7 +64,16 @@ def moves(section: Section, initial: dict[Expr, Expr], draw: dict[Expr, Expr]) -
 def filter_kit(layout: Layout, proposal: Proposal) -> Section:
     """The particle filter's functions under one proposal."""
     section = Section(layout, proposal.name)
-    moves(section, proposal.initial_draw, proposal.draw)
+    level = depends(proposal.fit, level_of)
+    section.fits.update(
+        (e, k) for k, e in enumerate(f for f in proposal.fit if level[f] == PARTICLE)
+    )
+    if section.fits:
+        section.particle_pass(
+            "fit", "What the proposal knows of x_t from x_{t-1} and y_t.", FIT,
+            [Target(f"fits[{k}, i]", e) for e, k in section.fits.items()],
+        )  # fmt: skip
+    moves(section, proposal.initial_draw, proposal.draw, FITTED_DRAW)
     section.particle_pass(
         "weigh_initial", "Log weight of x_1.", WEIGH_INITIAL,
         weight_targets(proposal.initial_weight), accumulate="log_w",
@@ -82,7 +104,7 @@ def conditional_passes(trace: Trace, layout: Layout, section: Section, plain: Pr
     )  # fmt: skip
     noisy = [t for t in terms(trace, "transition") if t.site.value.ravel()[0] not in value]
     section.particle_pass(
-        "weigh_connected", "log f(x_t | x_{t-1}).", WEIGH, weight_targets(noisy),
+        "weigh_connected", "log f(x_t | x_{t-1}).", WEIGH_CONNECTED, weight_targets(noisy),
         accumulate="log_w",
     )  # fmt: skip
     section.particle_pass(

@@ -7,7 +7,7 @@ the loop over particles. A `Section` is one algorithm's functions over one pair 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ssmppl.codegen.render import Names, Writer, comment, depends, symbol_name, topological_until
@@ -79,12 +79,14 @@ class Section:
     """One algorithm's generated functions, over its own arrays `c` and `s`.
 
     suffix : ends the name of each function.
+    fits : what is computed once per particle and kept in the rows of `fits`.
     """
 
     layout: Layout
     suffix: str
     c: dict[Expr, int] = field(default_factory=dict)
     s: dict[Expr, int] = field(default_factory=dict)
+    fits: dict[Expr, int] = field(default_factory=dict)
     functions: list[str] = field(default_factory=list)
     normals: int = 0
     uniforms: int = 0
@@ -96,13 +98,11 @@ class Section:
     def particle_pass(
         self, role: str, doc: str, arguments: str, targets: Sequence[Target], *,
         accumulate: str | None = None, scalars: dict[Expr, str] | None = None,
-        rows: Iterable[str] = (),
     ) -> None:  # fmt: skip
         """A function that loops over particles and writes `targets` for each.
 
         accumulate : name of the array that targets with guards add up in; it starts at 0.
         scalars : state symbols bound to array elements instead of to the particles' rows.
-        rows : state arrays among the arguments whose rows targets write to.
         """
         scalars = scalars or {}
         if accumulate:
@@ -113,23 +113,32 @@ class Section:
             level[node] = PARTICLE
         reserved = Names()
         head: list[str] = []
-        names = self._load_outer(roots, level, reserved, head)
+        fits = self.fits if "fits" in arguments and role != "fit" else {}
+        names = self._load_outer(roots, level, fits, reserved, head)
+        for node in topological_until(roots, {**names, **fits}):
+            if node in fits:
+                row = reserved.fresh(f"fit_{fits[node]}")
+                head.append(f"    {row} = fits[{fits[node]}]")
+                names[node] = f"{row}[i]"
         self._load_rows(roots, scalars, reserved, head, names)
         self._load_noise(roots, reserved, head, names)
         body: list[str] = []
         for group in _grouped(targets):
             body += self._loop(group, names, reserved, accumulate, first=not body)
         lines = [f"@kernel\ndef {self.name(role)}({arguments}):", f'    """{doc}"""']
-        size = "log_w.shape[0]" if "log_w" in arguments else "states.shape[1]"
+        size = "states_prev.shape[1]" if role == "fit" else "states.shape[1]"
+        if "log_w" in arguments:
+            size = "log_w.shape[0]"
         lines.append(f"    n = {size}")
         self.functions.append("\n".join([*lines, *head, *body]) + "\n")
 
     def _load_outer(
-        self, roots: list[Expr], level: dict[Expr, int], reserved: Names, head: list[str]
-    ) -> dict[Expr, str]:
+        self, roots: list[Expr], level: dict[Expr, int], fits: dict[Expr, int], reserved: Names,
+        head: list[str],
+    ) -> dict[Expr, str]:  # fmt: skip
         """Load what was computed once per call and once per step into local names."""
         names: dict[Expr, str] = {}
-        for node in self._frontier(roots, level):
+        for node in self._frontier(roots, level, fits):
             if node.op == "symbol" and level[node] == THETA:
                 source, wanted = self.layout.element(node), symbol_name(node)
             elif level[node] == THETA:
@@ -144,11 +153,13 @@ class Section:
             head.append(f"    {names[node]} = {source}{note}")
         return names
 
-    def _frontier(self, roots: list[Expr], level: dict[Expr, int]) -> list[Expr]:
+    def _frontier(
+        self, roots: list[Expr], level: dict[Expr, int], fits: dict[Expr, int]
+    ) -> list[Expr]:
         """The largest subexpressions that are known before the loop over particles."""
         outer = {n: True for n, lv in level.items() if lv in (THETA, STEP) and not _is_matrix(n)}
-        used = topological_until(roots, outer)
-        inside = [n for n in used if n not in outer]
+        used = topological_until(roots, {**outer, **fits})
+        inside = [n for n in used if n not in outer and n not in fits]
         needed = {a for n in inside for a in n.args} | set(roots)
         return [n for n in used if n in outer and n in needed]
 

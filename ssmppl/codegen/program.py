@@ -106,13 +106,12 @@ def _write(trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotAp
         section = filter_kit(layout, proposal)
         conditional_passes(trace, layout, section, plain)
         out.add(f"particle filter, {name}: {proposal.explanation}", section)
-        ahead, bound = "NO_LOOK_AHEAD", {"look_ahead": "no_look_ahead"}
+        ahead = "NO_LOOK_AHEAD"
         if proposal.look_ahead is not None:
-            ahead, bound = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE", {}
-        for role, predict in (("filter", "no_prediction"), ("filter_predict", "predict")):
-            own = {**bound, "ahead": ahead, "predict": predict}
-            out.algorithm(particle_filter, section.name(role), section, "entry", own)
-        own = {**bound, "ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
+            ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
+        own = {"ahead": ahead, "predict": "predict"}
+        out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
+        own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
     out.add_function("complete-data log density", log_joint_function(trace, layout, missing))

@@ -4,12 +4,16 @@ Numba's disk cache finds only module-level functions again, and not those that a
 compiled functions as arguments. So the kernels under `kernels/` are written with the model's
 functions as their first parameters, readable and testable as they stand, and `specialise` copies
 their text, comments included, into the generated module with these parameters bound to names.
+Branches that the bound parameters decide are decided in the text: what a model does not need is
+neither read nor compiled.
 """
 
 from __future__ import annotations
 
+import ast
 import inspect
 import io
+import textwrap
 import tokenize
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,7 +31,7 @@ class Specialised:
 def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]) -> Specialised:
     """The text of `function`, renamed, without the parameters in `bound`, which stand for text."""
     plain = getattr(function, "py_func", inspect.unwrap(function))
-    source = inspect.getsource(plain)
+    source = _decided(inspect.getsource(plain), plain.__globals__, bound)
     tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))
     start = next(i for i, t in enumerate(tokens) if t.string == "def")
     depth, end = 0, start
@@ -48,6 +52,9 @@ def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]
             after = tokens[i + 1] if tokens[i + 1].string == "," else token
             edits.append(_edit(token, after, ""))
         elif token.string in bound and previous != ".":
+            if (entry := _entry(bound[token.string], tokens[i + 1 : i + 4])) is not None:
+                edits.append(_edit(token, tokens[i + 3], entry))
+                continue
             edits.append(_edit(token, token, bound[token.string]))
         elif previous != "." and token.string in plain.__globals__:
             if token.string not in ("np", "math"):
@@ -64,7 +71,58 @@ def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]
     return Specialised(text.replace("(\n    \n", "(\n"), imports)
 
 
+def _entry(text: str, following: list[tokenize.TokenInfo]) -> str | None:
+    """What `text` followed by these tokens, `[`, a number and `]`, is, if it is a tuple."""
+    if [t.string for t in following[::2]] == ["[", "]"] and text.startswith("("):
+        return repr(ast.literal_eval(text)[int(following[1].string)])
+    return None
+
+
 def _edit(
     first: tokenize.TokenInfo, last: tokenize.TokenInfo, text: str
 ) -> tuple[int, int, int, str]:
     return first.start[0], first.start[1], last.end[1], text
+
+
+def _decided(source: str, known: Mapping[str, Any], bound: Mapping[str, str]) -> str:
+    """`source` without the `if` statements whose condition follows from the bound parameters."""
+    values = {name: v for name, v in known.items() if isinstance(v, int)}
+    for name, text in bound.items():
+        try:
+            values[name] = eval(text, values.copy())
+        except (NameError, SyntaxError):  # a function
+            continue
+    while True:
+        for node in ast.walk(ast.parse(source)):
+            if not isinstance(node, ast.If):
+                continue
+            names = {n.id for n in ast.walk(node.test) if isinstance(n, ast.Name)}
+            if names & set(bound) and names <= set(values):
+                truth = bool(eval(ast.unparse(node.test), values.copy()))
+                source = _keep_branch(source, node, truth)
+                break
+        else:
+            return source
+
+
+def _keep_branch(source: str, node: ast.If, truth: bool) -> str:
+    """`source` with one branch of an `if` or `elif` statement in place of the whole."""
+    lines = source.splitlines()
+    indent = " " * node.col_offset
+    before, after = lines[: node.lineno - 1], lines[node.end_lineno :]
+    elif_ = lines[node.lineno - 1].lstrip().startswith("elif")
+    body = lines[node.test.end_lineno : node.body[-1].end_lineno]
+    rest = lines[node.body[-1].end_lineno : node.end_lineno]  # from `else:` or `elif` on
+    if truth:
+        kept = [f"{indent}else:", *body] if elif_ else _dedented(body)
+    elif elif_ or not rest:
+        kept = rest
+    elif rest[0].lstrip().startswith("elif"):
+        kept = [rest[0].replace("elif", "if", 1), *rest[1:]]
+    else:
+        kept = _dedented(rest[1:])
+    return "\n".join([*before, *kept, *after]) + "\n"
+
+
+def _dedented(lines: list[str]) -> list[str]:
+    return [textwrap.dedent(li[:4]) + li[4:] for li in lines]

@@ -25,6 +25,8 @@ MODULES = {
     "flags": "exact kernel",
 }
 
+OPTIONAL = ("fit", "look_ahead")  # functions that some sections lack, and then are not called
+
 
 class ModuleText:
     """The parts of a generated module, in order, and the names that they import."""
@@ -47,10 +49,13 @@ class ModuleText:
         bound: dict[str, str] | None = None,
     ) -> None:  # fmt: skip
         """A kernel with the section's functions for its parameters of the same names."""
-        counts = (len(section.c), len(section.s), self.n_states, section.normals, section.uniforms)
+        counts = (
+            len(section.c), len(section.s), self.n_states, section.normals, section.uniforms,
+            len(section.fits),
+        )  # fmt: skip
         parameters = inspect.signature(getattr(function, "py_func", function)).parameters
         roles = [p for p in parameters if f"def {section.name(p)}(" in "\n".join(section.functions)]
-        names = {role: section.name(role) for role in ["prepare", "step", *roles]}
+        names = {role: section.name(role) for role in [*OPTIONAL, "prepare", "step", *roles]}
         names |= {"sizes": f"({', '.join(map(str, counts))})", **(bound or {})}
         made = specialise(function, name, {k: v for k, v in names.items() if k in parameters})
         self.parts.append(made.text.replace("@exact", f"@{decorator}", 1))

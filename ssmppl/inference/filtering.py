@@ -25,7 +25,6 @@ SCHEMES = {
     "residual": RESIDUAL,
     "multinomial": MULTINOMIAL,
 }
-_NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -97,14 +96,13 @@ def log_likelihood_estimate(
     SamplingError : the weights are NaN or infinite for some particles only.
     """
     run = problem.program.entry(f"filter_{settings.proposal}")
-    d, k = len(problem.trace.state_symbols), len(problem.trace.observation_symbols)
+    scheme = None if settings.scheme == SYSTEMATIC else settings.scheme
     total = 0.0
     for experiment in problem.experiments:
         increments, ess = np.empty(experiment.steps), np.empty(experiment.steps)
         status, t = run(
             theta, experiment.y, experiment.seen, experiment.u, settings.particles,
-            settings.scheme, settings.ess_threshold, rng, increments, ess, _NOTHING,
-            np.empty((0, d)), np.empty((0, d, d)), np.empty((0, 0, d)), np.empty((0, 4, k)),
+            scheme, settings.ess_threshold, rng, increments, ess, None,
         )  # fmt: skip
         if status == ALL_ZERO:
             return -np.inf
@@ -163,10 +161,10 @@ def full_run(
         np.empty(steps), np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)),
         np.empty((steps, p, d)), np.empty((steps, 4, k)),
     )  # fmt: skip
-    status, t = problem.program.entry(f"filter_predict_{settings.proposal}")(
+    status, t = problem.program.entry(f"filter_{settings.proposal}")(
         theta, experiment.y, experiment.seen, experiment.u, settings.particles, settings.scheme,
-        settings.ess_threshold, rng, out.log_increments, out.ess, probabilities,
-        out.mean, out.covariance, out.quantiles, out.prediction,
+        settings.ess_threshold, rng, out.log_increments, out.ess,
+        (probabilities, out.mean, out.covariance, out.quantiles, out.prediction),
     )  # fmt: skip
     if status != OK:
         raise failure(problem, theta, status, t, experiment)

@@ -63,13 +63,23 @@ class Generated:
         return self.call(role, self.numbers.theta, self.c, self.s, *args)
 
 
+def fitted(generated, t):
+    """What the proposal computes once per particle, as the arguments of a pass; or nothing."""
+    if not hasattr(generated.program.module, f"weigh_{generated.suffix}"):
+        return []  # a section that only simulates
+    fits = np.full((ROOM, PARTICLES), np.nan)
+    if hasattr(generated.program.module, f"fit_{generated.suffix}"):
+        generated.pass_("fit", generated.numbers.states[t - 1], fits)
+    return [fits]
+
+
 def check_draw(generated, role, draws, t, rng):
     """A pass that moves particles against the draws' expressions."""
     numbers, order = generated.numbers, generated.numbers.traced.state_symbols
     roots = [draws[s] for s in order]
     normals, uniforms, noise = noise_of(roots, rng)
     out = np.full((len(order), PARTICLES), np.nan)
-    before = [] if role == "draw_initial" else [numbers.states[t - 1]]
+    before = [] if role == "draw_initial" else [numbers.states[t - 1], *fitted(generated, t)]
     generated.pass_(role, *before, out, normals, uniforms, None)
     expected = evaluate(roots, {**numbers.values(t), **noise}, stand_in)
     for k, e in enumerate(expected):
@@ -80,6 +90,8 @@ def check_weight(generated, role, weight, t):
     numbers = generated.numbers
     log_w = np.full(PARTICLES, np.nan)
     before = [] if role == "weigh_initial" else [numbers.states[t - 1]]
+    if role == "weigh":
+        before += fitted(generated, t)
     generated.pass_(role, *before, numbers.states[t], log_w)
     expected = sum(evaluate([w.guarded() for w in weight], numbers.values(t)), 0.0)
     close(log_w, expected, f"{generated.suffix} {role} t={t}")
@@ -101,7 +113,7 @@ def test_particle_filters(case):
             check_weight(generated, "weigh", p.weight, t)
             if p.look_ahead is not None:
                 log_v = np.full(PARTICLES, np.nan)
-                generated.pass_("look_ahead", numbers.states[t - 1], log_v)
+                generated.pass_("look_ahead", numbers.states[t - 1], *fitted(generated, t), log_v)
                 expected = evaluate(p.look_ahead, numbers.values(t))
                 close(log_v, expected, f"{name} look_ahead t={t}")
 

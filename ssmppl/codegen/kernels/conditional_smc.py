@@ -35,9 +35,8 @@ from ssmppl.codegen.kernels.particle_filter import (
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform, uniform
 from ssmppl.codegen.kernels.resampling import (
     PADDING,
-    SYSTEMATIC,
     conditional_systematic,
-    resample,
+    systematic,
 )
 from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise
 
@@ -57,7 +56,7 @@ def draw_index(w, u):
 
 @exact
 def conditional_smc(
-    prepare, step, draw_initial, weigh_initial, draw, weigh, look_ahead,
+    prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh,
     connect, weigh_connected, weigh_observed, sizes, ahead, horizon,
     theta, y, seen, u, particles, rng, reference, trajectory, statistics,
 ):  # fmt: skip
@@ -70,6 +69,7 @@ def conditional_smc(
     c, s, s_later = np.empty(sizes[0]), np.empty(sizes[1]), np.empty(sizes[1])
     history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
     x_prev, joined, joined_next = np.empty((d, n)), np.empty((d, n)), np.empty((d, n))
+    fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     log_v, log_base, part = np.empty(n), np.empty(n), np.empty(n)
     w, p = np.empty(n), np.empty(n)
@@ -81,7 +81,8 @@ def conditional_smc(
         x = history[t]
         if t == 0:
             fill_normal(rng, normals)
-            fill_uniform(rng, uniforms)
+            if sizes[4] > 0:
+                fill_uniform(rng, uniforms)
             draw_initial(theta, c, s, x, normals, uniforms, rng)
             for k in range(d):
                 x[k, last] = reference[0, k]
@@ -112,7 +113,9 @@ def conditional_smc(
                 keep = draw_index(p, uniform(rng))
             # all others, given that one
             if ahead != NO_LOOK_AHEAD:
-                look_ahead(theta, c, s, x_before, log_v)
+                if sizes[5] > 0:
+                    fit(theta, c, s, x_before, fits_prev)
+                look_ahead(theta, c, s, x_before, fits_prev, log_v)
                 take_log(w, log_base)
                 add(log_v, log_base)
                 _, _, status = normalise(log_v, p)
@@ -126,15 +129,21 @@ def conditional_smc(
                 p[:] = w
             conditional_systematic(rng, p, keep, ancestors)
             gather(x_before, ancestors, x_prev)
+            if sizes[5] > 0:
+                if ahead != NO_LOOK_AHEAD:
+                    gather(fits_prev, ancestors, fits)
+                else:
+                    fit(theta, c, s, x_prev, fits)
             fill_normal(rng, normals)
-            fill_uniform(rng, uniforms)
-            draw(theta, c, s, x_prev, x, normals, uniforms, rng)
+            if sizes[4] > 0:
+                fill_uniform(rng, uniforms)
+            draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
             connect(theta, c, s, x_prev, reference[t], joined)
             for k in range(d):
                 x[k, last] = joined[k, last]
-            weigh(theta, c, s, x_prev, x, log_v)
+            weigh(theta, c, s, x_prev, fits, x, log_v)
             if ahead != NO_LOOK_AHEAD:
-                second_stage(w, p, ancestors, log_base)
+                second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
             ancestry[t] = ancestors[:n]
         _, ess, status = normalise(log_v, w)
@@ -161,7 +170,7 @@ def conditional_smc(
 
 @exact
 def filtered_path(
-    prepare, step, draw_initial, weigh_initial, draw, weigh, look_ahead, sizes, ahead,
+    prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh, sizes, ahead,
     theta, y, seen, u, particles, rng, trajectory, log_increment,
 ):  # fmt: skip
     """A particle filter that keeps one ancestral path; returns (status, t, log Z).
@@ -173,8 +182,10 @@ def filtered_path(
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
     x_prev = np.empty((d, n))
+    fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
-    log_v, log_base, w, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    log_v, log_base, part = np.empty(n), np.empty(n), np.empty(n)
+    w, p = np.empty(n), np.empty(n)
     ancestors = np.empty(n + PADDING, dtype=np.int32)
     log_increment[:] = 0.0
     prepare(theta, c)
@@ -184,7 +195,9 @@ def filtered_path(
         if t > 0:
             p[:] = w
             if ahead != NO_LOOK_AHEAD:
-                look_ahead(theta, c, s, history[t - 1], log_v)
+                if sizes[5] > 0:
+                    fit(theta, c, s, history[t - 1], fits_prev)
+                look_ahead(theta, c, s, history[t - 1], fits_prev, log_v)
                 take_log(w, log_base)
                 add(log_v, log_base)
                 _, _, status = normalise(log_v, p)
@@ -194,21 +207,28 @@ def filtered_path(
                     p[:] = w
                 elif ahead == APPROXIMATE:
                     mix(p, w)
-            resample(SYSTEMATIC, rng, p, ancestors)
+            systematic(rng, p, ancestors)
             gather(history[t - 1], ancestors, x_prev)
+            if sizes[5] > 0:
+                if ahead != NO_LOOK_AHEAD:
+                    gather(fits_prev, ancestors, fits)
+                else:
+                    fit(theta, c, s, x_prev, fits)
             ancestry[t] = ancestors[:n]
         fill_normal(rng, normals)
-        fill_uniform(rng, uniforms)
+        if sizes[4] > 0:
+            fill_uniform(rng, uniforms)
         if t == 0:
             draw_initial(theta, c, s, x, normals, uniforms, rng)
             weigh_initial(theta, c, s, x, log_v)
         else:
-            draw(theta, c, s, x_prev, x, normals, uniforms, rng)
-            weigh(theta, c, s, x_prev, x, log_v)
-        if t > 0 and ahead != NO_LOOK_AHEAD:
-            second_stage(w, p, ancestors, log_base)
-            add(log_v, log_base)
-            log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
+            draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
+            weigh(theta, c, s, x_prev, fits, x, log_v)
+        if ahead != NO_LOOK_AHEAD:
+            if t > 0:
+                second_stage(w, p, ancestors, part, log_base)
+                add(log_v, log_base)
+                log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
         log_sum, _, status = normalise(log_v, w)
         if status == NAN and not any_finite(log_v):
             status = ALL_ZERO

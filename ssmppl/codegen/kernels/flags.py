@@ -9,7 +9,7 @@ the vector registers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import cached_property, update_wrapper, wraps
 from typing import Any
 
 import numba
@@ -22,13 +22,45 @@ PRECISE = frozenset({"contract", "nsz"})
 """For polynomials with an argument reduction: fused multiply-add, but no reordering."""
 
 
+class Kernel:
+    """A compiled function that Python seldom calls: compiled code does.
+
+    The way in from Python, which checks and unboxes every argument, takes Numba longer to compile
+    than most functions here themselves. So compiled code calls a variant without it, and the one
+    with it is compiled when Python first calls.
+    """
+
+    def __init__(self, function: Callable, options: dict[str, Any]):
+        update_wrapper(self, function)
+        self.py_func = function
+        self.options = options
+        without: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        self.bare = numba.njit(**options, **without)(function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        return self.bare._numba_type_
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The variant that Python can call."""
+        return numba.njit(**self.options)(self.py_func)
+
+    def inspect_asm(self) -> dict[Any, str]:
+        """The machine code of each signature that Python called."""
+        return self.compiled.inspect_asm()
+
+    def __call__(self, *args: Any) -> Any:
+        return self.compiled(*args)
+
+
 def _decorator(**options: Any) -> Callable[[Callable], Any]:
-    compile_function = numba.njit(nogil=True, error_model="numpy", boundscheck=False, **options)
+    options = {"nogil": True, "error_model": "numpy", "boundscheck": False, **options}
 
     def decorate(function: Callable) -> Any:
         if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
             return _interpreted(function)
-        return compile_function(function)
+        return Kernel(function, options)
 
     return decorate
 

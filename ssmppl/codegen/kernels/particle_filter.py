@@ -21,7 +21,7 @@ import numpy as np
 from ssmppl.codegen.kernels.elementary import log
 from ssmppl.codegen.kernels.flags import exact, kernel
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
-from ssmppl.codegen.kernels.resampling import PADDING, resample
+from ssmppl.codegen.kernels.resampling import PADDING, resample, systematic
 from ssmppl.codegen.kernels.summaries import summarise
 from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise
 
@@ -55,12 +55,16 @@ def mix(p, w):
 
 
 @kernel
-def second_stage(w, p, ancestors, log_base):
-    """log_base[i] = log (w / (N p)) at the ancestor of i, the second-stage weight."""
+def second_stage(w, p, ancestors, log_ratio, log_base):
+    """log_base[i] = log (w / (N p)) at the ancestor of i, the second-stage weight.
+
+    log_ratio : (N,) scratch. Two loops, of which the first one vectorises.
+    """
     n = log_base.size
+    for j in range(n):
+        log_ratio[j] = log(w[j] / (n * p[j]))
     for i in range(n):
-        j = np.uint64(ancestors[i])
-        log_base[i] = log(w[j] / (n * p[j]))
+        log_base[i] = log_ratio[np.uint64(ancestors[i])]
 
 
 @kernel
@@ -81,20 +85,23 @@ def any_finite(log_v):
 
 @exact
 def particle_filter(
-    prepare, step, draw_initial, weigh_initial, draw, weigh, look_ahead, predict,
+    prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh, predict,
     sizes, ahead, theta, y, seen, u, particles, scheme, ess_threshold, rng,
-    log_increment, ess, probabilities, mean, covariance, quantiles, prediction,
+    log_increment, ess, moments,
 ):  # fmt: skip
     """Run the filter; returns (status, t), t the step at which a status other than OK arose.
 
-    sizes : (theta constants, step constants, states, normals, uniforms) of the generated code.
-    log_increment, ess : (T,), written. mean (T, D), covariance (T, D, D), quantiles
-    (T, P, D) and prediction (T, 3, K): written where their first axis is not empty.
-    prediction: mean, variance, and distribution function at y_t, of the one-step prediction.
+    sizes : (theta constants, step constants, states, normals, uniforms, fits) of the generated
+        code. ahead : which kind of look-ahead there is.
+    scheme : code of the resampling scheme; None: systematic, and no other one is compiled.
+    log_increment, ess : (T,), written.
+    moments : None, or what else is written, as a tuple: probabilities (P,), mean (T, D),
+        covariance (T, D, D), quantiles (T, P, D) and prediction (T, 4, K), see `predict_step`.
     """
     n_steps, n = y.shape[0], particles
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     x, x_prev = np.empty((sizes[2], n)), np.empty((sizes[2], n))
+    fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     log_v, log_base, w, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     ancestors = np.empty(n + PADDING, dtype=np.int32)
@@ -103,13 +110,15 @@ def particle_filter(
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
-        if prediction.shape[0] > 0:
-            predict(theta, y, seen, u, t, x, w, rng, prediction)
+        if moments is not None:
+            predict(theta, y, seen, u, t, x, w, rng, moments[4])
         uniform_base = True
         if t > 0:
             current_ess = ess[t - 1]
             if ahead != NO_LOOK_AHEAD:
-                look_ahead(theta, c, s, x, log_v)
+                if sizes[5] > 0:
+                    fit(theta, c, s, x, fits_prev)
+                look_ahead(theta, c, s, x, fits_prev, log_v)
                 take_log(w, log_base)
                 add(log_v, log_base)
                 _, current_ess, status = normalise(log_v, p)
@@ -123,23 +132,35 @@ def particle_filter(
             else:
                 p, w = w, p
             if ess_threshold >= 1.0 or current_ess < ess_threshold * n:
-                resample(scheme, rng, p, ancestors)
+                if scheme is None:
+                    systematic(rng, p, ancestors)
+                else:
+                    resample(scheme, rng, p, ancestors)
                 gather(x, ancestors, x_prev)
                 if ahead != NO_LOOK_AHEAD:
-                    second_stage(w, p, ancestors, log_base)
+                    if sizes[5] > 0:
+                        gather(fits_prev, ancestors, fits)
+                    second_stage(w, p, ancestors, log_v, log_base)
                     uniform_base = False
             else:
-                take_log(w if ahead != NO_LOOK_AHEAD else p, log_base)
-                uniform_base = False
                 x, x_prev = x_prev, x
+                if ahead != NO_LOOK_AHEAD:
+                    fits, fits_prev = fits_prev, fits
+                    take_log(w, log_base)
+                else:
+                    take_log(p, log_base)
+                uniform_base = False
+            if ahead == NO_LOOK_AHEAD and sizes[5] > 0:
+                fit(theta, c, s, x_prev, fits)
         fill_normal(rng, normals)
-        fill_uniform(rng, uniforms)
+        if sizes[4] > 0:
+            fill_uniform(rng, uniforms)
         if t == 0:
             draw_initial(theta, c, s, x, normals, uniforms, rng)
             weigh_initial(theta, c, s, x, log_v)
         else:
-            draw(theta, c, s, x_prev, x, normals, uniforms, rng)
-            weigh(theta, c, s, x_prev, x, log_v)
+            draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
+            weigh(theta, c, s, x_prev, fits, x, log_v)
         if not uniform_base:
             add(log_v, log_base)
         log_sum, ess[t], status = normalise(log_v, w)
@@ -148,16 +169,6 @@ def particle_filter(
         if status != OK:
             return status, t
         log_increment[t] = log_sum - log_n if uniform_base else log_sum
-        if mean.shape[0] > 0:
-            summarise(x, w, probabilities, mean[t], covariance[t], quantiles[t], log_v)
+        if moments is not None:
+            summarise(x, w, moments[0], moments[1][t], moments[2][t], moments[3][t])
     return OK, n_steps
-
-
-@exact
-def no_look_ahead(theta, c, s, states_prev, log_w):
-    """Stands in for the look-ahead of a filter that has none."""
-
-
-@exact
-def no_prediction(theta, y, seen, u, t, x, w, rng, prediction):
-    """Stands in for the predictions where none are asked for."""

@@ -38,7 +38,7 @@ def weighted_quantiles(values, w, probabilities, out):
 
 
 @exact
-def summarise(x, w, probabilities, mean, covariance, quantiles, scratch):
+def summarise(x, w, probabilities, mean, covariance, quantiles):
     """Moments and quantiles of x : (D, N) under w : (N,) into (D,), (D, D), (P, D)."""
     for k in range(x.shape[0]):
         mean[k] = weighted_mean(x[k], w)
