@@ -12,7 +12,7 @@ import numpy as np
 
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import ExprArray, array
-from ssmppl.expressions.expr import Expr, apply, constant
+from ssmppl.expressions.expr import Expr, apply, attributed, constant
 from ssmppl.expressions.linear import inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import MvNormal
@@ -59,11 +59,19 @@ def terms(trace: Trace, role: str, missing: Missing = Missing(), guard: bool = T
     guard=False leaves the supports out of the densities, as algebra on them needs it.
     """
     if role == "observation":
-        return [t for s in trace.observations.values() for t in _observed(s, missing, guard)]
+        out = []
+        for s in trace.observations.values():
+            with attributed(trace.locations, s.distribution.location):
+                out += _observed(s, missing, guard)
+        return out
     sites = {
         "prior": trace.parameters, "initial": trace.initial, "transition": trace.transition
     }[role]  # fmt: skip
-    return [Term(s, s.distribution.log_density(s.value, guard), None) for s in sites.values()]
+    out = []
+    for s in sites.values():
+        with attributed(trace.locations, s.distribution.location):
+            out.append(Term(s, s.distribution.log_density(s.value, guard), None))
+    return out
 
 
 def _observed(site: Site, missing: Missing, guard: bool) -> list[Term]:

@@ -54,6 +54,7 @@ behaviour: dict[str, Callable[..., Any]] = {}
 _interned: weakref.WeakValueDictionary[tuple, Expr] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
 _locations: ContextVar[dict[Expr, Location] | None] = ContextVar("locations", default=None)
+_attributed: ContextVar[Location | None] = ContextVar("attributed", default=None)
 # Frames of these folders are never the place "where the user wrote it".
 _OWN = tuple(
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
@@ -101,7 +102,7 @@ class Expr:
                 _interned[key] = node
         places = _locations.get()
         if places is not None and args and node not in places:  # symbols are not written there
-            places[node] = user_location()
+            places[node] = _attributed.get() or user_location()
         return node
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -317,6 +318,20 @@ def recording() -> Iterator[dict[Expr, Location]]:
         yield places
     finally:
         _locations.reset(token)
+
+
+@contextmanager
+def attributed(places: dict[Expr, Location], location: Location) -> Iterator[None]:
+    """Within the block, nodes that have no place in `places` yet get this one.
+
+    For what is derived from a line of the user's rather than written there.
+    """
+    tokens = _locations.set(places), _attributed.set(location)
+    try:
+        yield
+    finally:
+        _locations.reset(tokens[0])
+        _attributed.reset(tokens[1])
 
 
 def user_location() -> Location:
