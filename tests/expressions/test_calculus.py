@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tests.expressions.graphs import HALF_SMOOTH, KINKED, SMOOTH, X, Y, Z, programs, run
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
@@ -18,6 +17,7 @@ from ssmppl.expressions.calculus import (
 )
 from ssmppl.expressions.evaluate import MEANING, evaluate
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, apply, constant, symbol
+from tests.expressions.graphs import HALF_SMOOTH, KINKED, SMOOTH, X, Y, Z, programs, run
 
 SYMBOLS = [X, Y, Z]
 NO_DERIVATIVE = {"poisson_quantile", "binomial_quantile", "negbinomial_quantile", "trigamma"}

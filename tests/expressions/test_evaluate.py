@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from tests.expressions.graphs import TABLE, X, Y, Z, programs, run
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import MEANING, evaluate, numpy_draws
 from ssmppl.expressions.expr import MATRIX_OPS, OPS, Expr, apply, constant, symbol
+from tests.expressions.graphs import TABLE, X, Y, Z, programs, run
 
 OTHERS = {"eq", "ne", "poisson_quantile", "binomial_quantile", "negbinomial_quantile"}
 

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import scipy.stats as st
-from tests.language.distribution_table import CASES, JOINT_CASES, NOT_IN_SCIPY, Case
 
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError
@@ -13,6 +12,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.distribution import Draws
+from tests.language.distribution_table import CASES, JOINT_CASES, NOT_IN_SCIPY, Case
 
 X = symbol("state", "x")
 scalar = pytest.mark.parametrize("case", CASES, ids=lambda c: c.id)

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import scipy.stats as st
-from tests.language.distribution_table import TRUNCATED_CASES
 
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError
@@ -13,6 +12,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.distribution import Draws
+from tests.language.distribution_table import TRUNCATED_CASES
 
 X = symbol("state", "x")
 cases = pytest.mark.parametrize("case", TRUNCATED_CASES, ids=lambda c: c.id)
