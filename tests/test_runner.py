@@ -158,18 +158,33 @@ def interrupt_after(seconds, times=1):
     return thread
 
 
+class InterruptAt:
+    """A `describe` that has Ctrl-C pressed, `seconds` after so many blocks have come back."""
+
+    def __init__(self, blocks, seconds=0.0):
+        self.blocks, self.seconds, self.seen = blocks, seconds, 0
+        self.thread = None
+
+    def __call__(self, recent):
+        self.seen += 1
+        if self.seen == self.blocks:
+            self.thread = interrupt_after(self.seconds)
+        return ""
+
+
 @pytest.mark.parametrize("kind", ["default", "one thread", "processes"])
 def test_ctrl_c_returns_what_was_drawn(kind):
     executor = EXECUTORS[kind]()
     handler = signal.getsignal(signal.SIGINT)
     if executor is not None:
         executor.submit(int).result()
-    thread = interrupt_after(0.8)
-    started = time.monotonic()
-    step = partial(walk, pause=0.002)
-    chains = run_chains(step, walks(3), 10**6, 20, executor=executor, block=20, progress=False)
-    assert time.monotonic() - started < 5
-    thread.join()
+    press = InterruptAt(30)  # by then, every chain has draws
+    chains = run_chains(
+        partial(walk, pause=0.002), walks(3), 10**6, 20,
+        executor=executor, block=20, progress=False, describe=press,
+    )  # fmt: skip
+    assert press.seen < 60
+    press.thread.join()
     assert signal.getsignal(signal.SIGINT) is handler
     assert all(chain.interrupted for chain in chains)
     lengths = {len(chain.draws["x"]) for chain in chains}
@@ -185,9 +200,9 @@ def test_ctrl_c_returns_what_was_drawn(kind):
 @pytest.mark.parametrize("delay", [0.011, 0.023, 0.037, 0.05, 0.061])
 def test_ctrl_c_among_tiny_blocks(delay):
     """Wherever it strikes in the loop, no block is lost between others or taken twice."""
-    thread = interrupt_after(delay)
-    chains = run_chains(walk, walks(2), 10**7, block=1, progress=False)
-    thread.join()
+    press = InterruptAt(10, delay)
+    chains = run_chains(walk, walks(2), 10**7, block=1, progress=False, describe=press)
+    press.thread.join()
     (n,) = {len(chain.draws["x"]) for chain in chains}
     whole = [walk(state, n)[1].draws["x"] for state in walks(2)]
     np.testing.assert_array_equal(stack(chains)[0]["x"], whole)
