@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.inference import kalman
 from ssmppl.inference.filtering import (
     FilterRun,
+    FilterSettings,
     check_count,
     full_run,
     random_state,
@@ -80,13 +82,8 @@ def particle_filter(
     levels = _levels(quantiles)
     root = seed_sequence(seed)
 
-    def one(repeat: int) -> list[FilterRun]:
-        return [
-            full_run(problem, e, theta, settings, random_state(root, repeat, i), levels)
-            for i, e in enumerate(problem.experiments)
-        ]
-
-    runs = run_tasks(one, list(range(repeats)), executor=executor)
+    task = partial(_one_run, problem, theta, settings, levels, root)
+    runs = run_tasks(task, list(range(repeats)), executor=executor)
     attrs = {
         "model": problem.trace.name, "particles": particles, "proposal": settings.proposal,
         "resampling": resampling, "ess_threshold": ess_threshold, "seed": str(root.entropy),
@@ -96,6 +93,17 @@ def particle_filter(
         for i, e in enumerate(problem.experiments)
     ]
     return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _one_run(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, levels: np.ndarray,
+    root: np.random.SeedSequence, repeat: int,
+) -> list[FilterRun]:  # fmt: skip
+    """One run over every experiment; a function that another process can be sent."""
+    return [
+        full_run(problem, e, theta, settings, random_state(root, repeat, i), levels)
+        for i, e in enumerate(problem.experiments)
+    ]
 
 
 def _dataset(

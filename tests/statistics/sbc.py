@@ -38,10 +38,7 @@ TABLE = Path(__file__).parents[2] / "docs" / "figures" / "calibration.csv"
 
 @dataclass(frozen=True)
 class Study:
-    """A model, how it is sampled, and what is ranked.
-
-    extra : functions of (parameters, states) ranked besides the parameters: here a state.
-    """
+    """A model, how it is sampled, and what is ranked: its parameters, and a state half-way."""
 
     model: str
     method: ssm.PMMH | ssm.PGAS
@@ -63,7 +60,7 @@ MODELS = {
     "two_states": (("a", "k", "precision", "r"), "drive"),
     "counts": (("mu", "phi", "tau"), "x"),
 }
-METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100, proposal="bootstrap"))
+METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100))
 STUDIES = {
     study.name: study
     for name, (parameters, state) in MODELS.items()
@@ -141,7 +138,7 @@ def uniform_p(ranks: np.ndarray) -> float:
     return float(stats.chisquare(histogram(ranks)).pvalue)
 
 
-def main(replications: int = 400, processes: int = 2) -> None:
+def main(replications: int = 256, processes: int = 2) -> None:
     rows = []
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as executor:
         for study in STUDIES.values():
