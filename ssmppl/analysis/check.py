@@ -14,20 +14,17 @@ update.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ssmppl.analysis.families import lower_half
 from ssmppl.analysis.sufficient import ROLES, CompleteData
+from ssmppl.analysis.update import Update
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import Separation, separate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.trace import Site, previous, seen, symbol, symbols
-
-if TYPE_CHECKING:
-    from ssmppl.analysis.update import Update
 
 POINTS = 24
 NEEDED = 5

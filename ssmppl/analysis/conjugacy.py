@@ -18,7 +18,7 @@ from ssmppl.analysis.check import verify
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.describe import Explanation, joined
 from ssmppl.analysis.families import Normal, NormalGamma
-from ssmppl.analysis.sampler import natural_bounds
+from ssmppl.analysis.sampler import draw, natural_bounds, sampler_of
 from ssmppl.analysis.search import Found, Search, kind_of
 from ssmppl.analysis.sufficient import (
     NOTHING_MISSING,
@@ -28,7 +28,7 @@ from ssmppl.analysis.sufficient import (
     degenerate,
     separate_block,
 )
-from ssmppl.analysis.update import Update, draw
+from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, to_text
 from ssmppl.language.trace import Trace
@@ -143,7 +143,7 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
 
 def _may_be_bounded(update: Update) -> bool:
     """Whether the correction has a known bound, for whatever sign its coefficients can have."""
-    for (low, high), j in zip(update.sampler.ranges, update.correction, strict=True):
+    for (low, high), j in zip(sampler_of(update).ranges, update.correction, strict=True):
         parts = [update.coefficients[r][j] for r in ("prior", "initial")]
         total = math.fsum(e.data for e in parts) if all(e.op == "const" for e in parts) else None
         if (total is None or total > 0.0) and high == math.inf:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-
-import numpy as np
 
 from ssmppl.analysis.describe import Explanation
 from ssmppl.analysis.families import Family
-from ssmppl.analysis.sampler import DrawInfo, Sampler
 from ssmppl.errors import Location
 from ssmppl.expressions.expr import Expr
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Update:
     """One Gibbs update: a block of parameter components and how it is drawn given all else.
 
@@ -44,32 +39,3 @@ class Update:
     needs_log_joint: bool = False
     kind: str = "real"  # or "simplex", "matrix"
     conditional: Family | None = field(default=None, repr=False)
-
-    @cached_property
-    def sampler(self) -> Sampler:
-        """Made when first needed."""
-        return Sampler(self)
-
-    def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "sampler"}  # made again
-
-
-def draw(
-    update: Update,
-    totals: np.ndarray,
-    current: np.ndarray,
-    rest: Mapping[Expr, float],
-    rng: np.random.Generator,
-    log_joint: Callable[[np.ndarray], float] | None = None,
-) -> tuple[np.ndarray, DrawInfo]:
-    """New values of the block's components, given the statistics.
-
-    Parameters
-    ----------
-    totals : the C_i, (len(functions),).
-    current : values of the components.
-    rest : values of the other parameters, read where bounds depend on them.
-    log_joint : log joint density as a function of the components' values; needed (and used) only
-        where update.needs_log_joint.
-    """
-    return update.sampler.draw(totals, current, rest, rng, log_joint)

@@ -8,6 +8,7 @@ from ssmppl.analysis.conjugacy import draw
 from ssmppl.analysis.density import terms
 from ssmppl.analysis.families import lower_half
 from ssmppl.analysis.pythontext import DOMAIN, python_function
+from ssmppl.analysis.sampler import sampler_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbols_of
 
@@ -87,10 +88,10 @@ class Conditional:
                 return p / p.sum(0)
 
             return z, back, lambda v: np.log(v).sum(0)
-        limits = self.update.sampler.limits(self.rest)
+        limits = sampler_of(self.update).limits(self.rest)
         ends = [
             (max(a, n[0]), min(b, n[1]))
-            for (a, b), n in zip(limits, self.update.sampler.natural, strict=True)
+            for (a, b), n in zip(limits, sampler_of(self.update).natural, strict=True)
         ]
         return self._real_coordinates(draws, ends)
 

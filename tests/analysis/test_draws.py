@@ -11,6 +11,7 @@ from scipy import stats
 
 from ssmppl.analysis import check
 from ssmppl.analysis.conjugacy import derive_updates
+from ssmppl.analysis.sampler import sampler_of
 from ssmppl.analysis.sufficient import complete_data
 from ssmppl.language.trace import trace
 from tests.analysis.corpus import CORPUS, build
@@ -40,7 +41,7 @@ def compare(conditional, n=1500, thin=None, seed=1):
         thin = 1 if conditional.update.conditional else 8
     draws, infos = conditional.draws(n, rng, thin)
     assert np.all(np.isfinite(draws))
-    if conditional.update.family == "joint Normal" and not conditional.update.sampler.truncated:
+    if conditional.update.family == "joint Normal" and not sampler_of(conditional.update).truncated:
         _compare_normal(conditional, draws)
         return infos
     values, weights = conditional.grid(draws)

@@ -189,9 +189,9 @@ def laplace_case(name):
     return traced, y, lambda x: density(y, *arguments(x))
 
 
-def log_q(proposal):
-    """The last term of a Laplace proposal's weight is minus log q(x_t | x_{t-1}, y_t)."""
-    return -proposal.weight[-1].log_density
+def log_ratio(proposal):
+    """The last term of a Laplace proposal's weight is log (f / q)(x_t | x_{t-1}, y_t)."""
+    return proposal.weight[-1].log_density
 
 
 @pytest.mark.parametrize("x_prev", [-1.0, 0.5, 2.0])
@@ -205,7 +205,7 @@ def test_laplace(name, x_prev):
     f = st.norm(DRIFT * x_prev, SPREAD)
 
     def q(at):
-        return np.exp(evaluate(log_q(guided), known | {x: at}))
+        return np.exp(f.logpdf(at) - evaluate(log_ratio(guided), known | {x: at}))
 
     assert quad(q, f.mean() - 9, f.mean() + 9, points=[f.mean()], limit=400)[0] == pytest.approx(
         1.0, abs=1e-6
@@ -257,10 +257,10 @@ def test_laplace_of_a_vector():
         step = 0.04
         axis = np.arange(-4, 4, step)
         grid = dict(zip(traced.state_symbols, np.meshgrid(axis, axis), strict=True))
-        log_density = evaluate(log_q(found["guided"]), known | grid)
-        assert np.exp(log_density).sum() * step**2 == pytest.approx(1.0, abs=1e-4)
         a, b = grid.values()
         f = st.multivariate_normal([0.27, -0.18], Q).logpdf(np.stack([a, b], axis=-1))
+        log_density = f - evaluate(log_ratio(found["guided"]), known | grid)
+        assert np.exp(log_density).sum() * step**2 == pytest.approx(1.0, abs=1e-4)
         g = mask[0] * st.poisson(np.exp(a + b / 2)).logpmf(4) + mask[1] * st.poisson(
             np.exp(b)
         ).logpmf(1)
@@ -285,8 +285,30 @@ def test_laplace_where_the_density_is_not_concave():
     for x_prev in (0.0, 0.01, 3.0):
         known = values(traced, [x_prev], [2.0])
         edges = np.linspace(x_prev - 9, x_prev + 9, 100_001)
-        density = np.exp(evaluate(log_q(guided), known | {x: edges}))
+        log_f = st.norm(x_prev, 1).logpdf(edges)
+        density = np.exp(log_f - evaluate(log_ratio(guided), known | {x: edges}))
         assert np.sum(density) * (edges[1] - edges[0]) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_laplace_far_from_the_transition():
+    """An observation a hundred standard deviations away: the weight stays right on the log scale."""
+    traced = model_of(
+        lambda: {"x": D.Normal(0, sd=0.1)},
+        lambda x: {"x": D.Normal(x, sd=0.1)},
+        lambda x: {"y": D.StudentT(50, x, scale=0.1)},
+    )
+    guided = derive(traced, Missing(none=True))["guided"]
+    (x,) = traced.state_symbols
+    known, at = values(traced, [0.0], [10.0]), np.array([4.0, 5.0, 6.0])
+    fitted = st.norm(*_fit(guided, known))
+    expected = st.norm(0, 0.1).logpdf(at) - fitted.logpdf(at) - math.log(1 - DEFENSIVE)
+    np.testing.assert_allclose(evaluate(log_ratio(guided), known | {x: at}), expected, rtol=1e-9)
+
+
+def _fit(proposal, known):
+    """Mean and standard deviation of the Gaussian that a scalar Laplace proposal fits."""
+    mode, root = (float(evaluate(e, known)) for e in proposal.fit)
+    return mode, 1.0 / root
 
 
 # -- the user's own

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ssmppl.analysis.conjugacy import derive_updates, draw
-from ssmppl.analysis.sampler import MAX_TRIES
+from ssmppl.analysis.sampler import MAX_TRIES, sampler_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, to_text
 from ssmppl.language.trace import trace
@@ -69,8 +69,8 @@ def test_shape_rate_mean_and_precision(update, steps):
 def test_correction_and_bounds(update):
     assert [to_text(update.functions[j]) for j in update.correction] == ["log(1 - phi**2)"]
     assert update.coefficients["initial"][update.correction[0]].data == 0.5
-    assert update.sampler.limits({}) == [(-1.0, 1.0), (0.0, np.inf)]
-    assert update.sampler.ceiling([*totals(update, series(50)), 0.0]) == 0.0
+    assert sampler_of(update).limits({}) == [(-1.0, 1.0), (0.0, np.inf)]
+    assert sampler_of(update).ceiling([*totals(update, series(50)), 0.0]) == 0.0
 
 
 def test_explanation_reads_as_the_paper(update):
