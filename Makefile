@@ -69,9 +69,7 @@ docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -T -W --keep-going -b html docs docs/_build/html
 
 bench: $(VENV)/.installed-dev
-	@set -e; for file in $(sort $(wildcard bench/bench_*.py)); do \
-	    echo "== $$file"; $(BIN)/python $$file; \
-	done
+	$(BIN)/python bench/run.py
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff format .
