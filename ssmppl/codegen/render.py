@@ -164,7 +164,7 @@ class Writer:
         if op == "where":
             c, a, b = (self._part(x, _TERNARY + 1) for x in args)
             return f"{a} if {c} else {b}", _TERNARY
-        if op == "pow" and _small_power(node):
+        if op == "pow" and is_small_power(node):
             power = int(node.args[1].data)
             product = " * ".join([self._part(args[0], _ATOM)] * abs(power))
             return (product, _PRODUCT) if power > 0 else (f"1.0 / ({product})", _PRODUCT)
@@ -182,7 +182,8 @@ class Writer:
         return f"{CALLS[op]}({parts})", _ATOM
 
 
-def _small_power(node: Expr) -> bool:
+def is_small_power(node: Expr) -> bool:
+    """Whether a power is written as a product."""
     e = node.args[1]
     return e.op == "const" and e.data == int(e.data) and 1 <= abs(e.data) <= 4
 
@@ -202,7 +203,7 @@ def _uses(roots: list[Expr], named: Mapping[Expr, object]) -> dict[Expr, int]:
             continue
         for a in node.args:
             uses[a] = uses.get(a, 0) + 1
-        if node.op == "pow" and _small_power(node):
+        if node.op == "pow" and is_small_power(node):
             uses[node.args[0]] += 1
     return uses
 

@@ -14,9 +14,9 @@ import numpy as np
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.codegen.module import PARTICLE, level_of
-from ssmppl.codegen.render import depends
+from ssmppl.codegen.render import depends, is_small_power, topological_until
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.expr import Expr
 from ssmppl.inference.filtering import FilterSettings, repeated_estimates
 from ssmppl.inference.problem import Problem
 
@@ -25,6 +25,25 @@ COST = {"exp": 1.0, "log": 1.0, "log1p": 1.5, "expm1": 1.5, "sin": 1.3, "cos": 1
         "div": 0.7, "sqrt": 1.0, "pow": 8.0, "logaddexp": 3.5, "where": 0.3}  # fmt: skip
 SLOW = 30.0  # what is no vectorised pass: special functions, factorisations, scalar draws
 CHEAP = 0.15
+CHEAP_OPERATIONS = frozenset(
+    [
+        "add",
+        "sub",
+        "mul",
+        "neg",
+        "lt",
+        "le",
+        "eq",
+        "ne",
+        "and",
+        "or",
+        "abs",
+        "maximum",
+        "minimum",
+        "floor",
+        "item",
+    ]
+)
 STEP = 2.6  # normalise, resample, gather
 NORMAL, UNIFORM = 1.5, 0.6
 LOOK_AHEAD = 4.0  # one more normalisation and the second-stage weights
@@ -47,29 +66,28 @@ class Choice:
 
 def cost(proposal: Proposal) -> float:
     """Estimated nanoseconds per particle and step."""
-    passes = [list(proposal.draw.values()), [t.guarded() for t in proposal.weight]]
+    fit = list(proposal.fit)  # computed once, and read by the other passes
+    later = [list(proposal.draw.values()), [t.guarded() for t in proposal.weight]]
     extra = 0.0
     if proposal.look_ahead is not None:
-        passes.append([proposal.look_ahead])
+        later.append([proposal.look_ahead])
         extra = LOOK_AHEAD
-    return STEP + extra + sum(_pass_cost(p) for p in passes)
+    known = dict.fromkeys(fit, True)
+    return STEP + extra + _pass_cost(fit, {}) + sum(_pass_cost(p, known) for p in later)
 
 
-def _pass_cost(roots: list[Expr]) -> float:
+def _pass_cost(roots: list[Expr], known: dict[Expr, bool]) -> float:
     level = depends(roots, level_of)
     total = 0.0
-    for node in topological(roots):
-        if level[node] != PARTICLE or node.op == "symbol":
+    for node in topological_until(roots, known):
+        if level[node] != PARTICLE or node.op == "symbol" or node in known:
             continue
         if node.op == "random":
             total += {"normal": NORMAL, "uniform": UNIFORM}.get(node.data[0], SLOW)
-        elif node.op in COST:
-            total += COST[node.op]
-        elif node.op in ("add", "sub", "mul", "neg", "lt", "le", "eq", "ne", "and", "or", "abs",
-                         "maximum", "minimum", "floor", "item"):  # fmt: skip
+        elif node.op in CHEAP_OPERATIONS or (node.op == "pow" and is_small_power(node)):
             total += CHEAP
         else:
-            total += SLOW
+            total += COST.get(node.op, SLOW)
     return total
 
 
