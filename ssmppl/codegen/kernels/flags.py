@@ -83,9 +83,9 @@ def _interpreted(function: Callable) -> Callable:
 kernel = _decorator(fastmath=set(FAST), forceinline=True)
 """Decorator of passes over particles.
 
-Inlining is forced, so that each entry point has its own copy of a pass, in one form. Else a process
-that compiles would run the pass compiled by itself, one that finds the entry point in the disk cache
-the copy optimised inside of it, and their sums would differ in the last digits.
+Inlining is forced, so that each entry point has its own copy of a pass, in one form. Else a
+process that compiles would run the pass compiled by itself, one that finds the entry point in the
+disk cache the copy optimised inside of it, and their sums would differ in the last digits.
 """
 
 precise = _decorator(fastmath=set(PRECISE), forceinline=True)
