@@ -1,7 +1,7 @@
 """The verb `sample`: shapes, arguments, interrupts, several experiments; not its statistics."""
 
 import signal
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -156,15 +156,25 @@ def test_no_finite_start_says_so():
         ssm.sample(model, {"y": np.array([0.0, 1e6, 0.0])}, **SHORT)
 
 
+class InterruptAfter(ThreadPoolExecutor):
+    """Ctrl-C in the main thread when the given number of blocks has been submitted."""
+
+    def __init__(self, blocks):
+        super().__init__(2)
+        self.left = blocks
+
+    def submit(self, *args, **kwargs):
+        self.left -= 1
+        if self.left == 0:
+            signal.raise_signal(signal.SIGINT)
+        return super().submit(*args, **kwargs)
+
+
 def test_an_interrupt_keeps_what_was_drawn():
-    ssm.sample(walk, DATA, METHODS[0], seed=1, **SHORT)  # compiled before the clock starts
-    timer = threading.Timer(3.0, lambda: signal.raise_signal(signal.SIGINT))
-    timer.start()
-    try:
+    with InterruptAfter(blocks=8) as executor:
         idata = ssm.sample(
-            walk, DATA, METHODS[0], draws=10**7, warmup=0, chains=2, states=False, progress=False
-        )
-    finally:
-        timer.cancel()
+            walk, DATA, METHODS[0], draws=10**7, warmup=0, chains=2, states=False,
+            progress=False, executor=executor,
+        )  # fmt: skip
     assert idata["posterior"].attrs["interrupted"] == 1
     assert 0 < idata["posterior"].sizes["draw"] < 10**7
