@@ -26,7 +26,15 @@ from ssmppl.analysis.structure import GaussianBlock, affine_observation, gaussia
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
-from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, topological
+from ssmppl.expressions.expr import (
+    Expr,
+    apply,
+    attributed,
+    constant,
+    depends_on,
+    substitute,
+    topological,
+)
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import Draws
@@ -56,18 +64,19 @@ def bootstrap(trace: Trace, missing: Missing) -> Proposal:
     observed = tuple(terms(trace, "observation", missing))
     return Proposal(
         "bootstrap",
-        _draws(list(trace.initial.values())),
+        _draws(trace, list(trace.initial.values())),
         observed,
-        _draws(list(trace.transition.values())),
+        _draws(trace, list(trace.transition.values())),
         observed,
         explanation="particles move by the transition and are weighed by the observation",
     )
 
 
-def _draws(sites: list[Site]) -> dict[Expr, Expr]:
+def _draws(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
     out: dict[Expr, Expr] = {}
     for site in sites:
-        sample = array(site.distribution.sample(Draws(site.name)))
+        with attributed(trace.locations, site.distribution.location):
+            sample = array(site.distribution.sample(Draws(site.name)))
         out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
     return out
 
@@ -117,10 +126,10 @@ class _Split:
         return dict(zip(expressions, values, strict=True))
 
 
-def _split(sites: list[Site]) -> _Split:
+def _split(trace: Trace, sites: list[Site]) -> _Split:
     block = gaussian_block(sites)
     own = set(block.symbols)
-    others = {s: e for s, e in _draws(sites).items() if s not in own}
+    others = {s: e for s, e in _draws(trace, sites).items() if s not in own}
     random = any(n.op == "random" for n in topological(others.values()))
     return _Split(block, others, random)
 
@@ -132,7 +141,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
-    move = _split(list(trace.transition.values()))
+    move = _split(trace, list(trace.transition.values()))
     if not len(move.gaussian):
         where = next(iter(trace.transition.values())).distribution.location
         return NotApplicable("no state has a Gaussian transition", where)
@@ -159,7 +168,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         return {**split.others, **split.insert(draw)}, predictive
 
     draw, predictive = law(move)
-    start = _split(list(trace.initial.values()))
+    start = _split(trace, list(trace.initial.values()))
     same = set(start.gaussian.symbols) == set(move.gaussian.symbols)
     if same:
         place = {s: i for i, s in enumerate(start.gaussian.symbols)}  # no .index: == is symbolic
@@ -169,7 +178,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         site = sites[0]
         initial_weight: tuple[Term, ...] = (Term(site, initial_predictive, None),)
     else:
-        initial_draw = _draws(list(trace.initial.values()))
+        initial_draw = _draws(trace, list(trace.initial.values()))
         initial_weight = tuple(terms(trace, "observation", missing))
     weight = Term(sites[0], predictive, None)
     look_ahead = None if move.random else move.insert({predictive: predictive})[predictive]
@@ -237,7 +246,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     total = constant(0.0)
     for t in smooth:
         total = total + t.guarded()
-    move = _split(list(trace.transition.values()))
+    move = _split(trace, list(trace.transition.values()))
     where = sites[0].distribution.location
     if not len(move.gaussian):
         law = next(iter(trace.transition.values())).distribution
@@ -255,7 +264,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     correction = Term(observed[0].site, -log_ratio, None)
     return Proposal(
         "guided",
-        _draws(list(trace.initial.values())),
+        _draws(trace, list(trace.initial.values())),
         tuple(observed),
         draw,
         (*observed, correction),

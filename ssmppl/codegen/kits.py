@@ -20,7 +20,7 @@ from ssmppl.codegen.module import (
 )
 from ssmppl.codegen.render import Names, Writer, depends
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import Expr, constant
+from ssmppl.expressions.expr import Expr, attributed, constant
 from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace
 from ssmppl.language.transforms import transforms
@@ -117,7 +117,8 @@ def observation_draws(trace: Trace) -> list[Expr]:
     """A draw of every observed component given x_t, in the trace's order."""
     out: list[Expr] = []
     for site in trace.observations.values():
-        sample = array(site.distribution.sample(Draws(site.name))).ravel()
+        with attributed(trace.locations, site.distribution.location):
+            sample = array(site.distribution.sample(Draws(site.name))).ravel()
         by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
         out += [by_symbol[s] for s in site.components]
     return out
