@@ -76,20 +76,30 @@ def assert_within(found: dict[str, float], limit: float = MCSE) -> None:
     assert abs(found[worst]) <= limit, f"{worst} lies {found[worst]:+.2f} MCSE off; all: {found}"
 
 
-def assert_moments(draws, mean, sd, label="", tables=1) -> None:
-    """Draws (chain, draw, ...) have these means and sds (...).
+def moment_deviations(draws, mean, sd, lag_one) -> list[float]:
+    """Deviations, in Monte Carlo standard errors, of draws (chain, draw, T, D) of trajectories.
+
+    mean, sd : (T, D). lag_one : (T - 1, D), covariance of each state with itself a step later.
+    """
+    draws, z = np.asarray(draws, float), []
+    for t, i in np.ndindex(*mean.shape):
+        x = draws[:, :, t, i]
+        if sd[t, i] < 1e-12:  # the initial value of a deterministic component
+            np.testing.assert_allclose(x, mean[t, i], atol=1e-12)
+            continue
+        z += deviations(x, mean=mean[t, i], sd=sd[t, i]).values()
+        if t + 1 < len(mean):
+            product = (x - mean[t, i]) * (draws[:, :, t + 1, i] - mean[t + 1, i])
+            z.append((product.mean() - lag_one[t, i]) / mcse_mean(product))
+    return z
+
+
+def assert_moments(draws, exact, label, tables) -> None:
+    """Trajectories (chain, draw, T, D) have the moments of a `DenseGaussian`.
 
     Bonferroni at `LEVEL` over all of them, and over the `tables` tests of this kind.
     """
-    draws = np.asarray(draws, float)
-    flat = draws.reshape(*draws.shape[:2], -1)
-    means, sds = np.ravel(mean), np.ravel(sd)
-    z = []
-    for i in range(flat.shape[2]):
-        if sds[i] < 1e-12:  # known exactly: the initial value of a deterministic component
-            assert np.all(flat[:, :, i] == means[i])
-            continue
-        z += deviations(flat[:, :, i], mean=means[i], sd=sds[i]).values()
+    z = moment_deviations(draws, exact.mean, exact.sd, exact.lag_one)
     limit = float(stats.norm.isf(LEVEL / (2 * len(z) * tables)))
     print(f"{label}: {len(z)} moments, largest deviation {np.max(np.abs(z)):.2f} of {limit:.2f}")
     assert np.max(np.abs(z)) <= limit, (label, np.round(z, 1))

@@ -39,6 +39,7 @@ class DenseGaussian:
         self.mean = (mean.ravel() + gain @ residual).reshape(T, D)
         self.covariance = S - gain @ H @ S
         self.sd = np.sqrt(np.maximum(np.diag(self.covariance), 0)).reshape(T, D)
+        self.lag_one = np.diag(self.covariance, D).reshape(T - 1, D)
 
 
 def varve_log_likelihood(y, phi, tau, points=600):

@@ -16,6 +16,10 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
+from ssmppl.inference.filtering import FilterSettings, random_state
+from ssmppl.inference.pilot import space_of
+from ssmppl.inference.pmmh import run_filters
+from ssmppl.inference.problem import pose
 
 from . import models
 from .checks import LEVEL, mean_one_p, seed_of
@@ -182,6 +186,24 @@ def test_very_few_particles(proposal, particles, repeats):
                 models.varves, {"y": y}, parameters, combination, particles, repeats, seed_of(name)
             )
             table.cell(name, log_z, exact, particles, len(y))
+    table.judge()
+
+
+@pytest.mark.parametrize("proposal", FILTERS)
+def test_filters_inside_of_pmmh(proposal):
+    """The kernel that keeps a path makes the same estimate as the one behind `log_likelihood`."""
+    problem = pose(models.varves, {"y": CALM})
+    space, settings = space_of(problem, {}, {}), FilterSettings(10, proposal)
+    table = Table(len(FEW_POINTS) * len(FILTERS))
+    for parameters in FEW_POINTS:
+        name = f"path of {proposal} {parameters}"
+        theta = np.array([parameters["phi"], parameters["tau"]])
+        stream = random_state(np.random.SeedSequence(seed_of(name)))
+        log_z = np.empty(5000)
+        for i in range(len(log_z)):
+            log_z[i], _, increments = run_filters(space, theta, settings, stream)
+            assert log_z[i] == pytest.approx(sum(v.sum() for v in increments))
+        table.cell(name, log_z, varve_log_likelihood(CALM, **parameters), 10, len(CALM))
     table.judge()
 
 
