@@ -15,7 +15,6 @@ with the transition); the transition itself (bootstrap).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,7 +40,7 @@ from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Site, Trace, seen
 
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
-LARGEST_EXPONENT = 600.0  # of q / f, before it is computed on the log scale
+LARGEST_EXPONENT = 600.0  # of q / f where exp is taken
 
 
 @dataclass(frozen=True)
@@ -303,9 +302,8 @@ def _newton(
         narrower = narrower * factor[i, i]
     ratio = narrower * apply("exp", apply("minimum", distance, LARGEST_EXPONENT))
     log_ratio = apply("log", DEFENSIVE + (1.0 - DEFENSIVE) * ratio)
-    # so far from the transition that exp would overflow, its share counts for nothing
-    far = math.log(1.0 - DEFENSIVE) + apply("log", narrower) + distance
-    log_ratio = apply("where", apply("lt", LARGEST_EXPONENT, distance), far, log_ratio)
+    # beyond the cap the transition's share counts for nothing, and log q / f goes on as distance
+    log_ratio = log_ratio + np.maximum(distance - LARGEST_EXPONENT, 0.0)
     at_mode = dict(zip(block.symbols, x, strict=True))
     (g_mode,) = substitute([total], at_mode)
     to_mode = array(x - block.mean)
