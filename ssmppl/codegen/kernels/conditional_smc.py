@@ -27,6 +27,7 @@ from ssmppl.codegen.kernels.particle_filter import (
     NO_LOOK_AHEAD,
     add,
     any_finite,
+    copy,
     gather,
     mix,
     second_stage,
@@ -122,11 +123,11 @@ def conditional_smc(
                 if status == NAN and any_finite(log_v):
                     return status, t
                 if status != OK:
-                    p[:] = w
+                    copy(w, p)
                 elif ahead == APPROXIMATE:
                     mix(p, w)
             else:
-                p[:] = w
+                copy(w, p)
             conditional_systematic(rng, p, keep, ancestors)
             gather(x_before, ancestors, x_prev)
             if sizes[5] > 0:
@@ -145,7 +146,7 @@ def conditional_smc(
             if ahead != NO_LOOK_AHEAD:
                 second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
-            ancestry[t] = ancestors[:n]
+            copy(ancestors, ancestry[t])
         _, ess, status = normalise(log_v, w)
         if status == NAN and not any_finite(log_v):
             status = ALL_ZERO
@@ -193,7 +194,7 @@ def filtered_path(
         step(theta, c, y, seen, u, t, s)
         x = history[t]
         if t > 0:
-            p[:] = w
+            copy(w, p)
             if ahead != NO_LOOK_AHEAD:
                 if sizes[5] > 0:
                     fit(theta, c, s, history[t - 1], fits_prev)
@@ -204,7 +205,7 @@ def filtered_path(
                 if status == NAN and any_finite(log_v):
                     return status, t, -np.inf
                 if status != OK:
-                    p[:] = w
+                    copy(w, p)
                 elif ahead == APPROXIMATE:
                     mix(p, w)
             systematic(rng, p, ancestors)
@@ -214,7 +215,7 @@ def filtered_path(
                     gather(fits_prev, ancestors, fits)
                 else:
                     fit(theta, c, s, x_prev, fits)
-            ancestry[t] = ancestors[:n]
+            copy(ancestors, ancestry[t])
         fill_normal(rng, normals)
         if sizes[4] > 0:
             fill_uniform(rng, uniforms)

@@ -41,6 +41,13 @@ def gather(x, ancestors, x_prev):
 
 
 @kernel
+def copy(source, target):
+    """target = source, as far as target goes (slices would drag Numba's string functions in)."""
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@kernel
 def add(log_v, log_base):
     """log_v += log_base."""
     for i in range(log_v.size):
@@ -125,7 +132,7 @@ def particle_filter(
                 if status == NAN and any_finite(log_v):
                     return status, t
                 if status != OK:  # nowhere to go by the look-ahead: go by the weights
-                    p[:] = w
+                    copy(w, p)
                     current_ess = ess[t - 1]
                 elif ahead == APPROXIMATE:
                     mix(p, w)
