@@ -291,7 +291,7 @@ def test_laplace_where_the_density_is_not_concave():
 
 
 def test_laplace_far_from_the_transition():
-    """An observation a hundred standard deviations away: the weight stays right on the log scale."""
+    """An observation a hundred standard deviations away: the weight is right on the log scale."""
     traced = model_of(
         lambda: {"x": D.Normal(0, sd=0.1)},
         lambda x: {"x": D.Normal(x, sd=0.1)},
