@@ -36,10 +36,13 @@ class PGAS:
     particles : N of the conditional particle filter, at least 2; None: 25, or 200 where ancestors
         cannot be sampled.
     proposal : "auto", "bootstrap", "guided", "auxiliary" or "user".
+    log_likelihood : whether to estimate log p(y_t | y_1:t-1, theta) at each draw too, by a particle
+        filter, for the group `log_likelihood`.
     """
 
     particles: int | None = None
     proposal: str = "auto"
+    log_likelihood: bool = False
 
 
 Method = PMMH | PGAS

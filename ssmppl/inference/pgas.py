@@ -23,6 +23,8 @@ from ssmppl.inference.filtering import FilterSettings, failure
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block
 
+PREDICTIVE_PARTICLES = 500
+
 
 @dataclass(frozen=True)
 class Sweeper:
@@ -121,9 +123,12 @@ def start_chain(
 
 
 def pgas_block(
-    sweeper: Sweeper, thin: int, warmup_thin: int, state: PGASState, n: int
+    sweeper: Sweeper, thin: int, predictive: bool, state: PGASState, n: int
 ) -> tuple[PGASState, Block]:
-    """n draws of one chain, each after `thin` sweeps."""
+    """n draws of one chain, each after `thin` sweeps.
+
+    predictive : whether to estimate log p(y_t | y_1:t-1, theta) at each, by a particle filter.
+    """
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta, paths = state.theta.copy(), [p.copy() for p in state.paths]
     draws: dict[str, list[np.ndarray]] = {"theta": []}
@@ -139,6 +144,9 @@ def pgas_block(
         draws["theta"].append(theta.copy())
         for i, path in enumerate(paths):
             draws[f"path_{i}"].append(path.copy())
+        if predictive:
+            for i, increments in enumerate(_predictive(sweeper, theta, stream)):
+                draws.setdefault(f"increment_{i}", []).append(increments)
         stats["lp"].append(log_joint(sweeper, theta, paths))
         stats["update_rate"].append(moved)
         stats["ess"].append(ess)
@@ -147,6 +155,22 @@ def pgas_block(
         {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
     )
     return PGASState(theta, tuple(paths), generator, stream), block
+
+
+def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:
+    """log p(y_t | y_1:t-1, theta) of each experiment, (T,); -inf from where the filter dies."""
+    problem = sweeper.problem
+    run = problem.program.entry(f"filter_{sweeper.settings.proposal}")
+    own = stream.copy()  # a stream beside the chain's, so that the draws stay the same without
+    own[1] ^= np.uint64(0x5851F42D4C957F2D)
+    out = []
+    for e in problem.experiments:
+        increments, ess = np.empty(e.steps), np.empty(e.steps)
+        run(
+            theta, e.y, e.seen, e.u, PREDICTIVE_PARTICLES, None, 1.0, own, increments, ess, None
+        )  # fmt: skip
+        out.append(increments)
+    return out
 
 
 def _trajectories(

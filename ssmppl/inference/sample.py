@@ -90,8 +90,8 @@ def sample(
         * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
         * sample_stats: lp, acceptance_rate, and log_likelihood (PMMH: the estimate at the draw) or
           update_rate and ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
-        * log_likelihood (PMMH): log p(y_t | y_1:t-1, theta), for leave-future-out scores; az.loo on
-          it is not valid, because the rows are not exchangeable;
+        * log_likelihood (PMMH; PGAS on request): log p(y_t | y_1:t-1, theta), for
+          leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
         * observed_data, constant_data (inputs).
 
         Attributes name method, settings, seed, versions, the plan, and the time taken.
@@ -209,7 +209,7 @@ def _prepare_pgas(
         "plan": "\n".join(str(u.explanation) for u in sweeper.updates),
         "pilot_mode": _by_name(problem, space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
-    step = partial(pgas.pgas_block, sweeper, thin, 1)
+    step = partial(pgas.pgas_block, sweeper, thin, method.log_likelihood)
     return Sampler(step, states, report)
 
 

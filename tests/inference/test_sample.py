@@ -67,6 +67,19 @@ def test_groups_and_shapes(method):
         np.testing.assert_allclose(per_step, idata["sample_stats"]["log_likelihood"], rtol=1e-9)
 
 
+def test_predictive_densities_after_pgas_on_request():
+    plain = ssm.sample(walk, DATA, ssm.PGAS(particles=10), seed=3, **SHORT)
+    asked = ssm.sample(walk, DATA, ssm.PGAS(particles=10, log_likelihood=True), seed=3, **SHORT)
+    np.testing.assert_array_equal(plain["posterior"]["q"], asked["posterior"]["q"])
+    values = asked["log_likelihood"]["y"]
+    assert values.shape == (2, 20, 40)
+    at = {n: asked["posterior"][n].values[0, 0] for n in ("b", "q", "p")}
+    reference = ssm.particle_filter(walk, DATA, at, particles=20_000, seed=1)
+    exact = reference["log_likelihood_increment"].values[0]
+    # 500 particles: each increment is right to a few hundredths; a wrong row would be off by ones
+    assert np.abs(values[0, 0] - exact).mean() < 0.1
+
+
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
 def test_same_seed_same_draws_and_thinning(method):
     one = ssm.sample(walk, DATA, method, seed=5, **SHORT)["posterior"]
