@@ -5,20 +5,17 @@ prior, data simulated from them, and the rank of each parameter among L nearly i
 from its posterior is uniform on 0, ..., L if simulation and sampling agree. The draws are thinned
 by the effective sample size that a pilot finds, on data sets of its own.
 
-    python -m tests.statistics.sbc [replications] [processes]
+    python -m tests.statistics.sbc [replications] [study ...]
 
-writes docs/figures/calibration.csv (one row per model, method, parameter and bin of ranks), which
-the page on calibration plots.
+writes docs/figures/calibration.csv (one row per model, method, quantity and bin of ranks), which the
+page on calibration plots; with names, these studies only, the others in the table staying.
 """
 
 from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import arviz as az
@@ -80,10 +77,11 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     seeds = np.random.SeedSequence(seed_of("sbc", label, study.name, replication)).spawn(2)
     first, second = (int(s.generate_state(1)[0]) for s in seeds)
     u = inputs_of(model)
+    warmup = 600 if isinstance(study.method, ssm.PMMH) else 200  # PMMH adapts during it
     truth = ssm.simulate(model, steps=STEPS, inputs=u or None, seed=first)
     data = {"y": truth["y"].values[0]} | u
     idata = ssm.sample(
-        model, data, study.method, draws=draws, warmup=600, chains=1, thin=thin, progress=False,
+        model, data, study.method, draws=draws, warmup=warmup, chains=1, thin=thin, progress=False,
         seed=second,
     )  # fmt: skip
     posterior = idata["posterior"]
@@ -102,30 +100,21 @@ def iterations_per_draw(study: Study, replication: int) -> np.ndarray:
     return np.array([length / az.ess(d[None], method="mean") for d in drawn])
 
 
-def rank(job: tuple[Study, int, int]) -> np.ndarray:
+def rank(study: Study, replication: int, thin: int) -> np.ndarray:
     """Rank of the truth among `KEPT` draws, for every ranked quantity."""
-    study, replication, thin = job
     known, drawn = draws_of(study, replication, KEPT, thin, "data")
     return (drawn < known[:, None]).sum(axis=1)
 
 
-def _pilot(job: tuple[Study, int]) -> np.ndarray:
-    return iterations_per_draw(*job)
-
-
-def calibrate(
-    study: Study, replications: int, executor: Executor | None = None, pilots: int = 8
-) -> tuple[np.ndarray, int]:
+def calibrate(study: Study, replications: int, pilots: int = 8) -> tuple[np.ndarray, int]:
     """Ranks (replications, quantities), and the thinning.
 
     Thinning is by the worst quantity of the second worst pilot data set: the few data sets whose
     chains mix worse leave their ranks a little too far out.
     """
-    each: Callable = executor.map if executor is not None else map
-    worst = np.sort([costs.max() for costs in each(_pilot, [(study, i) for i in range(pilots)])])
+    worst = np.sort([iterations_per_draw(study, i).max() for i in range(pilots)])
     thin = max(1, int(np.ceil(worst[-2])))
-    ranks = list(each(rank, [(study, i, thin) for i in range(replications)]))
-    return np.array(ranks), thin
+    return np.array([rank(study, i, thin) for i in range(replications)]), thin
 
 
 def histogram(ranks: np.ndarray) -> np.ndarray:
@@ -138,24 +127,40 @@ def uniform_p(ranks: np.ndarray) -> float:
     return float(stats.chisquare(histogram(ranks)).pvalue)
 
 
-def main(replications: int = 256, processes: int = 2) -> None:
-    rows = []
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as executor:
-        for study in STUDIES.values():
-            ranks, thin = calibrate(study, replications, executor)
-            for quantity, column in zip(study.ranked, ranks.T, strict=True):
-                p = uniform_p(column)
-                print(f"{study.name:24} {quantity:12} thin {thin:4} p {p:.3f}", flush=True)
-                rows += [
-                    (study.model, type(study.method).__name__, quantity, thin, i, count)
-                    for i, count in enumerate(histogram(column))
-                ]
+def read_table() -> dict[str, list[tuple]]:
+    """Rows of the table, by study."""
+    rows: dict[str, list[tuple]] = {}
+    if TABLE.exists():
+        with TABLE.open(encoding="utf-8") as file:
+            for row in list(csv.reader(file))[1:]:
+                rows.setdefault(f"{row[0]} {row[1]}", []).append(tuple(row))
+    return rows
+
+
+def write_table(rows: dict[str, list[tuple]]) -> None:
     TABLE.parent.mkdir(parents=True, exist_ok=True)
     with TABLE.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("model", "method", "quantity", "thin", "bin", "count"))
-        writer.writerows(rows)
+        writer.writerows(row for name in STUDIES for row in rows.get(name, []))
+
+
+def main(replications: int, chosen: list[str]) -> None:
+    """Run the studies whose names begin with one of `chosen`, and put them into the table."""
+    for name, study in STUDIES.items():
+        if chosen and not name.startswith(tuple(chosen)):
+            continue
+        ranks, thin = calibrate(study, replications)
+        own = []
+        for quantity, column in zip(study.ranked, ranks.T, strict=True):
+            p = uniform_p(column)
+            print(f"{name:24} {quantity:12} thin {thin:4} p {p:.3f}", flush=True)
+            own += [
+                (study.model, type(study.method).__name__, quantity, thin, i, count)
+                for i, count in enumerate(histogram(column))
+            ]
+        write_table(read_table() | {name: own})
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(int(sys.argv[1]) if sys.argv[1:] else 256, sys.argv[2:])
