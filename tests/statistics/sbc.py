@@ -7,8 +7,8 @@ by the effective sample size that a pilot finds, on data sets of its own.
 
     python -m tests.statistics.sbc [replications] [study ...]
 
-writes docs/figures/calibration.csv (one row per model, method, quantity and bin of ranks), which the
-page on calibration plots; with names, these studies only, the others in the table staying.
+writes docs/figures/calibration.csv (one row per model, method, quantity and bin of ranks), which
+the page on calibration plots; with names, these studies only, the others in the table staying.
 """
 
 from __future__ import annotations
