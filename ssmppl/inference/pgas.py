@@ -7,23 +7,74 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from types import ModuleType
 
 import numpy as np
 
 from ssmppl.analysis.conjugacy import Update, derive_updates, draw
+from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.gibbs import compile_updates, statistics_name
 from ssmppl.codegen.kernels.weights import OK
-from ssmppl.errors import SamplingError
+from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.filtering import FilterSettings, failure
+from ssmppl.inference.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.methods import PGAS
+from ssmppl.inference.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block
+from ssmppl.inference.sampling import Sampler, Setup
 
+PARTICLES = 25
+PARTICLES_WITHOUT_ANCESTORS = 200
 PREDICTIVE_PARTICLES = 500
+
+
+def prepare(setup: Setup, method: PGAS) -> Sampler:
+    """Derive the updates, find a mode, and start the chains from particle filters."""
+    problem, space = setup.problem, setup.space
+    memory = deterministic_memory(problem.trace)
+    usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
+    particles = usual if method.particles is None else method.particles
+    check_count("particles", particles, 2)
+    proposal = method.proposal
+    if proposal == "auto":
+        proposal = pgas_proposal(problem)
+    problem.proposal(proposal)
+    settings = FilterSettings(int(particles), proposal)
+    sweeper = Sweeper(problem, plan_updates(problem, setup.held), settings)
+    if space.where.size:
+        pilot = find_mode(space, setup.root)
+    else:
+        pilot = Pilot(np.empty(0), np.empty(0), 0.0)
+    states = []
+    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
+        generator, stream = setup.streams(chain)
+        theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
+        states.append(start_chain(sweeper, theta, generator, stream))
+    report = {
+        "particles": settings.particles,
+        "proposal": proposal,
+        "settings": asdict(method),
+        "ancestor_sampling": memory is not None,
+        "plan": "\n".join(str(u.explanation) for u in sweeper.updates),
+        "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
+    }
+    step = partial(pgas_block, sweeper, setup.thin, method.log_likelihood)
+    return Sampler(step, states, report)
+
+
+def pgas_proposal(problem: Problem) -> str:
+    """The user's, else the locally optimal one where it is exact, else the transition."""
+    proposals = problem.program.proposals
+    if "user" in proposals:
+        return "user"
+    auxiliary = proposals.get("auxiliary")
+    if auxiliary is None or isinstance(auxiliary, NotApplicable):
+        return "bootstrap"
+    return "auxiliary" if auxiliary.exact_look_ahead else "bootstrap"
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,53 @@ draws are those of one Markov chain.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
-from ssmppl.inference.filtering import FilterSettings, failure
-from ssmppl.inference.pilot import Space
+from ssmppl.inference.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.methods import PMMH
+from ssmppl.inference.pilot import Space, dispersed, find_mode, tune_particles
+from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.runner import Block
+from ssmppl.inference.sampling import Sampler, Setup
 
 ADAPTATION_POWER = 0.66
+
+
+def prepare(setup: Setup, method: PMMH) -> Sampler:
+    """Find a mode, choose proposal and number of particles there, and start the chains."""
+    problem, space = setup.problem, setup.space
+    if method.particles is not None:
+        check_count("particles", method.particles, 1)
+    pilot = find_mode(space, setup.root)
+    theta, _ = space.parameters(pilot.z)
+    choice = choose(problem, theta, kalman=False) if method.proposal == "auto" else None
+    proposal = choice.name if choice else method.proposal
+    problem.proposal(proposal)
+    particles, tuned = method.particles, None
+    if particles is None:
+        tuned = tune_particles(problem, theta, proposal, method.target_sd, setup.root)
+        particles = tuned.particles
+    settings = FilterSettings(int(particles), proposal)
+    d = len(pilot.z)
+    target = method.target_acceptance or (0.25 if d <= 1 else 0.2 if d == 2 else 0.15)
+    states = []
+    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
+        generator, stream = setup.streams(chain)
+        states.append(start_chain(space, z, pilot.scale, settings, generator, stream))
+    report = {
+        "particles": settings.particles,
+        "proposal": str(choice or proposal),
+        "settings": asdict(method),
+        "pilot_mode": setup.by_name(theta),
+    }
+    if tuned is not None:
+        report["pilot_sd_of_log_likelihood"] = tuned.sd
+    step = partial(pmmh_block, space, settings, setup.warmup, target, setup.thin)
+    return Sampler(step, states, report)
 
 
 @dataclass(frozen=True)

@@ -5,48 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.data import check_values, unpack_parameters, unpack_states
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError
 from ssmppl.inference import pgas, pmmh
-from ssmppl.inference.filtering import (
-    FilterSettings,
-    check_count,
-    random_state,
-    seed_sequence,
-)
+from ssmppl.inference.filtering import check_count, seed_sequence
 from ssmppl.inference.methods import PGAS, PMMH, Method
-from ssmppl.inference.pilot import (
-    Pilot,
-    Space,
-    dispersed,
-    find_mode,
-    space_of,
-    tune_particles,
-)
+from ssmppl.inference.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.proposal_choice import choose
-from ssmppl.inference.runner import Block, ChainDraws, run_chains, stack
+from ssmppl.inference.runner import ChainDraws, run_chains, stack
+from ssmppl.inference.sampling import Sampler, Setup
 from ssmppl.language.model import Model
 from ssmppl.results import to_inference_data
 
-PGAS_PARTICLES = 25
-PGAS_PARTICLES_WITHOUT_ANCESTORS = 200
-
-
-@dataclass(frozen=True)
-class Sampler:
-    """A method made ready: how a block of draws is made, where chains start, what to report."""
-
-    step_block: Callable[[Any, int], tuple[Any, Block]]
-    states: list[Any]
-    report: dict[str, Any]
+PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {PMMH: pmmh.prepare, PGAS: pgas.prepare}
 
 
 def sample(
@@ -109,17 +84,15 @@ def sample(
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     chosen = PGAS() if method is None else method
-    if not isinstance(chosen, (PMMH, PGAS)):
+    prepare = PREPARE.get(type(chosen))
+    if prepare is None:
         raise ArgumentError(
             f"method={method!r} is no method of sampling",
-            fix="use ssm.PMMH(...), ssm.PGAS(...) or None",
+            fix=f"use {', '.join(f'ssm.{m.__name__}(...)' for m in PREPARE)} or None",
         )
     root = seed_sequence(seed)
     space = space_of(problem, held, near)
-    if isinstance(chosen, PMMH):
-        sampler = _prepare_pmmh(problem, space, chosen, held, chains, warmup, thin, root)
-    else:
-        sampler = _prepare_pgas(problem, space, chosen, held, chains, warmup, thin, root)
+    sampler = prepare(Setup(problem, space, held, chains, warmup, thin, root), chosen)
     result = run_chains(
         sampler.step_block, sampler.states, draws, warmup, executor=executor, progress=progress,
         title=type(chosen).__name__,
@@ -134,98 +107,6 @@ def sample(
         "seconds": time.perf_counter() - began,
     }  # fmt: skip
     return _to_arviz(problem, result, held, states, attrs)
-
-
-def _streams(root: np.random.SeedSequence, chain: int) -> tuple[np.random.Generator, np.ndarray]:
-    """The random numbers of a chain: for the parameters, and for the kernels."""
-    from_root = [*root.spawn_key, 1, chain]
-    seed = np.random.SeedSequence(root.entropy, spawn_key=from_root)
-    own, kernels = seed.spawn(2)
-    return np.random.default_rng(own), random_state(kernels)
-
-
-def _prepare_pmmh(
-    problem: Problem, space: Space, method: PMMH, held: dict[str, np.ndarray], chains: int,
-    warmup: int, thin: int, root: np.random.SeedSequence,
-) -> Sampler:  # fmt: skip
-    if method.particles is not None:
-        check_count("particles", method.particles, 1)
-    pilot = find_mode(space, root)
-    theta, _ = space.parameters(pilot.z)
-    choice = choose(problem, theta, kalman=False) if method.proposal == "auto" else None
-    proposal = choice.name if choice else method.proposal
-    problem.proposal(proposal)
-    particles, tuned = method.particles, None
-    if particles is None:
-        tuned = tune_particles(problem, theta, proposal, method.target_sd, root)
-        particles = tuned.particles
-    settings = FilterSettings(int(particles), proposal)
-    d = len(pilot.z)
-    target = method.target_acceptance or (0.25 if d <= 1 else 0.2 if d == 2 else 0.15)
-    states = []
-    for chain, z in enumerate(dispersed(space, pilot, chains, root, "bootstrap")):
-        generator, stream = _streams(root, chain)
-        states.append(pmmh.start_chain(space, z, pilot.scale, settings, generator, stream))
-    report = {
-        "particles": settings.particles,
-        "proposal": str(choice or proposal),
-        "settings": asdict(method),
-        "pilot_mode": _by_name(problem, theta),
-    }
-    if tuned is not None:
-        report["pilot_sd_of_log_likelihood"] = tuned.sd
-    step = partial(pmmh.pmmh_block, space, settings, warmup, target, thin)
-    return Sampler(step, states, report)
-
-
-def _prepare_pgas(
-    problem: Problem, space: Space, method: PGAS, held: dict[str, np.ndarray], chains: int,
-    warmup: int, thin: int, root: np.random.SeedSequence,
-) -> Sampler:  # fmt: skip
-    memory = deterministic_memory(problem.trace)
-    usual = PGAS_PARTICLES if memory is not None else PGAS_PARTICLES_WITHOUT_ANCESTORS
-    particles = usual if method.particles is None else method.particles
-    check_count("particles", particles, 2)
-    proposal = method.proposal
-    if proposal == "auto":
-        proposal = pgas_proposal(problem)
-    problem.proposal(proposal)
-    settings = FilterSettings(int(particles), proposal)
-    sweeper = pgas.Sweeper(problem, pgas.plan_updates(problem, held), settings)
-    if space.where.size:
-        pilot = find_mode(space, root)
-    else:
-        pilot = Pilot(np.empty(0), np.empty(0), 0.0)
-    states = []
-    for chain, z in enumerate(dispersed(space, pilot, chains, root, "bootstrap")):
-        generator, stream = _streams(root, chain)
-        theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
-        states.append(pgas.start_chain(sweeper, theta, generator, stream))
-    report = {
-        "particles": settings.particles,
-        "proposal": proposal,
-        "settings": asdict(method),
-        "ancestor_sampling": memory is not None,
-        "plan": "\n".join(str(u.explanation) for u in sweeper.updates),
-        "pilot_mode": _by_name(problem, space.parameters(pilot.z)[0]) if len(pilot.z) else {},
-    }
-    step = partial(pgas.pgas_block, sweeper, thin, method.log_likelihood)
-    return Sampler(step, states, report)
-
-
-def pgas_proposal(problem: Problem) -> str:
-    """The user's, else the locally optimal one where it is exact, else the transition."""
-    proposals = problem.program.proposals
-    if "user" in proposals:
-        return "user"
-    auxiliary = proposals.get("auxiliary")
-    if auxiliary is None or isinstance(auxiliary, NotApplicable):
-        return "bootstrap"
-    return "auxiliary" if auxiliary.exact_look_ahead else "bootstrap"
-
-
-def _by_name(problem: Problem, theta: np.ndarray) -> dict[str, Any]:
-    return {n: v.tolist() for n, v in unpack_parameters(problem.trace, theta).items()}
 
 
 def _to_arviz(
