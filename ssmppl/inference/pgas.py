@@ -6,22 +6,22 @@ Lindsten, Jordan and Schön (2014), algorithm 3; Schön et al. (2015), algorithm
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
-from types import ModuleType
+from functools import partial
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy import Update, derive_updates, draw
 from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.gibbs import compile_updates, statistics_name
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr
 from ssmppl.inference.filtering import FilterSettings, check_count, failure
 from ssmppl.inference.methods import PGAS
+from ssmppl.inference.parameter_steps import (
+    ParameterSteps,
+    draw_parameters,
+    log_joint,
+    plan_updates,
+)
 from ssmppl.inference.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block
@@ -78,65 +78,13 @@ def pgas_proposal(problem: Problem) -> str:
 
 
 @dataclass(frozen=True)
-class Sweeper:
+class Sweeper(ParameterSteps):
     """A problem with its updates: what one iteration of PGAS needs.
 
-    updates : in the order in which they are made; settings : of the conditional particle filter.
+    settings : of the conditional particle filter.
     """
 
-    problem: Problem
-    updates: tuple[Update, ...]
     settings: FilterSettings
-
-    @cached_property
-    def module(self) -> ModuleType:
-        return compile_updates(self.problem.trace, self.updates)
-
-    @cached_property
-    def index(self) -> dict[Expr, int]:
-        return {s: i for i, s in enumerate(self.problem.trace.parameter_symbols)}
-
-    @cached_property
-    def where(self) -> list[np.ndarray]:
-        """Positions in theta of each update's components."""
-        return [np.array([self.index[c] for c in u.components]) for u in self.updates]
-
-    @cached_property
-    def prior_totals(self) -> list[np.ndarray | None]:
-        """The prior's part of the statistics where it is constant."""
-        out: list[np.ndarray | None] = []
-        for u in self.updates:
-            summands = u.coefficients.get("prior", ())
-            known = all(e.op == "const" for e in summands)
-            out.append(np.array([e.data for e in summands]) if known else None)
-        return out
-
-    def __getstate__(self) -> dict:
-        return {k: self.__dict__[k] for k in ("problem", "updates", "settings")}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
-
-
-def plan_updates(problem: Problem, fixed: Mapping[str, np.ndarray]) -> tuple[Update, ...]:
-    """The updates of the parameters that are not fixed."""
-    return tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
-
-
-class ThetaValues(Mapping[Expr, float]):
-    """theta as a mapping from symbols, without copying."""
-
-    def __init__(self, index: dict[Expr, int], theta: np.ndarray):
-        self.index, self.theta = index, theta
-
-    def __getitem__(self, key: Expr) -> float:
-        return float(self.theta[self.index[key]])
-
-    def __iter__(self) -> Iterator[Expr]:
-        return iter(self.index)
-
-    def __len__(self) -> int:
-        return len(self.index)
 
 
 @dataclass(frozen=True)
@@ -189,7 +137,7 @@ def pgas_block(
         moved, ess, accepted, made = 0.0, 0.0, 0, 0
         for _ in range(thin):
             rates = _trajectories(sweeper, theta, paths, stream)
-            infos = _parameters(sweeper, theta, paths, generator)
+            infos = draw_parameters(sweeper, theta, paths, generator)
             moved, ess = moved + rates[0] / thin, ess + rates[1] / thin
             accepted, made = accepted + sum(infos), made + len(infos)
         draws["theta"].append(theta.copy())
@@ -239,66 +187,6 @@ def _trajectories(
         paths[i] = new
         figures += own / len(paths)
     return float(figures[0]), float(figures[1])
-
-
-def _parameters(
-    sweeper: Sweeper, theta: np.ndarray, paths: list[np.ndarray], generator: np.random.Generator
-) -> list[bool]:
-    """One pass over the updates, in place; whether each was accepted."""
-    infos = []
-    for k, update in enumerate(sweeper.updates):
-        where = sweeper.where[k]
-        rest = ThetaValues(sweeper.index, theta)
-        totals = _totals(sweeper, k, theta, paths)
-        if update.needs_log_joint:
-            density = partial(_with, sweeper, theta, where, paths=paths)
-            values, info = draw(update, totals, theta[where], rest, generator, density)
-            theta[where] = values
-            log_joint(sweeper, theta, paths)  # sets what is deterministic in the trajectories
-        else:
-            values, info = draw(update, totals, theta[where], rest, generator)
-            theta[where] = values
-        infos.append(info.accepted)
-    return infos
-
-
-def _with(
-    sweeper: Sweeper, theta: np.ndarray, where: np.ndarray, values: np.ndarray,
-    paths: list[np.ndarray],
-) -> float:  # fmt: skip
-    trial = theta.copy()
-    trial[where] = values
-    return log_joint(sweeper, trial, paths)
-
-
-def _totals(sweeper: Sweeper, k: int, theta: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
-    """The statistics C_i of update k: the prior once, the rest summed over experiments."""
-    update = sweeper.updates[k]
-    if update.needs_log_joint:
-        return np.empty(0)
-    total, part = np.zeros(len(update.functions)), np.empty(len(update.functions))
-    run = getattr(sweeper.module, statistics_name(update))
-    for e, path in zip(sweeper.problem.experiments, paths, strict=True):
-        run(theta, e.y, e.seen, e.u, path, part)
-        total += part
-    prior = sweeper.prior_totals[k]
-    if prior is None:
-        values = ThetaValues(sweeper.index, theta)
-        prior = np.array(evaluate(update.coefficients["prior"], values), dtype=float)
-    return total + prior
-
-
-def log_joint(sweeper: Sweeper, theta: np.ndarray, paths: list[np.ndarray]) -> float:
-    """log p(theta, x, y), deterministic components of x set on the way; -inf for nan."""
-    program = sweeper.problem.program
-    value = program.entry("log_prior")(theta) if len(theta) else 0.0
-    if value == -np.inf:
-        return -np.inf
-    part = np.empty(1)
-    for e, path in zip(sweeper.problem.experiments, paths, strict=True):
-        program.entry("log_joint")(theta, e.y, e.seen, e.u, path, part)
-        value += part[0]
-    return -np.inf if np.isnan(value) else float(value)
 
 
 __all__ = ["PGASState", "SamplingError", "Sweeper", "pgas_block", "plan_updates", "start_chain"]

@@ -1,0 +1,143 @@
+"""Gibbs steps of the parameters given trajectories and data, by their derived updates.
+
+Schön et al. (2015), section 4.2: each block is drawn given the trajectories and the newest values
+of the other blocks, from the statistics that one compiled pass over the data sums up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from types import ModuleType
+
+import numpy as np
+
+from ssmppl.analysis.conjugacy import Update, derive_updates, draw
+from ssmppl.codegen.gibbs import compile_updates, statistics_name
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.problem import Problem
+
+
+@dataclass(frozen=True)
+class ParameterSteps:
+    """A problem with the updates of its parameters, in the order in which they are made."""
+
+    problem: Problem
+    updates: tuple[Update, ...]
+
+    @cached_property
+    def module(self) -> ModuleType:
+        return compile_updates(self.problem.trace, self.updates)
+
+    @cached_property
+    def index(self) -> dict[Expr, int]:
+        return {s: i for i, s in enumerate(self.problem.trace.parameter_symbols)}
+
+    @cached_property
+    def where(self) -> list[np.ndarray]:
+        """Positions in theta of each update's components."""
+        return [np.array([self.index[c] for c in u.components]) for u in self.updates]
+
+    @cached_property
+    def prior_totals(self) -> list[np.ndarray | None]:
+        """The prior's part of the statistics where it is constant."""
+        out: list[np.ndarray | None] = []
+        for u in self.updates:
+            summands = u.coefficients.get("prior", ())
+            known = all(e.op == "const" for e in summands)
+            out.append(np.array([e.data for e in summands]) if known else None)
+        return out
+
+    def __getstate__(self) -> dict:
+        return {f.name: self.__dict__[f.name] for f in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+
+
+def plan_updates(problem: Problem, fixed: Mapping[str, np.ndarray]) -> tuple[Update, ...]:
+    """The updates of the parameters that are not fixed."""
+    return tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
+
+
+class ThetaValues(Mapping[Expr, float]):
+    """theta as a mapping from symbols, without copying."""
+
+    def __init__(self, index: dict[Expr, int], theta: np.ndarray):
+        self.index, self.theta = index, theta
+
+    def __getitem__(self, key: Expr) -> float:
+        return float(self.theta[self.index[key]])
+
+    def __iter__(self) -> Iterator[Expr]:
+        return iter(self.index)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def draw_parameters(
+    steps: ParameterSteps,
+    theta: np.ndarray,
+    paths: list[np.ndarray],
+    generator: np.random.Generator,
+) -> list[bool]:
+    """One pass over the updates, in place; whether each was accepted."""
+    infos = []
+    for k, update in enumerate(steps.updates):
+        where = steps.where[k]
+        rest = ThetaValues(steps.index, theta)
+        totals = _totals(steps, k, theta, paths)
+        if update.needs_log_joint:
+            density = partial(_with, steps, theta, where, paths=paths)
+            values, info = draw(update, totals, theta[where], rest, generator, density)
+            theta[where] = values
+            log_joint(steps, theta, paths)  # sets what is deterministic in the trajectories
+        else:
+            values, info = draw(update, totals, theta[where], rest, generator)
+            theta[where] = values
+        infos.append(info.accepted)
+    return infos
+
+
+def _with(
+    steps: ParameterSteps, theta: np.ndarray, where: np.ndarray, values: np.ndarray,
+    paths: list[np.ndarray],
+) -> float:  # fmt: skip
+    trial = theta.copy()
+    trial[where] = values
+    return log_joint(steps, trial, paths)
+
+
+def _totals(
+    steps: ParameterSteps, k: int, theta: np.ndarray, paths: list[np.ndarray]
+) -> np.ndarray:
+    """The statistics C_i of update k: the prior once, the rest summed over experiments."""
+    update = steps.updates[k]
+    if update.needs_log_joint:
+        return np.empty(0)
+    total, part = np.zeros(len(update.functions)), np.empty(len(update.functions))
+    run = getattr(steps.module, statistics_name(update))
+    for e, path in zip(steps.problem.experiments, paths, strict=True):
+        run(theta, e.y, e.seen, e.u, path, part)
+        total += part
+    prior = steps.prior_totals[k]
+    if prior is None:
+        values = ThetaValues(steps.index, theta)
+        prior = np.array(evaluate(update.coefficients["prior"], values), dtype=float)
+    return total + prior
+
+
+def log_joint(steps: ParameterSteps, theta: np.ndarray, paths: list[np.ndarray]) -> float:
+    """log p(theta, x, y), deterministic components of x set on the way; -inf for nan."""
+    program = steps.problem.program
+    value = program.entry("log_prior")(theta) if len(theta) else 0.0
+    if value == -np.inf:
+        return -np.inf
+    part = np.empty(1)
+    for e, path in zip(steps.problem.experiments, paths, strict=True):
+        program.entry("log_joint")(theta, e.y, e.seen, e.u, path, part)
+        value += part[0]
+    return -np.inf if np.isnan(value) else float(value)
