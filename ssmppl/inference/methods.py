@@ -2,7 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class MetropolisHastings:
+    """Metropolis-Hastings with the exact likelihood of a linear Gaussian model (Schön et al. 2015,
+    algorithm 1): a random walk on the parameters, the states drawn afterwards, given each kept
+    draw, by exact backward sampling.
+
+    Priors may be improper (`Flat`, `HalfFlat`). Whether the posterior is proper is then for the
+    user to know: a chain cannot tell, and its draws mean nothing where it is not.
+
+    Parameters
+    ----------
+    covariance, scale, transform, adapt, target_acceptance : the walk, as in `PMMH`; the usual
+        acceptance rates are those of Gelman, Roberts and Gilks (1996).
+    """
+
+    covariance: Any = None
+    scale: str = "unconstrained"
+    transform: Mapping[str, str] | None = None
+    adapt: bool | None = None
+    target_acceptance: float | None = None
+
+
+@dataclass(frozen=True)
+class Gibbs:
+    """Gibbs sampling of a linear Gaussian model (Schön et al. 2015, section 4.2): trajectories by
+    exact backward sampling (Frühwirth-Schnatter 1994; Carter and Kohn 1994), parameters by the
+    updates that were derived for them. It has no settings.
+    """
 
 
 @dataclass(frozen=True)
@@ -15,15 +47,43 @@ class PMMH:
     particles : N; None tunes it in a pilot to a standard deviation of log Z of about `target_sd`
         (Doucet et al. 2015; Sherlock et al. 2015).
     proposal : the particle filter's proposal, as in `log_likelihood`.
-    target_sd : of the estimate of the log-likelihood, which the pilot aims at.
-    target_acceptance : what the covariance of the random walk adapts to during warmup (Vihola
-        2012); None: 0.25 for one parameter, less for more.
+    target_sd : of the estimate of the log-likelihood, which the pilot aims at; with `correlation`,
+        of the difference between two successive estimates, over sqrt(2).
+    target_acceptance : what the walk adapts to during warmup (Vihola 2012); None: 0.25 for one
+        parameter, less for more; 0.25 for orders 1 and 2; 0.3 with `correlation`.
+    covariance : (d, d), of the walk's steps, the free parameters in the order of declaration, on
+        the scale below. None: 2.562^2 / d times the inverse information at the mode, which a
+        pilot estimates (Sherlock et al. 2015).
+    scale : on which the walk moves: "unconstrained" (numbers between bounds by logit, positive ones
+        by log, simplices by stick breaking, matrices by their Cholesky factor), or "natural".
+        What falls outside the support is refused; the Jacobian is accounted for.
+    transform : the scale of single parameters: {"tau": "reciprocal", ...}, out of "unconstrained",
+        "natural", "log" and "reciprocal".
+    adapt : whether the walk adapts during warmup; None: unless `covariance` is given. It is held
+        fixed afterwards.
+    order : 0: a random walk. 1: Langevin steps along the gradient of the log posterior (PMH1 of
+        Dahlin, Lindsten and Schön 2015). 2: Newton-like steps, with the observed information too
+        (PMH2 there). Both are estimated by a fixed-lag smoother from the particles that give the
+        likelihood, so that a step takes one particle filter whatever the order.
+    lag : of that smoother.
+    correlation : rho of the correlated pseudo-marginal method (Deligiannidis, Doucet and Pitt
+        2018): the normals behind the particle filter move by v' = rho v + sqrt(1 - rho^2) e, and
+        particles are sorted before they are resampled, so that successive estimates of log Z err
+        alike and fewer particles do. 0: fresh random numbers. Only for models whose particles are
+        drawn from normals and uniforms; not with orders 1 and 2.
     """
 
     particles: int | None = None
     proposal: str = "auto"
     target_sd: float = 1.2
     target_acceptance: float | None = None
+    covariance: Any = None
+    scale: str = "unconstrained"
+    transform: Mapping[str, str] | None = None
+    adapt: bool | None = None
+    order: int = 0
+    lag: int = 12
+    correlation: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -45,4 +105,28 @@ class PGAS:
     log_likelihood: bool = False
 
 
-Method = PMMH | PGAS
+@dataclass(frozen=True)
+class DirectOptimization:
+    """Quasi-Newton ascent of the log-likelihood on the unconstrained scale (Schön et al. 2015,
+    section on direct optimisation).
+
+    On linear Gaussian models with the exact likelihood and score of the Kalman filter; else, for
+    one scalar state, over a particle filter with common random numbers that is continuous in the
+    parameters (Malik and Pitt 2011).
+
+    Parameters
+    ----------
+    particles : N of the continuous filter.
+    averages : number of its random seeds that the likelihood is averaged over.
+    restarts : further starts, dispersed round the first, of which the best is kept; None: 2 where
+        the likelihood is exact, else 0.
+    steps : most iterations of a climb.
+    """
+
+    particles: int = 1000
+    averages: int = 8
+    restarts: int | None = None
+    steps: int = 200
+
+
+Method = MetropolisHastings | Gibbs | PMMH | PGAS

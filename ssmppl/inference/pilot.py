@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,6 +25,7 @@ from ssmppl.inference.filtering import (
     random_state,
     repeated_estimates,
 )
+from ssmppl.inference.kalman import kalman_log_likelihood
 from ssmppl.inference.problem import Problem
 from ssmppl.language.trace import Site
 from ssmppl.language.transforms import transforms, unconstrain
@@ -34,6 +36,15 @@ TUNING_REPEATS = 40
 SCALE_REPEATS = 8
 FALL = 8.0  # how far log p falls where its scale is measured
 MOST_PARTICLES = 1_000_000
+
+
+class Region(Protocol):
+    """A space with coordinates: a point in, (theta, log density of the prior there) out."""
+
+    @property
+    def problem(self) -> Problem: ...
+
+    def parameters(self, point: np.ndarray, /) -> tuple[np.ndarray, float]: ...
 
 
 @dataclass(frozen=True)
@@ -121,23 +132,16 @@ def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "boots
     ------
     ArgumentError : the likelihood is zero at every point that was tried.
     """
-    settings = FilterSettings(PILOT_PARTICLES, proposal)
-    stream = random_state(seed)
+    estimate = pilot_likelihood(space.problem, proposal)
 
     def log_density(z: np.ndarray) -> float:
         theta, log_prior = space.parameters(z)
-        if log_prior == -np.inf:
-            return -np.inf
-        try:
-            value = log_likelihood_estimate(space.problem, theta, settings, stream.copy())
-        except SamplingError:
-            return -np.inf
-        return value + log_prior
+        return -np.inf if log_prior == -np.inf else estimate(theta, seed) + log_prior
 
     z = space.z[space.where]
     if not len(z):
         return Pilot(z, z, log_density(z))
-    z = _finite_point(z, log_density, np.random.default_rng(seed))
+    z = finite_point(z, log_density, np.random.default_rng(seed))
     best, value = z, log_density(z)
     size = 1.0
     for _ in range(4):  # restarts, as a simplex may collapse early on a ragged function
@@ -154,22 +158,63 @@ def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "boots
             break
         size = 0.5
 
+    averaged = averaged_density(space, seed, proposal, SCALE_REPEATS)
+    return Pilot(best, _scale(best, averaged), value)
+
+
+def pilot_likelihood(
+    problem: Problem, proposal: str
+) -> Callable[[np.ndarray, np.random.SeedSequence], float]:
+    """(theta, seed) -> log p(y | theta): exact for "kalman", else a particle filter's estimate.
+
+    -inf where it is zero, or where it does not exist.
+    """
+    if proposal == "kalman":
+        return lambda theta, _: kalman_log_likelihood(problem.trace, problem.experiments, theta)
+    settings = FilterSettings(PILOT_PARTICLES, proposal)
+
+    def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
+        try:
+            return log_likelihood_estimate(problem, theta, settings, random_state(seed))
+        except SamplingError:
+            return -np.inf
+
+    return estimate
+
+
+def averaged_density(
+    space: Region, seed: np.random.SeedSequence, proposal: str, repeats: int
+) -> Callable[[np.ndarray], float]:
+    """The log posterior as a function of the coordinates, from the mean of several estimates of the
+    likelihood with common random numbers (exact for "kalman")."""
+    problem = space.problem
+    exact = pilot_likelihood(problem, proposal) if proposal == "kalman" else None
+    settings = FilterSettings(PILOT_PARTICLES, proposal)
+
     def averaged(v: np.ndarray) -> float:
         theta, log_prior = space.parameters(v)
         if log_prior == -np.inf:
             return -np.inf
+        if exact is not None:
+            return exact(theta, seed) + log_prior
         try:
-            log_z = repeated_estimates(space.problem, theta, settings, seed, range(SCALE_REPEATS))
+            log_z = repeated_estimates(problem, theta, settings, seed, range(repeats))
         except SamplingError:
             return -np.inf
         return float(np.logaddexp.reduce(log_z) - np.log(len(log_z))) + log_prior
 
-    return Pilot(best, _scale(best, averaged), value)
+    return averaged
 
 
-def _finite_point(
+def finite_point(
     z: np.ndarray, log_density: Callable[[np.ndarray], float], rng: np.random.Generator
 ) -> np.ndarray:
+    """z (free,) itself, or a random point round it, where log p is finite.
+
+    Raises
+    ------
+    ArgumentError : the likelihood is zero at every point that was tried.
+    """
     for attempt in range(TRIES):
         point = z if attempt == 0 else z + (1.0 + attempt / 40.0) * rng.standard_normal(len(z))
         if log_density(point) > -np.inf:
@@ -202,7 +247,7 @@ def dispersed(
     space: Space, pilot: Pilot, chains: int, seed: np.random.SeedSequence, proposal: str
 ) -> list[np.ndarray]:
     """A start for each chain, three scales about the mode, with a finite likelihood."""
-    settings = FilterSettings(PILOT_PARTICLES, proposal)
+    estimate = pilot_likelihood(space.problem, proposal)
     starts = []
     for chain in range(chains):
         child = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 7, chain))
@@ -214,11 +259,7 @@ def dispersed(
             spread *= 0.97
             if log_prior == -np.inf:
                 continue
-            try:
-                value = log_likelihood_estimate(space.problem, theta, settings, random_state(child))
-            except SamplingError:
-                continue
-            if value > -np.inf:
+            if estimate(theta, child) > -np.inf:
                 point = trial
                 break
         starts.append(point)

@@ -1,0 +1,191 @@
+"""The coordinates in which a Metropolis chain moves, with their Jacobian.
+
+Each parameter keeps to the unconstrained scale of `language/transforms.py`, or is moved itself, or
+its logarithm or reciprocal is. A proposal outside the support has density zero there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError, listing
+from ssmppl.inference.pilot import Space
+from ssmppl.inference.problem import Problem
+from ssmppl.language.trace import Site
+from ssmppl.language.transforms import transforms
+
+SCALES = ("unconstrained", "natural", "log", "reciprocal")
+STEP = 1e-3  # of finite differences, in standard deviations
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """w (d,), the free parameters on the scales that were chosen.
+
+    kinds : (d,) one of `SCALES` each. place : (d,) positions in z where the kind is
+    "unconstrained", else in theta. by_z : (sites,) which sites are computed from z.
+    """
+
+    space: Space
+    kinds: np.ndarray
+    place: np.ndarray
+    by_z: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    @property
+    def problem(self) -> Problem:
+        return self.space.problem
+
+    def at(self, z_free: np.ndarray) -> np.ndarray:
+        """w of a point given by the unconstrained values of the free parameters."""
+        if bool(np.all(self.kinds == "unconstrained")):
+            return z_free
+        theta, _ = self.space.parameters(z_free)
+        z = self.space.z.copy()
+        z[self.space.where] = z_free
+        w = np.where(self.kinds == "unconstrained", z[self._in_z], theta[self._in_theta])
+        log, reciprocal = self.kinds == "log", self.kinds == "reciprocal"
+        w[log], w[reciprocal] = np.log(w[log]), 1.0 / w[reciprocal]
+        return w
+
+    def parameters(self, w: np.ndarray) -> tuple[np.ndarray, float]:
+        """(theta, log prior + log |d theta / d w|), -inf outside the support."""
+        space = self.space
+        if bool(np.all(self.by_z == space.free)):
+            return space.parameters(w)
+        z, theta, log_jacobian = space.z.copy(), space.theta.copy(), 0.0
+        for value, kind, i in zip(w.tolist(), self.kinds, self.place, strict=True):
+            if kind == "unconstrained":
+                z[i] = value
+            elif kind == "natural":
+                theta[i] = value
+            elif kind == "log":
+                theta[i] = np.exp(min(value, 700.0))
+                log_jacobian += value
+            else:
+                if value == 0.0:
+                    return theta, -np.inf
+                theta[i] = 1.0 / value
+                log_jacobian -= 2.0 * np.log(abs(value))
+        program = space.problem.program
+        log_jacobian += program.entry("constrain")(z, self.by_z, theta)
+        log_density = program.entry("log_prior")(theta) + log_jacobian
+        if not np.all(np.isfinite(theta)) or np.isnan(log_density):
+            return theta, -np.inf
+        return theta, float(log_density)
+
+    @property
+    def _in_z(self) -> np.ndarray:
+        return np.where(self.kinds == "unconstrained", self.place, 0)
+
+    @property
+    def _in_theta(self) -> np.ndarray:
+        return np.where(self.kinds == "unconstrained", 0, self.place)
+
+
+def coordinates(space: Space, scale: str, transform: Mapping[str, str] | None) -> Coordinates:
+    """The coordinates that a method's `scale` and `transform` ask for.
+
+    Raises
+    ------
+    ArgumentError : an unknown scale or parameter, or a scale that a parameter cannot have.
+    """
+    trace = space.problem.trace
+    given = dict(transform or {})
+    for name in given:
+        if name not in trace.parameters:
+            raise ArgumentError(
+                f"transform names {name!r}, which is no parameter",
+                fix=f"the parameters are: {listing(name, trace.parameters)}",
+            )
+    for name, kind in [("", scale), *given.items()]:
+        if kind not in SCALES or (not name and kind not in SCALES[:2]):
+            valid = SCALES if name else SCALES[:2]
+            raise ArgumentError(
+                f"transform={{{name!r}: {kind!r}}} is unknown" if name else f"scale={kind!r}",
+                fix=f"use one of: {listing(str(kind), valid)}",
+            )
+    kinds: list[str] = []
+    place: list[int] = []
+    by_z = np.zeros(len(trace.parameters), dtype=bool)
+    index = {s: i for i, s in enumerate(trace.parameter_symbols)}
+    start = 0
+    for k, (site, t) in enumerate(zip(trace.parameters.values(), transforms(trace), strict=True)):
+        kind = given.get(site.name, scale)
+        if space.free[k] and kind == "unconstrained":
+            by_z[k] = True
+            kinds += [kind] * len(t.free)
+            place += range(start, start + len(t.free))
+        elif space.free[k]:
+            _check(site, kind, space.theta[[index[s] for s in site.components]])
+            kinds += [kind] * len(site.components)
+            place += [index[s] for s in site.components]
+        start += len(t.free)
+    return Coordinates(space, np.array(kinds, dtype="U13"), np.array(place, dtype=int), by_z)
+
+
+def _check(site: Site, kind: str, values: np.ndarray) -> None:
+    support = site.distribution.support().kind
+    if support in ("simplex", "positive definite"):
+        raise ArgumentError(
+            f"{site.name} is a {support.replace('simplex', 'probability vector')}"
+            f"{' matrix' if support != 'simplex' else ''}: it cannot move on the {kind} scale",
+            fix=f'add transform={{"{site.name}": "unconstrained"}}',
+            where=site.distribution.location,
+        )
+    if kind == "log" and not np.all(values > 0.0):
+        raise ArgumentError(
+            f"{site.name} is not confined to positive numbers: it has no logarithm",
+            fix=f'use "natural" or "unconstrained" for {site.name}',
+            where=site.distribution.location,
+        )
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Derivatives of theta and of the log prior at a point, in w (d,).
+
+    jacobian (P, d), second (P, d, d) : of theta. slope (d,), curvature (d, d) : of the log prior
+    with the log Jacobian; 0 where there is no finite difference, next to the support's end.
+    """
+
+    jacobian: np.ndarray
+    second: np.ndarray
+    slope: np.ndarray
+    curvature: np.ndarray
+
+
+def chart(at: Coordinates, w: np.ndarray, sd: np.ndarray, second: bool) -> Chart:
+    """Central differences; sd (d,) gives the scale of each coordinate."""
+    d, h = len(w), STEP * sd
+    theta, log_p = at.parameters(w)
+    jacobian, slope = np.zeros((len(theta), d)), np.zeros(d)
+    twice, curvature = np.zeros((len(theta), d, d)), np.zeros((d, d))
+    ends = []
+    for i in range(d):
+        unit = np.eye(d)[i] * h[i]
+        up, down = at.parameters(w + unit), at.parameters(w - unit)
+        ends.append((up, down))
+        if np.isfinite(up[1]) and np.isfinite(down[1]):
+            jacobian[:, i] = (up[0] - down[0]) / (2.0 * h[i])
+            slope[i] = (up[1] - down[1]) / (2.0 * h[i])
+            twice[:, i, i] = (up[0] - 2.0 * theta + down[0]) / h[i] ** 2
+            curvature[i, i] = (up[1] - 2.0 * log_p + down[1]) / h[i] ** 2
+    for i in range(d if second else 0):
+        for j in range(i):
+            step = np.eye(d)[i] * h[i] + np.eye(d)[j] * h[j]
+            up, down = at.parameters(w + step), at.parameters(w - step)
+            logs = [up[1], down[1], *(e[1] for k in (i, j) for e in ends[k])]
+            if np.all(np.isfinite(logs)):
+                singles = [ends[k][m] for k in (i, j) for m in (0, 1)]
+                area = 2.0 * h[i] * h[j]
+                both = up[0] + down[0] + 2.0 * theta - sum(s[0] for s in singles)
+                twice[:, i, j] = twice[:, j, i] = both / area
+                both = up[1] + down[1] + 2.0 * log_p - sum(s[1] for s in singles)
+                curvature[i, j] = curvature[j, i] = both / area
+    return Chart(jacobian, twice, slope, curvature)
