@@ -52,30 +52,55 @@ def python_sum(
     return _compiled("lambda v, c: " + (" + ".join(terms) or "0.0"), functions)
 
 
+def straight_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
+    """As `python_function`, each shared subexpression computed once, statement by statement.
+
+    For larger graphs, whose text would repeat what is shared. Both cases of a condition are
+    computed.
+    """
+    done = {a: f"v[{i}]" for i, a in enumerate(arguments)}
+    lines = ["def run(v):"]
+    for node in topological(expressions):
+        if node in done:
+            continue
+        text = _spelled(node, [done[a] for a in node.args], simple=True)
+        if node.op == "const":
+            done[node] = text
+        else:
+            done[node] = f"a{len(lines)}"
+            lines.append(f"    {done[node]} = {text}")
+    lines.append("    return (" + "".join(f"{done[e]}, " for e in expressions) + ")")
+    names = _names(expressions)
+    exec("\n".join(lines), names)
+    return names["run"]
+
+
 def _text(root: Expr, places: dict[Expr, str]) -> str:
     done: dict[Expr, str] = dict(places)
     for node in topological([root]):
-        if node in done:
-            continue
-        parts = [done[a] for a in node.args]
-        if node.op == "const":
-            done[node] = f"({node.data!r})" if math.isfinite(node.data) else f"float('{node.data}')"
-        elif node.op == "symbol":
-            raise KeyError(f"no value given for {node!r}")
-        elif node.op in MATRIX_OPS:
-            done[node] = f"matrix_{node.op}({node.data}, ({', '.join(parts)},))"
-        elif node.op == "item":
-            done[node] = f"{parts[0]}[{node.data[0]}, {node.data[1]}]"
-        elif node.op == "call":
-            done[node] = f"calls[{id(node.data)}]({', '.join(parts)})"
-        elif node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
-            simple = node.args[0] in places
-            done[node] = f"({parts[0]}*{parts[0]})" if simple else f"math.pow({parts[0]}, 2.0)"
-        elif node.op in _TEXT:
-            done[node] = _TEXT[node.op].format(*parts)
-        else:
-            done[node] = f"float(meaning[{node.op!r}]({', '.join(parts)}))"
+        if node not in done:
+            simple = bool(node.args) and node.args[0] in places
+            done[node] = _spelled(node, [done[a] for a in node.args], simple)
     return done[root]
+
+
+def _spelled(node: Expr, parts: list[str], simple: bool) -> str:
+    """The text of one operation on these texts; simple: the first of them is a name."""
+    if node.op == "const":
+        return f"({node.data!r})" if math.isfinite(node.data) else f"float('{node.data}')"
+    if node.op == "symbol":
+        raise KeyError(f"no value given for {node!r}")
+    if node.op in MATRIX_OPS:
+        return f"matrix_{node.op}({node.data}, ({', '.join(parts)},))"
+    if node.op == "item":
+        return f"{parts[0]}[{node.data[0]}, {node.data[1]}]"
+    if node.op == "call":
+        return f"calls[{id(node.data)}]({', '.join(parts)})"
+    if node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
+        return f"({parts[0]}*{parts[0]})" if simple else f"math.pow({parts[0]}, 2.0)"
+    if node.op in _TEXT:
+        return _TEXT[node.op].format(*parts)
+    return f"float(meaning[{node.op!r}]({', '.join(parts)}))"
 
 
 def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], Any]:
@@ -89,7 +114,12 @@ def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], 
 
 
 def _compiled(text: str, expressions: Sequence[Expr]) -> Callable[..., Any]:
-    names = {
+    return eval(text, _names(expressions))
+
+
+def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
+    """What the texts refer to."""
+    return {
         "math": math,
         "meaning": MEANING,
         "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
@@ -98,4 +128,3 @@ def _compiled(text: str, expressions: Sequence[Expr]) -> Callable[..., Any]:
         "matrix_det": _matrix(lambda m: float(np.linalg.det(m))),
         "matrix_logdet": _matrix(lambda m: float(np.linalg.slogdet(m)[1])),
     }
-    return eval(text, names)

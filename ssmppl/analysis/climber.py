@@ -1,0 +1,164 @@
+"""The numerical M-step: a function of parameters climbed on the unconstrained scale.
+
+Newton's method with the symbolic gradient and Hessian. Directions of wrong or no curvature are
+climbed by the size of their curvature (Nocedal and Wright 2006, "Numerical optimization", section
+3.4), steps are shortened and halved until the function rises. Many parameters: BFGS with the
+gradient. Where there is no derivative in closed form: the simplex of Nelder and Mead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ssmppl.analysis.pythontext import DOMAIN, Function, straight_function
+from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
+from ssmppl.expressions.expr import Expr, substitute
+from ssmppl.language.trace import Trace
+from ssmppl.language.transforms import Transform, transforms
+
+NEWTON_SIZE = 8  # the number of unconstrained parameters up to which a Hessian is derived
+STEPS, HALVINGS = 100, 40
+LONGEST_STEP = 3.0  # on the unconstrained scale: logarithms, logits
+LEAST_CURVATURE = 1e-10  # relative to the largest
+ENOUGH = 1e-14  # what a step may still promise, relative to the size of the function
+SMALL_STEP = 1e-12
+
+
+class Climber:
+    """A function of some components of theta, of the other parameters and of given numbers.
+
+    value : the function; statistics : the symbols of the given numbers.
+    """
+
+    def __init__(
+        self, trace: Trace, components: Sequence[Expr], value: Expr, statistics: Sequence[Expr]
+    ):
+        self.trace = trace
+        self.members = frozenset(components)
+        place = {s: i for i, s in enumerate(trace.parameter_symbols)}
+        self.where = np.array([place[c] for c in components])
+        self.transforms = [t for t in transforms(trace) if self.members & set(t.components)]
+        mapping: dict[Expr, Expr] = {}
+        self.z: list[Expr] = []
+        for t in self.transforms:
+            values = substitute(list(t.values), mapping)
+            kept = [i for i, c in enumerate(t.components) if c in self.members]
+            mapping |= {t.components[i]: values[i] for i in kept}
+            # of a simplex or a matrix all components are members
+            self.z += t.free if len(kept) == len(t.components) else [t.free[i] for i in kept]
+        rest = [*statistics, *trace.parameter_symbols]
+        self.arguments = [*self.z, *rest]
+        self.back = straight_function([mapping[c] for c in components], self.arguments)
+        self.value_of, self.order = self._derivatives(substitute([value], mapping)[0])
+
+    def _derivatives(self, value: Expr) -> tuple[Function, int]:
+        """((z, S, theta) -> value, gradient, Hessian), as far as there are derivatives."""
+        try:
+            slopes = gradient(value, self.z)
+            order = 1
+            curvatures: list[Expr] = []
+            if len(self.z) <= NEWTON_SIZE:
+                second = hessian(value, self.z)
+                curvatures = [second[i, j] for i in range(len(self.z)) for j in range(i + 1)]
+                order = 2
+            return straight_function([value, *slopes, *curvatures], self.arguments), order
+        except NotDifferentiable:
+            return straight_function([value], self.arguments), 0
+
+    def climb(self, s: Sequence[float], theta: np.ndarray) -> np.ndarray:
+        """theta with the members moved to where the function is largest, going up from here."""
+        try:
+            z = self._unconstrained(theta)
+        except DOMAIN:
+            return theta
+        rest = [*s, *theta.tolist()]
+        if not math.isfinite(self._at(z, rest)[0]):
+            return theta
+        if self.order == 2:
+            z = self._newton(z, rest)
+        else:
+            z = self._minimised(z, rest)
+        out = theta.copy()
+        try:
+            out[self.where] = self.back([*z.tolist(), *rest])
+        except DOMAIN:
+            return theta
+        return out
+
+    def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
+        known = dict(zip(self.trace.parameter_symbols, theta.tolist(), strict=True))
+        parts = []
+        for t in self.transforms:
+            z = t.inverse(_value(t, known), known)
+            if len(z) == len(t.components):
+                z = z[[c in self.members for c in t.components]]
+            parts.append(z)
+        z = np.concatenate(parts)
+        if not np.all(np.isfinite(z)):
+            raise ValueError("a parameter lies on the edge of its support")
+        return z
+
+    def _at(self, z: np.ndarray, rest: list[float]) -> tuple[float, ...]:
+        """(value, gradient..., Hessian...); -inf for the value outside of the domain."""
+        try:
+            out = self.value_of([*z.tolist(), *rest])
+        except DOMAIN:
+            return (-math.inf,)
+        return out if all(map(math.isfinite, out)) else (-math.inf,)
+
+    def _newton(self, z: np.ndarray, rest: list[float]) -> np.ndarray:
+        n, here = len(z), self._at(z, rest)
+        lower = np.tril_indices(n)
+        for _ in range(STEPS):
+            slope = np.array(here[1 : n + 1])
+            curvature = np.zeros((n, n))
+            curvature[lower] = here[n + 1 :]
+            values, vectors = np.linalg.eigh(curvature, UPLO="L")
+            size = np.abs(values)
+            floor = max(LEAST_CURVATURE * size.max(), 1e-300)
+            step = vectors @ ((vectors.T @ slope) / np.maximum(size, floor))
+            promised = float(slope @ step)
+            length = float(np.linalg.norm(step))
+            if not math.isfinite(length) or length == 0.0:
+                break
+            if promised <= ENOUGH * abs(here[0]) or length < SMALL_STEP:
+                # below what the function's own rounding can tell: Newton's last step
+                last = self._at(z + step, rest)
+                flatter = len(last) > 1 and np.linalg.norm(last[1 : n + 1]) < np.linalg.norm(slope)
+                return z + step if flatter and length < 1e-3 else z
+            step *= min(1.0, LONGEST_STEP / length)
+            for _ in range(HALVINGS):
+                there = self._at(z + step, rest)
+                if there[0] > here[0]:
+                    break
+                step *= 0.5
+            else:
+                break
+            z, here = z + step, there
+        return z
+
+    def _minimised(self, z: np.ndarray, rest: list[float]) -> np.ndarray:
+        n = len(z)
+
+        def negative(v: np.ndarray) -> float | tuple[float, np.ndarray]:
+            out = self._at(v, rest)
+            if self.order == 0:
+                return -out[0]
+            slope = np.array(out[1 : n + 1]) if len(out) > 1 else np.zeros(n)
+            return (-out[0] if len(out) > 1 else 1e300), -slope
+
+        if self.order == 1:
+            found = minimize(negative, z, jac=True, method="BFGS", options={"gtol": 1e-9})
+        else:
+            options = {"maxfev": 400 * n, "xatol": 1e-9, "fatol": 1e-12}
+            found = minimize(negative, z, method="Nelder-Mead", options=options)
+        return found.x if -found.fun >= self._at(z, rest)[0] else z
+
+
+def _value(t: Transform, known: dict[Expr, float]) -> np.ndarray:
+    """The parameter's value, of its own shape."""
+    return np.array([known[s] for s in t.site.value.ravel()]).reshape(t.site.shape)
