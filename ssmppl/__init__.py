@@ -8,7 +8,8 @@ from ssmppl.errors import ArgumentError, DataError, ModelError, SamplingError, S
 from ssmppl.inference.explain import compile, explain
 from ssmppl.inference.filters import kalman_filter, particle_filter
 from ssmppl.inference.likelihood import log_likelihood
-from ssmppl.inference.methods import PGAS, PMMH
+from ssmppl.inference.maximize import maximize
+from ssmppl.inference.methods import PGAS, PMMH, DirectOptimization, Gibbs, MetropolisHastings
 from ssmppl.inference.sample import sample
 from ssmppl.inference.simulation import simulate
 from ssmppl.language.distributions import (
@@ -55,10 +56,12 @@ __all__ = [
     "Cauchy",
     "DataError",
     "Dirac",
+    "DirectOptimization",
     "Dirichlet",
     "Exponential",
     "Flat",
     "Gamma",
+    "Gibbs",
     "HalfCauchy",
     "HalfFlat",
     "HalfNormal",
@@ -66,6 +69,7 @@ __all__ = [
     "InverseWishart",
     "Laplace",
     "LogNormal",
+    "MetropolisHastings",
     "Model",
     "ModelError",
     "MvNormal",
@@ -82,6 +86,7 @@ __all__ = [
     "explain",
     "kalman_filter",
     "log_likelihood",
+    "maximize",
     "particle_filter",
     "primitive",
     "sample",

@@ -1,0 +1,108 @@
+"""What the methods of maximum likelihood share: the question that they are set, and the answer.
+
+The module of each method has `climb(setup, method) -> Ascent`. A climb that is interrupted by
+Ctrl-C (KeyboardInterrupt) returns the best that it has, marked so, and lets the interrupt pass
+where it has nothing yet.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.chart import Chart
+from ssmppl.inference.kalman import KalmanModel, kalman_model
+from ssmppl.inference.pilot import Pilot, Space, at, find_mode, finite_point
+from ssmppl.inference.problem import Problem
+
+
+@dataclass(frozen=True)
+class Ascent:
+    """Where a climb came to (P components of theta, K iterates).
+
+    theta : (P,). log_likelihood : there, where the method knows it exactly, else None.
+    iterates : (K, P), the last one not necessarily theta. report : what is to be told of the run,
+    `converged` above all. information : (P, P), minus the second derivatives of the log-likelihood
+    in theta, where the method has them. error : (P, P), the Monte Carlo covariance of theta itself.
+    """
+
+    theta: np.ndarray
+    log_likelihood: float | None
+    iterates: np.ndarray
+    report: dict[str, Any] = field(default_factory=dict)
+    information: np.ndarray | None = None
+    error: np.ndarray | None = None
+    interrupted: bool = False
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The question: a problem, its free parameters, and what is to be maximised.
+
+    objective : "likelihood", or "posterior" for log likelihood + log prior density of theta.
+    held : values of the fixed parameters; near : those to start from, by name.
+    """
+
+    problem: Problem
+    space: Space
+    objective: str
+    held: dict[str, np.ndarray]
+    near: dict[str, np.ndarray]
+    root: np.random.SeedSequence
+    executor: Executor | None = None
+    progress: bool = False
+
+    @cached_property
+    def chart(self) -> Chart:
+        """Derivatives through the unconstrained scale."""
+        return Chart(self.space)
+
+    @cached_property
+    def kalman(self) -> KalmanModel | NotApplicable:
+        """The exact filter, or why there is none."""
+        return kalman_model(self.problem.trace)
+
+    @property
+    def with_prior(self) -> bool:
+        return self.objective == "posterior"
+
+    @cached_property
+    def pilot(self) -> Pilot:
+        """A mode found by a particle filter from the space's own point."""
+        return find_mode(self.space, self.root)
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """(F,) where to begin, on the unconstrained scale.
+
+        The user's own point where `start` gives every free parameter; on linear Gaussian models
+        moderate values at which the likelihood is finite; else the pilot's mode.
+        """
+        z = self.space.z[self.space.where]
+        free = set(self.problem.trace.parameters) - set(self.held)
+        if free <= set(self.near) or not len(z):
+            return z
+        if isinstance(self.kalman, NotApplicable):
+            return self.pilot.z
+        return finite_point(z, self._exact, np.random.default_rng(self.root))
+
+    def space_at(self, theta: np.ndarray) -> np.ndarray:
+        """(F,) the unconstrained place of theta (P,)."""
+        moved = at(self.space, theta)
+        return moved.z[moved.where]
+
+    def _exact(self, z: np.ndarray) -> float:
+        theta, log_prior = self.space.parameters(z)
+        if log_prior == -np.inf or isinstance(self.kalman, NotApplicable):
+            return -np.inf
+        return self.kalman.log_likelihood(self.problem.experiments, theta)
+
+    def seed(self, *path: int) -> np.random.SeedSequence:
+        """A seed for one part of a climb."""
+        key = (*self.root.spawn_key, 17, *path)
+        return np.random.SeedSequence(self.root.entropy, spawn_key=key)

@@ -1,0 +1,156 @@
+"""Direct optimisation: quasi-Newton ascent of the log-likelihood on the unconstrained scale.
+
+Schön et al. (2015), section on direct optimisation. On linear Gaussian models the likelihood and
+its score come from the Kalman filter and its sensitivities, and Newton steps with the observed
+information polish the result.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.filtering import check_count
+from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.methods import DirectOptimization
+
+NEWTON_STEPS = 8
+GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
+FAR = 1e30  # what the minimiser sees where the likelihood is zero
+EXACT_RESTARTS = 2
+
+
+def climb(setup: Setup, method: DirectOptimization) -> Ascent:
+    """Maximise; see the module.
+
+    Raises
+    ------
+    ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
+    """
+    check_count("particles", method.particles, 2)
+    check_count("averages", method.averages, 2)
+    check_count("steps", method.steps, 1)
+    if isinstance(setup.kalman, NotApplicable):
+        raise ArgumentError(
+            f"DirectOptimization does not apply: {setup.kalman}", fix="use another method"
+        )
+    return ExactClimb(setup, setup.kalman, method).run()
+
+
+class ExactClimb:
+    """Ascent of an exact log-likelihood with its exact score."""
+
+    def __init__(self, setup: Setup, kalman: KalmanModel, method: DirectOptimization):
+        self.setup, self.kalman, self.method = setup, kalman, method
+        self.experiments = setup.problem.experiments
+        self.best, self.best_value = np.empty(0), -np.inf
+        self.iterates: list[np.ndarray] = []
+        self.evaluations = 0
+
+    def run(self) -> Ascent:
+        """All climbs, and Newton's steps from the best point."""
+        restarts = self.method.restarts
+        restarts = EXACT_RESTARTS if restarts is None else restarts
+        check_count("restarts", restarts, 0)
+        interrupted, stopped, gap = False, "", np.inf
+        try:
+            for k in range(restarts + 1):
+                start = self.setup.start
+                if k:
+                    rng = np.random.default_rng(self.setup.seed(k))
+                    start = self.best + rng.standard_normal(len(start))
+                stopped = self._quasi_newton(start)
+            gap = self._polish()
+        except KeyboardInterrupt:
+            if not np.isfinite(self.best_value):
+                raise
+            interrupted = True
+        if not np.isfinite(self.best_value):
+            raise ArgumentError(
+                "the likelihood is zero at every point that was tried",
+                fix="give start={name: value} near plausible values",
+            )
+        if not np.isfinite(gap) and not interrupted:
+            stopped = "the climb ran to the edge of what the parameters can be: no maximum inside"
+        point = self.setup.chart.at(self.best)
+        report = {
+            "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
+            "likelihood": "exact, by the Kalman filter", "restarts": restarts,
+        }  # fmt: skip
+        return Ascent(
+            point.theta, self.kalman.log_likelihood(self.experiments, point.theta),
+            np.array(self.iterates), report, interrupted=interrupted,
+        )  # fmt: skip
+
+    def value(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """The objective and its gradient (F,) at z; -inf and zeros where there is none."""
+        self.evaluations += 1
+        nothing = -np.inf, np.zeros(len(z))
+        point = self.setup.chart.at(z)
+        if point.log_prior == -np.inf:
+            return nothing
+        value, gradient = self.kalman.score(self.experiments, point.theta)
+        slope = point.pull(gradient)
+        if self.setup.with_prior:
+            value, slope = value + point.log_prior, slope + point.d_log_prior
+        if not np.isfinite(value) or not np.all(np.isfinite(slope)):
+            return nothing
+        if value > self.best_value:
+            self.best, self.best_value = np.array(z), value
+        return value, slope
+
+    def _quasi_newton(self, start: np.ndarray) -> str:
+        def downhill(z: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = self.value(z)
+            return (-value, -slope) if value > -np.inf else (FAR, slope)
+
+        def remember(z: np.ndarray) -> None:
+            self.iterates.append(self.setup.space.parameters(z)[0].copy())
+
+        remember(start)
+        found: Any = minimize(
+            downhill, start, jac=True, method="L-BFGS-B", callback=remember,
+            options={"maxiter": self.method.steps, "ftol": 1e-13, "gtol": 1e-7},
+        )  # fmt: skip
+        return str(found.message)
+
+    def _polish(self) -> float:
+        """Newton's steps while they climb; how far the quadratic says that the top still is."""
+        gap = np.inf
+        for _ in range(NEWTON_STEPS):
+            value, slope = self.value(self.best)
+            curvature = self._curvature(self.best)
+            if not np.all(np.isfinite(curvature)) or _lowest(curvature) <= 0.0:
+                return np.inf
+            step = np.linalg.solve(curvature, slope)
+            gap = float(np.sqrt(max(slope @ step, 0.0)))
+            if gap < GRADIENT:
+                break
+            z, size = self.best, 1.0
+            new, _ = self.value(z + step)
+            while new < value and size > 1e-3:
+                size *= 0.5
+                new, _ = self.value(z + size * step)
+            if not new > value:
+                if gap < 1e-5:  # a gain below the rounding of the likelihood: the step is right
+                    self.best = z + step
+                break
+            self.iterates.append(self.setup.space.parameters(self.best)[0].copy())
+        return gap
+
+    def _curvature(self, z: np.ndarray) -> np.ndarray:
+        """Minus the second derivatives of the objective in z, (F, F)."""
+        point = self.setup.chart.at(z)
+        _, gradient = self.kalman.score(self.experiments, point.theta)
+        information = self.kalman.information(self.experiments, point.theta)
+        second = self.setup.chart.curvature(z, gradient)
+        out = point.jacobian.T @ information @ point.jacobian - second.theta
+        return out - second.log_prior if self.setup.with_prior else out
+
+
+def _lowest(matrix: np.ndarray) -> float:
+    return float(np.linalg.eigvalsh(matrix)[0])

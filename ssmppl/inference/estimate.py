@@ -1,0 +1,133 @@
+"""Estimate: what `maximize` returns, on the natural scale of the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.data import unpack_parameters
+from ssmppl.language.trace import Trace
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+__all__ = ["Estimate", "by_name", "free_components", "make_estimate", "table"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters that maximise the likelihood (or the posterior density), with their uncertainty.
+
+    Parameters
+    ----------
+    parameters : value of every parameter by name, the fixed ones too: a number, or an array of the
+        prior's shape.
+    covariance : of the free components, labelled as `phi`, `A[0, 1]`: the inverse of the observed
+        information. NaN where the information is not positive definite; `attrs["covariance"]` then
+        says so.
+    standard_errors : roots of its diagonal, by name, as `parameters`; without the fixed ones.
+    log_likelihood : at the estimate; with particles an estimate, whose standard error is
+        `attrs["log_likelihood_error"]`.
+    iterates : Dataset with dim `iteration`, the way to the estimate.
+    attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random
+        numbers were used, `monte_carlo_errors`: the estimate's own standard errors by component.
+    """
+
+    parameters: dict[str, float | np.ndarray]
+    covariance: pd.DataFrame
+    standard_errors: dict[str, float | np.ndarray]
+    log_likelihood: float
+    iterates: xr.Dataset
+    attrs: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        lines = [f"{self.attrs.get('model', '')}: maximum {self.attrs.get('objective', '')} by "
+                 f"{self.attrs.get('method', '')}"]  # fmt: skip
+        error = self.attrs.get("log_likelihood_error")
+        spread = f" (Monte Carlo error {error:.2g})" if error else ""
+        lines += [f"log-likelihood {self.log_likelihood:.6f}{spread}", ""]
+        rows = [("", "estimate", "std. error", *(["MC error"] if self._monte_carlo else []))]
+        for name, value in self.parameters.items():
+            errors = self.standard_errors.get(name)
+            for index in np.ndindex(np.shape(value)):
+                label = name + (f"[{', '.join(map(str, index))}]" if index else "")
+                cells = [f"{np.asarray(value)[index]:.6g}"]
+                cells.append("fixed" if errors is None else f"{np.asarray(errors)[index]:.3g}")
+                if self._monte_carlo:
+                    noise = self._monte_carlo.get(label)
+                    cells.append("" if noise is None else f"{noise:.2g}")
+                rows.append((label, *cells))
+        widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
+        for row in rows:
+            cells = [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
+            lines.append("  ".join([row[0].ljust(widths[0]), *cells]).rstrip())
+        return "\n".join(lines + [f"\nNote: {note}" for note in self.notes])
+
+    @property
+    def _monte_carlo(self) -> dict[str, float]:
+        return self.attrs.get("monte_carlo_errors") or {}
+
+    @property
+    def notes(self) -> list[str]:
+        """What has to be known before the figures are used."""
+        out = []
+        if self.attrs.get("interrupted"):
+            out.append("interrupted; this is the best point so far")
+        elif self.attrs.get("converged") is False:
+            reason = self.attrs.get("stopped", "")
+            out.append("not converged" + (f": {reason}" if reason else ""))
+        text = str(self.attrs.get("covariance", ""))
+        return [*out, text] if text.startswith("none") else out
+
+
+def free_components(trace: Trace, held: dict[str, np.ndarray]) -> np.ndarray:
+    """(P,) which components of theta belong to parameters that are not fixed."""
+    return np.array([s.data[1] not in held for s in trace.parameter_symbols], dtype=bool)
+
+
+def by_name(trace: Trace, values: np.ndarray) -> dict[str, float | np.ndarray]:
+    """Values (P,) of the components by name, numbers for scalar parameters."""
+    named = unpack_parameters(trace, values)
+    return {n: float(v) if v.ndim == 0 else v for n, v in named.items()}
+
+
+def table(labels: list[str], matrix: np.ndarray) -> pd.DataFrame:
+    """A square matrix with these labels on both sides."""
+    import pandas as pd
+
+    return pd.DataFrame(matrix, index=labels, columns=labels)
+
+
+def make_estimate(
+    trace: Trace, theta: np.ndarray, covariance: np.ndarray, log_likelihood: float,
+    iterates: np.ndarray, held: dict[str, np.ndarray], attrs: dict[str, Any],
+) -> Estimate:  # fmt: skip
+    """An Estimate from arrays over all P components: theta (P,), covariance (P, P), iterates
+    (K, P).
+
+    Rows and columns of fixed parameters are left out of the covariance.
+    """
+    free = free_components(trace, held)
+    labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
+    errors = np.full(len(theta), np.nan)
+    with np.errstate(invalid="ignore"):
+        errors[free] = np.sqrt(np.diagonal(covariance)[free])
+    variables = unpack_parameters(trace, iterates) if len(theta) else {}
+    return Estimate(
+        parameters=by_name(trace, theta),
+        covariance=table(labels, covariance[np.ix_(free, free)]),
+        standard_errors={n: v for n, v in by_name(trace, errors).items() if n not in held},
+        log_likelihood=log_likelihood,
+        iterates=to_dataset(
+            variables,
+            sample_dim="iteration",
+            over_time=(),
+            coords={"iteration": np.arange(len(iterates))},
+            attrs={k: v for k, v in attrs.items() if v is not None},
+        ),
+        attrs=attrs,
+    )

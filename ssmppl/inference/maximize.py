@@ -1,0 +1,215 @@
+"""The verb `maximize`: maximum likelihood, and posterior modes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data import check_values
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
+from ssmppl.inference import direct_optimization
+from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.estimate import Estimate, free_components, make_estimate
+from ssmppl.inference.filtering import FilterSettings, estimates_task, seed_sequence
+from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.methods import DirectOptimization
+from ssmppl.inference.pilot import space_of
+from ssmppl.inference.problem import pose
+from ssmppl.inference.proposal_choice import choose
+from ssmppl.inference.runner import run_tasks
+from ssmppl.language.model import Model
+
+# The methods: what climbs under each class of settings.
+CLIMBS: dict[type, Callable[[Setup, Any], Ascent]] = {
+    DirectOptimization: direct_optimization.climb,
+}
+OBJECTIVES = ("likelihood", "posterior")
+PARTICLES, REPEATS = 1000, 16  # of the log-likelihood at the estimate
+
+
+def maximize(
+    model: Model,
+    data: Any,
+    method: Any = None,
+    *,
+    start: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    objective: str = "likelihood",
+    seed: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Estimate:
+    """Maximise the likelihood of the parameters, or their posterior density.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    method : settings such as `ssm.DirectOptimization(...)`; None chooses by structure, and the
+        attributes say what and why.
+    start : parameter values to begin from; what is not given begins at a pilot's mode (at moderate
+        values, where the likelihood is exact).
+    fixed : parameters held at these values.
+    objective : "likelihood", for which the priors serve as supports only; or "posterior", which
+        adds the log prior density on the parameters' own scale, without a Jacobian.
+    seed : the same seed gives the same estimate, whatever the executor; None: a random one.
+    executor : any `concurrent.futures.Executor`; None: threads.
+    progress : whether to show how far it is, on stderr.
+
+    Returns
+    -------
+    Estimate
+        Parameters, covariance from the observed information, log-likelihood, iterates. Ctrl-C ends
+        the climb early and returns the best so far, with the attribute `interrupted`.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    """
+    began = time.perf_counter()
+    if objective not in OBJECTIVES:
+        raise ArgumentError(
+            f"objective={objective!r}", fix=f"use one of: {listing(str(objective), OBJECTIVES)}"
+        )
+    if method is not None and type(method) not in CLIMBS:
+        names = ", ".join(f"ssm.{c.__name__}(...)" for c in CLIMBS)
+        raise ArgumentError(
+            f"method={method!r} is no method of maximisation", fix=f"use {names} or None"
+        )
+    problem = pose(model, data)
+    held = check_values(problem.trace, fixed, argument="fixed")
+    near = check_values(problem.trace, start, argument="start")
+    twice = [n for n in near if n in held]
+    if twice:
+        raise ArgumentError(
+            f"{twice[0]!r} is given in start and in fixed", fix=f"leave {twice[0]!r} out of one"
+        )
+    root = seed_sequence(seed)
+    space = space_of(problem, held, near)
+    setup = Setup(problem, space, objective, held, near, root, executor, progress)
+    if not len(space.where):
+        chosen, reason = None, "every parameter is fixed, or the model has none"
+        ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
+    else:
+        chosen, reason = (method, "by the user") if method is not None else choose_method(setup)
+        ascent = CLIMBS[type(chosen)](setup, chosen)
+    attrs: dict[str, Any] = {
+        "model": problem.trace.name,
+        "method": type(chosen).__name__ if chosen is not None else "none",
+        "method_chosen": reason,
+        "objective": objective,
+        "settings": asdict(chosen) if chosen is not None else {},
+        "fixed": dict(fixed or {}),
+        **ascent.report,
+        "interrupted": ascent.interrupted,
+        "seed": str(root.entropy),
+    }
+    value = _log_likelihood(setup, ascent, attrs)
+    covariance = _covariance(setup, ascent, attrs)
+    if ascent.error is not None:
+        labels, errors = map(repr, problem.trace.parameter_symbols), np.diagonal(ascent.error)
+        free = free_components(problem.trace, held)
+        attrs["monte_carlo_errors"] = {
+            label: float(np.sqrt(max(e, 0.0)))
+            for label, e, f in zip(labels, errors, free, strict=True)
+            if f
+        }
+    attrs["seconds"] = time.perf_counter() - began
+    return make_estimate(
+        problem.trace, ascent.theta, covariance, value, ascent.iterates, held, attrs
+    )
+
+
+def choose_method(setup: Setup) -> tuple[Any, str]:
+    """The method for a model's structure, and why."""
+    if isinstance(setup.kalman, KalmanModel):
+        return DirectOptimization(), (
+            "automatically: the model is linear and Gaussian, so that its likelihood and score are "
+            "exact"
+        )
+    raise ArgumentError("no method", fix="give one")
+
+
+def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> float:
+    """log p(y | theta): the method's own, else exact, else estimated, its error into `attrs`."""
+    if ascent.log_likelihood is not None:
+        return ascent.log_likelihood
+    problem, theta = setup.problem, ascent.theta
+    if isinstance(setup.kalman, KalmanModel):
+        return setup.kalman.log_likelihood(problem.experiments, theta)
+    try:
+        settings = FilterSettings(PARTICLES, choose(problem, theta).name)
+        task = estimates_task(problem, theta, settings, setup.seed(1))
+        pieces = [range(r, r + 1) for r in range(REPEATS)]
+        log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
+    except (SamplingError, KeyboardInterrupt):
+        return np.nan
+    share = np.exp(log_z - log_z.max()) if np.max(log_z) > -np.inf else np.zeros(REPEATS)
+    if not share.any():
+        return -np.inf
+    attrs["log_likelihood_error"] = float(share.std(ddof=1) / share.mean() / np.sqrt(REPEATS))
+    return float(log_z.max() + np.log(share.mean()))
+
+
+def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:
+    """(P, P) inverse observed information of the free components; `attrs` says how, or why not."""
+    p, where = len(ascent.theta), setup.space.where
+    nothing = np.full((p, p), np.nan)
+    if not len(where):
+        return nothing
+    information = ascent.information
+    if information is None and not ascent.interrupted:
+        information = _information(setup, ascent.theta)
+    if information is None:
+        attrs["covariance"] = "none: interrupted before the observed information was known"
+        return nothing
+    covariance = natural_covariance(setup, ascent.theta, information)
+    if isinstance(covariance, NotApplicable):
+        attrs["covariance"] = f"none: {covariance.reason}"
+        return nothing
+    attrs["covariance"] = "inverse observed information"
+    return covariance
+
+
+def _information(setup: Setup, theta: np.ndarray) -> np.ndarray | None:
+    if isinstance(setup.kalman, KalmanModel):
+        return setup.kalman.information(setup.problem.experiments, theta)
+    return None
+
+
+def natural_covariance(
+    setup: Setup, theta: np.ndarray, information: np.ndarray
+) -> np.ndarray | NotApplicable:
+    """The delta method: J (J' I J - d2 log prior)^-1 J' over all components of theta.
+
+    At a maximum the gradient in theta vanishes, so that the second derivatives of theta(z) drop out
+    of the likelihood's part. The prior counts for objective "posterior" only.
+    """
+    try:
+        z = setup.space_at(theta)
+    except (ValueError, np.linalg.LinAlgError):
+        return NotApplicable("the estimate lies on the edge of what the parameters can be")
+    point = setup.chart.at(z)
+    with np.errstate(all="ignore"):
+        curvature = point.jacobian.T @ information @ point.jacobian
+    if setup.with_prior:
+        slope = np.linalg.pinv(point.jacobian).T @ point.d_log_prior
+        second = setup.chart.curvature(z, slope)
+        curvature = curvature - second.log_prior + second.theta
+    if not np.all(np.isfinite(curvature)):
+        return NotApplicable("the observed information is not finite at the estimate")
+    scale = np.sqrt(np.abs(np.diagonal(curvature)))
+    if not np.all(scale > 0.0):
+        return NotApplicable("the observed information is singular: a parameter is not identified")
+    values = np.linalg.eigvalsh(curvature / np.outer(scale, scale))
+    if values[0] < 1e-10:
+        return NotApplicable(
+            "the observed information is not positive definite: the estimate is no interior "
+            "maximum, or some parameters are not identified"
+        )
+    return point.jacobian @ np.linalg.solve(curvature, point.jacobian.T)
