@@ -129,4 +129,23 @@ class DirectOptimization:
     steps: int = 200
 
 
+@dataclass(frozen=True)
+class EM:
+    """Expectation maximisation of linear Gaussian models, with exact expectations (Shumway and
+    Stoffer 1982; Schön et al. 2015, section on EM) and the M-step that was derived.
+
+    Parameters
+    ----------
+    iterations : most EM steps.
+    tolerance : ends the climb once the limit is estimated to be nearer than this, on the
+        unconstrained scale (a relative change, of a positive parameter).
+    accelerate : whether to extrapolate the steps by SQUAREM (Varadhan and Roland 2008). The
+        log-likelihood never falls, with or without.
+    """
+
+    iterations: int = 2000
+    tolerance: float = 1e-8
+    accelerate: bool = True
+
+
 Method = MetropolisHastings | Gibbs | PMMH | PGAS
