@@ -1,0 +1,273 @@
+"""Expectation maximisation of linear Gaussian models, every step of it exact.
+
+Dempster, Laird and Rubin (1977); Shumway and Stoffer (1982); Schön et al. (2015), section on EM.
+The E-step takes the smoother's moments (`analysis/expectation.py`), the M-step is derived
+(`analysis/mstep.py`). Where the densities do not separate, Q is climbed as it stands, by BFGS with
+its symbolic gradient, evaluated over all rows at once.
+
+EM nears its limit by a constant factor at each step, close to one where the states tell much more
+of the parameters than the data do. So its steps are extrapolated by SQUAREM (Varadhan and Roland
+2008, "Simple and globally convergent methods for accelerating the convergence of any EM
+algorithm", scheme S3) on the unconstrained scale, followed by an EM step, and what was extrapolated
+is kept only where the exact log-likelihood is at least that of two plain steps: it never falls. The
+same extrapolation tells how far the limit still is, which, and not the length of a step, decides
+when to stop.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ssmppl.analysis.expectation import (
+    IN_TIME,
+    ExpectedDensity,
+    expected_density,
+    expected_statistics,
+    moments_of,
+)
+from ssmppl.analysis.mstep import MStep
+from ssmppl.data import Experiment
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.filtering import check_count
+from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.m_step import m_step
+from ssmppl.inference.methods import EM
+from ssmppl.language.trace import Trace, previous, seen
+
+SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
+ROUNDING = 1e-13  # of the log-likelihood, relative
+CALM = 2  # cycles in a row that have to find the limit near
+
+
+def climb(setup: Setup, method: EM) -> Ascent:
+    """Maximise; see the module.
+
+    Raises
+    ------
+    ArgumentError : the model is not linear and Gaussian, or its states cannot be the missing data.
+    """
+    check_count("iterations", method.iterations, 1)
+    if not method.tolerance > 0.0:
+        raise ArgumentError(f"tolerance={method.tolerance!r}", fix="give a positive number")
+    if isinstance(setup.kalman, NotApplicable):
+        raise ArgumentError(
+            f"EM needs a linear Gaussian model: {setup.kalman.reason}",
+            fix="use ssm.ParticleEM() or ssm.PSAEM()",
+            where=setup.kalman.where,
+        )
+    return _Climb(setup, setup.kalman, method).run()
+
+
+class ExactSteps:
+    """theta -> theta after one E-step and one M-step."""
+
+    def __init__(self, setup: Setup, kalman: KalmanModel):
+        self.setup, self.kalman = setup, kalman
+        trace = setup.problem.trace
+        self.step: MStep | NotApplicable = m_step(setup)
+        self.density: ExpectedDensity | None = None
+        self.coefficients: dict[str, list[Expr]] = {}
+        if isinstance(self.step, MStep):
+            found = expected_statistics(self.step)
+            if isinstance(found, NotApplicable):
+                self.step = found
+            else:
+                self.coefficients = found
+        if not isinstance(self.step, MStep):
+            missing = setup.problem.program.missing
+            density = expected_density(trace, tuple(setup.held), missing, setup.with_prior)
+            if isinstance(density, NotApplicable):
+                raise ArgumentError(
+                    f"EM does not apply: {density.reason}",
+                    fix="use ssm.DirectOptimization()",
+                    where=density.where,
+                )
+            self.density = density
+        self.rows = [row_values(trace, e) for e in setup.problem.experiments]
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        if isinstance(self.step, MStep):
+            return self.step.maximise(self.statistics(theta), theta)
+        return self._climbed(theta)
+
+    def statistics(self, theta: np.ndarray) -> np.ndarray:
+        """S = E[C | y, theta], summed over rows and experiments, with the prior's part."""
+        assert isinstance(self.step, MStep)
+        total = np.array(self.step.prior(theta.tolist()), dtype=float)
+        for e, rows in zip(self.setup.problem.experiments, self.rows, strict=True):
+            values = self._values(e, rows, theta)
+            for role, summands in self.coefficients.items():
+                total += summed(summands, values, role, e.steps)
+        return total
+
+    def _values(
+        self, experiment: Experiment, rows: dict[Expr, np.ndarray], theta: np.ndarray
+    ) -> dict[Expr, np.ndarray]:
+        """Every symbol of the summands, smoothed at theta."""
+        smoothed = self.kalman.smooth(experiment, theta)
+        trace = self.setup.problem.trace
+        own = moments_of(smoothed.mean, smoothed.covariance, smoothed.cross, trace)
+        return {**rows, **own, **dict(zip(trace.parameter_symbols, theta, strict=True))}
+
+    def _climbed(self, theta: np.ndarray) -> np.ndarray:
+        """The M-step on Q as it stands."""
+        assert self.density is not None
+        chart, symbols = self.setup.chart, self.setup.problem.trace.parameter_symbols
+        density, slopes = self.density, self.density.slopes
+        series = [
+            (self._values(e, rows, theta), e.steps)
+            for e, rows in zip(self.setup.problem.experiments, self.rows, strict=True)
+        ]
+        place = [i for i, s in enumerate(symbols) if s.data[1] not in self.setup.held]
+
+        def at(z: np.ndarray) -> tuple[float, np.ndarray]:
+            """-Q and its derivatives in z."""
+            point = chart.at(z)
+            if not np.all(np.isfinite(point.theta)):
+                return np.inf, np.zeros(len(z))
+            here = dict(zip(symbols, point.theta, strict=True))
+            total, gradient = 0.0, np.zeros(len(symbols))
+            for k, (values, steps) in enumerate(series):
+                for role, e in density.summands.items():
+                    if role == "prior" and k:
+                        continue
+                    both = [e, *(slopes[role] if isinstance(slopes, dict) else [])]
+                    found = summed(both, {**values, **here}, role, steps)
+                    total += found[0]
+                    gradient[place] += found[1:] if len(found) > 1 else 0.0
+            if not np.isfinite(total) or not np.all(np.isfinite(gradient)):
+                return np.inf, np.zeros(len(z))
+            return -total, -point.pull(gradient)
+
+        z = self.setup.space_at(theta)
+        before = at(z)[0]
+        with_slope = isinstance(slopes, dict)
+        found = minimize(
+            at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
+            method="BFGS" if with_slope else "Nelder-Mead",
+        )  # fmt: skip
+        return chart.at(found.x).theta if found.fun <= before else theta
+
+
+def row_values(trace: Trace, experiment: Experiment) -> dict[Expr, np.ndarray]:
+    """Symbol -> (T,): time, inputs and observations of each row, and of the row before."""
+    t = np.arange(experiment.steps)
+    before = np.maximum(t - 1, 0)
+    values: dict[Expr, np.ndarray] = {
+        symbol("time", "t"): t + 1.0,
+        symbol("time_prev", "t"): t + 0.0,
+    }
+    for s, column in zip(trace.input_symbols, experiment.u.T, strict=True):
+        values[s], values[previous(s)] = column, column[before]
+    for s, column, mask in zip(
+        trace.observation_symbols, experiment.y.T, experiment.seen.T, strict=True
+    ):
+        values[s], values[previous(s)], values[seen(s)] = column, column[before], mask
+    return values
+
+
+def summed(
+    summands: list[Expr], values: dict[Expr, np.ndarray], role: str, steps: int
+) -> np.ndarray:
+    """Each summand added up over the rows of its role: the first, the later ones, or all."""
+    rows = {"initial": slice(0, 1), "transition": slice(1, None), "observation": slice(None)}
+    if role not in IN_TIME:
+        return np.array([float(v) for v in evaluate(summands, values)])
+    own = {s: v[rows[role]] if np.ndim(v) else v for s, v in values.items()}
+    count = {"initial": 1, "transition": steps - 1, "observation": steps}[role]
+    if not count:
+        return np.zeros(len(summands))
+    return np.array([np.broadcast_to(v, count).sum() for v in evaluate(summands, own)])
+
+
+class _Climb:
+    """The iteration; `best` never has a smaller objective than what came before it."""
+
+    def __init__(self, setup: Setup, kalman: KalmanModel, method: EM):
+        self.setup, self.kalman, self.method = setup, kalman, method
+        self.map = ExactSteps(setup, kalman)
+        self.theta = setup.space.parameters(setup.start)[0].copy()
+        self.value = self.objective(self.theta)
+        self.iterates = [self.theta]
+        self.maps = 0
+
+    def objective(self, theta: np.ndarray) -> float:
+        """log p(y | theta), with the log prior density for a posterior mode; -inf where none."""
+        value = self.kalman.log_likelihood(self.setup.problem.experiments, theta)
+        if self.setup.with_prior:
+            value += float(self.setup.problem.program.entry("log_prior")(theta))
+        return value if np.isfinite(value) else -np.inf
+
+    def run(self) -> Ascent:
+        if self.value == -np.inf:
+            raise ArgumentError(
+                "the likelihood is zero at the start",
+                fix="give start={name: value} near plausible values",
+            )
+        interrupted, distance, calm = False, np.inf, 0
+        try:
+            while self.maps < self.method.iterations and calm < CALM:
+                distance = self._cycle()
+                calm = calm + 1 if distance < self.method.tolerance else 0
+        except KeyboardInterrupt:
+            interrupted = True
+        converged = calm >= CALM
+        report = {
+            "converged": converged,
+            "stopped": f"the limit is about {distance:.2g} away on the unconstrained scale, after "
+            f"{self.maps} EM steps",
+            "em_steps": self.maps,
+            "distance": float(distance),
+            "m_step": str(self.map.step)
+            if isinstance(self.map.step, MStep)
+            else f"BFGS on the expected log density: {self.map.step.reason}",
+            "likelihood": "exact, by the Kalman filter",
+        }
+        likelihood = self.kalman.log_likelihood(self.setup.problem.experiments, self.theta)
+        return Ascent(
+            self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted
+        )
+
+    def _step(self, theta: np.ndarray) -> np.ndarray:
+        self.maps += 1
+        return self.map(theta)
+
+    def _take(self, theta: np.ndarray, value: float) -> None:
+        self.theta, self.value = theta, value
+        self.iterates.append(theta)
+
+    def _cycle(self) -> float:
+        """Two EM steps, and from them an extrapolated one; how far the limit seems to be."""
+        start = self.setup.space_at(self.theta)
+        first = self._step(self.theta)
+        self._take(first, self.objective(first))
+        second = self._step(first)
+        self._take(second, self.objective(second))
+        z1, z2 = self.setup.space_at(first), self.setup.space_at(second)
+        r, v = z1 - start, (z2 - z1) - (z1 - start)
+        left, size = float(np.linalg.norm(r)), float(np.linalg.norm(v))
+        if left == 0.0:
+            return 0.0
+        # a factor of contraction at or above one tells nothing of the limit
+        alpha = max(left / size, 1.0) if size > 0.0 else np.inf
+        distance = alpha * float(np.abs(z2 - z1).max())
+        if not self.method.accelerate or alpha == 1.0 or not np.isfinite(alpha):
+            return distance
+        for _ in range(SHORTENINGS + 1):
+            point = start + 2.0 * alpha * r + alpha**2 * v
+            theta, log_prior = self.setup.space.parameters(point)
+            if log_prior > -np.inf:
+                try:
+                    there = self._step(theta.copy())
+                except SamplingError:
+                    there = theta
+                value = self.objective(there)
+                if value >= self.value - ROUNDING * abs(self.value):
+                    self._take(there, value)
+                    break
+            alpha = 0.5 * (alpha + 1.0)
+        return distance
