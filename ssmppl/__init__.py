@@ -5,6 +5,7 @@ verbs below derive and compile the rest.
 """
 
 from ssmppl.errors import ArgumentError, DataError, ModelError, SamplingError, SSMError
+from ssmppl.inference.evidence import Evidence, evidence
 from ssmppl.inference.explain import compile, explain
 from ssmppl.inference.filters import kalman_filter, particle_filter
 from ssmppl.inference.likelihood import log_likelihood
@@ -58,6 +59,7 @@ __all__ = [
     "Dirac",
     "DirectOptimization",
     "Dirichlet",
+    "Evidence",
     "Exponential",
     "Flat",
     "Gamma",
@@ -83,6 +85,7 @@ __all__ = [
     "Uniform",
     "Wishart",
     "compile",
+    "evidence",
     "explain",
     "kalman_filter",
     "log_likelihood",

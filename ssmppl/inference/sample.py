@@ -11,9 +11,9 @@ import numpy as np
 
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError
-from ssmppl.inference import pgas, pmmh
+from ssmppl.inference import gibbs, metropolis, pgas, pmmh
 from ssmppl.inference.filtering import check_count, seed_sequence
-from ssmppl.inference.methods import PGAS, PMMH, Method
+from ssmppl.inference.methods import PGAS, PMMH, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import ChainDraws, run_chains, stack
@@ -21,7 +21,12 @@ from ssmppl.inference.sampling import Sampler, Setup
 from ssmppl.language.model import Model
 from ssmppl.results import to_inference_data
 
-PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {PMMH: pmmh.prepare, PGAS: pgas.prepare}
+PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
+    MetropolisHastings: metropolis.prepare,
+    Gibbs: gibbs.prepare,
+    PMMH: pmmh.prepare,
+    PGAS: pgas.prepare,
+}
 
 
 def sample(
@@ -92,7 +97,7 @@ def sample(
         )
     root = seed_sequence(seed)
     space = space_of(problem, held, near)
-    sampler = prepare(Setup(problem, space, held, chains, warmup, thin, root), chosen)
+    sampler = prepare(Setup(problem, space, held, chains, warmup, thin, root, states), chosen)
     result = run_chains(
         sampler.step_block, sampler.states, draws, warmup, executor=executor, progress=progress,
         title=type(chosen).__name__,

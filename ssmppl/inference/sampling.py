@@ -24,7 +24,7 @@ class Setup:
     """A call of `sample`, checked.
 
     space : the free parameters, at the values near which to begin. held : the fixed ones.
-    chains, warmup, thin : as in `sample`. root : of all random numbers of the call.
+    chains, warmup, thin, states : as in `sample`. root : of all random numbers of the call.
     """
 
     problem: Problem
@@ -34,6 +34,7 @@ class Setup:
     warmup: int
     thin: int
     root: np.random.SeedSequence
+    states: bool = True
 
     def streams(self, chain: int) -> tuple[np.random.Generator, np.ndarray]:
         """The random numbers of a chain: for the parameters, and for the kernels."""
@@ -53,7 +54,7 @@ class Sampler:
     """A method made ready: how a block of draws is made, where chains start, what to report.
 
     step_block, states : as in `run_chains`. A block's draws hold theta (n, P), path_<i> (n, T, D)
-    for each experiment, and possibly increment_<i> (n, T).
+    for each experiment (unless the call wants no states), and possibly increment_<i> (n, T).
     """
 
     step_block: Callable[[Any, int], tuple[Any, Block]]

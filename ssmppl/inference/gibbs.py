@@ -1,0 +1,101 @@
+"""Gibbs sampling of linear Gaussian models.
+
+Schön et al. (2015), section 4.2: the states given the parameters by the Kalman filter and backward
+sampling (Frühwirth-Schnatter 1994; Carter and Kohn 1994), the parameters given the states by their
+derived updates.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.methods import Gibbs
+from ssmppl.inference.metropolis import exact_model
+from ssmppl.inference.parameter_steps import (
+    ParameterSteps,
+    draw_parameters,
+    log_joint,
+    plan_updates,
+)
+from ssmppl.inference.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.runner import Block
+from ssmppl.inference.sampling import Sampler, Setup
+
+
+@dataclass(frozen=True)
+class GibbsState:
+    """Where a chain stands: theta (P,) and its random states; the trajectories are drawn anew."""
+
+    theta: np.ndarray
+    generator: np.random.Generator
+    stream: np.ndarray
+
+
+def prepare(setup: Setup, method: Gibbs) -> Sampler:
+    """Derive the updates, find the mode, and start the chains round it.
+
+    Raises
+    ------
+    ArgumentError : the model is not linear and Gaussian; gives the reason and the line.
+    """
+    problem, space = setup.problem, setup.space
+    exact_model(problem, "Gibbs")
+    steps = ParameterSteps(problem, plan_updates(problem, setup.held))
+    if space.where.size:
+        pilot = find_mode(space, setup.root, "kalman")
+    else:
+        pilot = Pilot(np.empty(0), np.empty(0), 0.0)
+    states = []
+    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "kalman")):
+        generator, stream = setup.streams(chain)
+        theta = space.parameters(z)[0] if len(z) else space.theta
+        states.append(GibbsState(theta.copy(), generator, stream))
+    report = {
+        "trajectories": "exact, by backward sampling",
+        "plan": "\n".join(str(u.explanation) for u in steps.updates),
+        "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
+    }
+    return Sampler(partial(gibbs_block, steps, setup.thin), states, report)
+
+
+def gibbs_block(
+    steps: ParameterSteps, thin: int, state: GibbsState, n: int
+) -> tuple[GibbsState, Block]:
+    """n draws of one chain, each after `thin` sweeps."""
+    model = exact_model(steps.problem, "Gibbs")
+    generator, stream = copy.deepcopy(state.generator), state.stream.copy()
+    theta = state.theta.copy()
+    draws: dict[str, list[np.ndarray]] = {"theta": []}
+    draws |= {f"path_{i}": [] for i in range(len(steps.problem.experiments))}
+    stats: dict[str, list[float]] = {"lp": [], "acceptance_rate": []}
+    for _ in range(n):
+        accepted, made = 0, 0
+        for _ in range(thin):
+            paths = draw_paths(steps, model, theta, stream)
+            infos = draw_parameters(steps, theta, paths, generator)
+            accepted, made = accepted + sum(infos), made + len(infos)
+        draws["theta"].append(theta.copy())
+        for i, path in enumerate(paths):
+            draws[f"path_{i}"].append(path)
+        stats["lp"].append(log_joint(steps, theta, paths))
+        stats["acceptance_rate"].append(accepted / made if made else 1.0)
+    block = Block(
+        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
+    )
+    return GibbsState(theta, generator, stream), block
+
+
+def draw_paths(
+    steps: ParameterSteps, model: KalmanModel, theta: np.ndarray, stream: np.ndarray
+) -> list[np.ndarray]:
+    """Independent trajectories (T, D), one per experiment, from p(x_{1:T} | y_{1:T}, theta)."""
+    paths = [
+        np.ascontiguousarray(model.draw(e, theta, stream, 1)[0]) for e in steps.problem.experiments
+    ]
+    log_joint(steps, theta, paths)  # sets deterministic components to the last digit
+    return paths

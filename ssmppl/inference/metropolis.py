@@ -1,0 +1,93 @@
+"""Metropolis-Hastings with the exact likelihood of a linear Gaussian model.
+
+Schön et al. (2015), algorithm 1 and section 3.2: the Kalman filter gives the likelihood; the states
+follow given each kept draw by backward sampling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.coordinates import coordinates
+from ssmppl.inference.kalman import KalmanModel, kalman_model
+from ssmppl.inference.methods import MetropolisHastings
+from ssmppl.inference.pilot import dispersed, find_mode
+from ssmppl.inference.pmmh import adapts, settings_of, walk_factor
+from ssmppl.inference.problem import Problem
+from ssmppl.inference.sampling import Sampler, Setup
+from ssmppl.inference.walk import (
+    Metropolis,
+    Point,
+    RandomWalk,
+    Run,
+    metropolis_block,
+    start_chain,
+)
+
+
+def exact_model(problem: Problem, method: str) -> KalmanModel:
+    """The linear Gaussian form of the problem's model, for a method that needs one.
+
+    Raises
+    ------
+    ArgumentError : the model is not linear and Gaussian; gives the reason and the line.
+    """
+    model = kalman_model(problem.trace)
+    if isinstance(model, NotApplicable):
+        raise ArgumentError(
+            f"{method} needs a linear Gaussian model: {model.reason}",
+            fix="use ssm.PGAS(...) or ssm.PMMH(...), or None, which picks by structure",
+            where=model.where,
+        )
+    return model
+
+
+@dataclass(frozen=True)
+class ExactLikelihood:
+    """The Kalman filter's likelihood; states, if they are wanted, by backward sampling."""
+
+    problem: Problem
+    states: bool
+
+    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+        model = exact_model(self.problem, "MetropolisHastings")
+        value = model.log_likelihood(self.problem.experiments, theta)
+        return Run(value) if value > -np.inf else None
+
+    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+        model = exact_model(self.problem, "MetropolisHastings")
+        return {
+            f"path_{i}": model.draw(e, point.theta, stream, 1)[0]
+            for i, e in enumerate(self.problem.experiments)
+            if self.states
+        }
+
+
+def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
+    """Find the mode and the information there, and start the chains."""
+    problem, space = setup.problem, setup.space
+    exact_model(problem, "MetropolisHastings")
+    where = coordinates(space, method.scale, method.transform)
+    pilot = find_mode(space, setup.root, "kalman")
+    factor = walk_factor(setup, method, where, pilot, "kalman")
+    d = len(where)
+    target = method.target_acceptance or (0.44 if d <= 1 else 0.35 if d == 2 else 0.234)
+    kernel = Metropolis(
+        where, ExactLikelihood(problem, setup.states), RandomWalk(), setup.warmup,
+        setup.warmup if adapts(method) else 0, target, setup.thin,
+    )  # fmt: skip
+    states = []
+    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "kalman")):
+        generator, stream = setup.streams(chain)
+        states.append(start_chain(kernel, where.at(z), factor, generator, stream))
+    report = {
+        "settings": settings_of(method),
+        "likelihood": "exact, by the Kalman filter",
+        "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
+        "walk_covariance": (factor @ factor.T).tolist(),
+    }
+    return Sampler(partial(metropolis_block, kernel), states, report)
