@@ -19,6 +19,7 @@ from ssmppl.codegen.module import (
     time_sum,
 )
 from ssmppl.codegen.render import Names, Writer, depends
+from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed, constant
 from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
@@ -111,6 +112,35 @@ def conditional_passes(trace: Trace, layout: Layout, section: Section, plain: Pr
         "weigh_observed", "log g(y_t | x_t).", WEIGH_INITIAL, weight_targets(plain.weight),
         accumulate="log_w",
     )  # fmt: skip
+
+
+def backward_kit(
+    trace: Trace, layout: Layout, plain: Proposal, height: Expr | NotApplicable
+) -> Section:
+    """The functions of backward simulation; `bound` where the transition density has one."""
+    section = Section(layout, "backward")
+    conditional_passes(trace, layout, section, plain)
+    known = deterministic(list(trace.transition.values()))
+    value = {s: e for site in known
+             for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(),
+                             strict=True)}  # fmt: skip
+    section.particle_pass(
+        "complete", "The deterministic components of x_t, from x_{t-1}.",
+        "theta, c, s, states_prev, states", _state_targets(layout, value),
+    )  # fmt: skip
+    given = {s: f"reference[{layout.column(s)}]" for s in trace.state_symbols}
+    noisy = [t for t in terms(trace, "transition") if t.site.value.ravel()[0] not in value]
+    section.particle_pass(
+        "weigh_following", "log f(x_t | x_{t-1}) of a given x_t.",
+        "theta, c, s, states_prev, reference, log_w", weight_targets(noisy), accumulate="log_w",
+        scalars=given,
+    )  # fmt: skip
+    if not isinstance(height, NotApplicable):
+        section.particle_pass(
+            "bound", "The largest that log f(x_t | x_{t-1}) can get over x_{t-1}.",
+            WEIGH_INITIAL, [Target("log_w[i]", height)],
+        )  # fmt: skip
+    return section
 
 
 def observation_draws(trace: Trace) -> list[Expr]:

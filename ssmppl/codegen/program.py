@@ -16,14 +16,22 @@ from types import ModuleType
 from typing import Any
 
 from ssmppl.analysis.density import Missing
+from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen import cache
+from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
+from ssmppl.codegen.kernels.backward_pairs import (
+    backward_mcmc,
+    backward_rejection,
+    continuation,
+)
 from ssmppl.codegen.kernels.conditional_smc import conditional_smc, filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
 from ssmppl.codegen.kernels.simulation import simulate
 from ssmppl.codegen.kits import (
+    backward_kit,
     conditional_passes,
     filter_kit,
     log_joint_function,
@@ -114,10 +122,28 @@ def _write(trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotAp
         own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
+    if trace.observations:
+        _backward(out, trace, layout, plain)
     out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
     if trace.parameters:
         out.add_function("parameters", parameter_functions(trace, layout))
     return out.finish(_introduction(trace, proposals))
+
+
+def _backward(out: ModuleText, trace: Trace, layout: Layout, plain: Proposal) -> None:
+    """The entry points of backward simulation."""
+    height, memory = transition_height(trace), deterministic_memory(trace)
+    section = backward_kit(trace, layout, plain, height)
+    why = f"; no rejection: {height.reason}" if isinstance(height, NotApplicable) else ""
+    out.add(f"backward simulation{why}", section)
+    own = {"horizon": "-1" if memory is None else str(memory)}
+    for function in (backward_weights, continuation):
+        out.algorithm(function, function.__name__, section, "exact", own)
+        own[function.__name__] = function.__name__
+    out.algorithm(backward_exact, "backward_exact", section, "entry", own)
+    out.algorithm(backward_mcmc, "backward_mcmc", section, "entry", own)
+    if not isinstance(height, NotApplicable):
+        out.algorithm(backward_rejection, "backward_rejection", section, "entry", own)
 
 
 def _introduction(trace: Trace, proposals: dict[str, Proposal | NotApplicable]) -> list[str]:

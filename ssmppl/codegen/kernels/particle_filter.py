@@ -48,6 +48,13 @@ def copy(source, target):
 
 
 @kernel
+def count(ancestors):
+    """ancestors[i] = i: nobody was resampled."""
+    for i in range(ancestors.size):
+        ancestors[i] = i
+
+
+@kernel
 def add(log_v, log_base):
     """log_v += log_base."""
     for i in range(log_v.size):
@@ -94,7 +101,7 @@ def any_finite(log_v):
 def particle_filter(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh, predict,
     sizes, ahead, theta, y, seen, u, particles, scheme, ess_threshold, rng,
-    log_increment, ess, moments,
+    log_increment, ess, moments, kept=None,
 ):  # fmt: skip
     """Run the filter; returns (status, t), t the step at which a status other than OK arose.
 
@@ -104,6 +111,8 @@ def particle_filter(
     log_increment, ess : (T,), written.
     moments : None, or what else is written, as a tuple: probabilities (P,), mean (T, D),
         covariance (T, D, D), quantiles (T, P, D) and prediction (T, 4, K), see `predict_step`.
+    kept : None, or the whole particle system, written, as a tuple: particles (T, D, N), weights
+        (T, N), normalised, and ancestors (T, N), row 0 without meaning.
     """
     n_steps, n = y.shape[0], particles
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
@@ -143,6 +152,8 @@ def particle_filter(
                     systematic(rng, p, ancestors)
                 else:
                     resample(scheme, rng, p, ancestors)
+                if kept is not None:
+                    copy(ancestors, kept[2][t])
                 gather(x, ancestors, x_prev)
                 if ahead != NO_LOOK_AHEAD:
                     if sizes[5] > 0:
@@ -150,6 +161,8 @@ def particle_filter(
                     second_stage(w, p, ancestors, log_v, log_base)
                     uniform_base = False
             else:
+                if kept is not None:
+                    count(kept[2][t])
                 x, x_prev = x_prev, x
                 if ahead != NO_LOOK_AHEAD:
                     fits, fits_prev = fits_prev, fits
@@ -176,6 +189,10 @@ def particle_filter(
         if status != OK:
             return status, t
         log_increment[t] = log_sum - log_n if uniform_base else log_sum
+        if kept is not None:
+            for k in range(sizes[2]):
+                copy(x[k], kept[0][t, k])
+            copy(w, kept[1][t])
         if moments is not None:
             summarise(x, w, moments[0], moments[1][t], moments[2][t], moments[3][t])
     return OK, n_steps

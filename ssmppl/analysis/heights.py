@@ -1,0 +1,147 @@
+"""How high the transition density of a given x_t can get over all x_{t-1}.
+
+What rejection sampling of backward indices needs (Douc, Garivier, Moulines and Olsson 2011): for
+each law, the density with those parameters that depend on x_{t-1} at the values that maximise it.
+A location goes to the value itself, a rate or a mean to its maximum likelihood estimate from one
+value. The result is free of x_{t-1}, and no smaller than the density anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.bounds import interval
+from ssmppl.analysis.structure import deterministic, deterministic_memory
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import Expr, attributed, constant, depends_on
+from ssmppl.language import distributions as laws
+from ssmppl.language.distribution import Distribution
+from ssmppl.language.trace import Site, Trace
+
+Estimate = Callable[[Any, ExprArray], Any]
+
+
+TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
+
+
+# law -> parameter -> its maximising value, given the law and the value, the others fixed
+_MAXIMISERS: dict[type, dict[str, Estimate]] = {
+    laws.Normal: {"mean_": lambda d, v: v},
+    laws.MvNormal: {"mean_": lambda d, v: v},
+    laws.LogNormal: {"mean_": lambda d, v: ew("log", v)},
+    laws.StudentT: {"loc": lambda d, v: v},
+    laws.Laplace: {"loc": lambda d, v: v},
+    laws.Cauchy: {"loc": lambda d, v: v},
+    laws.HalfNormal: {"sd": lambda d, v: v},
+    laws.HalfCauchy: {"scale": lambda d, v: v},
+    laws.Exponential: {"rate": lambda d, v: 1.0 / v, "scale": lambda d, v: v},
+    laws.Gamma: {"rate": lambda d, v: d.shape_ / v, "scale": lambda d, v: v / d.shape_},
+    laws.InverseGamma: {"scale": lambda d, v: d.shape_ * v},
+    laws.Poisson: {"rate": lambda d, v: ew("maximum", v, TINY)},
+    laws.NegativeBinomial: {"mean_": lambda d, v: ew("maximum", v, TINY)},
+    laws.Binomial: {
+        "p": lambda d, v: ew("minimum", ew("maximum", array(v / d.n), TINY), 1.0 - TINY)
+    },
+}
+# law -> parameters whose smallest value gives the highest density at the centre
+_SPREADS = {laws.Normal: ("sd", "variance"), laws.StudentT: ("scale",), laws.Laplace: ("scale",),
+            laws.Cauchy: ("scale",), laws.LogNormal: ("sd",)}  # fmt: skip
+
+
+def transition_height(trace: Trace) -> Expr | NotApplicable:
+    """An upper bound over x_{t-1} of the log density of the noisy components of x_t.
+
+    An expression in x_t, theta, inputs and time; or the reason why there is none.
+    """
+    if deterministic_memory(trace) != 0:
+        (site, *_) = deterministic(list(trace.transition.values()))
+        return NotApplicable(
+            f"the deterministic component {site.name} changes later densities too",
+            site.distribution.location,
+        )
+    skipped = {s.name for s in deterministic(list(trace.transition.values()))}
+    total = constant(0.0)
+    for site in trace.transition.values():
+        if site.name in skipped:
+            continue
+        with attributed(trace.locations, site.distribution.location):
+            height = _height(site, trace.state_prev_symbols)
+        if isinstance(height, NotApplicable):
+            return height
+        total = total + height
+    return total
+
+
+def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    d, where = site.distribution, site.distribution.location
+    free = {n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())}
+    if not free:
+        return d.log_density(site.value, guard=False)
+    kind = type(d)
+    if isinstance(d, (laws.Bernoulli, laws.Categorical)):
+        return constant(0.0)  # no probability is above 1
+    if isinstance(d, laws.Uniform):
+        return _uniform(site, prev)
+    known, changed = _MAXIMISERS.get(kind, {}), {}
+    for name in sorted(free, key=lambda n: n in known):  # spreads first
+        if name in known:
+            best = array(known[name](d, site.value))
+        elif (
+            name in _SPREADS.get(kind, ())
+            and (low := _lowest(d.parameters[name], prev)) is not None
+        ):
+            best = low
+        else:
+            reason = f"{_plain(name)} of {site.name} ({kind.__name__}) depends on the state before"
+            return NotApplicable(reason, where)
+        changed[name] = best if d.joint else _replaced(d.parameters[name], best, prev)
+    return _with(d, changed).log_density(site.value, guard=False)
+
+
+def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    """1 / the smallest width."""
+    d: Any = site.distribution
+    width = _lowest(array(d.upper - d.lower), prev)
+    if width is None:
+        return NotApplicable(f"the width of {site.name} depends on the state before", d.location)
+    return array(np.sum(-array(ew("log", width))))[()]
+
+
+def _lowest(spread: ExprArray, prev: Sequence[Expr]) -> ExprArray | None:
+    """`spread` with a positive number below it for each entry that depends on the state before.
+
+    None where there is no such number.
+    """
+    out = np.empty(spread.shape, dtype=object)
+    for i in np.ndindex(spread.shape):
+        out[i] = spread[i]
+        if depends_on(spread[i], prev):
+            low = interval(spread[i], {})[0]
+            if not 0.0 < low < np.inf:
+                return None
+            out[i] = constant(low)
+    return array(out)
+
+
+def _replaced(old: ExprArray, best: ExprArray, prev: Sequence[Expr]) -> ExprArray:
+    """`best` in place of the entries of `old` that depend on the state before."""
+    wide = np.broadcast_to(best.view(np.ndarray), old.shape)
+    out = np.empty(old.shape, dtype=object)
+    for i in np.ndindex(old.shape):
+        out[i] = wide[i] if depends_on(old[i], prev) else old[i]
+    return array(out)
+
+
+def _with(d: Distribution, changed: dict[str, ExprArray]) -> Distribution:
+    """The same law with other values for some parameters."""
+    given = {_plain(n): changed.get(n, p) for n, p in d.parameters.items()}
+    return type(d)(**given)
+
+
+def _plain(name: str) -> str:
+    return name.rstrip("_")

@@ -1,0 +1,224 @@
+"""Backward simulation: trajectories from the joint smoothing distribution.
+
+A particle filter whose whole particle system is kept, and trajectories drawn from it backwards in
+time (FFBSi: Godsill, Doucet and West 2004; Schön et al. 2015, section 5). Moments of the draws have
+a bias of order 1 / N; N is the number of particles.
+
+The kernel says how the index of x_t is drawn given x_{t+1}:
+
+* "exact": with all N weights;
+* "rejection": by rejection sampling with early stopping, the same law (Douc et al. 2011; Taghavi et
+  al. 2013), where the transition density is bounded;
+* "mcmc": by Metropolis-Hastings steps from the filter's own ancestor (Bunch and Godsill 2013);
+* "genealogy": the filter's own ancestors (Kitagawa 1996): one pass, but all paths soon meet in one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.analysis.heights import transition_height
+from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.codegen.kernels.random import fill_uniform
+from ssmppl.codegen.kernels.resampling import SYSTEMATIC
+from ssmppl.codegen.kernels.weights import OK
+from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
+from ssmppl.inference.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.problem import Problem
+
+__all__ = [
+    "KERNELS",
+    "ParticleSystem",
+    "backward_draws",
+    "choose_kernel",
+    "draw_paths",
+    "genealogy",
+    "particle_system",
+]
+
+KERNELS = ("exact", "rejection", "mcmc", "genealogy")
+MOVES = 20  # Metropolis-Hastings steps of the kernel "mcmc"
+MOST_WEIGHTS = 2e10  # densities that "auto" lets the exact kernel evaluate: about a minute
+MANY = 100  # particles from which rejection pays
+
+
+@dataclass(frozen=True)
+class ParticleSystem:
+    """All that a particle filter went through (T steps, D states, N particles).
+
+    particles : (T, D, N). weights : (T, N), normalised. ancestors : (T, N), row 0 without meaning.
+    log_increments : (T,), whose sum is log Z. ess : (T,).
+    """
+
+    particles: np.ndarray
+    weights: np.ndarray
+    ancestors: np.ndarray
+    log_increments: np.ndarray
+    ess: np.ndarray
+
+    @property
+    def log_Z(self) -> float:
+        return float(self.log_increments.sum())
+
+
+def particle_system(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, experiment: Experiment,
+    stream: np.ndarray,
+) -> ParticleSystem:  # fmt: skip
+    """Run the filter over one experiment, and keep every particle.
+
+    stream : state of the kernels' generator, advanced in place.
+
+    Raises
+    ------
+    SamplingError : all weights vanish, or are NaN; names the step, the user's line, the parameters.
+    """
+    steps, n = experiment.steps, settings.particles
+    out = ParticleSystem(
+        np.empty((steps, len(problem.trace.state_symbols), n)), np.empty((steps, n)),
+        np.zeros((steps, n), dtype=np.int32), np.empty(steps), np.empty(steps),
+    )  # fmt: skip
+    scheme = None if settings.scheme == SYSTEMATIC else settings.scheme
+    status, t = problem.program.entry(f"filter_{settings.proposal}")(
+        theta, experiment.y, experiment.seen, experiment.u, n, scheme, settings.ess_threshold,
+        stream, out.log_increments, out.ess, None, (out.particles, out.weights, out.ancestors),
+    )  # fmt: skip
+    if status != OK:
+        raise failure(problem, theta, status, t, experiment)
+    return out
+
+
+def choose_kernel(
+    problem: Problem, settings: FilterSettings, trajectories: int, kernel: str = "auto"
+) -> tuple[str, str]:
+    """(kernel, why): "auto" resolved, and what does not apply refused.
+
+    Raises
+    ------
+    ArgumentError : no kernel has this name, or it does not apply; gives the reason and the line.
+    """
+    if kernel not in ("auto", *KERNELS):
+        raise ArgumentError(
+            f"kernel={kernel!r} is unknown",
+            fix=f"use one of: {listing(str(kernel), ['auto', *KERNELS])}",
+        )
+    height = transition_height(problem.trace)
+    if kernel == "rejection" and isinstance(height, NotApplicable):
+        raise ArgumentError(
+            f'kernel="rejection" needs a bound of the transition density over the state before: '
+            f"{height.reason}",
+            fix='use kernel="exact", which has the same law, or "auto"',
+            where=height.where,
+        )
+    if kernel != "auto":
+        return kernel, "asked for"
+    never = deterministic_memory(problem.trace) is None
+    steps = [e.steps for e in problem.experiments]
+    pairs = sum(t * (t + 1) / 2 for t in steps) if never else sum(steps)
+    if never and settings.particles * trajectories * pairs > MOST_WEIGHTS:
+        return "mcmc", (
+            "deterministic components change all later densities with each index, which makes the "
+            "exact kernel too expensive for so many steps"
+        )
+    if not isinstance(height, NotApplicable) and settings.particles >= MANY:
+        return "rejection", "the transition density has a bound, and the law is that of the exact"
+    if isinstance(height, NotApplicable):
+        return "exact", f"no rejection: {height.reason}"
+    return "exact", "with few particles rejection does not pay"
+
+
+def backward_draws(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, trajectories: int,
+    stream: np.ndarray, kernel: str = "auto", moves: int = MOVES,
+) -> tuple[list[np.ndarray], float]:  # fmt: skip
+    """Trajectories from the joint smoothing distribution p(x_{1:T} | y_{1:T}, theta).
+
+    Parameters
+    ----------
+    theta : (P,) values of all parameters.
+    settings : of the particle filter; its proposal may be any but "kalman".
+    trajectories : number M. stream : state of the kernels' generator, advanced in place.
+    kernel : "auto", "exact", "rejection", "mcmc" or "genealogy"; see `choose_kernel`.
+    moves : Metropolis-Hastings steps of the kernel "mcmc".
+
+    Returns
+    -------
+    For each experiment an array (M, T, D), states in the trace's order, and the filter's log Z,
+    summed over experiments.
+
+    Raises
+    ------
+    ArgumentError : the kernel is unknown or does not apply.
+    SamplingError : the filter's weights vanish, or some density is NaN; names step and parameters.
+    """
+    check_count("trajectories", trajectories, 1)
+    kernel, _ = choose_kernel(problem, settings, trajectories, kernel)
+    paths, log_z = [], 0.0
+    for e in problem.experiments:
+        system = particle_system(problem, theta, settings, e, stream)
+        paths.append(draw_paths(problem, theta, e, system, trajectories, stream, kernel, moves))
+        log_z += system.log_Z
+    return paths, log_z
+
+
+def draw_paths(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, system: ParticleSystem,
+    trajectories: int, stream: np.ndarray, kernel: str, moves: int = MOVES,
+) -> np.ndarray:  # fmt: skip
+    """Trajectories (M, T, D) from a particle system, by a kernel that applies."""
+    if kernel == "genealogy":
+        return genealogy(system, trajectories, stream)
+    steps, d, _ = system.particles.shape
+    paths = np.empty((steps, d, trajectories))
+    run = problem.program.entry(f"backward_{kernel}")
+    given = (
+        theta, experiment.y, experiment.seen, experiment.u, stream,
+        system.particles, system.weights,
+    )  # fmt: skip
+    if kernel == "mcmc":
+        status, t = run(*given, system.ancestors, moves, paths)
+    elif kernel == "rejection":
+        status, t = run(*given, paths, np.zeros(2))
+    else:
+        status, t = run(*given, paths)
+    if status != OK:
+        raise _failure(problem, theta, t, experiment)
+    return np.ascontiguousarray(np.moveaxis(paths, 2, 0))
+
+
+def genealogy(system: ParticleSystem, trajectories: int, stream: np.ndarray) -> np.ndarray:
+    """Ancestral paths (M, T, D) of particles drawn by the last weights."""
+    steps, d, _ = system.particles.shape
+    index = draw_particles(system.weights[-1], trajectories, stream)
+    paths = np.empty((trajectories, steps, d))
+    for t in range(steps - 1, -1, -1):
+        paths[:, t] = system.particles[t][:, index].T
+        if t > 0:
+            index = system.ancestors[t, index]
+    return paths
+
+
+def draw_particles(weights: np.ndarray, draws: int, stream: np.ndarray) -> np.ndarray:
+    """Indices (draws,) of particles with these weights (N,), independent."""
+    uniforms = np.empty(draws)
+    fill_uniform(stream, uniforms)
+    cumulative = np.cumsum(weights)
+    return np.searchsorted(cumulative, uniforms * cumulative[-1], side="right")
+
+
+def _failure(problem: Problem, theta: np.ndarray, t: int, experiment: Experiment) -> SamplingError:
+    label = "" if experiment.time is None else f" (time {experiment.time[t + 1]})"
+    parameters = ", ".join(
+        f"{n} = {np.array2string(np.asarray(v), precision=6)}"
+        for n, v in unpack_parameters(problem.trace, theta).items()
+    )
+    site = next(iter(problem.trace.transition.values()))
+    return SamplingError(
+        f"the transition density into t={t + 2}{label} is not a number for some particle; "
+        f"parameters: {parameters}",
+        fix="some parameter, state or input leads outside the domain of an operation",
+        where=site.distribution.location,
+    )
