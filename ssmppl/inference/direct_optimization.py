@@ -127,7 +127,7 @@ class ExactClimb:
             if not np.all(np.isfinite(curvature)) or _lowest(curvature) <= 0.0:
                 return np.inf
             step = np.linalg.solve(curvature, slope)
-            gap = float(np.sqrt(max(slope @ step, 0.0)))
+            gap = float(np.sqrt(max(float(slope @ step), 0.0)))
             if gap < GRADIENT:
                 break
             z, size = self.best, 1.0

@@ -1,0 +1,140 @@
+"""Derivatives of log p(x, y | theta) along trajectories, in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from ssmppl.analysis.score import CompleteScore
+from ssmppl.codegen.score import ScoreProgram, compile_score
+from ssmppl.errors import ArgumentError
+from ssmppl.inference.problem import Problem
+
+__all__ = ["CompleteScores", "complete_scores"]
+
+FIRST, SECOND = 6e-6, 1e-4  # steps of central differences, relative to the parameter
+LEAST = 1e-3  # parameters nearer to zero count as this large for a step
+
+Function = Callable[[np.ndarray, list[np.ndarray]], np.ndarray]
+
+
+class CompleteScores:
+    """First and second derivatives of the complete-data log density, prior excluded.
+
+    Closed forms where there are, else central differences of log p(x, y | theta) along the
+    trajectory with its noisy components held; `differences` says which and why.
+    P parameters, D states, M trajectories, T steps.
+    """
+
+    def __init__(self, problem: Problem, derived: CompleteScore):
+        self.problem, self.derived = problem, derived
+        place = {s: i for i, s in enumerate(problem.trace.parameter_symbols)}
+        self.where = np.array([place[p] for p in derived.parameters], dtype=int)
+
+    @cached_property
+    def program(self) -> ScoreProgram:
+        return compile_score(self.derived)
+
+    @property
+    def differences(self) -> dict[str, str]:
+        """What is computed by central differences ("score", "curvature"), with the reason."""
+        return self.program.missing
+
+    def gradient(self, theta: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
+        """(M, P) scores of M trajectories at theta (P,), summed over experiments.
+
+        paths : for each experiment (M, T, D). Zero in parameters that were left out.
+        """
+        f, p = len(self.where), len(theta)
+        if not f:
+            return np.zeros((len(paths[0]), p))
+        if "score" in self.program.widths:
+            values = self._sums("score", f, theta, paths)
+        else:
+            values = self._slopes(self.log_density, theta, paths, FIRST)
+        out = np.zeros((len(values), p))
+        out[:, self.where] = values
+        return out
+
+    def hessian(self, theta: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
+        """(M, P, P) second derivatives, as `gradient`."""
+        f, p = len(self.where), len(theta)
+        if not f:
+            return np.zeros((len(paths[0]), p, p))
+        lower = np.tril_indices(f)
+        if "curvature" in self.program.widths:
+            values = self._sums("curvature", len(lower[0]), theta, paths)
+            square = np.zeros((len(values), f, f))
+            square[:, lower[0], lower[1]] = square[:, lower[1], lower[0]] = values
+        elif "score" in self.program.widths:
+            square = self._slopes(self.gradient, theta, paths, FIRST)[:, self.where]
+        else:
+            square = self._slopes(
+                lambda v, x: self._slopes(self.log_density, v, x, SECOND), theta, paths, SECOND
+            )
+        out = np.zeros((len(square), p, p))
+        out[:, self.where[:, None], self.where] = 0.5 * (square + np.swapaxes(square, 1, 2))
+        return out
+
+    def log_density(self, theta: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
+        """(M,) log p(x, y | theta) of the noisy components and the observations."""
+        run, part = self.problem.program.entry("log_joint"), np.empty(1)
+        total = np.zeros(len(paths[0]))
+        for e, group in zip(self.problem.experiments, paths, strict=True):
+            for m, path in enumerate(group):
+                run(theta, e.y, e.seen, e.u, np.array(path), part)
+                total[m] += part[0]
+        return total
+
+    def _sums(
+        self, name: str, size: int, theta: np.ndarray, paths: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """(M, size) totals of a generated function, over experiments."""
+        run, part = getattr(self.program.module, name), np.empty(size)
+        total = np.zeros((len(paths[0]), size))
+        theta = np.ascontiguousarray(theta, dtype=float)
+        for e, group in zip(self.problem.experiments, paths, strict=True):
+            wide = np.zeros((e.steps, self.program.widths[name]))
+            for m, path in enumerate(group):
+                wide[:, : path.shape[1]] = path
+                run(theta, e.y, e.seen, e.u, wide, part)
+                total[m] += part
+        return total
+
+    def _slopes(
+        self, function: Function, theta: np.ndarray, paths: Sequence[np.ndarray], step: float
+    ) -> np.ndarray:
+        """Central differences of a function (theta, paths) -> (M, ...), (M, ..., F)."""
+        out = []
+        for i in self.where:
+            h = step * max(abs(theta[i]), LEAST)
+            up, down = theta.copy(), theta.copy()
+            up[i], down[i] = theta[i] + h, theta[i] - h
+            out.append(
+                (function(up, list(paths)) - function(down, list(paths))) / (up[i] - down[i])
+            )
+        return np.stack(out, axis=-1)
+
+
+def complete_scores(problem: Problem, held: Collection[str] = ()) -> CompleteScores:
+    """The complete-data score of a problem, in all parameters but those held fixed.
+
+    Raises
+    ------
+    ArgumentError : Fisher's identity does not hold in some parameter, as the support of a law, or
+        the law by steps, depends on it; names the line.
+    """
+    symbols = [s for s in problem.trace.parameter_symbols if s.data[1] not in held]
+    derived = CompleteScore(problem.trace, symbols, problem.program.missing)
+    for s in symbols:
+        reason = derived.obstacle(s)
+        if reason is not None:
+            raise ArgumentError(
+                f"the score in {s!r} is not the mean of complete-data scores: {reason.reason}",
+                fix=f"fix {s.data[1]!r}, write the law so that it changes smoothly with it, or use "
+                "a method without scores",
+                where=reason.where,
+            )
+    return CompleteScores(problem, derived)
