@@ -49,7 +49,8 @@ def varve_log_likelihood(y, phi, tau, points=600):
     converges faster than any power of its spacing.
     """
     sd = 1 / np.sqrt(tau)
-    reach = max(9 * sd / np.sqrt(1 - phi**2), 4.5)
+    # beyond 12 the first thickness alone rules a state out, however wide its stationary law
+    reach = min(max(9 * sd / np.sqrt(1 - phi**2), 4.5), 12.0)
     x, h = np.linspace(-reach, reach, points, retstep=True)
     density = stats.norm.pdf(x, 0, sd / np.sqrt(1 - phi**2))
     move = stats.norm.pdf(x[:, None], phi * x[None, :], sd) * h

@@ -1,0 +1,295 @@
+"""The verb `evidence`: log p(y), the parameters integrated out, by bridge sampling.
+
+The estimate of the likelihood by a particle filter is a density over the parameters *and* the
+filter's random numbers: the posterior draws of particle Metropolis-Hastings, with the estimates
+that they were accepted with, are draws from it (Andrieu, Doucet and Holenstein 2010), and fresh
+estimates at draws of any other law are draws from that law on the same space. Bridge sampling
+between the two is therefore consistent for every number of particles, which only sets its error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.special import gammaln
+
+from ssmppl.analysis.density import terms
+from ssmppl.data import check_values
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import symbols_of
+from ssmppl.inference.bridge import Bridge, bridge, importance
+from ssmppl.inference.filtering import (
+    FilterSettings,
+    check_count,
+    log_likelihood_estimate,
+    random_state,
+    repeated_estimates,
+    seed_sequence,
+)
+from ssmppl.inference.kalman import kalman_log_likelihood, kalman_model
+from ssmppl.inference.methods import PMMH, MetropolisHastings
+from ssmppl.inference.pilot import Space, find_mode, space_of, tune_particles
+from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.proposal_choice import choose
+from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.sample import sample
+from ssmppl.language.model import Model
+from ssmppl.language.transforms import unconstrain
+
+DEGREES = 7.0  # of freedom of the law bridged to: tails heavier than a posterior's
+TASKS = 16
+TARGET_SD = 1.0
+REPEATS = 200  # estimates of the likelihood where there is no parameter to integrate out
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """log p(y) of a model.
+
+    log_evidence : the estimate. standard_error : its Monte Carlo standard error.
+    report : how it was made: method, particles, draws, and the estimate by importance sampling
+        from the same draws, which is a check on the other.
+    """
+
+    log_evidence: float
+    standard_error: float
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+    def bayes_factor(self, other: Evidence) -> tuple[float, float]:
+        """log of p(y | this model) / p(y | other), and its standard error."""
+        error = float(np.hypot(self.standard_error, other.standard_error))
+        return self.log_evidence - other.log_evidence, error
+
+    def __str__(self) -> str:
+        return f"log evidence {self.log_evidence:.4f} (standard error {self.standard_error:.4f})"
+
+
+def evidence(
+    model: Model,
+    data: Any,
+    method: PMMH | MetropolisHastings | None = None,
+    *,
+    draws: int = 2000,
+    warmup: int = 1000,
+    chains: int = 4,
+    start: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Evidence:
+    """log p(y) = log of the likelihood averaged over the prior, with its standard error.
+
+    Posterior draws by `method` are bridged to a multivariate t fitted to the first half of them,
+    on the unconstrained scale (Meng and Wong 1996; Overstall and Forster 2010), the second half
+    and as many draws of the t giving the estimate.
+
+    Parameters
+    ----------
+    data, start, fixed, seed, executor, progress : as in `sample`. Fixed parameters are held, not
+        integrated over.
+    method : `ssm.PMMH(...)`, or `ssm.MetropolisHastings(...)` for linear Gaussian models; None:
+        the exact one where it applies.
+    draws, warmup, chains : of the sampler.
+
+    Raises
+    ------
+    ArgumentError : a free parameter has an improper prior, so that p(y) has no meaning.
+    """
+    for name, value, least in (("draws", draws, 4), ("warmup", warmup, 0), ("chains", chains, 1)):
+        check_count(name, value, least)
+    problem = pose(model, data)
+    held = check_values(problem.trace, fixed, argument="fixed")
+    near = check_values(problem.trace, start, argument="start")
+    _refuse_improper(problem, held)
+    chosen = _chosen(problem, method)
+    root = seed_sequence(seed)
+    space = space_of(problem, held, near)
+    if isinstance(chosen, PMMH):
+        chosen = _settled(problem, space, chosen, root)
+    if not space.where.size:
+        return _without_parameters(problem, space, chosen, root)
+    result = sample(
+        model, data, chosen, draws=draws, warmup=warmup, chains=chains, start=start, fixed=fixed,
+        states=False, seed=seed, executor=executor, progress=progress,
+    )  # fmt: skip
+    z, own = _posterior(space, result)
+    half = z.shape[1] // 2
+    law = _Student.fitted(z[:, :half].reshape(-1, z.shape[-1]))
+    own_ratio = own[:, half:] - law.log_density(z[:, half:])
+    generator = np.random.default_rng(_child(root, 1))
+    points = law.draw(generator, own_ratio.size)
+    task = partial(_log_densities, space, chosen, root)
+    pieces = np.array_split(np.arange(len(points)), TASKS)
+    density = run_tasks(
+        task, [(points[p], p) for p in pieces], executor=executor, progress=progress,
+        title="evidence",
+    )  # fmt: skip
+    other_ratio = np.concatenate(density) - law.log_density(points)
+    found, check = bridge(own_ratio, other_ratio), importance(other_ratio)
+    known = _log_prior_of_fixed(problem, held)
+    return Evidence(
+        found.log_constant - known, found.standard_error,
+        _report(chosen, own_ratio, replace(check, log_constant=check.log_constant - known)),
+    )  # fmt: skip
+
+
+def _refuse_improper(problem: Problem, held: Mapping[str, np.ndarray]) -> None:
+    for site in problem.trace.parameters.values():
+        if not site.distribution.proper and site.name not in held:
+            kind = type(site.distribution).__name__
+            raise ArgumentError(
+                f"the prior of {site.name!r} is {kind}, which is improper: the evidence is then "
+                f"only defined up to a constant ({site.distribution.location})",
+                fix=f"give {site.name!r} a proper prior, or its value by fixed=",
+            )
+
+
+def _log_prior_of_fixed(problem: Problem, held: Mapping[str, np.ndarray]) -> float:
+    """What the priors of fixed parameters add to the log density; they are conditioned on.
+
+    That of one whose prior depends on a free parameter stays: it is data for that parameter.
+    """
+    known = {s: held[s.data[1]][s.data[2]] for s in problem.trace.parameter_symbols
+             if s.data[1] in held}  # fmt: skip
+    total = 0.0
+    for term in terms(problem.trace, "prior"):
+        if term.site.name in held and symbols_of(term.log_density) <= known.keys():
+            total += float(evaluate([term.log_density], known)[0])
+    return total
+
+
+def _chosen(
+    problem: Problem, method: PMMH | MetropolisHastings | None
+) -> PMMH | MetropolisHastings:
+    linear = not isinstance(kalman_model(problem.trace), NotApplicable)
+    if method is None:
+        return MetropolisHastings() if linear else PMMH()
+    if not isinstance(method, (PMMH, MetropolisHastings)):
+        raise ArgumentError(
+            f"method={method!r} gives no estimates of the likelihood to bridge with",
+            fix="use ssm.PMMH(...), ssm.MetropolisHastings(...) or None",
+        )
+    if isinstance(method, PMMH) and method.correlation:
+        raise ArgumentError(
+            f"correlation={method.correlation!r}: its filter sorts the particles, so that its "
+            "estimates have another law than the fresh ones that the bridge needs",
+            fix="leave correlation=0 for the evidence",
+        )
+    return method
+
+
+def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedSequence) -> PMMH:
+    """The method with proposal and particles settled, as the sampler and the bridge share them."""
+    proposal, particles = method.proposal, method.particles
+    if proposal == "auto" or particles is None:
+        theta, _ = space.parameters(find_mode(space, root).z)
+        if proposal == "auto":
+            proposal = choose(problem, theta, kalman=False).name
+        problem.proposal(proposal)
+        if particles is None:
+            particles = tune_particles(problem, theta, proposal, TARGET_SD, root).particles
+    return replace(method, proposal=proposal, particles=particles)
+
+
+def _without_parameters(
+    problem: Problem, space: Space, method: PMMH | MetropolisHastings, root: np.random.SeedSequence
+) -> Evidence:
+    if isinstance(method, MetropolisHastings):
+        exact = kalman_log_likelihood(problem.trace, problem.experiments, space.theta)
+        return Evidence(exact, 0.0, {"method": "kalman"})
+    assert method.particles is not None
+    settings = FilterSettings(method.particles, method.proposal)
+    found = importance(repeated_estimates(problem, space.theta, settings, root, range(REPEATS)))
+    return Evidence(
+        found.log_constant, found.standard_error,
+        {"method": "particle filter", "particles": method.particles, "repeats": REPEATS},
+    )  # fmt: skip
+
+
+def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
+    """z (chains, draws, free) and log p(y | theta) + log prior + log Jacobian at each."""
+    trace = space.problem.trace
+    posterior, likelihood = result["posterior"], result["sample_stats"]["log_likelihood"].values
+    fixed = dict(zip(trace.parameter_symbols, space.theta, strict=True))
+    z = np.empty((*likelihood.shape, len(space.where)))
+    total = likelihood.astype(float).copy()
+    drawn = {n: posterior[n].values for n in trace.parameters if n in posterior}
+    for index in np.ndindex(likelihood.shape):
+        values = {n: v[index] for n, v in drawn.items()}
+        for site in trace.parameters.values():
+            if site.name not in values:
+                values[site.name] = np.reshape([fixed[s] for s in site.value.ravel()], site.shape)
+        theta = np.array([values[s.data[1]][s.data[2]] for s in trace.parameter_symbols])
+        z[index] = unconstrain(trace, theta, values)[space.where]
+        total[index] += space.parameters(z[index])[1]
+    return z, total
+
+
+def _log_densities(
+    space: Space, method: PMMH | MetropolisHastings, root: np.random.SeedSequence,
+    piece: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:  # fmt: skip
+    """log p~ at points z of the law bridged to, with fresh estimates of the likelihood."""
+    problem, out = space.problem, np.full(len(piece[0]), -np.inf)
+    for i, (z, number) in enumerate(zip(*piece, strict=True)):
+        theta, log_prior = space.parameters(z)
+        if log_prior == -np.inf:
+            continue
+        if isinstance(method, PMMH):
+            assert method.particles is not None
+            settings = FilterSettings(method.particles, method.proposal)
+            stream = random_state(root, 2, int(number))
+            out[i] = log_likelihood_estimate(problem, theta, settings, stream) + log_prior
+        else:
+            out[i] = kalman_log_likelihood(problem.trace, problem.experiments, theta) + log_prior
+    return out
+
+
+def _report(method: PMMH | MetropolisHastings, own: np.ndarray, check: Bridge) -> dict[str, Any]:
+    out: dict[str, Any] = {"method": f"bridge sampling over {type(method).__name__}"}
+    if isinstance(method, PMMH):
+        out |= {"particles": method.particles, "proposal": method.proposal}
+    return out | {
+        "chains": own.shape[0], "draws": own.shape[1],
+        "importance_sampling": check.log_constant,
+        "importance_sampling_standard_error": check.standard_error,
+    }  # fmt: skip
+
+
+def _child(root: np.random.SeedSequence, *path: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 11, *path))
+
+
+@dataclass(frozen=True)
+class _Student:
+    """A multivariate t law: location (d,), factor (d, d) of its scale matrix."""
+
+    location: np.ndarray
+    factor: np.ndarray
+
+    @classmethod
+    def fitted(cls, points: np.ndarray) -> _Student:
+        """The one with the mean and covariance of points (n, d), a little wider."""
+        covariance = np.atleast_2d(np.cov(points.T))
+        scale = covariance + 1e-10 * np.diag(np.diag(covariance) + 1e-300)
+        return cls(points.mean(axis=0), np.linalg.cholesky(scale))
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        d = len(self.location)
+        u = np.linalg.solve(self.factor, (points - self.location).reshape(-1, d).T)
+        square = np.sum(u**2, axis=0).reshape(points.shape[:-1])
+        log_norm = gammaln((DEGREES + d) / 2) - gammaln(DEGREES / 2)
+        log_norm -= 0.5 * d * np.log(DEGREES * np.pi) + np.log(np.diag(self.factor)).sum()
+        return log_norm - 0.5 * (DEGREES + d) * np.log1p(square / DEGREES)
+
+    def draw(self, generator: np.random.Generator, n: int) -> np.ndarray:
+        normal = generator.standard_normal((n, len(self.location)))
+        mixing = np.sqrt(DEGREES / generator.chisquare(DEGREES, n))
+        return self.location + mixing[:, None] * (normal @ self.factor.T)
