@@ -9,14 +9,16 @@ gradient. Where there is no derivative in closed form: the simplex of Nelder and
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
 
 from ssmppl.analysis.pythontext import DOMAIN, Function, straight_function
+from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
-from ssmppl.expressions.expr import Expr, substitute
+from ssmppl.expressions.expr import Expr, apply, substitute
 from ssmppl.language.trace import Trace
 from ssmppl.language.transforms import Transform, transforms
 
@@ -50,6 +52,7 @@ class Climber:
             mapping |= {t.components[i]: values[i] for i in kept}
             # of a simplex or a matrix all components are members
             self.z += t.free if len(kept) == len(t.components) else [t.free[i] for i in kept]
+        self.there = [self._inverse(t) for t in self.transforms]
         rest = [*statistics, *trace.parameter_symbols]
         self.arguments = [*self.z, *rest]
         self.back = straight_function([mapping[c] for c in components], self.arguments)
@@ -89,15 +92,17 @@ class Climber:
             return theta
         return out
 
+    def _inverse(self, t: Transform) -> Callable[[list[float]], Sequence[float]]:
+        """theta -> the unconstrained numbers of the members of one parameter."""
+        support, symbols = t.site.distribution.support(), self.trace.parameter_symbols
+        if support.kind in ("simplex", "positive definite"):
+            return partial(_whole, t, symbols)
+        lower, upper = (array(b).ravel() for b in (support.lower, support.upper))
+        limits = zip(t.components, lower, upper, strict=True)
+        return straight_function([_free(*b) for b in limits if b[0] in self.members], symbols)
+
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
-        known = dict(zip(self.trace.parameter_symbols, theta.tolist(), strict=True))
-        parts = []
-        for t in self.transforms:
-            z = t.inverse(_value(t, known), known)
-            if len(z) == len(t.components):
-                z = z[[c in self.members for c in t.components]]
-            parts.append(z)
-        z = np.concatenate(parts)
+        z = np.array([x for inverse in self.there for x in inverse(theta.tolist())])
         if not np.all(np.isfinite(z)):
             raise ValueError("a parameter lies on the edge of its support")
         return z
@@ -159,6 +164,20 @@ class Climber:
         return found.x if -found.fun >= self._at(z, rest)[0] else z
 
 
-def _value(t: Transform, known: dict[Expr, float]) -> np.ndarray:
-    """The parameter's value, of its own shape."""
-    return np.array([known[s] for s in t.site.value.ravel()]).reshape(t.site.shape)
+def _free(value: Expr, lower: Expr, upper: Expr) -> Expr:
+    """The unconstrained number of a bounded one: the inverse of `language/transforms.py`."""
+    low, high = (b.op == "const" and math.isinf(b.data) for b in (lower, upper))
+    if low and high:
+        return value
+    if high:
+        return apply("log", value - lower)
+    if low:
+        return apply("log", upper - value)
+    return apply("log", value - lower) - apply("log", upper - value)
+
+
+def _whole(t: Transform, symbols: Sequence[Expr], theta: list[float]) -> list[float]:
+    """The unconstrained numbers of a simplex or a matrix."""
+    known = dict(zip(symbols, theta, strict=True))
+    value = np.array([known[s] for s in t.site.value.ravel()]).reshape(t.site.shape)
+    return t.inverse(value, known).tolist()

@@ -34,7 +34,7 @@ from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.filtering import check_count
 from ssmppl.inference.kalman import KalmanModel
-from ssmppl.inference.m_step import m_step
+from ssmppl.inference.m_step import maximiser
 from ssmppl.inference.methods import EM
 from ssmppl.language.trace import Trace, previous, seen
 
@@ -68,7 +68,7 @@ class ExactSteps:
     def __init__(self, setup: Setup, kalman: KalmanModel):
         self.setup, self.kalman = setup, kalman
         trace = setup.problem.trace
-        self.step: MStep | NotApplicable = m_step(setup)
+        self.step: MStep | NotApplicable = maximiser(setup).step
         self.density: ExpectedDensity | None = None
         self.coefficients: dict[str, list[Expr]] = {}
         if isinstance(self.step, MStep):

@@ -148,4 +148,29 @@ class EM:
     accelerate: bool = True
 
 
+@dataclass(frozen=True)
+class PSAEM:
+    """Particle stochastic approximation EM over the PGAS kernel (Lindsten 2013; Schön et al. 2015,
+    algorithm of maximum likelihood with PGAS), for densities that separate in the parameters.
+
+    Parameters
+    ----------
+    particles : N of the conditional particle filter, at least 2; None: 25, or 200 where ancestors
+        cannot be sampled.
+    proposal : "auto", "bootstrap", "guided", "auxiliary" or "user".
+    iterations : of each chain, one sweep and one M-step each.
+    burn_in : the first k_0 iterations, with step size 1; later it is (k / k_0)^-exponent. At least
+        as many as EM needs to come near its limit.
+    exponent : above 0.5, at most 1.
+    chains : independent climbs, whose mean is the estimate; their spread tells its error.
+    """
+
+    particles: int | None = None
+    proposal: str = "auto"
+    iterations: int = 1000
+    burn_in: int = 150
+    exponent: float = 0.7
+    chains: int = 8
+
+
 Method = MetropolisHastings | Gibbs | PMMH | PGAS

@@ -5,7 +5,10 @@ et al. 2015, algorithm 7): particle N follows the reference trajectory; its ance
 at every step with probability proportional to w_{t-1} f(x'_t | x_{t-1}). The other ancestors are
 drawn given that one by conditional systematic resampling (Chopin and Singh 2015), which has the
 same marginals as independent draws, so the kernel leaves p(x_{1:T} | y_{1:T}, theta) invariant for
-every N >= 2.
+every N >= 2. It draws the new trajectory among the N ancestral paths by their final weights; so
+under the invariant law the weighted mean of a function over all N paths has the expectation of the
+function of the one that was drawn, with less variance. Particle SAEM averages so (Lindsten 2013;
+Schön et al. 2015, equation for its approximation of Q).
 
 Deterministic (Dirac) components of the reference are those that follow from its noisy components
 and the new ancestor. Where they forget the ancestor within `horizon` steps, the weights take the
@@ -56,15 +59,28 @@ def draw_index(w, u):
 
 
 @exact
+def ancestral_path(history, ancestry, k, path):
+    """Write the path (T, D) that ends in particle k of the last step."""
+    n_steps, d = path.shape
+    for back in range(n_steps):
+        t = n_steps - 1 - back
+        for m in range(d):
+            path[t, m] = history[t, m, k]
+        if t > 0:
+            k = ancestry[t, k]
+
+
+@exact
 def conditional_smc(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh,
     connect, weigh_connected, weigh_observed, sizes, ahead, horizon,
-    theta, y, seen, u, particles, rng, reference, trajectory, statistics,
+    theta, y, seen, u, particles, rng, reference, trajectory, statistics, paths=None, weights=None,
 ):  # fmt: skip
     """One sweep from `reference` to `trajectory`; returns (status, t).
 
     statistics : (2,), written: the share of steps at which the trajectory changed, and the mean
-    effective sample size as a share of N.
+    effective sample size as a share of N. paths, weights : (N, T, D) and (N,), written where given:
+    all ancestral paths and their weights, by which the trajectory is drawn.
     """
     n_steps, n, d = y.shape[0], particles, reference.shape[1]
     c, s, s_later = np.empty(sizes[0]), np.empty(sizes[1]), np.empty(sizes[1])
@@ -153,17 +169,17 @@ def conditional_smc(
         if status != OK:
             return status, t
         ess_total += ess
-    k = draw_index(w, uniform(rng))
+    if paths is not None:
+        copy(w, weights)
+        for i in range(n):
+            ancestral_path(history, ancestry, i, paths[i])
+    ancestral_path(history, ancestry, draw_index(w, uniform(rng)), trajectory)
     changed = 0
-    for back in range(n_steps):
-        t = n_steps - 1 - back
+    for t in range(n_steps):
         different = False
         for m in range(d):
-            trajectory[t, m] = history[t, m, k]
             different = different or trajectory[t, m] != reference[t, m]
         changed += 1 if different else 0
-        if t > 0:
-            k = ancestry[t, k]
     statistics[0] = changed / n_steps
     statistics[1] = ess_total / (n_steps * n)
     return OK, n_steps
@@ -236,11 +252,5 @@ def filtered_path(
         if status != OK:
             return status, t, -np.inf
         log_increment[t] += log_sum - math.log(n)
-    k = draw_index(w, uniform(rng))
-    for back in range(n_steps):
-        t = n_steps - 1 - back
-        for m in range(d):
-            trajectory[t, m] = history[t, m, k]
-        if t > 0:
-            k = ancestry[t, k]
+    ancestral_path(history, ancestry, draw_index(w, uniform(rng)), trajectory)
     return OK, n_steps, log_increment.sum()

@@ -1,0 +1,186 @@
+"""Particle stochastic approximation EM: one short sweep of conditional SMC in each iteration.
+
+Lindsten (2013), "An efficient stochastic approximation EM algorithm using conditional particle
+filters"; Schön et al. (2015), algorithm of maximum likelihood with PGAS. In iteration k the PGAS
+kernel moves the reference path at theta_{k-1}; the statistics of all its N ancestral paths,
+averaged by their final weights, enter
+
+    S_k = (1 - gamma_k) S_{k-1} + gamma_k sum_i w_T^i C(x_{1:T}^i),
+    theta_k = argmax S_k . s(theta).
+
+gamma_k is 1 for the first k_0 iterations, which forget where they began, then (k / k_0)^-exponent
+(Delyon, Lavielle and Moulines 1999 ask for a divergent sum and a convergent sum of squares). It
+converges for every N >= 2. The estimate is the mean of the later iterates on the unconstrained
+scale (Polyak and Juditsky 1992) over independent chains; its error is told from how they differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.codegen.kernels.weights import OK
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.filtering import FilterSettings, check_count, failure, random_state
+from ssmppl.inference.m_step import DRIFT, Maximiser, maximiser, pool
+from ssmppl.inference.methods import PSAEM
+from ssmppl.inference.pgas import (
+    PARTICLES,
+    PARTICLES_WITHOUT_ANCESTORS,
+    Sweeper,
+    pgas_proposal,
+    start_chain,
+)
+from ssmppl.inference.runner import Block, run_chains
+
+
+def climb(setup: Setup, method: PSAEM) -> Ascent:
+    """Maximise; see the module.
+
+    Raises
+    ------
+    ArgumentError : the densities do not separate in the parameters, or the states cannot be the
+        missing data; names the line.
+    """
+    maximum = _checked(setup, method)
+    settings = conditional_settings(setup, method)
+    theta, states = setup.space.parameters(setup.start)[0], []
+    for chain in range(method.chains):
+        seed = setup.seed(2, chain)
+        begun = start_chain(
+            Sweeper(setup.problem, (), settings), theta, np.random.default_rng(seed),
+            random_state(seed),
+        )  # fmt: skip
+        states.append(State(theta.copy(), begun.paths, begun.stream, np.empty(0), 0))
+    chains = run_chains(
+        partial(saem_block, maximum, settings, method), states, method.iterations,
+        executor=setup.executor, progress=setup.progress, title="PSAEM", describe=_no_words,
+    )  # fmt: skip
+    iterates = np.stack([c.draws["theta"] for c in chains])
+    interrupted = any(c.interrupted for c in chains)
+    began = min(averaged_from(method), iterates.shape[1] - 1)
+    pooled = pool(setup, iterates[:, began:])
+    report = {
+        **convergence(pooled.drift, interrupted),
+        "particles": settings.particles,
+        "proposal": settings.proposal,
+        "m_step": str(maximum.step),
+        "averaged": f"iterations {began + 1} to {iterates.shape[1]} of {method.chains} chains",
+        "update_rate": float(np.mean([c.stats["update_rate"].mean() for c in chains])),
+    }
+    return Ascent(
+        pooled.theta, None, iterates.mean(axis=0), report, error=pooled.error,
+        interrupted=interrupted,
+    )  # fmt: skip
+
+
+def convergence(drift: float, interrupted: bool) -> dict[str, Any]:
+    """What a report says of it: whether the averaged iterates still move one way."""
+    if np.isnan(drift) or interrupted:
+        return {"converged": None}
+    moving = drift > DRIFT
+    stopped = f"the iterates still drift ({drift:.1f} standard errors): give more iterations"
+    return {"converged": not moving, "drift": drift, **({"stopped": stopped} if moving else {})}
+
+
+def _checked(setup: Setup, method: PSAEM) -> Maximiser:
+    check_count("burn_in", method.burn_in, 1)
+    check_count("iterations", method.iterations, method.burn_in + 1)
+    check_count("chains", method.chains, 1)
+    if not 0.5 < method.exponent <= 1.0:
+        raise ArgumentError(
+            f"exponent={method.exponent!r}", fix="give a number above 0.5 and at most 1"
+        )
+    maximum = maximiser(setup)
+    if isinstance(maximum.step, NotApplicable):
+        raise ArgumentError(
+            f"PSAEM needs statistics, and the density does not separate: {maximum.step.reason}",
+            fix="use ssm.ParticleEM() or ssm.ScoreAscent()",
+            where=maximum.step.where,
+        )
+    return maximum
+
+
+def conditional_settings(setup: Setup, method: PSAEM) -> FilterSettings:
+    """Particles and proposal of the conditional filter, as PGAS takes them."""
+    problem = setup.problem
+    memory = deterministic_memory(problem.trace)
+    usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
+    particles = usual if method.particles is None else method.particles
+    check_count("particles", particles, 2)
+    proposal = pgas_proposal(problem) if method.proposal == "auto" else method.proposal
+    problem.proposal(proposal)
+    return FilterSettings(int(particles), proposal)
+
+
+def step_size(k: int, method: PSAEM) -> float:
+    """gamma_k, k from 1."""
+    return 1.0 if k <= method.burn_in else (k / method.burn_in) ** -method.exponent
+
+
+def averaged_from(method: PSAEM) -> int:
+    """The number of iterates that are left out of the mean."""
+    return method.burn_in + (method.iterations - method.burn_in) // 4
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a chain stands: theta (P,), a path (T, D) per experiment, the kernels' random state,
+    the statistics S, and the number of iterations made."""
+
+    theta: np.ndarray
+    paths: tuple[np.ndarray, ...]
+    stream: np.ndarray
+    statistics: np.ndarray
+    done: int
+
+
+def saem_block(
+    maximum: Maximiser, settings: FilterSettings, method: PSAEM, state: State, n: int
+) -> tuple[State, Block]:
+    """n iterations of one chain."""
+    stream, theta, paths, total = state.stream.copy(), state.theta, state.paths, state.statistics
+    thetas, rates = [], []
+    for k in range(state.done + 1, state.done + n + 1):
+        fresh, paths, rate = averaged_sweep(maximum, settings, theta, paths, stream)
+        gamma = step_size(k, method)
+        total = fresh if gamma == 1.0 else (1.0 - gamma) * total + gamma * fresh
+        assert not isinstance(maximum.step, NotApplicable)
+        theta = maximum.step.maximise(total, theta)
+        thetas.append(theta)
+        rates.append(rate)
+    block = Block({"theta": np.array(thetas)}, {"update_rate": np.array(rates)})
+    return State(theta, paths, stream, total, state.done + n), block
+
+
+def averaged_sweep(
+    maximum: Maximiser, settings: FilterSettings, theta: np.ndarray,
+    paths: Sequence[np.ndarray], stream: np.ndarray,
+) -> tuple[np.ndarray, tuple[np.ndarray, ...], float]:  # fmt: skip
+    """One sweep at theta: (statistics averaged over all N paths, new paths, share renewed)."""
+    problem, n = maximum.problem, settings.particles
+    run = problem.program.entry(f"conditional_smc_{settings.proposal}")
+    every, weights, new, rate = [], [], [], 0.0
+    for e, path in zip(problem.experiments, paths, strict=True):
+        drawn, figures = np.empty_like(path), np.empty(2)
+        all_paths, w = np.empty((n, *path.shape)), np.empty(n)
+        status, t = run(
+            theta, e.y, e.seen, e.u, n, stream, path, drawn, figures, all_paths, w
+        )  # fmt: skip
+        if status != OK:
+            raise failure(problem, theta, status, t, e)
+        every.append(all_paths)
+        weights.append(w)
+        new.append(drawn)
+        rate += figures[0] / len(paths)
+    return maximum.statistics(theta, every, weights), tuple(new), rate
+
+
+def _no_words(recent: Sequence[Any]) -> str:
+    return ""
