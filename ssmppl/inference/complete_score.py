@@ -37,6 +37,9 @@ class CompleteScores:
     def program(self) -> ScoreProgram:
         return compile_score(self.derived)
 
+    def __getstate__(self) -> dict:  # another process finds the generated module in its cache
+        return {k: v for k, v in self.__dict__.items() if k != "program"}
+
     @property
     def differences(self) -> dict[str, str]:
         """What is computed by central differences ("score", "curvature"), with the reason."""

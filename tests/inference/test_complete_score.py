@@ -13,6 +13,7 @@ import ssmppl as ssm
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import compile_trace
 from ssmppl.data import unpack_parameters
+from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import NotDifferentiable
 from ssmppl.inference.complete_score import complete_scores
@@ -115,9 +116,8 @@ def posed(model, seed, steps=12, experiments=2, missing=True):
             for y in series.values():
                 y[3] = np.nan
         data.append(series | inputs)
-        group = [made[s.name].values[i::experiments].reshape(4, steps, -1) for s in
-                 traced.initial.values()]  # fmt: skip
-        paths.append(np.ascontiguousarray(np.concatenate(group, axis=-1)))
+        group = {n: made[n].values[i::experiments] for n in traced.initial}
+        paths.append(np.ascontiguousarray(pack(traced.initial.values(), group)))
     problem = pose(model, data)
     theta, _ = space.parameters(space.z[space.where] + 0.1 * rng.normal(size=len(space.where)))
     return problem, theta.copy(), paths
