@@ -68,7 +68,7 @@ class ExactSteps:
     def __init__(self, setup: Setup, kalman: KalmanModel):
         self.setup, self.kalman = setup, kalman
         trace = setup.problem.trace
-        self.step: MStep | NotApplicable = maximiser(setup).step
+        self.step: MStep | NotApplicable = maximiser(setup, "EM").step
         self.density: ExpectedDensity | None = None
         self.coefficients: dict[str, list[Expr]] = {}
         if isinstance(self.step, MStep):

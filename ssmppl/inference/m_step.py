@@ -4,40 +4,51 @@ trajectories, and the estimate from the iterates of several chains.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import ModuleType
+from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from ssmppl.analysis.expectation import unsuited
 from ssmppl.analysis.mstep import MStep, counted, derive_m_step
-from ssmppl.analysis.sufficient import complete_data
+from ssmppl.analysis.sufficient import complete_data, restricted
 from ssmppl.codegen.statistics import compile_statistics
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.ascent import Setup
+from ssmppl.inference.chart import Chart
+from ssmppl.inference.complete_score import CompleteScores, complete_scores
+from ssmppl.inference.pilot import Space, at
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.runner import Block, run_chains, stack
 
-__all__ = ["Maximiser", "Pooled", "maximiser", "pool"]
+__all__ = ["Chains", "Maximiser", "Pooled", "maximiser", "pool", "run_to_estimate"]
 
+BFGS_STEPS = 50  # of an M-step without statistics
 DRIFT = 5.0  # standard errors that the halves of the iterates may differ by
 
 
 @dataclass(frozen=True)
 class Maximiser:
-    """A problem with its M-step; other processes derive it again.
+    """A question with its M-step; other processes derive it again.
 
     fixed : names of the parameters that are held. posterior : whether the prior counts.
     """
 
-    problem: Problem
+    space: Space
     fixed: tuple[str, ...]
     posterior: bool
 
+    @property
+    def problem(self) -> Problem:
+        return self.space.problem
+
     @cached_property
     def step(self) -> MStep | NotApplicable:
-        """The M-step; the reason where the densities do not separate."""
+        """The M-step from statistics; the reason where the densities do not separate."""
         missing = self.problem.program.missing
         return derive_m_step(self.problem.trace, self.fixed, missing, self.posterior)
 
@@ -45,6 +56,15 @@ class Maximiser:
     def module(self) -> ModuleType:
         assert isinstance(self.step, MStep)
         return compile_statistics(self.step)
+
+    @cached_property
+    def chart(self) -> Chart:
+        return Chart(self.space)
+
+    @cached_property
+    def scores(self) -> CompleteScores:
+        """The complete-data scores, for the M-step without statistics."""
+        return complete_scores(self.problem, self.fixed)
 
     def statistics(
         self, theta: np.ndarray, paths: Sequence[np.ndarray], weights: Sequence[np.ndarray]
@@ -58,33 +78,105 @@ class Maximiser:
             run(theta, e.y, e.seen, e.u, some, w, None, part, total)
         return total
 
+    def from_paths(self, theta: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
+        """theta after an M-step on M trajectories, (M, T, D) of each experiment."""
+        if isinstance(self.step, MStep):
+            equal = [np.full(len(some), 1.0 / len(some)) for some in paths]
+            return self.step.maximise(self.statistics(theta, paths, equal), theta)
+        z = self._unconstrained(theta)
+
+        def negative(z: np.ndarray) -> tuple[float, np.ndarray]:
+            point = self.chart.at(z)
+            if point.log_prior == -np.inf:
+                return np.inf, np.zeros(len(z))
+            value = float(np.mean(self.scores.log_density(point.theta, paths)))
+            slope = point.pull(np.mean(self.scores.gradient(point.theta, paths), axis=0))
+            if self.posterior:
+                value, slope = value + point.log_prior, slope + point.d_log_prior
+            if not np.isfinite(value) or not np.all(np.isfinite(slope)):
+                return np.inf, np.zeros(len(z))
+            return -value, -slope
+
+        found = minimize(negative, z, jac=True, method="BFGS", options={"maxiter": BFGS_STEPS})
+        return self.chart.at(found.x).theta if found.fun <= negative(z)[0] else theta
+
+    def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
+        moved = at(self.space, theta)
+        return moved.z[moved.where]
+
     def __getstate__(self) -> dict:
-        return {k: self.__dict__[k] for k in ("problem", "fixed", "posterior")}
+        return {k: self.__dict__[k] for k in ("space", "fixed", "posterior")}
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
 
 
-def maximiser(setup: Setup) -> Maximiser:
+def maximiser(setup: Setup, method: str) -> Maximiser:
     """The M-step of a question.
 
     Raises
     ------
-    ArgumentError : the states determine a free parameter or cut it off, so that they cannot be the
-        missing data; names parameter, line and what to use instead.
+    ArgumentError : a free parameter cuts off the support of a state or an observation, or sets a
+        deterministic state, so that given the states it cannot move; names parameter and line.
     """
     problem = setup.problem
     free = [s for s in problem.trace.parameter_symbols if s.data[1] not in setup.held]
     data = counted(complete_data(problem.trace, problem.program.missing), setup.with_prior)
-    reason = unsuited(data, free)
+    if method == "ParticleEM":  # its numerical M-step takes the noisy components alone
+        reason = restricted(data, free)
+        others = "ssm.PMMH()"
+    else:
+        reason = unsuited(data, free)
+        others = "ssm.ParticleEM()"
     if reason is not None:
         raise ArgumentError(
-            f"EM does not apply: {reason.reason}",
-            fix="use ssm.DirectOptimization() or ssm.ScoreAscent(), or hold the parameter by "
-            "fixed={...}",
+            f"{method} does not apply: {reason.reason}",
+            fix=f"use another method, for example {others}, or hold the parameter by fixed={{...}}",
             where=reason.where,
         )
-    return Maximiser(problem, tuple(setup.held), setup.with_prior)
+    return Maximiser(setup.space, tuple(setup.held), setup.with_prior)
+
+
+@dataclass(frozen=True)
+class Chains:
+    """What the iterates of independent chains tell: the ascent, without its report's rest."""
+
+    pooled: Pooled
+    iterates: np.ndarray
+    stats: dict[str, np.ndarray]
+    interrupted: bool
+    report: dict[str, Any]
+
+
+def run_to_estimate(
+    setup: Setup, step_block: Callable[[Any, int], tuple[Any, Block]], states: Sequence[Any],
+    iterations: int, left_out: int, title: str,
+) -> Chains:  # fmt: skip
+    """Run chains whose blocks hold "theta" (n, P), and pool what comes after `left_out`."""
+    chains = run_chains(
+        step_block, states, iterations, executor=setup.executor, progress=setup.progress,
+        title=title, describe=_no_words,
+    )  # fmt: skip
+    drawn, stats = stack(chains)
+    iterates = drawn["theta"]
+    interrupted = any(c.interrupted for c in chains)
+    first = min(left_out, iterates.shape[1] - 1)
+    pooled = pool(setup, iterates[:, first:])
+    report: dict[str, Any] = {"converged": None}
+    if not np.isnan(pooled.drift) and not interrupted:
+        moving = pooled.drift > DRIFT
+        report = {"converged": not moving, "drift": pooled.drift}
+        if moving:
+            report["stopped"] = (
+                f"the iterates still drift ({pooled.drift:.1f} standard errors from the first to "
+                "the second half): give more iterations"
+            )
+    report["averaged"] = f"iterations {first + 1} to {iterates.shape[1]} of {len(chains)} chains"
+    return Chains(pooled, iterates.mean(axis=0), stats, interrupted, report)
+
+
+def _no_words(recent: Sequence[Any]) -> str:
+    return ""
 
 
 @dataclass(frozen=True)

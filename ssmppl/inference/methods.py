@@ -51,9 +51,9 @@ class PMMH:
         of the difference between two successive estimates, over sqrt(2).
     target_acceptance : what the walk adapts to during warmup (Vihola 2012); None: 0.25 for one
         parameter, less for more; 0.25 for orders 1 and 2; 0.3 with `correlation`.
-    covariance : (d, d), of the walk's steps, the free parameters in the order of declaration, on
-        the scale below. None: 2.562^2 / d times the inverse information at the mode, which a
-        pilot estimates (Sherlock et al. 2015).
+    covariance : (d, d), of the steps, the free parameters in the order of declaration, on the scale
+        below. None: the inverse information at the mode, which a pilot estimates, times 2.562^2 / d
+        for a random walk (Sherlock et al. 2015).
     scale : on which the walk moves: "unconstrained" (numbers between bounds by logit, positive ones
         by log, simplices by stick breaking, matrices by their Cholesky factor), or "natural".
         What falls outside the support is refused; the Jacobian is accounted for.
@@ -146,6 +146,33 @@ class EM:
     iterations: int = 2000
     tolerance: float = 1e-8
     accelerate: bool = True
+
+
+@dataclass(frozen=True)
+class ParticleEM:
+    """EM over a particle smoother: in each iteration fresh trajectories by backward simulation
+    (Schön, Wills and Ninness 2011; Schön et al. 2015, section on EM for nonlinear models), and the
+    M-step that was derived, or a numerical one where the densities do not separate.
+
+    Parameters
+    ----------
+    particles : N of the filter; expectations have a bias of order 1 / N.
+    trajectories : number M drawn in each iteration.
+    proposal : "auto", "bootstrap", "guided", "auxiliary" or "user".
+    kernel : of backward simulation: "auto", "exact", "rejection" or "mcmc".
+    iterations : of each chain.
+    burn_in : iterations that are left out of the mean; at least as many as EM needs to come near
+        its limit.
+    chains : independent climbs, whose mean is the estimate; their spread tells its error.
+    """
+
+    particles: int = 300
+    trajectories: int = 50
+    proposal: str = "auto"
+    kernel: str = "auto"
+    iterations: int = 150
+    burn_in: int = 50
+    chains: int = 8
 
 
 @dataclass(frozen=True)

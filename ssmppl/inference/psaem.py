@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.filtering import FilterSettings, check_count, failure, random_state
-from ssmppl.inference.m_step import DRIFT, Maximiser, maximiser, pool
+from ssmppl.inference.m_step import Maximiser, maximiser, run_to_estimate
 from ssmppl.inference.methods import PSAEM
 from ssmppl.inference.pgas import (
     PARTICLES,
@@ -37,7 +36,7 @@ from ssmppl.inference.pgas import (
     pgas_proposal,
     start_chain,
 )
-from ssmppl.inference.runner import Block, run_chains
+from ssmppl.inference.runner import Block
 
 
 def climb(setup: Setup, method: PSAEM) -> Ascent:
@@ -58,35 +57,22 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
             random_state(seed),
         )  # fmt: skip
         states.append(State(theta.copy(), begun.paths, begun.stream, np.empty(0), 0))
-    chains = run_chains(
-        partial(saem_block, maximum, settings, method), states, method.iterations,
-        executor=setup.executor, progress=setup.progress, title="PSAEM", describe=_no_words,
+    found = run_to_estimate(
+        setup, partial(saem_block, maximum, settings, method), states, method.iterations,
+        averaged_from(method), "PSAEM",
     )  # fmt: skip
-    iterates = np.stack([c.draws["theta"] for c in chains])
-    interrupted = any(c.interrupted for c in chains)
-    began = min(averaged_from(method), iterates.shape[1] - 1)
-    pooled = pool(setup, iterates[:, began:])
     report = {
-        **convergence(pooled.drift, interrupted),
+        **found.report,
         "particles": settings.particles,
         "proposal": settings.proposal,
         "m_step": str(maximum.step),
-        "averaged": f"iterations {began + 1} to {iterates.shape[1]} of {method.chains} chains",
-        "update_rate": float(np.mean([c.stats["update_rate"].mean() for c in chains])),
+        "update_rate": float(found.stats["update_rate"].mean()),
     }
+    pooled = found.pooled
     return Ascent(
-        pooled.theta, None, iterates.mean(axis=0), report, error=pooled.error,
-        interrupted=interrupted,
+        pooled.theta, None, found.iterates, report, error=pooled.error,
+        interrupted=found.interrupted,
     )  # fmt: skip
-
-
-def convergence(drift: float, interrupted: bool) -> dict[str, Any]:
-    """What a report says of it: whether the averaged iterates still move one way."""
-    if np.isnan(drift) or interrupted:
-        return {"converged": None}
-    moving = drift > DRIFT
-    stopped = f"the iterates still drift ({drift:.1f} standard errors): give more iterations"
-    return {"converged": not moving, "drift": drift, **({"stopped": stopped} if moving else {})}
 
 
 def _checked(setup: Setup, method: PSAEM) -> Maximiser:
@@ -97,7 +83,7 @@ def _checked(setup: Setup, method: PSAEM) -> Maximiser:
         raise ArgumentError(
             f"exponent={method.exponent!r}", fix="give a number above 0.5 and at most 1"
         )
-    maximum = maximiser(setup)
+    maximum = maximiser(setup, "PSAEM")
     if isinstance(maximum.step, NotApplicable):
         raise ArgumentError(
             f"PSAEM needs statistics, and the density does not separate: {maximum.step.reason}",
@@ -180,7 +166,3 @@ def averaged_sweep(
         new.append(drawn)
         rate += figures[0] / len(paths)
     return maximum.statistics(theta, every, weights), tuple(new), rate
-
-
-def _no_words(recent: Sequence[Any]) -> str:
-    return ""
