@@ -10,7 +10,16 @@ from ssmppl.inference.explain import compile, explain
 from ssmppl.inference.filters import kalman_filter, particle_filter
 from ssmppl.inference.likelihood import log_likelihood
 from ssmppl.inference.maximize import maximize
-from ssmppl.inference.methods import PGAS, PMMH, DirectOptimization, Gibbs, MetropolisHastings
+from ssmppl.inference.methods import (
+    EM,
+    PGAS,
+    PMMH,
+    PSAEM,
+    DirectOptimization,
+    Gibbs,
+    MetropolisHastings,
+    ParticleEM,
+)
 from ssmppl.inference.sample import sample
 from ssmppl.inference.simulation import simulate
 from ssmppl.language.distributions import (
@@ -47,8 +56,10 @@ from ssmppl.results import summary
 __version__ = "0.1.0"
 
 __all__ = [
+    "EM",
     "PGAS",
     "PMMH",
+    "PSAEM",
     "ArgumentError",
     "Bernoulli",
     "Beta",
@@ -77,6 +88,7 @@ __all__ = [
     "MvNormal",
     "NegativeBinomial",
     "Normal",
+    "ParticleEM",
     "Poisson",
     "SSMError",
     "SamplingError",

@@ -12,12 +12,12 @@ import numpy as np
 
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference import direct_optimization
+from ssmppl.inference import direct_optimization, em, particle_em, psaem
 from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.filtering import FilterSettings, estimates_task, seed_sequence
 from ssmppl.inference.kalman import KalmanModel
-from ssmppl.inference.methods import DirectOptimization
+from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM
 from ssmppl.inference.pilot import space_of
 from ssmppl.inference.problem import pose
 from ssmppl.inference.proposal_choice import choose
@@ -27,6 +27,9 @@ from ssmppl.language.model import Model
 # The methods: what climbs under each class of settings.
 CLIMBS: dict[type, Callable[[Setup, Any], Ascent]] = {
     DirectOptimization: direct_optimization.climb,
+    EM: em.climb,
+    ParticleEM: particle_em.climb,
+    PSAEM: psaem.climb,
 }
 OBJECTIVES = ("likelihood", "posterior")
 PARTICLES, REPEATS = 1000, 16  # of the log-likelihood at the estimate
