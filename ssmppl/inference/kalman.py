@@ -1,7 +1,8 @@
-"""The exact filter of linear Gaussian models (Kalman 1960).
+"""The exact filter of linear Gaussian models (Kalman 1960), and what follows from it.
 
 Applies where `structure.linear_gaussian` does. The matrices are evaluated by the interpreter, all
-time steps at once, and handed to the compiled filter of `codegen/kernels/kalman.py`.
+time steps at once, and handed to the compiled filter of `codegen/kernels/kalman.py`; the smoother
+and the sampler are in `kalman_moments.py`.
 """
 
 from __future__ import annotations
@@ -9,44 +10,35 @@ from __future__ import annotations
 import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from ssmppl.analysis.structure import LinearGaussian, linear_gaussian
 from ssmppl.codegen.kernels import kalman as kernel
+from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.program import Program
-from ssmppl.data import Experiment, unpack_parameters
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.language.trace import Trace, previous
+from ssmppl.data import Experiment
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference import kalman_matrices
+from ssmppl.inference.kalman_moments import (
+    Disturbances,
+    SmoothedMoments,
+    Stopped,
+    drawn,
+    smoothed,
+)
+from ssmppl.language.trace import Trace
 
 __all__ = [
+    "Disturbances",
     "KalmanModel",
     "KalmanMoments",
     "Matrices",
+    "SmoothedMoments",
     "kalman_filter",
     "kalman_log_likelihood",
     "kalman_model",
 ]
-
-
-class Matrices(NamedTuple):
-    """A linear Gaussian model in numbers, in the order of the kernel's arguments.
-
-    m (D,), P (D, D): law of x_1. A, Q (T or 1, D, D), b (T or 1, D): into row t, row 0 without
-    meaning. C (T or 1, K, D), d (T or 1, K), R (T or 1, K, K): at row t.
-    """
-
-    m: np.ndarray
-    P: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
-    Q: np.ndarray
-    C: np.ndarray
-    d: np.ndarray
-    R: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -72,22 +64,6 @@ class KalmanMoments:
         return float(self.log_increments.sum())
 
 
-_CAUSE = {
-    kernel.NOT_COVARIANCE: (
-        "a covariance is not positive semidefinite",
-        "restrict the parameters, by their priors, to values that give variances",
-    ),
-    kernel.SINGULAR: (
-        "the prediction of the observation has no spread",
-        "give the observation noise of its own",
-    ),
-    kernel.NOT_FINITE: (
-        "the prediction of the observation is not finite",
-        "some parameter or input leads outside the domain of an operation",
-    ),
-}
-
-
 @dataclass(frozen=True)
 class KalmanModel:
     """A traced model as a linear Gaussian one, and its filter."""
@@ -97,11 +73,7 @@ class KalmanModel:
 
     def matrices(self, experiment: Experiment, theta: np.ndarray) -> Matrices:
         """The matrices at theta (P,), for the rows of one experiment."""
-        values = _values(self.trace, experiment, theta)
-        fields = [getattr(self.form, name) for name in Matrices._fields]
-        flat = iter(evaluate([e for field in fields for e in field.ravel()], values))
-        rows = [_by_row([next(flat) for _ in range(f.size)], f.shape) for f in fields]
-        return Matrices(rows[0][0], rows[1][0], *rows[2:])
+        return kalman_matrices.matrices(self.trace, self.form, experiment, theta)
 
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
         """log p(y | theta), summed over experiments; -inf where it does not exist at theta."""
@@ -138,37 +110,58 @@ class KalmanModel:
             out.covariance_predicted, out.observation_mean, out.observation_covariance,
         )  # fmt: skip
         if status != kernel.OK:
-            found, fix = _CAUSE[status]
-            parameters = ", ".join(
-                f"{name} = {np.array2string(np.asarray(value), precision=6)}"
-                for name, value in unpack_parameters(self.trace, theta).items()
-            )
-            site = next(iter((self.trace.transition if t else self.trace.initial).values()))
-            raise SamplingError(
-                f"{found} at t={t + 1}; parameters: {parameters}",
-                fix=fix,
-                where=site.distribution.location,
-            )
+            raise kalman_matrices.failure(self.trace, theta, status, t)
         return out
 
+    def smooth(self, experiment: Experiment, theta: np.ndarray) -> SmoothedMoments:
+        """Moments of all states given all data (Rauch, Tung and Striebel 1965).
 
-def _values(trace: Trace, experiment: Experiment, theta: np.ndarray) -> dict[Expr, np.ndarray]:
-    """Values of every symbol that a matrix may depend on: numbers, or one for each row."""
-    t = np.arange(experiment.steps)
-    before = np.maximum(t - 1, 0)
-    values: dict[Expr, np.ndarray] = dict(zip(trace.parameter_symbols, theta, strict=True))
-    values[symbol("time", "t")], values[symbol("time_prev", "t")] = t + 1.0, t + 0.0
-    for s, column in zip(trace.input_symbols, experiment.u.T, strict=True):
-        values[s], values[previous(s)] = column, column[before]
-    for s, column in zip(trace.observation_symbols, experiment.y.T, strict=True):
-        values[previous(s)] = column[before]
-    return values
+        Raises
+        ------
+        SamplingError : the laws have no density at theta; names the step and the parameters.
+        """
+        return self._smooth(experiment, theta)[0]
 
+    def disturbances(self, experiment: Experiment, theta: np.ndarray) -> Disturbances:
+        """Moments of the noises of states and observations given all data (Koopman 1993).
 
-def _by_row(entries: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """Entries, each a number or one for each row, as an array (T or 1, *shape)."""
-    columns = np.broadcast_arrays(*(np.atleast_1d(e) for e in entries))
-    return np.ascontiguousarray(np.stack(columns, axis=-1), dtype=float).reshape(-1, *shape)
+        Raises
+        ------
+        SamplingError : as of `smooth`.
+        """
+        found = self._smooth(experiment, theta, noises=True)[1]
+        assert found is not None
+        return found
+
+    def draw(
+        self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
+    ) -> np.ndarray:
+        """Independent draws of x_{1:T} given y_{1:T}, (draws, T, D), by backward sampling.
+
+        stream : state of the kernels' random numbers, (4,) uint64, advanced in place.
+
+        Raises
+        ------
+        SamplingError : as of `smooth`.
+        """
+        model = self.matrices(experiment, theta)
+        try:
+            return drawn(model, self._start(model), experiment, stream, draws)
+        except Stopped as stop:
+            raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
+
+    def _smooth(
+        self, experiment: Experiment, theta: np.ndarray, noises: bool = False
+    ) -> tuple[SmoothedMoments, Disturbances | None]:
+        model = self.matrices(experiment, theta)
+        try:
+            return smoothed(model, self._start(model), experiment, noises)
+        except Stopped as stop:
+            raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
+
+    def _start(self, model: Matrices) -> np.ndarray:
+        """The mean of x_1 (D, 1)."""
+        return model.m[:, None].copy()
 
 
 _forms: dict[int, tuple[weakref.ref[Trace], LinearGaussian | NotApplicable]] = {}

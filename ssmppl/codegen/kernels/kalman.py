@@ -31,44 +31,72 @@ from ssmppl.codegen.kernels.flags import exact
 
 OK, NOT_COVARIANCE, SINGULAR, NOT_FINITE = 0, 1, 2, 3
 LOG_2PI = math.log(2.0 * math.pi)
-# Pivots below this share of their diagonal entry are rounding errors of zero ...
-PIVOT = 1e-14
-# ... and what stands below such a pivot may be as large as this share.
-BELOW_PIVOT = 1e-6
+# Of a covariance's entries: pivots below this share are zero, and what they leave may be as large
+# as that one.
+PIVOT, REST = 1e-14, 1e-10
 
 entry = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @exact
 def square_root(covariance, root):
-    """Write a lower triangular root of a semidefinite matrix; False where it is not one."""
+    """Write a root of a semidefinite matrix, root root' = covariance; False where there is none.
+
+    Cholesky's factorisation in the order of the largest share of variance that is left, which is
+    stable for singular matrices (Higham 2002, "Accuracy and stability of numerical algorithms",
+    section 10.3); shares of the entries' own variance, so that units do not matter.
+    """
     n = covariance.shape[0]
-    root[:] = 0.0
-    for j in range(n):
-        pivot = covariance[j, j]
-        for k in range(j):
-            pivot -= root[j, k] * root[j, k]
-        slack = PIVOT * n * abs(covariance[j, j])
-        if not -slack <= pivot < np.inf:
+    for i in range(n):
+        for j in range(n):
+            root[i, j] = 0.0
+        if not 0.0 <= covariance[i, i] < np.inf:
             return False
-        positive = pivot > slack
-        root[j, j] = math.sqrt(pivot) if positive else 0.0
-        for i in range(j + 1, n):
-            rest = covariance[i, j]
-            for k in range(j):
-                rest -= root[i, k] * root[j, k]
-            if positive:
-                root[i, j] = rest / root[j, j]
-            elif not rest * rest <= BELOW_PIVOT**2 * abs(covariance[i, i] * covariance[j, j]):
-                return False
+    left, done = np.empty(n), np.zeros(n)
+    for i in range(n):
+        left[i] = covariance[i, i]
+    for step in range(n):
+        chosen, largest = -1, PIVOT * n
+        for i in range(n):
+            if done[i] == 0.0 and left[i] > largest * covariance[i, i]:
+                chosen, largest = i, left[i] / covariance[i, i]
+        if chosen < 0:
+            break
+        pivot = math.sqrt(left[chosen])
+        done[chosen] = 1.0
+        root[chosen, step] = pivot
+        for i in range(n):
+            if done[i] == 0.0:
+                entry = covariance[i, chosen]
+                for k in range(step):
+                    entry -= root[i, k] * root[chosen, k]
+                root[i, step] = entry / pivot
+                left[i] -= root[i, step] * root[i, step]
+    for i in range(n):  # what is left must be rounding errors of zero
+        for j in range(i + 1):
+            if done[i] == 0.0 or done[j] == 0.0:
+                entry = covariance[i, j]
+                for k in range(n):
+                    entry -= root[i, k] * root[j, k]
+                if not abs(entry) <= REST * math.sqrt(covariance[i, i] * covariance[j, j]):
+                    return False
     return True
 
 
 @exact
 def triangularise(a):
     """Make a (n, m), m >= n, lower triangular in place, a a' kept: Householder reflections."""
+    reflect(a, a.shape[0])
+
+
+@exact
+def reflect(a, pivots):
+    """Make the first rows of a (n, m), m >= pivots, lower triangular; a a' of all rows is kept.
+
+    Rows of a unit matrix below the pivots hold the orthogonal transformation afterwards.
+    """
     n, m = a.shape
-    for i in range(n):
+    for i in range(pivots):
         norm = 0.0
         for k in range(i, m):
             norm += a[i, k] * a[i, k]
