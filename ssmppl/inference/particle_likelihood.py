@@ -1,12 +1,21 @@
-"""The particle filter as a likelihood for Metropolis-Hastings."""
+"""Particle filters as likelihoods for Metropolis-Hastings."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
+from ssmppl.codegen.kernels.random import fill_normal
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
+from ssmppl.codegen.metropolis import (
+    NumberedFilter,
+    ScoredFilter,
+    numbered_filter,
+    scored_filter,
+)
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.filtering import FilterSettings, failure
 from ssmppl.inference.pilot import Space
 from ssmppl.inference.problem import Problem
@@ -37,6 +46,135 @@ class ParticleLikelihood:
             paths.append(path)
             increments.append(increment)
         return Run(total, tuple(paths), tuple(increments))
+
+    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+        return paths_of(point)
+
+
+@dataclass(frozen=True)
+class ScoredLikelihood:
+    """A particle filter that estimates score and information too, zero for fixed parameters.
+
+    wanted : positions in theta of the free parameters. second : whether the information is wanted.
+    """
+
+    problem: Problem
+    settings: FilterSettings
+    lag: int
+    wanted: tuple[int, ...]
+    second: bool
+
+    @cached_property
+    def filter(self) -> ScoredFilter:
+        program, name = self.problem.program, self.settings.proposal
+        symbols = [self.problem.trace.parameter_symbols[i] for i in self.wanted]
+        made = scored_filter(program, self.problem.proposal(name), symbols, self.second)
+        if isinstance(made, NotApplicable):
+            raise ArgumentError(
+                f"order={2 if self.second else 1} does not apply: {made.reason}",
+                fix="use ssm.PMMH(order=0)",
+                where=made.where,
+            )
+        return made
+
+    def __getstate__(self) -> dict:
+        return {f.name: self.__dict__[f.name] for f in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+
+    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+        entry, p = self.filter.module.filter_with_score, len(self.wanted)
+        total, paths, increments = 0.0, [], []
+        slope, curvature = np.zeros(p), np.zeros((p, p))
+        for e in self.problem.experiments:
+            path = np.empty((e.steps, len(self.problem.trace.state_symbols)))
+            increment, own_slope, own = np.empty(e.steps), np.empty(p), np.zeros((p, p))
+            status, t, log_z = entry(
+                theta, e.y, e.seen, e.u, self.settings.particles, stream, path, increment,
+                self.lag, own_slope, own,
+            )  # fmt: skip
+            if status == ALL_ZERO:
+                return None
+            if status != OK:
+                raise failure(self.problem, theta, status, t, e)
+            total += log_z
+            slope += own_slope
+            curvature += own
+            paths.append(path)
+            increments.append(increment)
+        score, information = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
+        score[list(self.wanted)] = slope
+        information[np.ix_(self.wanted, self.wanted)] = curvature
+        return Run(total, tuple(paths), tuple(increments), score, information)
+
+    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+        return paths_of(point)
+
+
+@dataclass(frozen=True)
+class CorrelatedLikelihood:
+    """A particle filter on random numbers that move by v' = rho v + sqrt(1 - rho^2) e.
+
+    The move leaves the normal law of the numbers invariant and is reversible, so that they may be
+    part of the chain's state (Deligiannidis, Doucet and Pitt 2018, section 2.2).
+    """
+
+    problem: Problem
+    settings: FilterSettings
+    correlation: float
+
+    @cached_property
+    def filter(self) -> NumberedFilter:
+        program, name = self.problem.program, self.settings.proposal
+        made = numbered_filter(program, self.problem.proposal(name))
+        if isinstance(made, NotApplicable):
+            raise ArgumentError(
+                f"correlation={self.correlation} does not apply: {made.reason}",
+                fix="use ssm.PMMH(correlation=0.0)",
+                where=made.where,
+            )
+        return made
+
+    def __getstate__(self) -> dict:
+        return {f.name: self.__dict__[f.name] for f in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+
+    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+        old = None if before is None else before.numbers
+        total, paths, increments, numbers = 0.0, [], [], []
+        made, n = self.filter, self.settings.particles
+        for i, e in enumerate(self.problem.experiments):
+            fresh = [(e.steps, made.normals * n), (e.steps, made.uniforms * n), (e.steps + 1,)]
+            own = [self._moved(shape, None if old is None else old[i][k], stream)
+                   for k, shape in enumerate(fresh)]  # fmt: skip
+            path = np.empty((e.steps, len(self.problem.trace.state_symbols)))
+            increment = np.empty(e.steps)
+            status, t, log_z = made.module.correlated_path(
+                theta, e.y, e.seen, e.u, n, *own, path, increment
+            )
+            if status == ALL_ZERO:
+                return None
+            if status != OK:
+                raise failure(self.problem, theta, status, t, e)
+            total += log_z
+            paths.append(path)
+            increments.append(increment)
+            numbers.append(own)
+        return Run(total, tuple(paths), tuple(increments), numbers=numbers)
+
+    def _moved(
+        self, shape: tuple[int, ...], old: np.ndarray | None, stream: np.ndarray
+    ) -> np.ndarray:
+        new = np.empty(int(np.prod(shape)))
+        if new.size:
+            fill_normal(stream, new)
+        if old is None:
+            return new.reshape(shape)
+        rho = self.correlation
+        return rho * old + np.sqrt(1.0 - rho * rho) * new.reshape(shape)
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
         return paths_of(point)

@@ -278,12 +278,21 @@ def tune_particles(
     problem: Problem, theta: np.ndarray, proposal: str, target: float, seed: np.random.SeedSequence
 ) -> Tuning:
     """N at which log Z has about the target's standard deviation: var(log Z) falls as 1 / N."""
-    particles, sd = 50, np.inf
-    for _ in range(8):
+
+    def spread(particles: int) -> float:
         settings = FilterSettings(particles, proposal)
         log_z = repeated_estimates(problem, theta, settings, seed, range(TUNING_REPEATS))
         finite = log_z[np.isfinite(log_z)]
-        sd = float(np.std(finite, ddof=1)) if len(finite) > 0.9 * TUNING_REPEATS else np.inf
+        return float(np.std(finite, ddof=1)) if len(finite) > 0.9 * TUNING_REPEATS else np.inf
+
+    return particles_for(spread, target)
+
+
+def particles_for(spread: Callable[[int], float], target: float) -> Tuning:
+    """N at which `spread`, a standard deviation that falls as its root, is about the target."""
+    particles, sd = 50, np.inf
+    for _ in range(8):
+        sd = spread(particles)
         if 0.8 * target <= sd <= 1.15 * target or (sd < target and particles <= 50):
             break
         factor = np.clip((sd / target) ** 2, 0.3, 8.0) if np.isfinite(sd) else 8.0

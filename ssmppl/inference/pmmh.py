@@ -16,20 +16,36 @@ import numpy as np
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.coordinates import Coordinates, coordinates
 from ssmppl.inference.curvature import fitted_covariance
-from ssmppl.inference.filtering import FilterSettings, check_count
+from ssmppl.inference.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.langevin import Langevin
 from ssmppl.inference.methods import PMMH, MetropolisHastings
-from ssmppl.inference.particle_likelihood import ParticleLikelihood, run_filters
+from ssmppl.inference.particle_likelihood import (
+    CorrelatedLikelihood,
+    ParticleLikelihood,
+    ScoredLikelihood,
+    run_filters,
+)
 from ssmppl.inference.pilot import (
     SCALE_REPEATS,
+    TUNING_REPEATS,
     Pilot,
+    Tuning,
     averaged_density,
     dispersed,
     find_mode,
+    particles_for,
     tune_particles,
 )
 from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.sampling import Sampler, Setup
-from ssmppl.inference.walk import Metropolis, RandomWalk, metropolis_block, start_chain
+from ssmppl.inference.walk import (
+    Likelihood,
+    Metropolis,
+    Proposal,
+    RandomWalk,
+    metropolis_block,
+    start_chain,
+)
 
 __all__ = ["prepare", "run_filters"]
 
@@ -37,10 +53,14 @@ STRETCH = 2.562  # of a random walk's steps, over sqrt(d): Sherlock et al. (2015
 
 
 def prepare(setup: Setup, method: PMMH) -> Sampler:
-    """Find a mode, choose proposal and number of particles there, and start the chains."""
+    """Find a mode, choose proposal and number of particles there, and start the chains.
+
+    Raises
+    ------
+    ArgumentError : a setting is out of range, or does not apply to the model; gives the reason.
+    """
     problem, space = setup.problem, setup.space
-    if method.particles is not None:
-        check_count("particles", method.particles, 1)
+    check_settings(method)
     where = coordinates(space, method.scale, method.transform)
     pilot = find_mode(space, setup.root)
     theta, _ = space.parameters(pilot.z)
@@ -49,20 +69,28 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     problem.proposal(proposal)
     particles, tuned = method.particles, None
     if particles is None:
-        tuned = tune_particles(problem, theta, proposal, method.target_sd, setup.root)
+        tuned = _tuned(setup, method, theta, proposal)
         particles = tuned.particles
     settings = FilterSettings(int(particles), proposal)
     d = len(where)
-    target = method.target_acceptance or (0.25 if d <= 1 else 0.2 if d == 2 else 0.15)
-    kernel = Metropolis(
-        where, ParticleLikelihood(problem, settings), RandomWalk(), setup.warmup,
-        setup.warmup if adapts(method) else 0, target, setup.thin,
-    )  # fmt: skip
     factor = walk_factor(setup, method, where, pilot, "bootstrap")
+    tuning: Any = factor
+    move: Proposal = RandomWalk()
+    usual = 0.25 if d <= 1 else 0.2 if d == 2 else 0.15
+    if method.order:
+        if method.covariance is None:
+            factor = factor * np.sqrt(max(d, 1)) / STRETCH  # steps of one standard deviation
+        move, tuning, usual = Langevin(where, factor, method.order == 2), 0.0, 0.25
+    elif method.correlation:
+        usual = 0.3
+    kernel = Metropolis(
+        where, _likelihood(setup, method, settings), move, setup.warmup,
+        setup.warmup if adapts(method) else 0, method.target_acceptance or usual, setup.thin,
+    )  # fmt: skip
     states = []
     for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
         generator, stream = setup.streams(chain)
-        states.append(start_chain(kernel, where.at(z), factor, generator, stream))
+        states.append(start_chain(kernel, where.at(z), tuning, generator, stream))
     report = {
         "particles": settings.particles,
         "proposal": str(choice or proposal),
@@ -73,6 +101,63 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     if tuned is not None:
         report["pilot_sd_of_log_likelihood"] = tuned.sd
     return Sampler(partial(metropolis_block, kernel), states, report)
+
+
+def check_settings(method: PMMH) -> None:
+    """Refuse settings that are out of range, or that exclude each other."""
+    if method.particles is not None:
+        check_count("particles", method.particles, 1)
+    check_count("lag", method.lag, 0)
+    if method.order not in (0, 1, 2):
+        raise ArgumentError(
+            f"order={method.order!r}",
+            fix="use 0 (random walk), 1 (gradient) or 2 (gradient and information)",
+        )
+    if not 0.0 <= method.correlation < 1.0:
+        raise ArgumentError(
+            f"correlation={method.correlation!r}",
+            fix="give a number from 0 (fresh random numbers) to below 1, as 0.99",
+        )
+    if method.order and method.correlation:
+        raise ArgumentError(
+            f"order={method.order} together with correlation={method.correlation}",
+            fix="use one of them: the sorted filter of the correlated method keeps no scores",
+        )
+
+
+def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelihood:
+    """The particle filter in the form that the method needs, compiled to find out if it applies."""
+    problem = setup.problem
+    if method.correlation:
+        correlated = CorrelatedLikelihood(problem, settings, method.correlation)
+        _ = correlated.filter
+        return correlated
+    if method.order:
+        held = [n not in setup.held for n, s in problem.trace.parameters.items()
+                for _ in s.components]  # fmt: skip
+        wanted = tuple(np.flatnonzero(held).tolist())
+        scored = ScoredLikelihood(problem, settings, method.lag, wanted, method.order == 2)
+        _ = scored.filter
+        return scored
+    return ParticleLikelihood(problem, settings)
+
+
+def _tuned(setup: Setup, method: PMMH, theta: np.ndarray, proposal: str) -> Tuning:
+    """The number of particles by the spread of log Z, or of the difference of correlated ones."""
+    if not method.correlation:
+        return tune_particles(setup.problem, theta, proposal, method.target_sd, setup.root)
+
+    def spread(particles: int) -> float:
+        settings = FilterSettings(particles, proposal)
+        likelihood = CorrelatedLikelihood(setup.problem, settings, method.correlation)
+        stream, run, log_z = random_state(setup.root, 9), None, []
+        for _ in range(TUNING_REPEATS):
+            run = likelihood.run(theta, run, stream)
+            log_z.append(-np.inf if run is None else run.log_likelihood)
+        change = np.diff(log_z)
+        return float(np.std(change) / np.sqrt(2.0)) if np.all(np.isfinite(change)) else np.inf
+
+    return particles_for(spread, method.target_sd)
 
 
 def adapts(method: PMMH | MetropolisHastings) -> bool:
