@@ -3,9 +3,14 @@
 Fisher's identity: the score is the smoothed mean of the complete-data score S (Fisher 1925; Schön
 et al. 2015, section on direct optimisation); Louis' identity: the observed information is
 E[-H] - Cov(S), H the second derivatives of the complete-data log density (Louis 1982; Poyiadjis,
-Doucet and Singh 2011). Trajectories come from backward simulation, several independent runs give
-the Monte Carlo error, and their means the square of E[S] without bias by noise. What remains is the
-bias of the smoother, of order 1 / N.
+Doucet and Singh 2011). Trajectories come from backward simulation; several independent runs give
+the Monte Carlo error, and pairs of them E[S]E[S]' without bias by noise.
+
+The mean over a run's trajectories has a bias of order 1 / N. Times that run's estimate of the
+likelihood it is unbiased for the smoothed mean times the likelihood (P. Del Moral, A. Doucet and
+S. S. Singh, "A backward particle interpretation of Feynman-Kac formulae", *ESAIM: M2AN* 44, 2010),
+so the runs are weighted by those estimates, and the bias falls to order 1 / (N runs); not where
+the estimates scatter so much that few runs would be left.
 """
 
 from __future__ import annotations
@@ -21,6 +26,8 @@ from ssmppl.inference.backward import backward_draws
 from ssmppl.inference.complete_score import CompleteScores
 from ssmppl.inference.filtering import FilterSettings, random_state
 from ssmppl.inference.runner import run_tasks
+
+LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
 
 
 @dataclass(frozen=True)
@@ -89,32 +96,43 @@ def several_runs(
 
 
 def combine(runs: Sequence[Run]) -> ParticleScore:
-    """Averages of at least two runs, with their errors."""
+    """Weighted averages of at least two runs, with their errors."""
     n = len(runs)
     log_z = np.array([r.log_z for r in runs])
     share = np.exp(log_z - log_z.max())
+    w = run_weights(log_z)
     means = np.stack([r.mean for r in runs])
+    gradient = w @ means
+    off = w[:, None] * (means - gradient)
     information, error = None, None
     if all(r.hessian is not None for r in runs):
-        information = _louis(runs)
+        information = _louis(runs, w)
         if n > 2:  # the jackknife over runs
-            without = np.stack([_louis([*runs[:k], *runs[k + 1 :]]) for k in range(n)])
+            others = [[j for j in range(n) if j != k] for k in range(n)]
+            without = np.stack([_louis([runs[j] for j in o], w[o] / w[o].sum()) for o in others])
             error = np.sqrt((n - 1) * without.var(axis=0))
     return ParticleScore(
         float(log_z.max() + np.log(share.mean())),
         float(share.std(ddof=1) / share.mean() / np.sqrt(n)),
-        means.mean(axis=0),
-        np.atleast_2d(np.cov(means, rowvar=False)) / n,
+        gradient,
+        off.T @ off * n / (n - 1),
         information,
         error,
     )
 
 
-def _louis(runs: Sequence[Run]) -> np.ndarray:
+def run_weights(log_z: np.ndarray) -> np.ndarray:
+    """(R,) likelihood estimates as weights, or equal ones where those would leave few runs."""
+    w = np.exp(log_z - log_z.max())
+    w /= w.sum()
+    return w if 1.0 / (w @ w) >= LEAST_SHARE * len(w) else np.full(len(w), 1.0 / len(w))
+
+
+def _louis(runs: Sequence[Run], w: np.ndarray) -> np.ndarray:
     """E[-H] - E[SS'] + E[S]E[S]', the last one from pairs of different runs."""
-    n = len(runs)
-    total = sum((r.mean for r in runs), np.zeros_like(runs[0].mean))
-    own = sum((np.outer(r.mean, r.mean) for r in runs), np.zeros_like(runs[0].square))
-    product = (np.outer(total, total) - own) / (n * (n - 1))
-    inside = sum(-r.hessian - r.square for r in runs if r.hessian is not None) / n
-    return inside + product
+    means = np.stack([r.mean for r in runs])
+    total = w @ means
+    own = (means * (w**2)[:, None]).T @ means
+    product = (np.outer(total, total) - own) / (1.0 - w @ w)
+    inside = [-r.hessian - r.square for r in runs if r.hessian is not None]
+    return np.tensordot(w, np.stack(inside), axes=1) + product

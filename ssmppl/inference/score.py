@@ -16,7 +16,13 @@ from ssmppl.inference.estimate import by_name, free_components, table
 from ssmppl.inference.filtering import check_count, seed_sequence
 from ssmppl.inference.kalman import KalmanModel, kalman_model
 from ssmppl.inference.likelihood import settle
-from ssmppl.inference.particle_score import ParticleScore, Smoothing, combine, several_runs
+from ssmppl.inference.particle_score import (
+    ParticleScore,
+    Smoothing,
+    combine,
+    run_weights,
+    several_runs,
+)
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.language.model import Model
 
@@ -37,8 +43,9 @@ class Score:
     information : minus the second derivatives, labelled as `phi`, `A[0, 1]`.
     log_likelihood : at the parameters.
     gradient_errors, information_errors, log_likelihood_error : Monte Carlo standard errors, from
-        independent runs; zero where everything is exact. They know nothing of the bias of order
-        1 / particles.
+        independent runs; zero where everything is exact. They know nothing of the bias, which is of
+        order 1 / (particles * repeats) where the runs can be weighted by their likelihoods, else
+        1 / particles (`attrs["weighted"]` says which).
     attrs : how it was computed.
     """
 
@@ -71,8 +78,8 @@ def score(
     *,
     fixed: Mapping[str, Any] | None = None,
     particles: int = 1000,
-    trajectories: int = 500,
-    repeats: int = 12,
+    trajectories: int = 1000,
+    repeats: int = 16,
     proposal: str = "auto",
     kernel: str = "auto",
     seed: int | None = None,
@@ -123,6 +130,7 @@ def score(
             "method": "Fisher's and Louis' identities over backward trajectories",
             "particles": particles, "trajectories": trajectories, "repeats": repeats,
             "proposal": settings.proposal, "kernel": kernel, "seed": str(root.entropy),
+            "weighted": bool(np.ptp(run_weights(np.array([r.log_z for r in runs]))) > 0.0),
         }  # fmt: skip
         if scores.differences:
             attrs["central_differences"] = scores.differences
