@@ -18,8 +18,9 @@ from ssmppl.codegen.kernels import kalman as kernel
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.program import Program
 from ssmppl.data import Experiment
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference import kalman_matrices
+from ssmppl.inference.differences import observed_information
 from ssmppl.inference.kalman_moments import (
     Disturbances,
     SmoothedMoments,
@@ -27,6 +28,7 @@ from ssmppl.inference.kalman_moments import (
     drawn,
     smoothed,
 )
+from ssmppl.inference.kalman_score import Slopes, check_free, score, slopes
 from ssmppl.language.trace import Trace
 
 __all__ = [
@@ -150,6 +152,56 @@ class KalmanModel:
         except Stopped as stop:
             raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
 
+    def score(
+        self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
+    ) -> tuple[float, np.ndarray]:
+        """log p(y | theta) and its gradient (P,), summed over experiments, exact.
+
+        free : (P,) bool, the parameters that matter; the gradient is 0 in the others. None: all.
+        Where the density does not exist at theta: -inf, and NaN for the gradient.
+
+        Raises
+        ------
+        ArgumentError : a matrix has no derivative in a free parameter; names it and the reason.
+        """
+        wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
+        found = _slopes(self.trace, self.form)
+        check_free(self.trace, found, wanted)
+        total, gradient = 0.0, np.zeros(len(theta))
+        for e in experiments:
+            model = self.matrices(e, theta)
+            try:
+                value, slope = score(self.trace, found, model, self._start(model), e, theta)
+            except Stopped:
+                return -np.inf, np.where(wanted, np.nan, 0.0)
+            total, gradient = total + value, gradient + slope
+        return total, np.where(wanted, gradient, 0.0)
+
+    def information(
+        self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The observed information -d^2 log p(y | theta), (P, P), by differences of the score.
+
+        Extrapolated to zero step (`differences.py`): errors of about 1e-9 of
+        sqrt(I_ii I_jj). free : as in `score`; rows and columns of the others are zero.
+
+        Raises
+        ------
+        ArgumentError : as of `score`.
+        SamplingError : theta lies at the edge of where the density exists.
+        """
+        data = list(experiments)
+        wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
+        matrix, _ = observed_information(lambda v: self.score(data, v, wanted)[1], theta, wanted)
+        if not np.isfinite(matrix).all():
+            raise SamplingError(
+                "the log-likelihood has no second derivative at "
+                f"{kalman_matrices.spelled(self.trace, theta)}",
+                fix="the parameters lie at the edge of where the model has a density: fix the one "
+                "that is at its bound by fixed={...}",
+            )
+        return matrix
+
     def _smooth(
         self, experiment: Experiment, theta: np.ndarray, noises: bool = False
     ) -> tuple[SmoothedMoments, Disturbances | None]:
@@ -176,6 +228,18 @@ def kalman_model(source: Trace | Program) -> KalmanModel | NotApplicable:
         _forms[key] = reference, linear_gaussian(trace)
     form = _forms[key][1]
     return form if isinstance(form, NotApplicable) else KalmanModel(trace, form)
+
+
+_slopes_of: dict[int, tuple[weakref.ref[Trace], Slopes]] = {}
+
+
+def _slopes(trace: Trace, form: LinearGaussian) -> Slopes:
+    """The derivatives of a traced model's matrices, derived once."""
+    key = id(trace)
+    if key not in _slopes_of:
+        reference = weakref.ref(trace, lambda _: _slopes_of.pop(key, None))
+        _slopes_of[key] = reference, slopes(trace, form)
+    return _slopes_of[key][1]
 
 
 def _applicable(source: Trace | Program) -> KalmanModel:

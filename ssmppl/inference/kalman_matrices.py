@@ -62,13 +62,17 @@ def _by_row(entries: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
 def failure(trace: Trace, theta: np.ndarray, status: int, t: int) -> SamplingError:
     """The error of a filter that stopped with this status at step t (from 0)."""
     found, fix = CAUSE[status]
-    parameters = ", ".join(
-        f"{name} = {np.array2string(np.asarray(value), precision=6)}"
-        for name, value in unpack_parameters(trace, theta).items()
-    )
     site = next(iter((trace.transition if t else trace.initial).values()))
     return SamplingError(
-        f"{found} at t={t + 1}; parameters: {parameters}",
+        f"{found} at t={t + 1}; parameters: {spelled(trace, theta)}",
         fix=fix,
         where=site.distribution.location,
+    )
+
+
+def spelled(trace: Trace, theta: np.ndarray) -> str:
+    """theta (P,) by name."""
+    return ", ".join(
+        f"{name} = {np.array2string(np.asarray(value), precision=6)}"
+        for name, value in unpack_parameters(trace, theta).items()
     )

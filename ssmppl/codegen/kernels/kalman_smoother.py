@@ -122,7 +122,7 @@ def smooth(
 
 @exact
 def law_of_noise(noise_root, known, told, untold, mu, root, mean, covariance):
-    """Moments of noise_root (known + told e + untold rest); rest ~ N(0, I), e ~ (mu, root root')."""
+    """Moments of noise_root (known + told e + untold rest); rest ~ N(0, I), e ~ (mu, U U')."""
     n, d, more = told.shape[0], told.shape[1], untold.shape[1]
     inner, spread = np.empty((n, d + more)), np.zeros((n, d + more))
     multiply(told, root, inner[:, :d])
