@@ -16,6 +16,7 @@ import numpy as np
 from ssmppl.analysis.bounds import interval
 from ssmppl.analysis.structure import deterministic, deterministic_memory
 from ssmppl.errors import NotApplicable
+from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, attributed, constant, depends_on
@@ -106,7 +107,12 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
 def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     """1 / the smallest width."""
     d: Any = site.distribution
-    width = _lowest(array(d.upper - d.lower), prev)
+    width = array(d.upper - d.lower)
+    form = affine(width.ravel(), prev)  # x + 1 - (x - 1) is 2
+    if not isinstance(form, NotApplicable) and all(e.op == "const" and e.data == 0.0
+                                                   for e in form[0].ravel()):  # fmt: skip
+        width = array(form[1].reshape(width.shape))
+    width = _lowest(width, prev)
     if width is None:
         return NotApplicable(f"the width of {site.name} depends on the state before", d.location)
     return array(np.sum(-array(ew("log", width))))[()]

@@ -33,7 +33,7 @@ ABOVE_BOUND = 4
 SLACK = 1e-6
 """By how much rounding may lift the log of a density above its bound."""
 
-PRICE = 8.0
+PRICE = 20.0
 """Cost of a proposal, as a number of particles that the exact kernel could have weighed."""
 
 
