@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import compress
 
 import numpy as np
 from scipy.optimize import minimize
@@ -30,6 +31,39 @@ ENOUGH = 1e-14  # what a step may still promise, relative to the size of the fun
 SMALL_STEP = 1e-12
 
 
+class Unconstrained:
+    """theta -> the unconstrained numbers z of some of its components, compiled.
+
+    Of a simplex or a matrix all components are members. z, transforms : in the trace's order.
+    """
+
+    def __init__(self, trace: Trace, components: Sequence[Expr]):
+        self.trace, self.members = trace, frozenset(components)
+        self.transforms = [t for t in transforms(trace) if self.members & set(t.components)]
+        self.z: list[Expr] = []
+        for t in self.transforms:
+            inside = [c in self.members for c in t.components]
+            # a simplex or a matrix has numbers of z that are not those of its components
+            self.z += t.free if all(inside) else list(compress(t.free, inside))
+        self.inverses = [self._inverse(t) for t in self.transforms]
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        """z; one of the errors `DOMAIN` on the edge of a support."""
+        z = np.array([x for inverse in self.inverses for x in inverse(theta.tolist())])
+        if not np.all(np.isfinite(z)):
+            raise ValueError("a parameter lies on the edge of its support")
+        return z
+
+    def _inverse(self, t: Transform) -> Callable[[list[float]], Sequence[float]]:
+        """The members of one parameter."""
+        support, symbols = t.site.distribution.support(), self.trace.parameter_symbols
+        if support.kind in ("simplex", "positive definite"):
+            return partial(_whole, t, symbols)
+        lower, upper = (array(b).ravel() for b in (support.lower, support.upper))
+        limits = zip(t.components, lower, upper, strict=True)
+        return straight_function([_free(*b) for b in limits if b[0] in self.members], symbols)
+
+
 class Climber:
     """A function of some components of theta, of the other parameters and of given numbers.
 
@@ -39,22 +73,16 @@ class Climber:
     def __init__(
         self, trace: Trace, components: Sequence[Expr], value: Expr, statistics: Sequence[Expr]
     ):
-        self.trace = trace
-        self.members = frozenset(components)
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         self.where = np.array([place[c] for c in components])
-        self.transforms = [t for t in transforms(trace) if self.members & set(t.components)]
-        mapping: dict[Expr, Expr] = {}
-        self.z: list[Expr] = []
-        for t in self.transforms:
+        self.unconstrained = Unconstrained(trace, components)
+        self.z = self.unconstrained.z
+        members, mapping = self.unconstrained.members, dict[Expr, Expr]()
+        for t in self.unconstrained.transforms:
             values = substitute(list(t.values), mapping)
-            kept = [i for i, c in enumerate(t.components) if c in self.members]
-            mapping |= {t.components[i]: values[i] for i in kept}
-            # of a simplex or a matrix all components are members
-            self.z += t.free if len(kept) == len(t.components) else [t.free[i] for i in kept]
-        self.there = [self._inverse(t) for t in self.transforms]
-        rest = [*statistics, *trace.parameter_symbols]
-        self.arguments = [*self.z, *rest]
+            pairs = zip(t.components, values, strict=True)
+            mapping |= {c: value for c, value in pairs if c in members}
+        self.arguments = [*self.z, *statistics, *trace.parameter_symbols]
         self.back = straight_function([mapping[c] for c in components], self.arguments)
         self.value_of, self.order = self._derivatives(substitute([value], mapping)[0])
 
@@ -75,7 +103,7 @@ class Climber:
     def climb(self, s: Sequence[float], theta: np.ndarray) -> np.ndarray:
         """theta with the members moved to where the function is largest, going up from here."""
         try:
-            z = self._unconstrained(theta)
+            z = self.unconstrained(theta)
         except DOMAIN:
             return theta
         rest = [*s, *theta.tolist()]
@@ -91,21 +119,6 @@ class Climber:
         except DOMAIN:
             return theta
         return out
-
-    def _inverse(self, t: Transform) -> Callable[[list[float]], Sequence[float]]:
-        """theta -> the unconstrained numbers of the members of one parameter."""
-        support, symbols = t.site.distribution.support(), self.trace.parameter_symbols
-        if support.kind in ("simplex", "positive definite"):
-            return partial(_whole, t, symbols)
-        lower, upper = (array(b).ravel() for b in (support.lower, support.upper))
-        limits = zip(t.components, lower, upper, strict=True)
-        return straight_function([_free(*b) for b in limits if b[0] in self.members], symbols)
-
-    def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
-        z = np.array([x for inverse in self.there for x in inverse(theta.tolist())])
-        if not np.all(np.isfinite(z)):
-            raise ValueError("a parameter lies on the edge of its support")
-        return z
 
     def _at(self, z: np.ndarray, rest: list[float]) -> tuple[float, ...]:
         """(value, gradient..., Hessian...); -inf for the value outside of the domain."""

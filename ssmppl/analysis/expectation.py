@@ -143,7 +143,8 @@ def unsuited(data: CompleteData, free: Sequence[Expr]) -> NotApplicable | None:
     Given the states, a deterministic law or a support that depends on a parameter determines it,
     or cuts it off, so that Q has no interior maximum.
     """
-    return degenerate(data, free) or restricted(data, free)
+    found = degenerate(data, free)
+    return found if found is not None else restricted(data, free)
 
 
 def moments_of(

@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
+from ssmppl.analysis.climber import Unconstrained
 from ssmppl.analysis.expectation import (
     IN_TIME,
     ExpectedDensity,
@@ -149,6 +150,7 @@ class ExactSteps:
         found = minimize(
             at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
             method="BFGS" if with_slope else "Nelder-Mead",
+            options={"gtol": 1e-9} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},
         )  # fmt: skip
         return chart.at(found.x).theta if found.fun <= before else theta
 
@@ -190,6 +192,8 @@ class _Climb:
     def __init__(self, setup: Setup, kalman: KalmanModel, method: EM):
         self.setup, self.kalman, self.method = setup, kalman, method
         self.map = ExactSteps(setup, kalman)
+        free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held]
+        self.to_z = Unconstrained(setup.problem.trace, free)
         self.theta = setup.space.parameters(setup.start)[0].copy()
         self.value = self.objective(self.theta)
         self.iterates = [self.theta]
@@ -242,12 +246,12 @@ class _Climb:
 
     def _cycle(self) -> float:
         """Two EM steps, and from them an extrapolated one; how far the limit seems to be."""
-        start = self.setup.space_at(self.theta)
+        start = self.to_z(self.theta)
         first = self._step(self.theta)
         self._take(first, self.objective(first))
         second = self._step(first)
         self._take(second, self.objective(second))
-        z1, z2 = self.setup.space_at(first), self.setup.space_at(second)
+        z1, z2 = self.to_z(first), self.to_z(second)
         r, v = z1 - start, (z2 - z1) - (z1 - start)
         left, size = float(np.linalg.norm(r)), float(np.linalg.norm(v))
         if left == 0.0:

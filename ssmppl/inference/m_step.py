@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from ssmppl.analysis.climber import Unconstrained
 from ssmppl.analysis.expectation import unsuited
 from ssmppl.analysis.mstep import MStep, counted, derive_m_step
 from ssmppl.analysis.sufficient import complete_data, restricted
@@ -195,7 +196,9 @@ class Pooled:
 
 def pool(setup: Setup, iterates: np.ndarray) -> Pooled:
     """The mean on the unconstrained scale of iterates (R, K, P), over K and over R."""
-    z = np.array([[setup.space_at(theta) for theta in chain] for chain in iterates])
+    free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held]
+    to_z = Unconstrained(setup.problem.trace, free)
+    z = np.array([[to_z(theta) for theta in chain] for chain in iterates])
     chains = len(z)
     means = z.mean(axis=1)
     point = setup.chart.at(means.mean(axis=0))
