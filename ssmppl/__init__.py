@@ -16,12 +16,16 @@ from ssmppl.inference.methods import (
     PMMH,
     PSAEM,
     DirectOptimization,
+    FFBSi,
+    FixedLag,
     Gibbs,
+    KalmanSmoother,
     MetropolisHastings,
     ParticleEM,
 )
 from ssmppl.inference.sample import sample
 from ssmppl.inference.simulation import simulate
+from ssmppl.inference.smooth import smooth
 from ssmppl.language.distributions import (
     Bernoulli,
     Beta,
@@ -72,6 +76,8 @@ __all__ = [
     "Dirichlet",
     "Evidence",
     "Exponential",
+    "FFBSi",
+    "FixedLag",
     "Flat",
     "Gamma",
     "Gibbs",
@@ -80,6 +86,7 @@ __all__ = [
     "HalfNormal",
     "InverseGamma",
     "InverseWishart",
+    "KalmanSmoother",
     "Laplace",
     "LogNormal",
     "MetropolisHastings",
@@ -106,5 +113,6 @@ __all__ = [
     "primitive",
     "sample",
     "simulate",
+    "smooth",
     "summary",
 ]

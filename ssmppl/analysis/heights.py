@@ -112,10 +112,10 @@ def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     if not isinstance(form, NotApplicable) and all(e.op == "const" and e.data == 0.0
                                                    for e in form[0].ravel()):  # fmt: skip
         width = array(form[1].reshape(width.shape))
-    width = _lowest(width, prev)
-    if width is None:
+    lowest = _lowest(width, prev)
+    if lowest is None:
         return NotApplicable(f"the width of {site.name} depends on the state before", d.location)
-    return array(np.sum(-array(ew("log", width))))[()]
+    return array(np.sum(-array(ew("log", lowest))))[()]
 
 
 def _lowest(spread: ExprArray, prev: Sequence[Expr]) -> ExprArray | None:

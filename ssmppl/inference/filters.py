@@ -79,7 +79,7 @@ def particle_filter(
         raise ArgumentError(
             'particle_filter with proposal="kalman"', fix="call ssm.kalman_filter instead"
         )
-    levels = _levels(quantiles)
+    levels = quantile_levels(quantiles)
     root = seed_sequence(seed)
 
     task = partial(_one_run, problem, theta, settings, levels, root)
@@ -156,7 +156,13 @@ def _predictions(
     }
 
 
-def _levels(quantiles: tuple[float, ...]) -> np.ndarray:
+def quantile_levels(quantiles: tuple[float, ...]) -> np.ndarray:
+    """Levels in increasing order, checked.
+
+    Raises
+    ------
+    ArgumentError : some level is not between 0 and 1.
+    """
     levels = np.asarray(sorted(quantiles), dtype=float)
     if levels.ndim != 1 or np.any((levels <= 0) | (levels >= 1)):
         raise ArgumentError(f"quantiles={quantiles!r}", fix="give levels between 0 and 1")
@@ -183,7 +189,7 @@ def kalman_filter(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
     settle(problem, theta, 1, "kalman")
-    levels = _levels(quantiles)
+    levels = quantile_levels(quantiles)
     attrs = {"model": problem.trace.name, "proposal": "kalman"}
     root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
     datasets = []

@@ -200,4 +200,85 @@ class PSAEM:
     chains: int = 8
 
 
+@dataclass(frozen=True)
+class ScoreAscent:
+    """Stochastic approximation on particle estimates of the score (Poyiadjis, Doucet and Singh
+    2011; Schön et al. 2015, section on marginalisation and its appendix).
+
+    Parameters
+    ----------
+    steps : "newton" takes steps scaled by an averaged estimate of the observed information, until
+        they are noise; then it averages further iterates, scores and informations, and stops when
+        the Monte Carlo error is small. "paper" takes steps gamma k^exponent times the score, for
+        the paper's transformed parameters (log, and atanh between bounds), without end but
+        `iterations`; from far away, or with a flat likelihood, they stop short of the maximum.
+    particles, trajectories, runs : N of the filter, M backward trajectories of each run, and
+        independent runs for each score; None: 500, 200 and 8, for "paper" 500, 100 and 1.
+    iterations : at most; None: 200, for "paper" 250.
+    tolerance : Monte Carlo error at which "newton" stops, as a share of the standard error.
+    gamma, exponent : the sequence of "paper".
+    proposal, kernel : of the filter and of the backward pass, as in `score`.
+    """
+
+    steps: str = "newton"
+    particles: int | None = None
+    trajectories: int | None = None
+    runs: int | None = None
+    iterations: int | None = None
+    tolerance: float = 0.05
+    gamma: float = 0.01
+    exponent: float = -2.0 / 3.0
+    proposal: str = "auto"
+    kernel: str = "auto"
+
+
 Method = MetropolisHastings | Gibbs | PMMH | PGAS
+
+
+@dataclass(frozen=True)
+class KalmanSmoother:
+    """Exact smoothing of linear Gaussian models: moments (Rauch, Tung and Striebel 1965), or
+    independent draws by backward sampling."""
+
+
+@dataclass(frozen=True)
+class FFBSi:
+    """Forward filtering, backward simulation: independent draws, given the filter's particles, from
+    the joint smoothing distribution (Godsill, Doucet and West 2004; Schön et al. 2015, section 5).
+
+    Parameters
+    ----------
+    kernel : how the index of x_t is drawn given x_{t+1}: "exact", with all N weights; "rejection",
+        the same law by rejection sampling with early stopping (Douc et al. 2011; Taghavi et al.
+        2013), where the transition density has a bound; "mcmc" (Bunch and Godsill 2013);
+        "genealogy", the filter's own ancestors, which all meet in one soon; "auto".
+    moves : Metropolis-Hastings steps for each index of "mcmc".
+    proposal, resampling, ess_threshold : of the particle filter, as in `log_likelihood`.
+    """
+
+    kernel: str = "auto"
+    moves: int = 20
+    proposal: str = "auto"
+    resampling: str = "systematic"
+    ess_threshold: float = 1.0
+
+
+@dataclass(frozen=True)
+class FixedLag:
+    """Marginal moments from the filter's genealogy: x_t as the particles of step t + lag remember
+    it (Kitagawa 1996). What later data tell of x_t is left out, which is a bias that falls with the
+    lag; with too long a lag, the genealogy has few distinct ancestors left.
+
+    Parameters
+    ----------
+    lag : number of steps; None: 20.
+    proposal, resampling, ess_threshold : of the particle filter, as in `log_likelihood`.
+    """
+
+    lag: int | None = None
+    proposal: str = "auto"
+    resampling: str = "systematic"
+    ess_threshold: float = 1.0
+
+
+SmoothingMethod = KalmanSmoother | FFBSi | FixedLag | PGAS

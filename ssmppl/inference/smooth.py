@@ -1,0 +1,319 @@
+"""The verb `smooth`: states given all of the data, at known parameters."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
+from ssmppl.errors import ArgumentError, NotApplicable, listing
+from ssmppl.inference import pgas
+from ssmppl.inference.backward import choose_kernel, draw_paths, particle_system
+from ssmppl.inference.filtering import FilterSettings, check_count, random_state, seed_sequence
+from ssmppl.inference.filters import LEVELS, quantile_levels
+from ssmppl.inference.fixed_lag import LAG, lag_moments
+from ssmppl.inference.kalman import KalmanModel, kalman_model
+from ssmppl.inference.likelihood import settle
+from ssmppl.inference.methods import PGAS, FFBSi, FixedLag, KalmanSmoother, SmoothingMethod
+from ssmppl.inference.pilot import space_of
+from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.proposal_choice import choose
+from ssmppl.inference.runner import run_chains
+from ssmppl.inference.sampling import Setup
+from ssmppl.language.model import Model
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+PARTICLES, TRAJECTORIES = 1000, 1000
+PGAS_WARMUP = 100  # sweeps that are dropped
+
+# what a method may be called by
+NAMES: dict[str, SmoothingMethod] = {
+    "kalman": KalmanSmoother(),
+    "ffbsi": FFBSi(),
+    "exact": FFBSi(kernel="exact"),
+    "rejection": FFBSi(kernel="rejection"),
+    "mcmc": FFBSi(kernel="mcmc"),
+    "genealogy": FFBSi(kernel="genealogy"),
+    "fixed_lag": FixedLag(),
+    "pgas": PGAS(),
+}
+
+
+def smooth(
+    model: Model,
+    data: Any,
+    parameters: Mapping[str, Any],
+    method: SmoothingMethod | str | None = None,
+    *,
+    particles: int | None = None,
+    trajectories: int | None = None,
+    quantiles: tuple[float, ...] = LEVELS,
+    seed: int | None = None,
+) -> xr.Dataset | list[xr.Dataset]:
+    """The states given all of the data, p(x_{1:T} | y_{1:T}, parameters).
+
+    Parameters
+    ----------
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    parameters : value of each parameter of the model, {} where it has none.
+    method : `ssm.KalmanSmoother()`, exact, for linear Gaussian models; `ssm.FFBSi(...)`, particles
+        with backward simulation; `ssm.PGAS(...)`, a Markov chain of conditional particle filters;
+        `ssm.FixedLag(...)`, marginal moments from the genealogy. Or one of the names "kalman",
+        "ffbsi", "exact", "rejection", "mcmc", "genealogy", "pgas", "fixed_lag". None: Kalman where
+        the model is linear and Gaussian, else FFBSi; the attribute `method_chosen` says why.
+    particles : number N; None: 1000, and for PGAS its own. An exact smoother, where `method` is
+        left to the model, does without. Moments have a bias of order 1 / N, but
+        those of PGAS, whose chain has the right law for every N >= 2.
+    trajectories : number M of draws; None: exact moments from the Kalman smoother, and 1000 draws
+        from FFBSi and PGAS.
+    quantiles : levels of the quantiles that go with moments.
+    seed : the same seed gives the same numbers; None: a random one.
+
+    Returns
+    -------
+    Dataset, or a list of them for several experiments
+        Draws: the states, dims (trajectory, time, ...), and over time `distinct`, how many values
+        the draws have at each step, and for FFBSi `ess`, of the filter.
+        Moments, dim `draw` of length 1: as of `kalman_filter`, ``x``, ``x_sd``, ``x_quantile`` and
+        ``covariance`` of all stacked components, but given all of the data; and
+        ``covariance_previous``, that of x_t (`state`) with x_{t-1} (`state_`), NaN in the first
+        row. For FixedLag also `distinct`, the ancestors that are left.
+        Attributes name method, settings, seed and the log-likelihood (exact, or the filter's
+        estimate).
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
+    SamplingError : weights vanish or are NaN; names the step, the user's line, the parameters.
+    """
+    began = time.perf_counter()
+    problem = pose(model, data)
+    theta = check_parameters(problem.trace, parameters)
+    chosen, why = _choose(problem, method)
+    levels = quantile_levels(quantiles)
+    root = seed_sequence(seed)
+    for name, value, least in (("particles", particles, 1), ("trajectories", trajectories, 1)):
+        if value is not None:
+            check_count(name, value, least)
+    call = _Call(problem, theta, particles, trajectories, levels, root)
+    if isinstance(chosen, KalmanSmoother):
+        found = _kalman(call, method)
+    elif isinstance(chosen, FFBSi):
+        found = _ffbsi(call, chosen)
+    elif isinstance(chosen, FixedLag):
+        found = _fixed_lag(call, chosen)
+    else:
+        found = _pgas(call, chosen)
+    attrs = {
+        "model": problem.trace.name, "method": type(chosen).__name__, "method_chosen": why,
+        "settings": asdict(chosen), "seed": str(root.entropy),
+        "seconds": time.perf_counter() - began,
+    }  # fmt: skip
+    datasets = [
+        _dataset(call, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
+    ]
+    return datasets if len(datasets) > 1 else datasets[0]
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A call of `smooth`, checked; None where the caller left a number to the method."""
+
+    problem: Problem
+    theta: np.ndarray
+    particles: int | None
+    trajectories: int | None
+    levels: np.ndarray
+    root: np.random.SeedSequence
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What a method gives for one experiment: draws (M, T, D), or moments; and its report.
+
+    moments : mean (T, D), covariance (T, D, D), cross (T, D, D), quantiles (T, P, D).
+    over_time : further variables (T,).
+    """
+
+    attrs: dict[str, Any]
+    paths: np.ndarray | None = None
+    moments: tuple[np.ndarray, ...] | None = None
+    over_time: Mapping[str, np.ndarray] | None = None
+
+
+def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
+    exact = kalman_model(problem.trace)
+    if method is None:
+        if isinstance(exact, KalmanModel):
+            return KalmanSmoother(), "automatically: the model is linear and Gaussian"
+        return FFBSi(), f"automatically: the model is not linear and Gaussian: {exact.reason}"
+    if isinstance(method, str):
+        if method not in NAMES:
+            raise ArgumentError(
+                f"method={method!r} is unknown", fix=f"use one of: {listing(method, NAMES)}"
+            )
+        method = NAMES[method]
+    if not isinstance(method, SmoothingMethod):
+        names = ", ".join(f"ssm.{t.__name__}(...)" for t in (KalmanSmoother, FFBSi, FixedLag, PGAS))
+        raise ArgumentError(
+            f"method={method!r} is no method of smoothing", fix=f"use {names}, a name, or None"
+        )
+    if isinstance(method, KalmanSmoother) and isinstance(exact, NotApplicable):
+        raise ArgumentError(
+            f"KalmanSmoother needs a linear Gaussian model: {exact.reason}",
+            fix="use ssm.FFBSi(...) or ssm.PGAS(...), or None, which picks by structure",
+            where=exact.where,
+        )
+    return method, "by the user"
+
+
+def _kalman(call: _Call, method: SmoothingMethod | str | None) -> list[_Found]:
+    """Exact moments, or exact draws."""
+    if call.particles is not None and method is not None:
+        raise ArgumentError(
+            f"particles={call.particles}: KalmanSmoother is exact and has none",
+            fix="leave particles= out, or use method=ssm.FFBSi()",
+        )
+    model = kalman_model(call.problem.trace)
+    assert isinstance(model, KalmanModel)
+    out = []
+    for i, e in enumerate(call.problem.experiments):
+        if call.trajectories is not None:
+            stream = random_state(call.root, i)
+            paths = model.draw(e, call.theta, stream, call.trajectories)
+            exact = model.log_likelihood([e], call.theta)
+            out.append(_Found({"log_likelihood": exact}, paths=paths))
+            continue
+        m = model.smooth(e, call.theta)
+        sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
+        spread = m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :]
+        moments = m.mean, m.covariance, m.cross, spread
+        out.append(_Found({"log_likelihood": m.log_likelihood}, moments=moments))
+    return out
+
+
+def _filter(call: _Call, method: FFBSi | FixedLag) -> FilterSettings:
+    """The filter's settings, "auto" resolved among the particle proposals."""
+    proposal = method.proposal
+    if proposal == "kalman":
+        raise ArgumentError(
+            f'{type(method).__name__}(proposal="kalman") has no particles',
+            fix="use ssm.KalmanSmoother(), or another proposal",
+        )
+    if proposal == "auto":
+        proposal = choose(call.problem, call.theta, kalman=False).name
+    n = PARTICLES if call.particles is None else call.particles
+    return settle(call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold)
+
+
+def _ffbsi(call: _Call, method: FFBSi) -> list[_Found]:
+    settings = _filter(call, method)
+    check_count("moves", method.moves, 0)
+    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
+    kernel, why = choose_kernel(call.problem, settings, draws, method.kernel)
+    out = []
+    for i, e in enumerate(call.problem.experiments):
+        stream = random_state(call.root, i)
+        system = particle_system(call.problem, call.theta, settings, e, stream)
+        paths = draw_paths(call.problem, call.theta, e, system, draws, stream, kernel, method.moves)
+        report = {
+            "particles": settings.particles, "proposal": settings.proposal, "kernel": kernel,
+            "kernel_chosen": why, "log_likelihood": system.log_Z,
+        }  # fmt: skip
+        over_time = {"distinct": _distinct(paths), "ess": system.ess}
+        out.append(_Found(report, paths=paths, over_time=over_time))
+    return out
+
+
+def _fixed_lag(call: _Call, method: FixedLag) -> list[_Found]:
+    if call.trajectories is not None:
+        raise ArgumentError(
+            f"trajectories={call.trajectories}: FixedLag knows marginals only, no joint law to "
+            "draw trajectories from",
+            fix="leave trajectories= out, or use ssm.FFBSi()",
+        )
+    settings = _filter(call, method)
+    lag = LAG if method.lag is None else method.lag
+    check_count("lag", lag, 0)
+    out = []
+    for i, e in enumerate(call.problem.experiments):
+        stream = random_state(call.root, i)
+        system = particle_system(call.problem, call.theta, settings, e, stream)
+        m = lag_moments(system, lag, call.levels)
+        report = {
+            "particles": settings.particles, "proposal": settings.proposal, "lag": lag,
+            "log_likelihood": system.log_Z,
+        }  # fmt: skip
+        moments = m.mean, m.covariance, m.cross, m.quantiles
+        over_time = {"distinct": m.distinct, "ess": system.ess}
+        out.append(_Found(report, moments=moments, over_time=over_time))
+    return out
+
+
+def _pgas(call: _Call, method: PGAS) -> list[_Found]:
+    """Successive trajectories of one chain at fixed parameters."""
+    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
+    if method.particles is None and call.particles is not None:
+        method = PGAS(call.particles, method.proposal)
+    held = unpack_parameters(call.problem.trace, call.theta)
+    space = space_of(call.problem, held, {})
+    setup = Setup(call.problem, space, held, 1, PGAS_WARMUP, 1, call.root)
+    sampler = pgas.prepare(setup, method)
+    (chain,) = run_chains(
+        sampler.step_block, sampler.states, draws, PGAS_WARMUP, progress=False
+    )  # fmt: skip
+    report = {k: sampler.report[k] for k in ("particles", "proposal", "ancestor_sampling")}
+    report |= {"warmup": PGAS_WARMUP, "update_rate": float(chain.stats["update_rate"].mean())}
+    report["trajectories_are"] = "successive draws of a Markov chain, correlated"
+    out = []
+    for i in range(len(call.problem.experiments)):
+        paths = chain.draws[f"path_{i}"]
+        out.append(_Found(report, paths=paths, over_time={"distinct": _distinct(paths)}))
+    return out
+
+
+def _distinct(paths: np.ndarray) -> np.ndarray:
+    """How many values x_t has among draws (M, T, D): (T,)."""
+    return np.array([len(np.unique(paths[:, t], axis=0)) for t in range(paths.shape[1])])
+
+
+def _dataset(
+    call: _Call, experiment: Experiment, found: _Found, attrs: dict[str, Any]
+) -> xr.Dataset:
+    trace = call.problem.trace
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
+    if found.paths is not None:
+        variables, sample_dim = dict(unpack_states(trace, found.paths)), "trajectory"
+    else:
+        assert found.moments is not None
+        sample_dim = "draw"
+        mean, covariance, cross, spread = (m[None] for m in found.moments)
+        cross = cross.copy()
+        cross[:, 0] = np.nan
+        variables = dict(unpack_states(trace, mean))
+        sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
+        variables |= {f"{n}_sd": v for n, v in unpack_states(trace, sd).items()}
+        variables |= {"covariance": covariance, "covariance_previous": cross}
+        dims = {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
+        coords["state"] = coords["state_"] = [repr(s) for s in trace.state_symbols]
+        if len(call.levels):
+            by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(call.levels))]
+            for name in by_level[0]:
+                variables[f"{name}_quantile"] = np.stack([q[name] for q in by_level], axis=-1)
+                own = [f"{name}_dim_{i}" for i in range(by_level[0][name].ndim - 2)]
+                dims[f"{name}_quantile"] = ["time", *own, "quantile"]
+            coords["quantile"] = call.levels
+    out = to_dataset(
+        variables, sample_dim=sample_dim, time=experiment.time, dims=dims, coords=coords,
+        attrs={**attrs, **found.attrs},
+    )  # fmt: skip
+    return out.assign({k: ("time", v) for k, v in (found.over_time or {}).items()})
