@@ -17,8 +17,9 @@ import numpy as np
 import ssmppl as ssm
 from ssmppl import demo as varves_demo
 from ssmppl.errors import DataError, SSMError
+from ssmppl.inference.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments, read_csv
-from ssmppl.results import save
+from ssmppl.results import save, state_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -199,8 +200,9 @@ def simulate(
 @MODEL
 @click.argument("data", nargs=-1, required=True, type=CSV, metavar="DATA.csv...")
 @click.option(
-    "--method", type=click.Choice(["pgas", "pmmh"], case_sensitive=False),
-    help="Particle Gibbs, or particle Metropolis-Hastings [default: chosen by the model].",
+    "--method", type=click.Choice(["mh", "gibbs", "pmmh", "pgas"], case_sensitive=False),
+    help="Exact likelihood and states, for linear Gaussian models: Metropolis-Hastings or Gibbs. "
+    "By particles: Metropolis-Hastings (pmmh) or Gibbs (pgas). [default: chosen by the model]",
 )  # fmt: skip
 @click.option("--particles", type=int, help="Number of particles [default: tuned].")
 @click.option("--draws", type=int, default=1000, show_default=True, help="Kept draws of a chain.")
@@ -238,14 +240,17 @@ def sample(
         ssmppl sample model.py data.csv -o posterior.nc
         ssmppl sample model.py day1.csv day2.csv --method pmmh --fixed mass=1.2 --seed 1
     """
-    if particles is not None and method is None:
+    by_particles: dict[str, Any] = {"pgas": ssm.PGAS, "pmmh": ssm.PMMH}
+    exact: dict[str, Any] = {"mh": ssm.MetropolisHastings, "gibbs": ssm.Gibbs}
+    name = method.lower() if method else ""
+    if particles is not None and name not in by_particles:
         raise click.UsageError("--particles needs --method pgas or --method pmmh.")
-    methods = {"pgas": ssm.PGAS, "pmmh": ssm.PMMH}
+    chosen: Any = by_particles[name](particles=particles) if name in by_particles else None
     loaded = load_model(model)
     idata = ssm.sample(
         loaded,
         _data(data),
-        methods[method.lower()](particles=particles) if method else None,
+        exact[name]() if name in exact else chosen,
         draws=draws,
         warmup=warmup,
         chains=chains,
@@ -263,11 +268,57 @@ def sample(
         click.echo(f"Interrupted: {kept} of {draws} draws of each chain are kept.", err=True)
     click.echo(
         f"{attrs['model']} by {attrs['method']} (chosen {attrs['method_chosen']}): "
-        f"{attrs['particles']} particles, {chains} chains of {kept} draws, "
-        f"{attrs['seconds']:.1f} s\n"
+        f"{_particles(attrs)}{chains} chains of {kept} draws, {attrs['seconds']:.1f} s\n"
     )
     click.echo(_rounded(ssm.summary(idata)))
     click.echo(f"\nWrote {target}")
+
+
+@main.command(cls=Command)
+@MODEL
+@click.argument("data", nargs=-1, required=True, type=CSV, metavar="DATA.csv...")
+@click.option("-p", "--parameters", multiple=True, metavar="NAME=VALUE...", help="The parameters.")
+@click.option(
+    "--method", type=click.Choice([*SMOOTHERS], case_sensitive=False),
+    help="How to smooth [default: exact by the Kalman smoother, else ffbsi].",
+)  # fmt: skip
+@click.option("--particles", type=int, help="Number of particles [default: 1000; pgas: 25].")
+@click.option("--trajectories", type=int, help="Draws [default: moments if exact, else 1000].")
+@SEED
+@_output("the name of the data file, with .nc", "netCDF file for the moments or draws.")
+def smooth(
+    model: str, data: tuple[Path, ...], parameters: tuple[str, ...], method: str | None,
+    particles: int | None, trajectories: int | None, seed: int | None, output: Path | None,
+) -> None:  # fmt: skip
+    """The states of MODEL.py given all of DATA.csv, at known parameters.
+
+    Prints means and standard deviations and writes them, or trajectories drawn from the joint
+    smoothing distribution, to a netCDF file, which xarray.open_dataset reads. Several CSV files
+    are several experiments, and each gets a file of its own, numbered in the order given.
+
+    \b
+        ssmppl smooth model.py data.csv -p phi=0.95 tau=47
+        ssmppl smooth model.py data.csv -p phi=0.95 tau=47 --method pgas --seed 1 -o states.nc
+    """
+    read = _data(data)
+    given = parse_assignments(parameters, "--parameters")
+    found = ssm.smooth(
+        load_model(model), read, given, method.lower() if method else None,
+        particles=particles, trajectories=trajectories, seed=seed,
+    )  # fmt: skip
+    datasets = found if isinstance(found, list) else [found]
+    target = output or Path(data[0].stem + ".nc")
+    for i, dataset in enumerate(datasets, start=1):
+        path = target if len(datasets) == 1 else target.with_stem(f"{target.stem}_{i}")
+        attrs = dataset.attrs
+        click.echo(f"{attrs['model']} by {attrs['method']} (chosen {attrs['method_chosen']}), "
+                   f"{attrs['seconds']:.1f} s\n")  # fmt: skip
+        click.echo(state_table(dataset).to_string(float_format="{:.4g}".format, max_rows=10))
+        click.echo(f"\nWrote {save(dataset, path)}")
+
+
+def _particles(attrs: dict[str, Any]) -> str:
+    return f"{attrs['particles']} particles, " if "particles" in attrs else ""
 
 
 def _data(paths: tuple[Path, ...]) -> pd.DataFrame | list[pd.DataFrame]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["arviz", "save", "summary", "to_dataset", "to_inference_data"]
+__all__ = ["arviz", "save", "state_table", "summary", "to_dataset", "to_inference_data"]
 
 SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
@@ -153,6 +153,28 @@ def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
         return pd.DataFrame(columns=SUMMARY_COLUMNS, dtype=float)
     table = arviz().summary(idata, var_names=names, round_to="none", kind="all")
     return pd.DataFrame(table)[SUMMARY_COLUMNS].astype(float)
+
+
+def state_table(dataset: xr.Dataset) -> pd.DataFrame:
+    """Mean and standard deviation of each state over time, of a result of `smooth`; time its rows.
+
+    From moments, dim `draw` of length 1, or over the dim `trajectory`.
+    """
+    import pandas as pd
+
+    columns: dict[str, np.ndarray] = {}
+    for name, variable in dataset.data_vars.items():
+        if variable.dims[:2] == ("trajectory", "time"):
+            mean, sd = variable.mean("trajectory").values, variable.std("trajectory", ddof=1).values
+        elif f"{name}_sd" in dataset:
+            mean, sd = variable.values[0], dataset[f"{name}_sd"].values[0]
+        else:
+            continue
+        for index in np.ndindex(*mean.shape[1:]):
+            label = "_".join(map(str, (name, *index)))
+            columns[f"{label} mean"] = mean[(slice(None), *index)]
+            columns[f"{label} sd"] = sd[(slice(None), *index)]
+    return pd.DataFrame(columns, index=pd.Index(dataset["time"].values, name="time"))
 
 
 def save(idata: Any, path: str | os.PathLike[str]) -> Path:

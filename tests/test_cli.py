@@ -11,6 +11,7 @@ import click.testing
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import ssmppl as ssm
 from ssmppl import cli
@@ -86,7 +87,7 @@ def run(*args, code=0):
 
 
 # -- help
-@pytest.mark.parametrize("command", ["", "demo", "explain", "simulate", "sample"])
+@pytest.mark.parametrize("command", ["", "demo", "explain", "simulate", "sample", "smooth"])
 def test_help_teaches_with_an_example(command):
     text = run(*filter(None, [command]), "--help").stdout
     assert f"ssmppl {command}".rstrip() in text
@@ -165,6 +166,33 @@ def test_simulate_takes_values_one_by_one_or_in_a_row(folder):
 def test_simulate_names_its_file_by_the_model(folder):
     run("simulate", "walk.py:walk", "--steps", 3, "--seed", 1)
     assert Path("walk.csv").exists()
+
+
+# -- smooth
+def test_smooth_writes_exact_moments_of_a_linear_model(folder):
+    run("simulate", "walk.py", "--steps", 30, "-p", "q=0.1", "--seed", 1, "-o", "sim.csv")
+    shown = run("smooth", "walk.py", "sim.csv", "-p", "q=0.1").stdout
+    assert "KalmanSmoother (chosen automatically" in shown
+    expected = ssm.smooth(cli.load_model("walk.py"), read_csv("sim.csv"), {"q": 0.1})
+    with xr.open_dataset("sim.nc", engine="h5netcdf") as written:
+        np.testing.assert_array_equal(written["x"], expected["x"])
+        assert f"{float(expected['x'][0, 0]):.4g}" in shown
+
+
+def test_smooth_writes_trajectories_of_each_experiment(folder):
+    run("simulate", "walk.py", "--steps", 6, "-p", "q=0.1", "--seed", 1, "-o", "a.csv")
+    run("simulate", "walk.py", "--steps", 4, "-p", "q=0.1", "--seed", 2, "-o", "b.csv")
+    words = ["-p", "q=0.1", "--method", "ffbsi", "--particles", 200, "--trajectories", 50]
+    shown = run("smooth", "walk.py", "a.csv", "b.csv", *words, "--seed", 3, "-o", "s.nc").stdout
+    assert shown.count("walk by FFBSi (chosen by the user)") == 2
+    read = [read_csv("a.csv"), read_csv("b.csv")]
+    expected = ssm.smooth(cli.load_model("walk.py"), read, {"q": 0.1}, "ffbsi", particles=200,
+                          trajectories=50, seed=3)  # fmt: skip
+    for i, one in enumerate(expected, start=1):
+        with xr.open_dataset(f"s_{i}.nc", engine="h5netcdf") as written:
+            np.testing.assert_array_equal(written["x"], one["x"])
+    fault = run("smooth", "walk.py", "a.csv", code=1).output
+    assert "no value is given for parameter 'q'" in fault
 
 
 # -- sample
