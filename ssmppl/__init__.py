@@ -22,8 +22,10 @@ from ssmppl.inference.methods import (
     KalmanSmoother,
     MetropolisHastings,
     ParticleEM,
+    ScoreAscent,
 )
 from ssmppl.inference.sample import sample
+from ssmppl.inference.score import score
 from ssmppl.inference.simulation import simulate
 from ssmppl.inference.smooth import smooth
 from ssmppl.language.distributions import (
@@ -99,6 +101,7 @@ __all__ = [
     "Poisson",
     "SSMError",
     "SamplingError",
+    "ScoreAscent",
     "StudentT",
     "Truncated",
     "Uniform",
@@ -112,6 +115,7 @@ __all__ = [
     "particle_filter",
     "primitive",
     "sample",
+    "score",
     "simulate",
     "smooth",
     "summary",

@@ -96,6 +96,18 @@ class Setup:
         moved = at(self.space, theta)
         return moved.z[moved.where]
 
+    def natural(self, z: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """(P, P) minus the second derivatives in theta, from those in z (F, F) at a maximum.
+
+        The gradient of the likelihood is zero there, or minus that of the log prior.
+        """
+        point = self.chart.at(z)
+        inverse = np.linalg.pinv(point.jacobian)
+        if self.with_prior:
+            slope = -inverse.T @ point.d_log_prior
+            information = information + self.chart.curvature(z, slope).theta
+        return inverse.T @ information @ inverse
+
     def _exact(self, z: np.ndarray) -> float:
         theta, log_prior = self.space.parameters(z)
         if log_prior == -np.inf or isinstance(self.kalman, NotApplicable):

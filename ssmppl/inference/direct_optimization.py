@@ -2,7 +2,7 @@
 
 Schön et al. (2015), section on direct optimisation. On linear Gaussian models the likelihood and
 its score come from the Kalman filter and its sensitivities, and Newton steps with the observed
-information polish the result.
+information polish the result; for one scalar state see `smooth_likelihood.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference import smooth_likelihood
 from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.filtering import check_count
 from ssmppl.inference.kalman import KalmanModel
@@ -35,9 +37,15 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
     check_count("averages", method.averages, 2)
     check_count("steps", method.steps, 1)
     if isinstance(setup.kalman, NotApplicable):
-        raise ArgumentError(
-            f"DirectOptimization does not apply: {setup.kalman}", fix="use another method"
-        )
+        reason = smooth_filter_applies(setup.problem.trace)
+        if reason is not None:
+            raise ArgumentError(
+                f"DirectOptimization needs a linear Gaussian model, or one scalar state: "
+                f"{setup.kalman.reason}; {reason.reason}",
+                fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
+                where=reason.where or setup.kalman.where,
+            )
+        return smooth_likelihood.climb(setup, method)
     return ExactClimb(setup, setup.kalman, method).run()
 
 

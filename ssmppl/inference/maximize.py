@@ -10,14 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference import direct_optimization, em, particle_em, psaem
+from ssmppl.inference import direct_optimization, em, particle_em, psaem, score_ascent
 from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.complete_score import complete_scores
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.filtering import FilterSettings, estimates_task, seed_sequence
 from ssmppl.inference.kalman import KalmanModel
-from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM
+from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
+from ssmppl.inference.particle_score import Smoothing, combine, several_runs
 from ssmppl.inference.pilot import space_of
 from ssmppl.inference.problem import pose
 from ssmppl.inference.proposal_choice import choose
@@ -30,9 +33,11 @@ CLIMBS: dict[type, Callable[[Setup, Any], Ascent]] = {
     EM: em.climb,
     ParticleEM: particle_em.climb,
     PSAEM: psaem.climb,
+    ScoreAscent: score_ascent.climb,
 }
 OBJECTIVES = ("likelihood", "posterior")
-PARTICLES, REPEATS = 1000, 16  # of the log-likelihood at the estimate
+PARTICLES, REPEATS = 1000, 16  # of the log-likelihood and the information at the estimate
+TRAJECTORIES = 1000
 
 
 def maximize(
@@ -135,7 +140,16 @@ def choose_method(setup: Setup) -> tuple[Any, str]:
             "automatically: the model is linear and Gaussian, so that its likelihood and score are "
             "exact"
         )
-    raise ArgumentError("no method", fix="give one")
+    reason = smooth_filter_applies(setup.problem.trace)
+    if reason is None:
+        return DirectOptimization(), (
+            "automatically: for one scalar state a particle filter's likelihood can be made "
+            "continuous in the parameters"
+        )
+    return ScoreAscent(), (
+        f"automatically: Fisher's identity gives the score by particle smoothing; direct "
+        f"optimisation does not apply: {reason.reason}"
+    )
 
 
 def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> float:
@@ -166,10 +180,13 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
     if not len(where):
         return nothing
     information = ascent.information
-    if information is None and not ascent.interrupted:
+    if information is None and ascent.interrupted:
+        attrs["covariance"] = "none: interrupted before the observed information was known"
+        return nothing
+    if information is None:
         information = _information(setup, ascent.theta)
     if information is None:
-        attrs["covariance"] = "none: interrupted before the observed information was known"
+        attrs["covariance"] = "none: no second derivatives of the log-likelihood"
         return nothing
     covariance = natural_covariance(setup, ascent.theta, information)
     if isinstance(covariance, NotApplicable):
@@ -182,7 +199,16 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
 def _information(setup: Setup, theta: np.ndarray) -> np.ndarray | None:
     if isinstance(setup.kalman, KalmanModel):
         return setup.kalman.information(setup.problem.experiments, theta)
-    return None
+    try:
+        scores = complete_scores(setup.problem, setup.held)
+        settings = FilterSettings(PARTICLES, choose(setup.problem, theta, kalman=False).name)
+        smoothing = Smoothing(settings, TRAJECTORIES)
+        runs = several_runs(
+            scores, theta, smoothing, True, setup.seed(2), range(REPEATS), setup.executor
+        )
+    except (ArgumentError, SamplingError):
+        return None
+    return combine(runs).information
 
 
 def natural_covariance(

@@ -225,7 +225,7 @@ class ScoreAscent:
     trajectories: int | None = None
     runs: int | None = None
     iterations: int | None = None
-    tolerance: float = 0.05
+    tolerance: float = 0.04
     gamma: float = 0.01
     exponent: float = -2.0 / 3.0
     proposal: str = "auto"

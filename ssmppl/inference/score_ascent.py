@@ -1,0 +1,294 @@
+"""Score ascent: stochastic approximation on particle estimates of the score.
+
+G. Poyiadjis, A. Doucet and S. S. Singh, "Particle approximations of the score and observed
+information matrix in state space models", *Biometrika* 98 (2011); Schön et al. (2015), appendix.
+The score is estimated by Fisher's identity over backward trajectories, the information by Louis'.
+
+Near the top z* the estimates are g_k = -I (z_k - z*) + noise, so that with averages over all runs
+at iterates z_k that are near it
+
+    z* = mean z_k + I^-1 mean g_k,   its Monte Carlo covariance I^-1 Cov(mean g_k) I^-1,
+
+whatever steps led there. The runs are weighted by their estimates of the likelihood, over those of
+the quadratic at z_k, which takes away the bias of order 1 / N (see `particle_score.py`). The steps
+are z_{k+1} = z_k + k^-0.6 B^-1 g_k, B an estimate of I, after D.
+Ruppert (1988), and B. T. Polyak and A. B. Juditsky, *SIAM J. Control Optim.* 30 (1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ssmppl.errors import ArgumentError, SamplingError, listing
+from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.complete_score import complete_scores
+from ssmppl.inference.filtering import check_count
+from ssmppl.inference.likelihood import settle
+from ssmppl.inference.methods import ScoreAscent
+from ssmppl.inference.particle_score import Run, Smoothing, combine, run_weights, several_runs
+from ssmppl.inference.progress import Progress
+from ssmppl.inference.proposal_choice import choose
+from ssmppl.language.transforms import transforms
+
+STEPS = ("newton", "paper")
+LONGEST = 0.5  # of a step, in each unconstrained number
+LEAST_INFORMATION = 0.02  # share of the complete data's information that B has at least
+MEMORY = 0.3  # weight of the newest information in B
+NEAR = 3.0  # squared length of a step, in noise, below which the approach is over
+LEAST_APPROACH, LEAST_AVERAGE = 3, 10  # iterations
+GAIN = 0.6
+
+
+@dataclass(frozen=True)
+class Slope:
+    """What is estimated at z, in z: gradient (F,), its noise, information and that of the complete
+    data (F, F); natural : the information in theta (P, P). each : (R, F) gradients of the runs, and
+    their log_z (R,).
+    """
+
+    z: np.ndarray
+    gradient: np.ndarray
+    each: np.ndarray
+    log_z: np.ndarray
+    noise: np.ndarray
+    information: np.ndarray
+    complete: np.ndarray
+    natural: np.ndarray
+
+
+@dataclass
+class _Way:
+    """How far a climb has come."""
+
+    iterates: list[np.ndarray] = field(default_factory=list)
+    near: list[Slope] = field(default_factory=list)
+    b: np.ndarray | None = None
+
+
+def climb(setup: Setup, method: ScoreAscent) -> Ascent:
+    """Maximise; see the module.
+
+    Raises
+    ------
+    ArgumentError : Fisher's identity does not hold in some parameter; a setting is out of range.
+    SamplingError : the particle filter fails where the climb begins.
+    """
+    if method.steps not in STEPS:
+        raise ArgumentError(
+            f"steps={method.steps!r}", fix=f"use one of: {listing(str(method.steps), STEPS)}"
+        )
+    paper = method.steps == "paper"
+    counts = {
+        "particles": method.particles or 500,
+        "trajectories": method.trajectories or (100 if paper else 200),
+        "runs": method.runs or (1 if paper else 8),
+        "iterations": method.iterations or (250 if paper else 200),
+    }
+    for name, value in counts.items():
+        check_count(name, value, 2 if name == "runs" and not paper else 1)
+    if not method.tolerance > 0.0:
+        raise ArgumentError(f"tolerance={method.tolerance!r}", fix="give a positive number")
+    scores = complete_scores(setup.problem, setup.held)
+    start = setup.start
+    theta, _ = setup.space.parameters(start)
+    proposal = method.proposal
+    if proposal == "auto":
+        proposal = choose(setup.problem, theta, kalman=False).name
+    settings = settle(setup.problem, theta, counts["particles"], proposal)
+    smoothing = Smoothing(settings, counts["trajectories"], method.kernel)
+
+    def runs(z: np.ndarray, k: int) -> list[Run]:
+        theta, log_prior = setup.space.parameters(z)
+        if log_prior == -np.inf:
+            raise SamplingError("the parameters left their support")
+        numbers = range(counts["runs"])
+        return several_runs(
+            scores, theta.copy(), smoothing, not paper, setup.seed(5, k), numbers, setup.executor
+        )
+
+    run = _paper if paper else _newton
+    with Progress(counts["iterations"], "ScoreAscent", shown=setup.progress) as bar:
+        ascent = run(setup, method, start, runs, counts["iterations"], bar)
+    ascent.report.update(counts | {"proposal": proposal})
+    if scores.differences:
+        ascent.report["central_differences"] = scores.differences
+    return ascent
+
+
+Runs = Callable[[np.ndarray, int], list[Run]]
+
+
+def _newton(
+    setup: Setup, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int, bar: Progress
+) -> Ascent:
+    way = _Way()
+    z, interrupted, share = np.array(start), False, np.inf
+    try:
+        for k in range(most):
+            z, slope = _safe_slope(setup, way, z, runs, k)
+            way.iterates.append(z)
+            way.b = _preconditioner(way.b, slope)
+            step = np.linalg.solve(way.b, slope.gradient)
+            noise = float(np.trace(np.linalg.solve(way.b, slope.noise)))
+            if way.near or (k >= LEAST_APPROACH and slope.gradient @ step < NEAR * noise + 1e-12):
+                way.near.append(slope)
+                step = step * len(way.near) ** -GAIN
+            z = z + np.clip(step, -LONGEST, LONGEST)
+            bar.advance(1, f"Monte Carlo error {share:.2g} of the standard error")
+            if len(way.near) >= LEAST_AVERAGE:
+                share = _average(way)[3]
+                if share < method.tolerance:
+                    break
+    except KeyboardInterrupt:
+        if not way.iterates:
+            raise
+        interrupted = True
+    return _answer(setup, method, way, share, interrupted)
+
+
+def _safe_slope(
+    setup: Setup, way: _Way, z: np.ndarray, runs: Runs, k: int
+) -> tuple[np.ndarray, Slope]:
+    """(z, slope there); where the filter fails, at a point on the way back to the last iterate."""
+    for _ in range(6):
+        try:
+            return z, _slope(setup, z, runs(z, k))
+        except SamplingError:
+            if not way.iterates:
+                raise
+            z = 0.5 * (z + way.iterates[-1])
+    z = way.iterates[-1]
+    return z, _slope(setup, z, runs(z, k))
+
+
+def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
+    point, found = setup.chart.at(z), combine(runs)
+    j = point.jacobian
+    log_z = np.array([r.log_z for r in runs])
+    w = run_weights(log_z)
+    each = point.pull(np.stack([r.mean for r in runs]))
+    hessian = np.tensordot(w, np.stack([r.hessian for r in runs if r.hessian is not None]), axes=1)
+    second = setup.chart.curvature(z, found.gradient)
+    gradient, prior = point.pull(found.gradient), np.zeros_like(second.theta)
+    if setup.with_prior:
+        gradient, prior = gradient + point.d_log_prior, second.log_prior
+        each = each + point.d_log_prior
+    natural = found.information if found.information is not None else np.zeros_like(hessian)
+    rest = -second.theta - prior
+    return Slope(
+        z, gradient, each, log_z, j.T @ found.gradient_covariance @ j,
+        j.T @ natural @ j + rest, -j.T @ hessian @ j + rest, natural,
+    )  # fmt: skip
+
+
+def _preconditioner(b: np.ndarray | None, slope: Slope) -> np.ndarray:
+    """B with the newest information in it, positive definite: between a share of the complete
+    data's information and the whole of it, in every direction."""
+    complete = _positive(slope.complete)
+    new = slope.information if b is None else (1.0 - MEMORY) * b + MEMORY * slope.information
+    values, vectors = eigh(0.5 * (new + new.T), complete)
+    values = np.clip(values, LEAST_INFORMATION, 1.0)
+    back = complete @ vectors
+    return (back * values) @ back.T
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """The symmetric matrix with its eigenvalues' absolute values, none next to zero."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    values = np.maximum(np.abs(values), 1e-8 * max(float(np.abs(values).max()), 1e-8))
+    return (vectors * values) @ vectors.T
+
+
+def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """(top, Monte Carlo covariance, information, largest error in standard errors), in z."""
+    information = np.mean([s.information for s in way.near], axis=0)
+    complete = _positive(np.mean([s.complete for s in way.near], axis=0))
+    values, vectors = eigh(0.5 * (information + information.T), complete)
+    back = complete @ vectors
+    usable = (back * np.maximum(values, LEAST_INFORMATION)) @ back.T
+    inverse = np.linalg.inv(usable)
+    z = np.repeat([s.z for s in way.near], [len(s.each) for s in way.near], axis=0)
+    g, log_z = (
+        np.concatenate([s.each for s in way.near]),
+        np.concatenate([s.log_z for s in way.near]),
+    )
+    tops = z + g @ inverse  # where each run sees the top
+    off = z - tops.mean(axis=0)
+    w = run_weights(log_z + 0.5 * np.einsum("ki,ij,kj->k", off, usable, off))
+    rest = w[:, None] * (tops - w @ tops)
+    error = rest.T @ rest * len(w) / (len(w) - 1)
+    share = float(np.sqrt(np.max(np.diagonal(error) / np.diagonal(inverse))))
+    middle = w @ z
+    return middle + np.clip(w @ tops - middle, -LONGEST, LONGEST), error, usable, share
+
+
+def _answer(
+    setup: Setup, method: ScoreAscent, way: _Way, share: float, interrupted: bool
+) -> Ascent:
+    iterates = np.array([setup.space.parameters(z)[0].copy() for z in way.iterates])
+    converged = share < method.tolerance
+    report = {
+        "converged": converged, "averaged_iterates": len(way.near),
+        "monte_carlo_share": share if np.isfinite(share) else None,
+        "stopped": "" if converged else "the iterations are used up",
+    }  # fmt: skip
+    if len(way.near) < 2:
+        theta = iterates[-1]
+        return Ascent(theta, None, iterates, report, interrupted=interrupted)
+    top, error, _, _ = _average(way)
+    point = setup.chart.at(top)
+    natural = np.mean([s.natural for s in way.near], axis=0)
+    return Ascent(
+        point.theta, None, iterates, report, natural,
+        point.jacobian @ error @ point.jacobian.T, interrupted,
+    )  # fmt: skip
+
+
+def _paper(
+    setup: Setup, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int, bar: Progress
+) -> Ascent:
+    metric = paper_metric(setup)
+    way, z, interrupted = _Way([np.array(start)]), np.array(start), False
+    try:
+        for k in range(1, most + 1):
+            point = setup.chart.at(z)
+            batch = runs(z, k)
+            gradient = point.pull(np.mean([r.mean for r in batch], axis=0))
+            if setup.with_prior:
+                gradient = gradient + point.d_log_prior
+            z = z + method.gamma * k**method.exponent * metric * gradient
+            way.iterates.append(z)
+            bar.advance(1)
+    except KeyboardInterrupt:
+        if len(way.iterates) < 2:
+            raise
+        interrupted = True
+    iterates = np.array([setup.space.parameters(z)[0].copy() for z in way.iterates])
+    report = {"converged": False, "stopped": "this sequence of steps has no rule to stop"}
+    return Ascent(iterates[-1], None, iterates, report, interrupted=interrupted)
+
+
+def paper_metric(setup: Setup) -> np.ndarray:
+    """(F,) what turns a step in z into one of the paper's parameters: 4 for a logit, else 1.
+
+    A logit is twice the paper's atanh, whose gradient is twice that in the logit.
+    """
+    out: list[float] = []
+    for t, free in zip(transforms(setup.problem.trace), setup.space.free, strict=True):
+        if free:
+            support = t.site.distribution.support()
+            logit = [
+                support.kind == "interval" and _finite(a) and _finite(b)
+                for a, b in zip(support.lower.ravel(), support.upper.ravel(), strict=True)
+            ]
+            out += [4.0 if two else 1.0 for two in logit][: len(t.free)] or [1.0] * len(t.free)
+            out += [1.0] * (len(t.free) - len(logit))
+    return np.array(out)
+
+
+def _finite(bound: object) -> bool:
+    return not (getattr(bound, "op", "") == "const" and np.isinf(getattr(bound, "data", 0.0)))
