@@ -301,9 +301,11 @@ def _dataset(
         cross[:, 0] = np.nan
         variables = dict(unpack_states(trace, mean))
         sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
-        variables |= {f"{n}_sd": v for n, v in unpack_states(trace, sd).items()}
+        for n, v in unpack_states(trace, sd).items():
+            variables[f"{n}_sd"] = v
+            dims[f"{n}_sd"] = ["time", *(f"{n}_dim_{i}" for i in range(v.ndim - 2))]
         variables |= {"covariance": covariance, "covariance_previous": cross}
-        dims = {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
+        dims |= {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
         coords["state"] = coords["state_"] = [repr(s) for s in trace.state_symbols]
         if len(call.levels):
             by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(call.levels))]
