@@ -10,21 +10,29 @@ def test_names_are_the_loaders():
 
 
 @pytest.mark.parametrize(
-    ("name", "length"), [("ice_varves", 634), ("lgss_appendix", 100), ("lgss_main_text", 100)]
-)
-def test_series_are_finite_float_arrays(name, length):
+    ("name", "length", "first"),
+    [("ice_varves", 634, 0), ("lgss_appendix", 100, 0), ("lgss_main_text", 100, 0),
+     ("nile", 100, 1871)],
+)  # fmt: skip
+def test_series_are_finite_float_arrays(name, length, first):
     y = getattr(datasets, name)()
     assert y.shape == (length,)
     assert y.dtype == np.float64
     assert np.isfinite(y).all()
     assert datasets.load(name)["y"].tolist() == y.tolist()
-    assert datasets.load(name)["time"].tolist() == list(range(length))
+    assert datasets.load(name)["time"].tolist() == list(range(first, first + length))
 
 
 def test_first_and_last_varves():
     y = datasets.ice_varves()
     assert y[:2].tolist() == [26.28, 27.42]
     assert (y > 0).all()
+
+
+def test_the_nile_is_the_published_series():
+    nile = pytest.importorskip("statsmodels.datasets.nile").load_pandas().data
+    assert datasets.nile().tolist() == nile["volume"].tolist()
+    assert datasets.load("nile")["time"].tolist() == nile["year"].tolist()
 
 
 def test_loaded_arrays_belong_to_the_caller():

@@ -21,7 +21,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
 from ssmppl.analysis.laplace import NEWTON_STEPS, gaussian_fit
-from ssmppl.analysis.structure import GaussianBlock, affine_observation, gaussian_block
+from ssmppl.analysis.structure import GaussianBlock, affine_observation, flat_start, gaussian_block
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
@@ -74,14 +74,21 @@ def bootstrap(trace: Trace, missing: Missing) -> Proposal:
 def _draws(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
     out: dict[Expr, Expr] = {}
     for site in sites:
-        with attributed(trace.locations, site.distribution.location):
-            sample = array(site.distribution.sample(Draws(site.name)))
+        law = site.distribution
+        with attributed(trace.locations, law.location):
+            # of a flat law NaN, for code that is never run: no algorithm starts from it
+            sample = array(law.sample(Draws(site.name)) if law.proper else law.mean())
         out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
     return out
 
 
 def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:
     """All proposals by name: "bootstrap", "guided", "auxiliary", and the user's own."""
+    flat = flat_start(trace)
+    if flat:
+        reason = f"the initial law of {flat[0].name!r} is Flat: no particle can be drawn from it"
+        names = ("bootstrap", "guided", "auxiliary", *(["user"] if trace.proposal else []))
+        return dict.fromkeys(names, NotApplicable(reason, flat[0].distribution.location))
     found: dict[str, Proposal | NotApplicable] = {"bootstrap": bootstrap(trace, missing)}
     if trace.proposal:
         found["user"] = _user(trace, missing)

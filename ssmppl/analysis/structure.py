@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ModelError, NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, constant, depends_on, symbols_of
-from ssmppl.language.distributions import Dirac, MvNormal, Normal
+from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace, previous
 
 
@@ -107,7 +107,7 @@ class LinearGaussian:
     """x_1 ~ N(m, P), x_t = A x_{t-1} + b + N(0, Q), y_t = C x_t + d + N(0, R); x in trace order.
 
     Entries may depend on theta, inputs, time and (in A, b, Q) on y_{t-1}; Q and P may be singular
-    (Dirac components).
+    (Dirac components). flat : components of x_1 whose law is Flat; zero in m and P.
     """
 
     m: ExprArray
@@ -118,6 +118,7 @@ class LinearGaussian:
     C: ExprArray
     d: ExprArray
     R: ExprArray
+    flat: tuple[int, ...] = ()
 
 
 def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
@@ -142,25 +143,28 @@ def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
     observation = affine_observation(list(trace.observations.values()), states)
     if isinstance(observation, NotApplicable):
         return observation
+    flat = {s for site in flat_start(trace) for s in site.components}
     return LinearGaussian(
         m, p, form[0], form[1], q,
         observation.matrix, observation.offset, observation.covariance,
+        tuple(i for i, s in enumerate(states) if s in flat),
     )  # fmt: skip
 
 
 def _gaussian_law(
     role: str, sites: list[Site], states: list[Expr]
 ) -> tuple[ExprArray | NotApplicable, ExprArray]:
-    """Mean and covariance over `states`, Dirac components with zero variance."""
+    """Mean and covariance over `states`; Dirac components with zero variance, Flat ones zero."""
     zero = constant(0.0)
     n = len(states)
     place = {s: i for i, s in enumerate(states)}
     mean = np.empty(n, dtype=object)
+    mean[...] = [zero] * n
     covariance = np.empty((n, n), dtype=object)
     covariance[...] = [[zero] * n] * n
     for site in sites:
         d = site.distribution
-        if not isinstance(d, (Normal, MvNormal, Dirac)):
+        if not isinstance(d, (Normal, MvNormal, Dirac)) and type(d) is not Flat:
             reason = f"the {role} law of {site.name} is {type(d).__name__}"
             return NotApplicable(reason, d.location), array(covariance)
     block = gaussian_block(sites)
@@ -171,6 +175,29 @@ def _gaussian_law(
     for site in deterministic(sites):
         mean[[place[s] for s in site.value.ravel()]] = list(array(site.distribution.mean()).ravel())
     return array(mean), array(covariance)
+
+
+def flat_start(trace: Trace) -> list[Site]:
+    """The states that have no proper initial law."""
+    return [s for s in trace.initial.values() if isinstance(s.distribution, Flat)]
+
+
+def check_start(trace: Trace) -> None:
+    """Refuse flat initial laws but in a linear Gaussian model, where there is an exact answer.
+
+    Raises
+    ------
+    ModelError : naming the state, the line, and why the model is not linear and Gaussian.
+    """
+    flat = flat_start(trace)
+    reason = linear_gaussian(trace) if flat and trace.observations else None
+    if isinstance(reason, NotApplicable):
+        raise ModelError(
+            f"the initial law of {flat[0].name!r} is Flat, which only a linear Gaussian model may "
+            f"have, and this one is none: {reason}",
+            fix="give it a proper law; a vague one is one of large spread",
+            where=flat[0].distribution.location,
+        )
 
 
 def deterministic_memory(trace: Trace) -> int | None:

@@ -18,7 +18,7 @@ from typing import Any
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.proposals import Proposal, bootstrap, derive
-from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
 from ssmppl.codegen.kernels.backward_pairs import (
@@ -82,10 +82,16 @@ _MOST_PROGRAMS = 64
 
 
 def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
-    """Generate, write and import the module of a traced model, once per trace."""
+    """Generate, write and import the module of a traced model, once per trace.
+
+    Raises
+    ------
+    ModelError : a state has a flat initial law, and the model is not linear and Gaussian.
+    """
     key = id(trace), missing
     program = _programs.get(key)
     if program is None:
+        check_start(trace)
         proposals = derive(trace, missing)
         text = _write(trace, missing, proposals)
         module = cache.load(identifier(trace.name), text)

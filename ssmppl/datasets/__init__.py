@@ -10,7 +10,7 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
 
-__all__ = ["ice_varves", "lgss_appendix", "lgss_main_text", "load", "names"]
+__all__ = ["ice_varves", "lgss_appendix", "lgss_main_text", "load", "names", "nile"]
 
 
 def names() -> tuple[str, ...]:
@@ -60,3 +60,13 @@ def lgss_appendix() -> np.ndarray:
     As `lgss_main_text`, with y_t = x_t + N(0, 0.1), as in the appendix of Schön et al. (2015).
     """
     return load("lgss_appendix")["y"]
+
+
+def nile() -> np.ndarray:
+    """Annual flow of the Nile at Aswan from 1871 to 1970, in 10^8 m^3, shape (100,).
+
+    Cobb, *Biometrika* 65 (1978); the local level model of Durbin and Koopman, *Time Series Analysis
+    by State Space Methods*, chapter 2. The first dam at Aswan was begun in 1898. The years are the
+    column `time` of `load("nile")`.
+    """
+    return load("nile")["y"]

@@ -202,7 +202,8 @@ def kalman_filter(
 def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> FilterRun:
     """Exact moments in the form of a particle filter's."""
     sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
-    quantiles = exact.mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
+    with np.errstate(invalid="ignore"):  # nothing is known yet of a flat component
+        quantiles = exact.mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
     variance = np.diagonal(exact.observation_covariance, axis1=1, axis2=2)
     below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
     prediction = np.stack([exact.observation_mean, variance, below, below], axis=1)

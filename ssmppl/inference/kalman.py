@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference import kalman_matrices
 from ssmppl.inference.differences import observed_information
+from ssmppl.inference.kalman_diffuse import check_agreement, diffuse_filter, start_of
 from ssmppl.inference.kalman_moments import (
     Disturbances,
     SmoothedMoments,
@@ -78,7 +79,14 @@ class KalmanModel:
         return kalman_matrices.matrices(self.trace, self.form, experiment, theta)
 
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
-        """log p(y | theta), summed over experiments; -inf where it does not exist at theta."""
+        """log p(y | theta), summed over experiments; -inf where it does not exist at theta.
+
+        A Flat component of x_1 counts with density 1.
+
+        Raises
+        ------
+        SamplingError : the data do not tell the start of a Flat component.
+        """
         d, k = len(self.trace.state_symbols), len(self.trace.observation_symbols)
         nothing = (
             np.empty((0, d)), np.empty((0, d, d)), np.empty((0, d)), np.empty((0, d, d)),
@@ -86,13 +94,22 @@ class KalmanModel:
         )  # fmt: skip
         total = 0.0
         for e in experiments:
-            increments = np.empty(e.steps)
-            kernel.kalman_filter(*self.matrices(e, theta), e.y, e.seen, increments, *nothing)
+            model, increments = self.matrices(e, theta), np.empty(e.steps)
+            if self.form.flat:
+                try:
+                    total += start_of(self.trace, self.form.flat, model, e).log_density(np.nan)
+                except Stopped:
+                    return -np.inf
+                continue
+            kernel.kalman_filter(*model, e.y, e.seen, increments, *nothing)
             total += float(increments.sum())
         return total
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> KalmanMoments:
         """The filter's moments and predictions.
+
+        While the data do not tell a Flat component of x_1, what depends on it has variance inf and
+        mean NaN; the increments of the log-likelihood of those steps have a meaning in sum only.
 
         Raises
         ------
@@ -106,11 +123,14 @@ class KalmanModel:
             np.empty((steps, d)), np.empty((steps, d, d)),
             np.empty((steps, k)), np.empty((steps, k, k)),
         )  # fmt: skip
-        status, t = kernel.kalman_filter(
-            *self.matrices(experiment, theta), experiment.y, experiment.seen,
-            out.log_increments, out.mean, out.covariance, out.mean_predicted,
-            out.covariance_predicted, out.observation_mean, out.observation_covariance,
-        )  # fmt: skip
+        model, arrays = self.matrices(experiment, theta), vars(out).values()
+        if self.form.flat:
+            try:
+                diffuse_filter(model, self.form.flat, experiment, *arrays)
+            except Stopped as stop:
+                raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
+            return out
+        status, t = kernel.kalman_filter(*model, experiment.y, experiment.seen, *arrays)
         if status != kernel.OK:
             raise kalman_matrices.failure(self.trace, theta, status, t)
         return out
@@ -148,9 +168,12 @@ class KalmanModel:
         """
         model = self.matrices(experiment, theta)
         try:
-            return drawn(model, self._start(model), experiment, stream, draws)
+            start = start_of(self.trace, self.form.flat, model, experiment)
+            log_given, out = drawn(model, start.columns, experiment, stream, draws)
         except Stopped as stop:
             raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
+        check_agreement(self.trace, start, log_given)
+        return out
 
     def score(
         self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
@@ -171,10 +194,12 @@ class KalmanModel:
         for e in experiments:
             model = self.matrices(e, theta)
             try:
-                value, slope = score(self.trace, found, model, self._start(model), e, theta)
+                start = start_of(self.trace, self.form.flat, model, e)
+                log_given, slope = score(self.trace, found, model, start.columns, e, theta)
             except Stopped:
                 return -np.inf, np.where(wanted, np.nan, 0.0)
-            total, gradient = total + value, gradient + slope
+            check_agreement(self.trace, start, log_given)
+            total, gradient = total + start.log_density(log_given), gradient + slope
         return total, np.where(wanted, gradient, 0.0)
 
     def information(
@@ -207,13 +232,12 @@ class KalmanModel:
     ) -> tuple[SmoothedMoments, Disturbances | None]:
         model = self.matrices(experiment, theta)
         try:
-            return smoothed(model, self._start(model), experiment, noises)
+            start = start_of(self.trace, self.form.flat, model, experiment)
+            found, noise = smoothed(model, start.columns, experiment, noises)
         except Stopped as stop:
             raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
-
-    def _start(self, model: Matrices) -> np.ndarray:
-        """The mean of x_1 (D, 1)."""
-        return model.m[:, None].copy()
+        check_agreement(self.trace, start, found.log_likelihood)
+        return replace(found, log_likelihood=start.log_density(found.log_likelihood)), noise
 
 
 _forms: dict[int, tuple[weakref.ref[Trace], LinearGaussian | NotApplicable]] = {}

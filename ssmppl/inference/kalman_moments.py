@@ -76,8 +76,8 @@ def smoothed(
 
 def drawn(
     model: Matrices, start: np.ndarray, experiment: Experiment, stream: np.ndarray, draws: int
-) -> np.ndarray:
-    """Draws (draws, T, D) from p(x_{1:T} | y_{1:T}); stream is advanced in place."""
+) -> tuple[float, np.ndarray]:
+    """Log density of column 0, and draws (draws, T, D) from p(x_{1:T} | y_{1:T})."""
     steps = experiment.steps
     out, increments = np.empty((draws, steps, len(model.m))), np.empty(steps)
     status, t = exact_entry("draw")(
@@ -85,4 +85,4 @@ def drawn(
     )
     if status != OK:
         raise Stopped(status, t)
-    return out
+    return float(increments.sum()), out

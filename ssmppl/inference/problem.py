@@ -10,6 +10,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
@@ -39,10 +40,10 @@ class Problem:
                 fix=f"use one of: {listing(name, ['auto', 'kalman', *self.program.proposals])}",
             )
         if isinstance(found, NotApplicable):
-            raise ArgumentError(
-                f"proposal={name!r} does not apply: {found}",
-                fix='use proposal="auto" or "bootstrap"',
-            )
+            fix = 'use proposal="auto" or "bootstrap"'
+            if flat_start(self.trace):
+                fix = "use an exact method, or give the state a proper law in @initial"
+            raise ArgumentError(f"proposal={name!r} does not apply: {found}", fix=fix)
         return found
 
 

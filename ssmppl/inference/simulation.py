@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing
+from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.program import compile_trace
 from ssmppl.data import (
     bind_inputs,
@@ -16,7 +17,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
-from ssmppl.errors import SamplingError
+from ssmppl.errors import ModelError, SamplingError
 from ssmppl.expressions.expr import topological
 from ssmppl.inference.filtering import (
     check_count,
@@ -61,6 +62,12 @@ def simulate(
     ModelError, DataError, ArgumentError : what is wrong with model, inputs or call, and the fix.
     """
     traced = trace(model)
+    for site in flat_start(traced):
+        raise ModelError(
+            f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
+            fix="give it a proper law in @initial to simulate",
+            where=site.distribution.location,
+        )
     u, steps, time = bind_inputs(traced, inputs, steps)
     check_count("draws", draws, 1)
     root = seed_sequence(seed)

@@ -94,10 +94,13 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             fix="make it a state with a Dirac transition, or compare models",
             where=where,
         )
-    if role != "prior" and improper:
+    allowed = role == "prior" or (role == "initial" and kind == "Flat")
+    if improper and not allowed:
         raise ModelError(
             f"the law of {name!r} is {kind}, which is improper",
-            fix=f"use {kind} as a prior only; a vague law is one of large spread",
+            fix=f"use {kind} as a prior only"
+            + (", and in @initial of a linear Gaussian model" if kind == "Flat" else "")
+            + "; a vague law is one of large spread",
             where=where,
         )
     if role == "observation" and isinstance(distribution, Dirac):
