@@ -211,6 +211,8 @@ QUICK = ("--draws", 30, "--warmup", 10, "--chains", 2, "--seed", 1)
         [],
         ["--method", "pgas", "--particles", 5],
         ["--method", "PMMH", "--particles", 20, "--no-states"],
+        ["--method", "gibbs"],
+        ["--method", "mh"],
     ],
 )
 def test_sample_writes_draws_and_prints_a_table(series, method):
@@ -219,7 +221,8 @@ def test_sample_writes_draws_and_prints_a_table(series, method):
     posterior = idata["posterior"]
     assert posterior["q"].shape == (2, 30)
     assert ("x" in posterior) == ("--no-states" not in method)
-    assert posterior.attrs["method"] == (method[1].upper() if method else "PGAS")
+    expected = {"pgas": "PGAS", "PMMH": "PMMH", "mh": "MetropolisHastings"}
+    assert posterior.attrs["method"] == expected.get(method[1] if method else "", "Gibbs")
     table = result.stdout
     assert "r_hat" in table
     assert "\nq " in table
@@ -351,7 +354,7 @@ def test_a_model_file_may_import_its_neighbours(folder):
     ("args", "code", "found"),
     [
         (["--particles", "5"], 2, "--particles needs --method"),
-        (["--method", "nuts"], 2, "'pgas', 'pmmh'"),
+        (["--method", "nuts"], 2, "'pmmh', 'pgas'"),
         (["--fixed", "q"], 1, "not of the form name=value"),
         (["--fixed", "p=1"], 1, "'p'"),
         (["--fixed", "q=abc"], 1, "no number"),

@@ -14,6 +14,7 @@ from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, line
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.method_choice import choose_sampler
 from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
@@ -55,6 +56,8 @@ class Plan:
         out.append(("Structure", self._structure()))
         out.append(("Particle filter", [self._proposal(n, p) for n, p in self.proposals.items()]))
         out.append(("Trajectories", [("PGAS", self._trajectories())]))
+        method, why = choose_sampler(self.structure, self.updates)
+        out.append(("Posterior", [("sample", f"{type(method).__name__}: {why}")]))
         if self.updates:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
         return [(title, rows) for title, rows in out if rows]

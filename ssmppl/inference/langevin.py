@@ -22,7 +22,7 @@ from ssmppl.inference.coordinates import Coordinates, chart
 from ssmppl.inference.walk import ADAPTATION_POWER, Point, Run
 
 LEAST, MOST = 0.2, 5.0  # eigenvalues of the information, in units of the pilot's
-LONGEST = 2.0  # of the drift, in standard deviations of the step
+LONGEST = 1.0  # of the drift, in standard deviations of the step
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.data import check_values, unpack_parameters, unpack_states
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference import gibbs, metropolis, pgas, pmmh
 from ssmppl.inference.filtering import check_count, seed_sequence
+from ssmppl.inference.method_choice import choose_sampler
 from ssmppl.inference.methods import PGAS, PMMH, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.parameter_steps import plan_updates
 from ssmppl.inference.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import ChainDraws, run_chains, stack
@@ -51,8 +54,13 @@ def sample(
     ----------
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
-    method : `ssm.PMMH(...)` or `ssm.PGAS(...)`; None: PGAS, which is told in the attributes.
-    draws, warmup, chains : kept draws and dropped ones of each chain. PMMH adapts during warmup.
+    method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models,
+        `ssm.PMMH(...)` or `ssm.PGAS(...)` for all. None: for linear Gaussian models Gibbs if every
+        parameter has a closed-form conditional, else a random walk on the exact likelihood while
+        the parameters are few; for the others PGAS. `explain` and the attributes say which, and
+        why.
+    draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
+        warmup.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
         there.
     fixed : parameters held at these values.
@@ -68,8 +76,9 @@ def sample(
         Groups:
 
         * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
-        * sample_stats: lp, acceptance_rate, and log_likelihood (PMMH: the estimate at the draw) or
-          update_rate and ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
+        * sample_stats: lp, acceptance_rate, and log_likelihood (MetropolisHastings: exact; PMMH:
+          the estimate at the draw) or update_rate and ess (PGAS: share of the trajectory that a
+          sweep changed, ESS / N);
         * log_likelihood (PMMH; PGAS on request): log p(y_t | y_1:t-1, theta), for
           leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
         * observed_data, constant_data (inputs).
@@ -88,7 +97,7 @@ def sample(
     problem = pose(model, data)
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
-    chosen = PGAS() if method is None else method
+    chosen, reason = (method, "") if method is not None else _chosen(problem, held)
     prepare = PREPARE.get(type(chosen))
     if prepare is None:
         raise ArgumentError(
@@ -106,12 +115,19 @@ def sample(
         "model": problem.trace.name,
         "method": type(chosen).__name__,
         "method_chosen": "by the user" if method is not None else "automatically",
+        **({"method_reason": reason} if reason else {}),
         **sampler.report,
         "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
         "interrupted": any(c.interrupted for c in result),
         "seconds": time.perf_counter() - began,
     }  # fmt: skip
     return _to_arviz(problem, result, held, states, attrs)
+
+
+def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
+    structure = linear_gaussian(problem.trace)
+    linear = not isinstance(structure, NotApplicable)
+    return choose_sampler(structure, plan_updates(problem, held) if linear else ())
 
 
 def _to_arviz(

@@ -1,0 +1,45 @@
+"""Which method `sample` takes where it is left to choose, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ssmppl.analysis.structure import LinearGaussian
+from ssmppl.analysis.update import Update
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.methods import PGAS, Gibbs, MetropolisHastings
+
+FEW = 6  # numbers that a random walk moves at once without trouble
+
+
+def choose_sampler(
+    structure: LinearGaussian | NotApplicable, updates: Sequence[Update]
+) -> tuple[MetropolisHastings | Gibbs | PGAS, str]:
+    """The method for a model of this structure with these updates, and the reason.
+
+    Linear Gaussian models have their states drawn exactly. Gibbs then needs no tuning where every
+    parameter has a closed-form conditional; where some have none, slices given the states mix
+    slowly and cost a pass over the data each, and a random walk on the exact likelihood, which
+    integrates the states out, is better as long as the parameters are few.
+    """
+    if isinstance(structure, NotApplicable):
+        return PGAS(), "the model is not linear Gaussian: trajectories by conditional SMC"
+    open_ = [c for u in updates if u.conditional is None for c in u.block]
+    if not open_:
+        return Gibbs(), (
+            "linear Gaussian, and every parameter has a closed-form conditional: exact "
+            "trajectories by backward sampling"
+            if updates
+            else "linear Gaussian without free parameters: exact trajectories by backward sampling"
+        )
+    named = ", ".join(dict.fromkeys(open_))
+    numbers = sum(len(u.components) for u in updates)
+    if numbers <= FEW:
+        return MetropolisHastings(), (
+            f"linear Gaussian, but {named} has no closed-form conditional: a random walk on the "
+            "exact likelihood"
+        )
+    return Gibbs(), (
+        f"linear Gaussian with {numbers} numbers to move, too many for a random walk: exact "
+        f"trajectories, and slices for {named}"
+    )
