@@ -150,7 +150,7 @@ class ExactSteps:
         found = minimize(
             at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
             method="BFGS" if with_slope else "Nelder-Mead",
-            options={"gtol": 1e-9} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},
+            options={"gtol": 1e-7} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},
         )  # fmt: skip
         return chart.at(found.x).theta if found.fun <= before else theta
 

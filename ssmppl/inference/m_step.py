@@ -5,7 +5,7 @@ trajectories, and the estimate from the iterates of several chains.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -22,11 +22,11 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.ascent import Setup
 from ssmppl.inference.chart import Chart
 from ssmppl.inference.complete_score import CompleteScores, complete_scores
-from ssmppl.inference.pilot import Space, at
+from ssmppl.inference.pilot import Space, at, dispersed
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block, run_chains, stack
 
-__all__ = ["Chains", "Maximiser", "Pooled", "maximiser", "pool", "run_to_estimate"]
+__all__ = ["Chains", "Maximiser", "Pooled", "maximiser", "pool", "run_to_estimate", "starts"]
 
 BFGS_STEPS = 50  # of an M-step without statistics
 DRIFT = 5.0  # standard errors that the halves of the iterates may differ by
@@ -136,6 +136,17 @@ def maximiser(setup: Setup, method: str) -> Maximiser:
             where=reason.where,
         )
     return Maximiser(setup.space, tuple(setup.held), setup.with_prior)
+
+
+def starts(setup: Setup, chains: int) -> list[np.ndarray]:
+    """theta (P,) for each chain, dispersed round the start on the scale of the pilot's mode.
+
+    So a climb that has not forgotten where it began shows in how the chains differ.
+    """
+    pilot = setup.pilot
+    centre = replace(pilot, z=setup.start, scale=0.5 * pilot.scale)
+    points = dispersed(setup.space, centre, chains, setup.seed(4), "bootstrap")
+    return [setup.space.parameters(z)[0].copy() for z in points]
 
 
 @dataclass(frozen=True)

@@ -163,10 +163,11 @@ class ParticleEM:
     iterations : of each chain.
     burn_in : iterations that are left out of the mean; at least as many as EM needs to come near
         its limit.
-    chains : independent climbs, whose mean is the estimate; their spread tells its error.
+    chains : independent climbs from dispersed starts, whose mean is the estimate; their spread
+        tells its error.
     """
 
-    particles: int = 300
+    particles: int = 500
     trajectories: int = 50
     proposal: str = "auto"
     kernel: str = "auto"
@@ -189,7 +190,8 @@ class PSAEM:
     burn_in : the first k_0 iterations, with step size 1; later it is (k / k_0)^-exponent. At least
         as many as EM needs to come near its limit.
     exponent : above 0.5, at most 1.
-    chains : independent climbs, whose mean is the estimate; their spread tells its error.
+    chains : independent climbs from dispersed starts, whose mean is the estimate; their spread
+        tells its error.
     """
 
     particles: int | None = None

@@ -11,7 +11,8 @@ averaged by their final weights, enter
 gamma_k is 1 for the first k_0 iterations, which forget where they began, then (k / k_0)^-exponent
 (Delyon, Lavielle and Moulines 1999 ask for a divergent sum and a convergent sum of squares). It
 converges for every N >= 2. The estimate is the mean of the later iterates on the unconstrained
-scale (Polyak and Juditsky 1992) over independent chains; its error is told from how they differ.
+scale (Polyak and Juditsky 1992) over independent chains from dispersed starts; its error is told
+from how they differ.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.filtering import FilterSettings, check_count, failure, random_state
-from ssmppl.inference.m_step import Maximiser, maximiser, run_to_estimate
+from ssmppl.inference.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import PSAEM
 from ssmppl.inference.pgas import (
     PARTICLES,
@@ -49,14 +50,14 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
     """
     maximum = _checked(setup, method)
     settings = conditional_settings(setup, method)
-    theta, states = setup.space.parameters(setup.start)[0], []
-    for chain in range(method.chains):
+    states = []
+    for chain, theta in enumerate(starts(setup, method.chains)):
         seed = setup.seed(2, chain)
         begun = start_chain(
             Sweeper(setup.problem, (), settings), theta, np.random.default_rng(seed),
             random_state(seed),
         )  # fmt: skip
-        states.append(State(theta.copy(), begun.paths, begun.stream, np.empty(0), 0))
+        states.append(State(theta, begun.paths, begun.stream, np.empty(0), 0))
     found = run_to_estimate(
         setup, partial(saem_block, maximum, settings, method), states, method.iterations,
         averaged_from(method), "PSAEM",
