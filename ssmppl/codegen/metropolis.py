@@ -112,7 +112,7 @@ def numbered_filter(program: Program, proposal: Proposal) -> NumberedFilter | No
         for symbol, e in draws.items():
             for node in topological([e]):
                 if node.op == "random" and node.data[0] not in ("normal", "uniform"):
-                    site = next(s for s in sites.values() if symbol in s.value.ravel().tolist())
+                    site = next(s for s in sites.values() if symbol in set(s.value.ravel()))
                     return NotApplicable(
                         f"{site.name} is drawn by the {node.data[0]} sampler, which takes a random "
                         "count of random numbers, so that they cannot be moved a little",

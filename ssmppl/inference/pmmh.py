@@ -62,6 +62,8 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     problem, space = setup.problem, setup.space
     check_settings(method)
     where = coordinates(space, method.scale, method.transform)
+    if method.covariance is not None:
+        given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = find_mode(space, setup.root)
     theta, _ = space.parameters(pilot.z)
     choice = choose(problem, theta, kalman=False) if method.proposal == "auto" else None
