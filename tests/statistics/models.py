@@ -274,6 +274,29 @@ def regression_observation(x):
     return {"y": ssm.Normal(x, sd=0.5)}
 
 
+stationary = ssm.Model("stationary")
+
+
+@stationary.prior
+def stationary_prior():
+    return {"phi": ssm.Uniform(-0.5, 0.98), "tau": ssm.Gamma(6, rate=3)}
+
+
+@stationary.initial
+def stationary_initial(phi, tau):
+    return {"x": ssm.Normal(0, precision=(1 - phi**2) * tau)}
+
+
+@stationary.transition
+def stationary_transition(x, phi, tau):
+    return {"x": ssm.Normal(phi * x, precision=tau)}
+
+
+@stationary.observation
+def stationary_observation(x):
+    return {"y": ssm.Normal(x, sd=0.5)}
+
+
 two_states = ssm.Model("two states")
 
 

@@ -38,7 +38,7 @@ class Study:
     """A model, how it is sampled, and what is ranked: its parameters, and a state half-way."""
 
     model: str
-    method: ssm.PMMH | ssm.PGAS
+    method: ssm.PMMH | ssm.PGAS | ssm.Gibbs | ssm.MetropolisHastings
     parameters: tuple[str, ...]
     state: str
 
@@ -57,11 +57,17 @@ MODELS = {
     "two_states": (("a", "k", "precision", "r"), "drive"),
     "counts": (("mu", "phi", "tau"), "x"),
 }
+LINEAR = {  # for the methods with exact likelihood and trajectories
+    "stationary": (("phi", "tau"), "x"),
+    "two_states": MODELS["two_states"],
+}
 METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100))
+EXACT = (ssm.Gibbs(), ssm.MetropolisHastings())
 STUDIES = {
     study.name: study
-    for name, (parameters, state) in MODELS.items()
-    for method in METHODS
+    for models_, methods in ((MODELS, METHODS), (LINEAR, EXACT))
+    for name, (parameters, state) in models_.items()
+    for method in methods
     for study in [Study(name, method, parameters, state)]
 }
 
@@ -77,7 +83,8 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     seeds = np.random.SeedSequence(seed_of("sbc", label, study.name, replication)).spawn(2)
     first, second = (int(s.generate_state(1)[0]) for s in seeds)
     u = inputs_of(model)
-    warmup = 600 if isinstance(study.method, ssm.PMMH) else 200  # PMMH adapts during it
+    walks = isinstance(study.method, (ssm.PMMH, ssm.MetropolisHastings))
+    warmup = 600 if walks else 200  # random walks adapt during it
     truth = ssm.simulate(model, steps=STEPS, inputs=u or None, seed=first)
     data = {"y": truth["y"].values[0]} | u
     idata = ssm.sample(

@@ -76,6 +76,8 @@ def test_varves(exact_values, name, method, draws, warmup, long):
 
 LGSS = {"main text": (lgss_main_text, 0.5), "appendix": (lgss_appendix, 1.0)}
 LGSS_METHODS = [
+    ssm.MetropolisHastings(),
+    ssm.Gibbs(),
     *(ssm.PGAS(particles=n, proposal=p) for p in ("bootstrap", "auxiliary") for n in (2, 5, 20)),
     ssm.PMMH(),
     ssm.PMMH(particles=500, proposal="bootstrap"),
@@ -171,7 +173,9 @@ def test_likelihood_of_several_experiments_is_their_product():
 
 
 @pytest.mark.parametrize(
-    "method", [ssm.PGAS(particles=10), ssm.PMMH(particles=50, proposal="guided")], ids=str
+    "method",
+    [ssm.PGAS(particles=10), ssm.PMMH(particles=50, proposal="guided"), ssm.Gibbs()],
+    ids=str,
 )
 def test_posterior_of_several_experiments(method):
     def log_density(log_theta):  # Gamma(0.01, rate 0.01), on the scale of log theta
