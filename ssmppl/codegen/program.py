@@ -42,7 +42,7 @@ from ssmppl.codegen.kits import (
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.trace import Trace
 
 
@@ -72,7 +72,19 @@ class Program:
         return Path(str(self.module.__file__))
 
     def entry(self, name: str) -> Callable[..., Any]:
-        """A compiled entry point of the module."""
+        """A compiled entry point of the module.
+
+        Raises
+        ------
+        ArgumentError : it belongs to a proposal that could not be derived; gives the reason.
+        """
+        if not hasattr(self.module, name):
+            for proposal, found in self.proposals.items():
+                if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
+                    raise ArgumentError(
+                        f"particles cannot move by the proposal {proposal!r}: {found}",
+                        fix="use an exact method, or another proposal",
+                    )
         return getattr(self.module, name)
 
 

@@ -208,6 +208,12 @@ def test_particles_and_simulation_refuse_it():
         lambda: ssm.log_likelihood(model, DATA, AT, proposal="bootstrap"),
         lambda: ssm.log_likelihood(model, DATA, AT, proposal="auxiliary"),
         lambda: ssm.particle_filter(model, DATA, AT),
+        lambda: ssm.sample(model, DATA, method=ssm.PMMH(), draws=5, warmup=5, progress=False),
+        lambda: ssm.sample(model, DATA, method=ssm.PGAS(), draws=5, warmup=5, progress=False),
+        lambda: ssm.smooth(model, DATA, AT, method=ssm.FFBSi()),
+        lambda: ssm.maximize(model, DATA, method=ssm.PSAEM()),
+        lambda: ssm.maximize(model, DATA, method=ssm.ParticleEM()),
+        lambda: ssm.maximize(model, DATA, method=ssm.ScoreAscent()),
     ):
         with pytest.raises(ArgumentError, match="initial law of 'level' is Flat"):
             call()
