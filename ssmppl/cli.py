@@ -1,4 +1,4 @@
-"""The command line: `ssmppl demo`, `explain`, `simulate` and `sample`.
+"""The command line: `ssmppl demo`, `explain`, `simulate`, `sample`, `smooth` and `maximize`.
 
 Results go to standard output, and what a run shows while it goes on to standard error. Faults of
 the user's are printed without a traceback, exit code 1; a wrong command line has exit code 2.
@@ -12,18 +12,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 import ssmppl as ssm
 from ssmppl import demo as varves_demo
 from ssmppl.errors import DataError, SSMError
 from ssmppl.inference.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments, read_csv
-from ssmppl.results import save, state_table
+from ssmppl.results import save, state_table, summary_text, wide_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
+CLIMBERS: dict[str, Any] = {
+    "do": ssm.DirectOptimization, "score": ssm.ScoreAscent, "em": ssm.EM,
+    "particle-em": ssm.ParticleEM, "psaem": ssm.PSAEM,
+}  # fmt: skip
 ASSIGNMENTS = ("--parameters", "-p", "--fixed", "--start")
 
 
@@ -187,7 +190,7 @@ def simulate(
         draws=draws,
         seed=seed,
     )
-    table = _wide(dataset)
+    table = wide_table(dataset)
     if given is not None:
         for name in (n for n in given.columns if n not in table.columns):
             table[name] = list(given[name]) * draws
@@ -215,20 +218,10 @@ def simulate(
 @click.option("--states/--no-states", default=True, help="Whether to keep the states.")
 @_output("the name of the data file, with .nc", "netCDF file for the draws.")
 def sample(
-    model: str,
-    data: tuple[Path, ...],
-    method: str | None,
-    particles: int | None,
-    draws: int,
-    warmup: int,
-    chains: int,
-    thin: int,
-    seed: int | None,
-    fixed: tuple[str, ...],
-    start: tuple[str, ...],
-    states: bool,
-    output: Path | None,
-) -> None:
+    model: str, data: tuple[Path, ...], method: str | None, particles: int | None, draws: int,
+    warmup: int, chains: int, thin: int, seed: int | None, fixed: tuple[str, ...],
+    start: tuple[str, ...], states: bool, output: Path | None,
+) -> None:  # fmt: skip
     """Sample the posterior of MODEL.py given DATA.csv.
 
     Prints a table of the parameters and writes all draws to a netCDF file, which
@@ -270,7 +263,7 @@ def sample(
         f"{attrs['model']} by {attrs['method']} (chosen {attrs['method_chosen']}): "
         f"{_particles(attrs)}{chains} chains of {kept} draws, {attrs['seconds']:.1f} s\n"
     )
-    click.echo(_rounded(ssm.summary(idata)))
+    click.echo(summary_text(ssm.summary(idata)))
     click.echo(f"\nWrote {target}")
 
 
@@ -317,6 +310,48 @@ def smooth(
         click.echo(f"\nWrote {save(dataset, path)}")
 
 
+@main.command(cls=Command)
+@MODEL
+@click.argument("data", nargs=-1, required=True, type=CSV, metavar="DATA.csv...")
+@click.option(
+    "--method", type=click.Choice([*CLIMBERS], case_sensitive=False),
+    help="How to climb [default: chosen by the model].",
+)  # fmt: skip
+@click.option(
+    "--objective", type=click.Choice(["likelihood", "posterior"]), default="likelihood",
+    show_default=True, help="What to maximise.",
+)  # fmt: skip
+@SEED
+@click.option("--fixed", multiple=True, metavar="NAME=VALUE...", help="Parameters held fixed.")
+@click.option("--start", multiple=True, metavar="NAME=VALUE...", help="Values to begin from.")
+@_output("none", "CSV file for the estimate and its standard errors.")
+def maximize(
+    model: str, data: tuple[Path, ...], method: str | None, objective: str, seed: int | None,
+    fixed: tuple[str, ...], start: tuple[str, ...], output: Path | None,
+) -> None:  # fmt: skip
+    """The parameters of MODEL.py that make DATA.csv most likely.
+
+    Prints the estimate with standard errors from the observed information, and where random
+    numbers were used the estimate's own Monte Carlo error. Several CSV files are several
+    experiments of one system. Ctrl-C ends the climb early, and the best so far is kept.
+
+    \b
+        ssmppl maximize model.py data.csv --seed 1
+        ssmppl maximize model.py data.csv --method em --fixed mass=1.2 -o estimate.csv
+    """
+    estimate = ssm.maximize(
+        load_model(model), _data(data), CLIMBERS[method.lower()]() if method else None,
+        objective=objective, seed=seed, fixed=parse_assignments(fixed, "--fixed"),
+        start=parse_assignments(start, "--start"),
+    )  # fmt: skip
+    attrs = estimate.attrs
+    click.echo(f"{estimate!r}\n\n{attrs['method']}, chosen {attrs['method_chosen']}; "
+               f"{attrs['seconds']:.1f} s")  # fmt: skip
+    if output is not None:
+        estimate.table().to_csv(output, index_label="parameter")
+        click.echo(f"Wrote {output}")
+
+
 def _particles(attrs: dict[str, Any]) -> str:
     return f"{attrs['particles']} particles, " if "particles" in attrs else ""
 
@@ -337,31 +372,3 @@ def _data(paths: tuple[Path, ...]) -> pd.DataFrame | list[pd.DataFrame]:
 
 def _stem(model: str) -> str:
     return Path(model.rpartition(".py")[0] or model).stem
-
-
-def _wide(dataset: Any) -> pd.DataFrame:
-    """A Dataset of simulations as a table, (draw, time) its rows and scalars its columns."""
-    import pandas as pd
-
-    draws, steps = dataset.sizes["draw"], dataset.sizes["time"]
-    columns: dict[str, Any] = {}
-    if draws > 1:
-        columns["draw"] = np.repeat(np.arange(1, draws + 1), steps)
-    columns["time"] = np.tile(dataset["time"].values, draws)
-    for name, variable in dataset.data_vars.items():
-        values = variable.values
-        if "time" not in variable.dims:
-            values = np.repeat(values[:, None], steps, axis=1)
-        values = values.reshape(draws * steps, *values.shape[2:])
-        for index in np.ndindex(*values.shape[1:]):
-            columns["_".join(map(str, (name, *index)))] = values[(slice(None), *index)]
-    return pd.DataFrame(columns)
-
-
-def _rounded(table: pd.DataFrame) -> str:
-    """The summary with four digits, effective sample sizes whole."""
-    if table.empty:
-        return "There are no parameters to summarise: all are fixed, or the model has none."
-    whole = {name: "{:.0f}".format for name in table.columns if name.startswith("ess")}
-    others = {name: "{:.4g}".format for name in table.columns if name not in whole}
-    return table.to_string(formatters={**whole, **others, "r_hat": "{:.3f}".format})

@@ -24,7 +24,16 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["arviz", "save", "state_table", "summary", "to_dataset", "to_inference_data"]
+__all__ = [
+    "arviz",
+    "save",
+    "state_table",
+    "summary",
+    "summary_text",
+    "to_dataset",
+    "to_inference_data",
+    "wide_table",
+]
 
 SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
@@ -64,7 +73,8 @@ def to_inference_data(
     time
         The T values of the `time` coordinate; row numbers from 1 if None.
     dims
-        For single variables, names of all dims after chain and draw, instead of the rule above.
+        For single variables, names of all dims after chain and draw, instead of the rule above. A
+        variable of the same name in another group that has fewer takes the first of them.
     coords
         Values of further coordinates, by dim.
     attrs
@@ -177,6 +187,34 @@ def state_table(dataset: xr.Dataset) -> pd.DataFrame:
     return pd.DataFrame(columns, index=pd.Index(dataset["time"].values, name="time"))
 
 
+def wide_table(dataset: xr.Dataset) -> pd.DataFrame:
+    """A Dataset of simulations as a table, (draw, time) its rows and scalars its columns."""
+    import pandas as pd
+
+    draws, steps = dataset.sizes["draw"], dataset.sizes["time"]
+    columns: dict[str, Any] = {}
+    if draws > 1:
+        columns["draw"] = np.repeat(np.arange(1, draws + 1), steps)
+    columns["time"] = np.tile(dataset["time"].values, draws)
+    for name, variable in dataset.data_vars.items():
+        values = variable.values
+        if "time" not in variable.dims:
+            values = np.repeat(values[:, None], steps, axis=1)
+        values = values.reshape(draws * steps, *values.shape[2:])
+        for index in np.ndindex(*values.shape[1:]):
+            columns["_".join(map(str, (name, *index)))] = values[(slice(None), *index)]
+    return pd.DataFrame(columns)
+
+
+def summary_text(table: pd.DataFrame) -> str:
+    """The summary with four digits, effective sample sizes whole."""
+    if table.empty:
+        return "There are no parameters to summarise: all are fixed, or the model has none."
+    whole = {name: "{:.0f}".format for name in table.columns if name.startswith("ess")}
+    others = {name: "{:.4g}".format for name in table.columns if name not in whole}
+    return table.to_string(formatters={**whole, **others, "r_hat": "{:.3f}".format})
+
+
 def save(idata: Any, path: str | os.PathLike[str]) -> Path:
     """Write a result of `to_inference_data` to a netCDF file, which `arviz.from_netcdf` reads.
 
@@ -271,7 +309,7 @@ def _dataset(
     for name, values in variables.items():
         array = np.asarray(values)
         if name in dims:
-            labels = (*sample_dims, *dims[name])
+            labels = (*sample_dims, *dims[name][: array.ndim - len(sample_dims)])
         else:
             labels = (*sample_dims, "time") if name in over_time else sample_dims
             labels += tuple(f"{name}_dim_{i}" for i in range(array.ndim - len(labels)))

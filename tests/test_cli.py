@@ -451,3 +451,23 @@ def test_the_demo(folder):
         assert line in text
     assert arviz().from_netcdf("varves.nc")["posterior"]["x"].shape == (4, 100, 634)
     assert arviz().from_netcdf("varves_pmmh.nc")["posterior"].attrs["method"] == "PMMH"
+
+
+def test_maximize_prints_the_estimate_and_writes_it(series):
+    result = run("maximize", "walk.py", series, "--seed", 1, "-o", "estimate.csv")
+    assert "DirectOptimization, chosen automatically" in result.stdout
+    table = pd.read_csv("estimate.csv", index_col="parameter")
+    model = cli.load_model("walk.py")
+    exact = ssm.maximize(model, pd.read_csv(series), seed=1, progress=False)
+    assert table.loc["q", "estimate"] == pytest.approx(exact.parameters["q"])
+    assert table.loc["q", "standard_error"] == pytest.approx(exact.standard_errors["q"])
+    assert f"{exact.parameters['q']:.6g}" in result.stdout
+
+
+def test_maximize_takes_methods_fixed_values_and_the_posterior(series):
+    assert "by EM" in run("maximize", "walk.py", series, "--method", "em").stdout
+    assert "fixed" in run("maximize", "walk.py", series, "--fixed", "q=0.3").stdout
+    mode = run("maximize", "walk.py", series, "--objective", "posterior", "--start", "q=1").stdout
+    model = cli.load_model("walk.py")
+    exact = ssm.maximize(model, pd.read_csv(series), objective="posterior", progress=False)
+    assert f"{exact.parameters['q']:.4f}" in mode

@@ -16,6 +16,8 @@ from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference import smooth_likelihood
 from ssmppl.inference.ascent import Ascent, Setup
+from ssmppl.inference.estimate import free_components
+from ssmppl.inference.exact_score import exact_score
 from ssmppl.inference.filtering import check_count
 from ssmppl.inference.kalman import KalmanModel
 from ssmppl.inference.methods import DirectOptimization
@@ -55,6 +57,8 @@ class ExactClimb:
     def __init__(self, setup: Setup, kalman: KalmanModel, method: DirectOptimization):
         self.setup, self.kalman, self.method = setup, kalman, method
         self.experiments = setup.problem.experiments
+        free = free_components(setup.problem.trace, setup.held)
+        self.exact = exact_score(kalman, self.experiments, free, setup.space.theta)
         self.best, self.best_value = np.empty(0), -np.inf
         self.iterates: list[np.ndarray] = []
         self.evaluations = 0
@@ -89,6 +93,8 @@ class ExactClimb:
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
             "likelihood": "exact, by the Kalman filter", "restarts": restarts,
         }  # fmt: skip
+        if self.exact.differences:
+            report["central_differences"] = self.exact.differences
         return Ascent(
             point.theta, self.kalman.log_likelihood(self.experiments, point.theta),
             np.array(self.iterates), report, interrupted=interrupted,
@@ -101,7 +107,7 @@ class ExactClimb:
         point = self.setup.chart.at(z)
         if point.log_prior == -np.inf:
             return nothing
-        value, gradient = self.kalman.score(self.experiments, point.theta)
+        value, gradient = self.exact.score(point.theta)
         slope = point.pull(gradient)
         if self.setup.with_prior:
             value, slope = value + point.log_prior, slope + point.d_log_prior
@@ -153,8 +159,8 @@ class ExactClimb:
     def _curvature(self, z: np.ndarray) -> np.ndarray:
         """Minus the second derivatives of the objective in z, (F, F)."""
         point = self.setup.chart.at(z)
-        _, gradient = self.kalman.score(self.experiments, point.theta)
-        information = self.kalman.information(self.experiments, point.theta)
+        _, gradient = self.exact.score(point.theta)
+        information = self.exact.information(point.theta)
         second = self.setup.chart.curvature(z, gradient)
         out = point.jacobian.T @ information @ point.jacobian - second.theta
         return out - second.log_prior if self.setup.with_prior else out

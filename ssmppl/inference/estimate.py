@@ -50,26 +50,40 @@ class Estimate:
         error = self.attrs.get("log_likelihood_error")
         spread = f" (Monte Carlo error {error:.2g})" if error else ""
         lines += [f"log-likelihood {self.log_likelihood:.6f}{spread}", ""]
-        rows = [("", "estimate", "std. error", *(["MC error"] if self._monte_carlo else []))]
-        for name, value in self.parameters.items():
-            errors = self.standard_errors.get(name)
-            for index in np.ndindex(np.shape(value)):
-                label = name + (f"[{', '.join(map(str, index))}]" if index else "")
-                cells = [f"{np.asarray(value)[index]:.6g}"]
-                cells.append("fixed" if errors is None else f"{np.asarray(errors)[index]:.3g}")
-                if self._monte_carlo:
-                    noise = self._monte_carlo.get(label)
-                    cells.append("" if noise is None else f"{noise:.2g}")
-                rows.append((label, *cells))
+        shown = self.table()
+        rows = [("", *(str(c).replace("_", " ") for c in shown.columns))]
+        for label, cells in shown.iterrows():
+            value, *errors = map(float, cells)
+            known = [f"{e:.3g}" if e else "" for e in errors]
+            if errors[0] == 0.0:
+                known[0] = "fixed"
+            rows.append((str(label), f"{value:.6g}", *known))
         widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
         for row in rows:
             cells = [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
             lines.append("  ".join([row[0].ljust(widths[0]), *cells]).rstrip())
         return "\n".join(lines + [f"\nNote: {note}" for note in self.notes])
 
-    @property
-    def _monte_carlo(self) -> dict[str, float]:
-        return self.attrs.get("monte_carlo_errors") or {}
+    def table(self) -> pd.DataFrame:
+        """One row for each component: estimate, standard error, Monte Carlo error if there is one.
+
+        The standard error of a fixed parameter is zero.
+        """
+        import pandas as pd
+
+        noise: dict[str, float] = self.attrs.get("monte_carlo_errors") or {}
+        rows: dict[str, dict[str, float]] = {}
+        for name, value in self.parameters.items():
+            errors = self.standard_errors.get(name)
+            for index in np.ndindex(np.shape(value)):
+                label = name + (f"[{', '.join(map(str, index))}]" if index else "")
+                row = {"estimate": float(np.asarray(value)[index])}
+                row["standard_error"] = 0.0 if errors is None else float(np.asarray(errors)[index])
+                if noise:
+                    lower = ", ".join(map(str, sorted(index, reverse=True)))
+                    row["monte_carlo_error"] = noise.get(label, noise.get(f"{name}[{lower}]", 0.0))
+                rows[label] = row
+        return pd.DataFrame.from_dict(rows, orient="index")
 
     @property
     def notes(self) -> list[str]:

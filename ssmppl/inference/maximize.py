@@ -17,6 +17,7 @@ from ssmppl.inference import direct_optimization, em, particle_em, psaem, score_
 from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.complete_score import complete_scores
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
+from ssmppl.inference.exact_score import exact_score
 from ssmppl.inference.filtering import FilterSettings, estimates_task, seed_sequence
 from ssmppl.inference.kalman import KalmanModel
 from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
@@ -198,7 +199,10 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
 
 def _information(setup: Setup, theta: np.ndarray) -> np.ndarray | None:
     if isinstance(setup.kalman, KalmanModel):
-        return setup.kalman.information(setup.problem.experiments, theta)
+        free = free_components(setup.problem.trace, setup.held)
+        return exact_score(
+            setup.kalman, setup.problem.experiments, free, setup.space.theta
+        ).information(theta)
     try:
         scores = complete_scores(setup.problem, setup.held)
         settings = FilterSettings(PARTICLES, choose(setup.problem, theta, kalman=False).name)

@@ -13,6 +13,7 @@ from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.complete_score import complete_scores
 from ssmppl.inference.estimate import by_name, free_components, table
+from ssmppl.inference.exact_score import ExactScore, exact_score
 from ssmppl.inference.filtering import check_count, seed_sequence
 from ssmppl.inference.kalman import KalmanModel, kalman_model
 from ssmppl.inference.likelihood import settle
@@ -119,8 +120,14 @@ def score(
     attrs: dict[str, Any] = {"model": problem.trace.name, "fixed": dict(fixed or {})}
     kalman = kalman_model(problem.trace)
     if settings.proposal == "kalman" and isinstance(kalman, KalmanModel):
-        found = _exact(problem, kalman, theta)
+        exact = exact_score(
+            kalman, problem.experiments, free_components(problem.trace, held), theta
+        )
+        found = _exact(exact, theta)
         attrs["method"] = "exact, by the sensitivities of the Kalman filter"
+        if exact.differences:
+            attrs["method"] = "differences of the exact likelihood"
+            attrs["central_differences"] = exact.differences
     else:
         scores = complete_scores(problem, held)
         smoothing = Smoothing(settings, trajectories, kernel)
@@ -137,15 +144,15 @@ def score(
     return _score(problem, found, held, attrs)
 
 
-def _exact(problem: Problem, kalman: KalmanModel, theta: np.ndarray) -> ParticleScore:
-    value, gradient = kalman.score(problem.experiments, theta)
+def _exact(exact: ExactScore, theta: np.ndarray) -> ParticleScore:
+    value, gradient = exact.score(theta)
     if not np.isfinite(value):
         raise ArgumentError(
             "the likelihood is zero at these parameters, so that it has no score",
             fix="give parameters under which the data are possible",
         )
     zero = np.zeros((len(theta), len(theta)))
-    information = kalman.information(problem.experiments, theta)
+    information = exact.information(theta)
     return ParticleScore(float(value), 0.0, gradient, zero, information, zero)
 
 
