@@ -158,7 +158,7 @@ def _to_arviz(
             if mark:
                 for n, v in named.items():
                     rest = [f"{n}_dim_{k}" for k in range(v.ndim - leading)]
-                    dims[n] = [*axis, *rest]
+                    dims.setdefault(n, [*axis, *rest])  # the log likelihood has none but time
             return named
 
         if states:
