@@ -27,6 +27,7 @@ def test_score_of_the_embedded_series(name, gain, exact_values):
     exact = mp_derivatives(gain, datasets.load(name)["y"])
     assert value == pytest.approx(values["log_likelihood"]["1.0"], abs=1e-9)
     assert gradient == pytest.approx([float(exact[0])], rel=1e-12)
+    assert gradient == pytest.approx([values["score_at_1"]], rel=1e-8)
     assert abs(model.score(experiments, best)[1][0]) < 1e-6  # the maximum, rounded to 16 digits
     information = model.information(experiments, np.array([1.0]))
     assert information == pytest.approx(np.array([[-float(exact[1])]]), rel=1e-9)
