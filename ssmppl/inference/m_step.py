@@ -79,19 +79,26 @@ class Maximiser:
             run(theta, e.y, e.seen, e.u, some, w, None, part, total)
         return total
 
-    def from_paths(self, theta: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
-        """theta after an M-step on M trajectories, (M, T, D) of each experiment."""
+    def from_paths(
+        self, theta: np.ndarray, paths: Sequence[np.ndarray], log_z: np.ndarray
+    ) -> np.ndarray:
+        """theta after an M-step on trajectories of R runs, weighed by their likelihoods.
+
+        paths : for each experiment (R M, T, D), run by run. log_z : (experiments, R).
+        """
+        m = len(paths[0]) // log_z.shape[1]
         if isinstance(self.step, MStep):
-            equal = [np.full(len(some), 1.0 / len(some)) for some in paths]
-            return self.step.maximise(self.statistics(theta, paths, equal), theta)
+            weights = [np.repeat(ratio_weights(row) / m, m) for row in log_z]
+            return self.step.maximise(self.statistics(theta, paths, weights), theta)
+        w = np.repeat(ratio_weights(log_z.sum(axis=0)) / m, m)
         z = self._unconstrained(theta)
 
         def negative(z: np.ndarray) -> tuple[float, np.ndarray]:
             point = self.chart.at(z)
             if point.log_prior == -np.inf:
                 return np.inf, np.zeros(len(z))
-            value = float(np.mean(self.scores.log_density(point.theta, paths)))
-            slope = point.pull(np.mean(self.scores.gradient(point.theta, paths), axis=0))
+            value = float(w @ self.scores.log_density(point.theta, paths))
+            slope = point.pull(w @ self.scores.gradient(point.theta, paths))
             if self.posterior:
                 value, slope = value + point.log_prior, slope + point.d_log_prior
             if not np.isfinite(value) or not np.all(np.isfinite(slope)):
@@ -110,6 +117,14 @@ class Maximiser:
 
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
+
+
+def ratio_weights(log_z: np.ndarray) -> np.ndarray:
+    """(R,) weights, of sum 1, of independent runs with likelihood estimates Z; see particle_em."""
+    r = len(log_z)
+    share = np.exp(log_z - log_z.max())
+    share /= share.sum()
+    return share if r == 1 else (r * share - 1.0 / r) / (r - 1.0)
 
 
 def maximiser(setup: Setup, method: str) -> Maximiser:
@@ -162,7 +177,7 @@ class Chains:
 
 def run_to_estimate(
     setup: Setup, step_block: Callable[[Any, int], tuple[Any, Block]], states: Sequence[Any],
-    iterations: int, left_out: int, title: str,
+    iterations: int, left_out: int, title: str, by_regression: bool = False,
 ) -> Chains:  # fmt: skip
     """Run chains whose blocks hold "theta" (n, P), and pool what comes after `left_out`."""
     chains = run_chains(
@@ -173,17 +188,19 @@ def run_to_estimate(
     iterates = drawn["theta"]
     interrupted = any(c.interrupted for c in chains)
     first = min(left_out, iterates.shape[1] - 1)
-    pooled = pool(setup, iterates[:, first:])
+    pooled = pool(setup, iterates[:, first:], by_regression)
     report: dict[str, Any] = {"converged": None}
     if not np.isnan(pooled.drift) and not interrupted:
-        moving = pooled.drift > DRIFT
+        moving = pooled.drift > DRIFT and pooled.how == "mean"
         report = {"converged": not moving, "drift": pooled.drift}
         if moving:
             report["stopped"] = (
                 f"the iterates still drift ({pooled.drift:.1f} standard errors from the first to "
                 "the second half): give more iterations"
             )
-    report["averaged"] = f"iterations {first + 1} to {iterates.shape[1]} of {len(chains)} chains"
+    report["estimate"] = (
+        f"{pooled.how} of iterations {first + 1} to {iterates.shape[1]} of {len(chains)} chains"
+    )
     return Chains(pooled, iterates.mean(axis=0), stats, interrupted, report)
 
 
@@ -197,28 +214,58 @@ class Pooled:
 
     theta : (P,). error : (P, P) its Monte Carlo covariance, from how the chains differ; None for
     one chain. drift : the largest difference between the later and the earlier half of the
-    iterates, in its standard errors; nan for one chain.
+    iterates, in its standard errors; nan for one chain. how : mean, or fixed point.
     """
 
     theta: np.ndarray
     error: np.ndarray | None
     drift: float
+    how: str
 
 
-def pool(setup: Setup, iterates: np.ndarray) -> Pooled:
-    """The mean on the unconstrained scale of iterates (R, K, P), over K and over R."""
+def pool(setup: Setup, iterates: np.ndarray, by_regression: bool = False) -> Pooled:
+    """One estimate from iterates (R, K, P), on the unconstrained scale.
+
+    by_regression : the fixed point of the regression of iterates on those before, instead of their
+    mean.
+    """
     free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held]
     to_z = Unconstrained(setup.problem.trace, free)
     z = np.array([[to_z(theta) for theta in chain] for chain in iterates])
     chains = len(z)
-    means = z.mean(axis=1)
-    point = setup.chart.at(means.mean(axis=0))
+    centre, how = z.mean(axis=(0, 1)), "mean"
     if chains == 1:
-        return Pooled(point.theta, None, np.nan)
-    spread = np.atleast_2d(np.cov(means.T)) / chains
+        return Pooled(setup.chart.at(centre).theta, None, np.nan, how)
+    left_out = [np.delete(z, r, axis=0) for r in range(chains)]
+    points = np.array([some.mean(axis=(0, 1)) for some in left_out])
+    if by_regression:
+        limit = fixed_point(z)
+        limits = [fixed_point(some) for some in left_out]
+        found = [x for x in limits if x is not None]
+        if limit is not None and len(found) == chains:
+            centre, points, how = limit, np.array(found), "fixed point of the regression"
+    off = points - points.mean(axis=0)
+    spread = (chains - 1.0) / chains * off.T @ off
     half = z.shape[1] // 2
-    change = z[:, -half:].mean(axis=1) - z[:, :half].mean(axis=1) if half else 0.0 * means
+    change = z[:, -half:].mean(axis=1) - z[:, :half].mean(axis=1) if half else 0.0 * z[:, 0]
     error = change.std(axis=0, ddof=1) / np.sqrt(chains)
     with np.errstate(invalid="ignore", divide="ignore"):
         drift = np.nanmax(np.abs(change.mean(axis=0)) / error, initial=0.0)
-    return Pooled(point.theta, point.jacobian @ spread @ point.jacobian.T, float(drift))
+    point = setup.chart.at(centre)
+    return Pooled(point.theta, point.jacobian @ spread @ point.jacobian.T, float(drift), how)
+
+
+def fixed_point(z: np.ndarray) -> np.ndarray | None:
+    """(F,) where the regression z_{k+1} = c + B z_k + noise over chains (R, K, F) comes to rest.
+
+    None where it does not come to rest, or where there are too few iterates to tell.
+    """
+    before, after = z[:, :-1].reshape(-1, z.shape[2]), z[:, 1:].reshape(-1, z.shape[2])
+    f = z.shape[2]
+    if len(before) < 10 * f:
+        return None
+    centre = before.mean(axis=0)
+    slope, *_ = np.linalg.lstsq(before - centre, after - after.mean(axis=0), rcond=None)
+    if np.abs(np.linalg.eigvals(slope)).max() >= 1.0:
+        return None
+    return centre + np.linalg.solve(np.eye(f) - slope.T, after.mean(axis=0) - centre)

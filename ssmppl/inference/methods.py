@@ -156,23 +156,25 @@ class ParticleEM:
 
     Parameters
     ----------
-    particles : N of the filter; expectations have a bias of order 1 / N.
-    trajectories : number M drawn in each iteration.
+    particles : N of each filter.
+    runs : filters in each iteration, weighed by their likelihoods, which takes the bias of order
+        1 / N off; 1 leaves it in.
+    trajectories : number drawn in each iteration, over all runs.
     proposal : "auto", "bootstrap", "guided", "auxiliary" or "user".
     kernel : of backward simulation: "auto", "exact", "rejection" or "mcmc".
     iterations : of each chain.
-    burn_in : iterations that are left out of the mean; at least as many as EM needs to come near
-        its limit.
-    chains : independent climbs from dispersed starts, whose mean is the estimate; their spread
+    burn_in : iterations that are left out of the estimate.
+    chains : independent climbs from dispersed starts, which give one estimate; how they differ
         tells its error.
     """
 
-    particles: int = 500
-    trajectories: int = 50
+    particles: int = 1000
+    runs: int = 2
+    trajectories: int = 200
     proposal: str = "auto"
     kernel: str = "auto"
-    iterations: int = 150
-    burn_in: int = 50
+    iterations: int = 100
+    burn_in: int = 30
     chains: int = 8
 
 

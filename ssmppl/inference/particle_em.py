@@ -1,15 +1,23 @@
 """EM over a particle smoother: Monte Carlo expectations by backward simulation.
 
 Wei and Tanner (1990); Schön, Wills and Ninness (2011), "System identification of nonlinear
-state-space models"; Schön et al. (2015), section on EM for nonlinear models. Each iteration runs a
-filter at theta_k, draws M trajectories from it backwards, and maximises the mean of log p(x, y |
+state-space models"; Schön et al. (2015), section on EM for nonlinear models. Each iteration runs R
+filters at theta_k, draws M trajectories from them backwards, and maximises the mean of log p(x, y |
 theta) over them: through its statistics where it separates, else by BFGS with the complete-data
 score. Deterministic states that depend on a parameter then follow from the noisy ones, which alone
 are the missing data.
 
-With M fixed the iterates end in a stationary law round the limit. The estimate is the mean of the
-later ones, on the unconstrained scale, over independent chains from dispersed starts; its error is
-told from how these differ. The smoother's bias of order 1 / N is not in that error.
+EM magnifies what is wrong with its expectations as much as it is slow, so that the smoother's bias
+of order 1 / N matters. It is that of a ratio: the mean of Z S over independent runs, with Z the
+filter's estimate of the likelihood, is unbiased for p(y) E[S | y] (Del Moral 2004). So the runs are
+weighed by their Z, and the ratio's own bias is taken off by the jackknife (Quenouille 1956):
+weights R / (R - 1) Z_r / sum Z - 1 / (R (R - 1)).
+
+With M fixed the iterates end in a stationary law round the limit, which they near by the slow
+factors of EM. The estimate is the fixed point of the regression of the later iterates on those
+before them, on the unconstrained scale, over independent chains from dispersed starts: no more
+than their mean where they have come to rest, and where they have not, corrected for what is left
+of the way. Its error is told by the jackknife over chains.
 """
 
 from __future__ import annotations
@@ -19,9 +27,9 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.ascent import Ascent, Setup
-from ssmppl.inference.backward import backward_draws, choose_kernel
+from ssmppl.inference.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.complete_score import complete_scores
 from ssmppl.inference.filtering import FilterSettings, check_count, random_state
 from ssmppl.inference.m_step import Maximiser, maximiser, run_to_estimate, starts
@@ -39,7 +47,8 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
         move; names the line.
     SamplingError : the filter dies out.
     """
-    for name, least in (("particles", 2), ("trajectories", 1), ("burn_in", 0), ("chains", 1)):
+    for name, least in (("particles", 2), ("trajectories", 1), ("runs", 1), ("burn_in", 0),
+                        ("chains", 1)):  # fmt: skip
         check_count(name, getattr(method, name), least)
     check_count("iterations", method.iterations, method.burn_in + 1)
     maximum, problem = maximiser(setup, "ParticleEM"), setup.problem
@@ -49,7 +58,12 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
         proposal = choose(problem, theta, kalman=False).name
     problem.proposal(proposal)
     settings = FilterSettings(int(method.particles), proposal)
-    kernel, why = choose_kernel(problem, settings, method.trajectories, method.kernel)
+    each = -(-method.trajectories // method.runs)
+    kernel, why = choose_kernel(problem, settings, each, method.kernel)
+    if kernel == "genealogy":
+        raise ArgumentError(
+            'kernel="genealogy" gives paths that meet in one', fix='use "exact", or "auto"'
+        )
     if isinstance(maximum.step, NotApplicable):
         m_step = f"BFGS on the mean over trajectories: {maximum.step.reason}"
         complete_scores(problem, maximum.fixed)  # refuses what has none before anything runs
@@ -59,17 +73,17 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
         State(start, random_state(setup.seed(3, chain)))
         for chain, start in enumerate(starts(setup, method.chains))
     ]
-    task = partial(em_block, maximum, settings, int(method.trajectories), kernel)
+    task = partial(em_block, maximum, settings, int(method.runs), each, kernel)
     found = run_to_estimate(
-        setup, task, states, method.iterations, method.burn_in, "ParticleEM"
-    )  # fmt: skip
+        setup, task, states, method.iterations, method.burn_in, "ParticleEM", by_regression=True
+    )
     report = {
         **found.report,
         "particles": settings.particles,
         "proposal": settings.proposal,
         "kernel": f"{kernel}: {why}",
         "m_step": m_step,
-        "bias": f"of order 1 / {settings.particles}, not in the Monte Carlo errors",
+        "runs": int(method.runs),
     }
     pooled = found.pooled
     return Ascent(
@@ -87,18 +101,33 @@ class State:
 
 
 def em_block(
-    maximum: Maximiser, settings: FilterSettings, trajectories: int, kernel: str, state: State,
+    maximum: Maximiser, settings: FilterSettings, runs: int, each: int, kernel: str, state: State,
     n: int,
 ) -> tuple[State, Block]:  # fmt: skip
     """n iterations of one chain."""
     stream, theta = state.stream.copy(), state.theta
-    thetas, log_z = [], []
+    thetas, spreads = [], []
     for _ in range(n):
-        paths, estimate = backward_draws(
-            maximum.problem, theta, settings, trajectories, stream, kernel
-        )
-        theta = maximum.from_paths(theta, paths)
+        paths, log_z = smoothed(maximum, theta, settings, runs, each, kernel, stream)
+        theta = maximum.from_paths(theta, paths, log_z)
         thetas.append(theta)
-        log_z.append(estimate)
-    block = Block({"theta": np.array(thetas)}, {"log_likelihood": np.array(log_z)})
+        spreads.append(log_z.sum(axis=0).std())
+    block = Block({"theta": np.array(thetas)}, {"log_z_sd": np.array(spreads)})
     return State(theta, stream), block
+
+
+def smoothed(
+    maximum: Maximiser, theta: np.ndarray, settings: FilterSettings, runs: int, each: int,
+    kernel: str, stream: np.ndarray,
+) -> tuple[list[np.ndarray], np.ndarray]:  # fmt: skip
+    """Trajectories (R M, T, D) of each experiment, run by run, and log Z (experiments, R)."""
+    problem, paths = maximum.problem, []
+    log_z = np.empty((len(problem.experiments), runs))
+    for i, e in enumerate(problem.experiments):
+        drawn = []
+        for r in range(runs):
+            system = particle_system(problem, theta, settings, e, stream)
+            drawn.append(draw_paths(problem, theta, e, system, each, stream, kernel))
+            log_z[i, r] = system.log_Z
+        paths.append(np.concatenate(drawn))
+    return paths, log_z
