@@ -21,6 +21,7 @@ import numpy as np
 
 from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.codegen.kernels.weights import OK
@@ -185,7 +186,7 @@ def draw_paths(
     else:
         status, t = run(*given, paths)
     if status != OK:
-        raise _failure(problem, theta, t, experiment)
+        raise _failure(problem, theta, status, t, experiment)
     return np.ascontiguousarray(np.moveaxis(paths, 2, 0))
 
 
@@ -209,16 +210,22 @@ def draw_particles(weights: np.ndarray, draws: int, stream: np.ndarray) -> np.nd
     return np.searchsorted(cumulative, uniforms * cumulative[-1], side="right")
 
 
-def _failure(problem: Problem, theta: np.ndarray, t: int, experiment: Experiment) -> SamplingError:
+def _failure(
+    problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
+) -> SamplingError:
     label = "" if experiment.time is None else f" (time {experiment.time[t + 1]})"
     parameters = ", ".join(
         f"{n} = {np.array2string(np.asarray(v), precision=6)}"
         for n, v in unpack_parameters(problem.trace, theta).items()
     )
     site = next(iter(problem.trace.transition.values()))
+    what = "is not a number for some particle"
+    fix = "some parameter, state or input leads outside the domain of an operation"
+    if status == ABOVE_BOUND:
+        what = "lies above the bound that was derived for it"
+        fix = 'a fault of ssmppl: use kernel="exact", and report the model'
     return SamplingError(
-        f"the transition density into t={t + 2}{label} is not a number for some particle; "
-        f"parameters: {parameters}",
-        fix="some parameter, state or input leads outside the domain of an operation",
+        f"the transition density into t={t + 2}{label} {what}; parameters: {parameters}",
+        fix=fix,
         where=site.distribution.location,
     )

@@ -129,7 +129,7 @@ def backward_rejection(
     x, following = np.empty((d, n_paths)), np.empty((d, n_paths))
     log_f, log_bound = np.empty(n_paths), np.empty(n_paths)
     index, waiting = np.empty(n_paths, dtype=np.int64), np.empty(n_paths, dtype=np.int64)
-    proposed = np.empty(n_paths, dtype=np.int64)
+    proposed, later = np.empty(n_paths, dtype=np.int64), np.empty(n_paths, dtype=np.int64)
     log_w, log_v, p, reference = np.empty(n), np.empty(n), np.empty(n), np.empty(d)
     prepare(theta, c)
     draw_last(history, weights, rng, index, paths)
@@ -142,7 +142,7 @@ def backward_rejection(
         bound(theta, c, s, following, log_bound)
         left = n_paths
         for m in range(n_paths):
-            waiting[m] = m
+            waiting[m], later[m] = m, index[m]
         accepted, tried = 1.0, 1.0
         while left > 0 and accepted * n > PRICE * tried:
             for r in range(left):
@@ -166,17 +166,21 @@ def backward_rejection(
                         following[k, still] = following[k, r]
                     still += 1
             left = still
-        if left > 0:
-            take_log(weights[t], log_w)
         tally[1] += left
         for r in range(left):
-            for k in range(d):
-                reference[k] = following[k, r]
-            weigh_following(theta, c, s, history[t], reference, log_v)
-            add(log_v, log_w)
-            _, _, status = normalise(log_v, p)
-            if status != OK:
-                return status, t
+            proposed[r] = later[waiting[r]]
+        order = np.argsort(proposed[:left])
+        take_log(weights[t], log_w)
+        for q in range(left):
+            r = order[q]
+            if q == 0 or proposed[r] != proposed[order[q - 1]]:  # else the weights are the same
+                for k in range(d):
+                    reference[k] = following[k, r]
+                weigh_following(theta, c, s, history[t], reference, log_v)
+                add(log_v, log_w)
+                _, _, status = normalise(log_v, p)
+                if status != OK:
+                    return status, t
             index[waiting[r]] = draw_index(p, uniform(rng))
         take(history[t], index, paths[t])
     return OK, n_steps
