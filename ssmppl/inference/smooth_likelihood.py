@@ -27,7 +27,7 @@ from ssmppl.inference.problem import Problem
 SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of the likelihood
 CURVE_STEP = 0.5  # of those for second derivatives
 FAR = 1e30
-CLOSE = 0.02  # standard deviations from the top: where the climb has arrived
+CLOSE = 0.05  # standard deviations from the top: where the climb has arrived; counted in the error
 
 
 class SmoothLikelihood:
@@ -181,7 +181,8 @@ class SmoothClimb:
         off = w[:, None] * (slopes - w @ slopes)
         noise = off.T @ off * len(w) / (len(w) - 1)
         inverse = np.linalg.inv(whole)
-        return float(np.sqrt(whole_slope @ step)), information, inverse @ noise @ inverse * scale
+        error = inverse @ noise @ inverse + np.outer(step, step)
+        return float(np.sqrt(whole_slope @ step)), information, error * scale
 
     def _at(self, z: np.ndarray) -> float:
         return _log_mean(self.log_z(z))
