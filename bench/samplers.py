@@ -1,11 +1,11 @@
 """What a draw from the posterior of the ice varves costs, by method.
 
-For every method: particles, processor time of the iterations after warmup, the share of accepted moves,
-the integrated autocorrelation time (IACT = draws / ESS, ESS of the mean by ArviZ over all chains)
-of phi and tau, and effective draws per second of the slower of both, over four chains one after
-the other on one thread. The last columns say that the answers agree: the posterior means less the
-exact ones (0.950254, 46.1955), in Monte Carlo standard errors. Processor time, so that other work
-on the machine matters little.
+For every method: particles, the share of accepted moves, the integrated autocorrelation time (IACT
+= draws / ESS, ESS of the mean by ArviZ over all chains) of phi and tau, the processor time of a
+draw after warmup, and effective draws of the slower of both per second of it; four chains, one
+after the other on one thread. Processor time, so that other work on the machine matters little.
+The last columns say that the answers agree: the posterior means less the exact ones (0.950254,
+46.1955), in Monte Carlo standard errors.
 
     python bench/samplers.py [draws]
 
