@@ -335,3 +335,17 @@ def test_an_ascent_may_know_its_likelihood_and_its_error(monkeypatch):
     assert estimate.log_likelihood == -7.0
     assert estimate.standard_errors["theta"] == pytest.approx(0.5)
     assert estimate.attrs["monte_carlo_errors"] == {"theta": 0.5}
+
+
+def test_the_diffuse_maximum_of_the_nile():
+    """Level and noise variance as Durbin and Koopman (2012, section 2.10) print them."""
+    model = ssm.Model("nile level")
+    model.prior(lambda: {"r": ssm.HalfFlat(), "q": ssm.HalfFlat()})
+    model.initial(lambda: {"x": ssm.Flat()})
+    model.transition(lambda x, q: {"x": ssm.Normal(x, variance=q)})
+    model.observation(lambda x, r: {"y": ssm.Normal(x, variance=r)})
+    estimate = ssm.maximize(model, {"y": datasets.nile()}, seed=1, progress=False)
+    assert estimate.attrs["converged"]
+    assert estimate.parameters["r"] == pytest.approx(15098.5, abs=0.06)
+    assert estimate.parameters["q"] == pytest.approx(1469.17, abs=0.02)
+    assert estimate.log_likelihood == pytest.approx(-632.5456, abs=1e-4)
