@@ -14,7 +14,11 @@ from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, line
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.method_choice import choose_sampler
+from ssmppl.inference.method_choice import (
+    choose_maximiser,
+    choose_sampler,
+    choose_smoother,
+)
 from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
@@ -56,8 +60,7 @@ class Plan:
         out.append(("Structure", self._structure()))
         out.append(("Particle filter", [self._proposal(n, p) for n, p in self.proposals.items()]))
         out.append(("Trajectories", [("PGAS", self._trajectories())]))
-        method, why = choose_sampler(self.structure, self.updates)
-        out.append(("Posterior", [("sample", f"{type(method).__name__}: {why}")]))
+        out.append(("Chosen, unless a method is named", self._choices()))
         if self.updates:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
         return [(title, rows) for title, rows in out if rows]
@@ -73,7 +76,19 @@ class Plan:
             return name, f"not derived: {_reason(proposal)}"
         return name, proposal.explanation
 
+    def _choices(self) -> list[tuple[str, str]]:
+        choices: dict[str, tuple[Any, str]] = {
+            "sample": choose_sampler(self.structure, self.updates)
+        }
+        if self.trace.parameters:
+            choices["maximize"] = choose_maximiser(self.structure, self.trace)
+        choices["smooth"] = choose_smoother(self.structure)
+        return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
+
     def _trajectories(self) -> str:
+        flat = [s.name for s in self.trace.initial.values() if not s.distribution.proper]
+        if flat:
+            return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"
         if self.memory is None:
             return (
                 "conditional SMC without ancestor sampling: a deterministic component never "

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference import direct_optimization, em, particle_em, psaem, score_ascent
@@ -20,6 +19,7 @@ from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.exact_score import exact_score
 from ssmppl.inference.filtering import FilterSettings, estimates_task, seed_sequence
 from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.method_choice import choose_maximiser
 from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
 from ssmppl.inference.particle_score import Smoothing, combine, several_runs
 from ssmppl.inference.pilot import space_of
@@ -136,21 +136,10 @@ def maximize(
 
 def choose_method(setup: Setup) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
-    if isinstance(setup.kalman, KalmanModel):
-        return DirectOptimization(), (
-            "automatically: the model is linear and Gaussian, so that its likelihood and score are "
-            "exact"
-        )
-    reason = smooth_filter_applies(setup.problem.trace)
-    if reason is None:
-        return DirectOptimization(), (
-            "automatically: for one scalar state a particle filter's likelihood can be made "
-            "continuous in the parameters"
-        )
-    return ScoreAscent(), (
-        f"automatically: Fisher's identity gives the score by particle smoothing; direct "
-        f"optimisation does not apply: {reason.reason}"
-    )
+    exact = setup.kalman
+    structure = exact if isinstance(exact, NotApplicable) else exact.form
+    chosen, reason = choose_maximiser(structure, setup.problem.trace)
+    return chosen, f"automatically: {reason}"
 
 
 def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> float:

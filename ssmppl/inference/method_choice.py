@@ -1,13 +1,23 @@
-"""Which method `sample` takes where it is left to choose, and why."""
+"""Which method a verb takes where it is left to choose, and why."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.analysis.structure import LinearGaussian
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.methods import PGAS, Gibbs, MetropolisHastings
+from ssmppl.inference.methods import (
+    PGAS,
+    DirectOptimization,
+    FFBSi,
+    Gibbs,
+    KalmanSmoother,
+    MetropolisHastings,
+    ScoreAscent,
+)
+from ssmppl.language.trace import Trace
 
 FEW = 6  # numbers that a random walk moves at once without trouble
 
@@ -43,3 +53,32 @@ def choose_sampler(
         f"linear Gaussian with {numbers} numbers to move, too many for a random walk: exact "
         f"trajectories, and slices for {named}"
     )
+
+
+def choose_maximiser(
+    structure: LinearGaussian | NotApplicable, trace: Trace
+) -> tuple[DirectOptimization | ScoreAscent, str]:
+    """The method of `maximize` for a model of this structure, and the reason."""
+    if not isinstance(structure, NotApplicable):
+        return DirectOptimization(), (
+            "the model is linear and Gaussian, so that its likelihood and score are exact"
+        )
+    obstacle = smooth_filter_applies(trace)
+    if obstacle is None:
+        return DirectOptimization(), (
+            "for one scalar state a particle filter's likelihood can be made continuous in the "
+            "parameters"
+        )
+    return ScoreAscent(), (
+        "Fisher's identity gives the score by particle smoothing; direct optimisation does not "
+        f"apply: {obstacle.reason}"
+    )
+
+
+def choose_smoother(
+    structure: LinearGaussian | NotApplicable,
+) -> tuple[KalmanSmoother | FFBSi, str]:
+    """The method of `smooth` for a model of this structure, and the reason."""
+    if isinstance(structure, NotApplicable):
+        return FFBSi(), f"the model is not linear and Gaussian: {structure.reason}"
+    return KalmanSmoother(), "the model is linear and Gaussian"

@@ -19,6 +19,7 @@ from ssmppl.inference.filters import LEVELS, quantile_levels
 from ssmppl.inference.fixed_lag import LAG, lag_moments
 from ssmppl.inference.kalman import KalmanModel, kalman_model
 from ssmppl.inference.likelihood import settle
+from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS, FFBSi, FixedLag, KalmanSmoother, SmoothingMethod
 from ssmppl.inference.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
@@ -152,9 +153,8 @@ class _Found:
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
     exact = kalman_model(problem.trace)
     if method is None:
-        if isinstance(exact, KalmanModel):
-            return KalmanSmoother(), "automatically: the model is linear and Gaussian"
-        return FFBSi(), f"automatically: the model is not linear and Gaussian: {exact.reason}"
+        chosen, why = choose_smoother(exact.form if isinstance(exact, KalmanModel) else exact)
+        return chosen, f"automatically: {why}"
     if isinstance(method, str):
         if method not in NAMES:
             raise ArgumentError(
