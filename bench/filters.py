@@ -21,7 +21,7 @@ from table import show
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.datasets import ice_varves
 from ssmppl.demo import varves
-from ssmppl.inference.filtering import FilterSettings, log_likelihood_estimate
+from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
 from ssmppl.inference.problem import pose
 
 HERE = Path(__file__).parent

@@ -129,7 +129,12 @@ def ice_varves() -> Iterator[Row]:
     """The nonlinear model of section 2."""
     name, data, exact = "ice_varves", {"y": load("ice_varves")["y"]}, EXACT["ice_varves"]
     best = exact["mle"]
-    for method in (ssm.DirectOptimization(), ssm.ScoreAscent(), ssm.ParticleEM(), ssm.PSAEM()):
+    for method in (
+        ssm.DirectOptimization(),
+        ssm.ScoreAscent(particles=1000, trajectories=400, tolerance=0.025),
+        ssm.ParticleEM(),
+        ssm.PSAEM(iterations=4000),
+    ):
         yield from maximum(name, varves, data, method, best)
     for key, slope in exact["score_at"].items():
         phi, tau = map(float, key.split(","))

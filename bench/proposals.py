@@ -20,9 +20,9 @@ from table import show
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.filtering import FilterSettings, log_likelihood_estimate
+from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
+from ssmppl.inference.particles.proposal_choice import choose, cost
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.proposal_choice import choose, cost
 
 PARTICLES = (100, 1000)
 REPEATS = 200

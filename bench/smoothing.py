@@ -20,10 +20,10 @@ from table import show
 import ssmppl as ssm
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.data import check_parameters
-from ssmppl.inference.backward import backward_draws, draw_paths, particle_system
-from ssmppl.inference.filtering import FilterSettings
-from ssmppl.inference.kalman import kalman_model
-from ssmppl.inference.kalman_moments import SmoothedMoments
+from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.exact.kalman_moments import SmoothedMoments
+from ssmppl.inference.particles.backward import backward_draws, draw_paths, particle_system
+from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.problem import Problem, pose
 
 STEPS = 50

@@ -23,8 +23,10 @@ from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.bridge import Bridge, bridge, importance
-from ssmppl.inference.filtering import (
+from ssmppl.inference.chains.bridge import Bridge, bridge, importance
+from ssmppl.inference.exact.kalman import kalman_log_likelihood, kalman_model
+from ssmppl.inference.methods import PMMH, MetropolisHastings
+from ssmppl.inference.particles.filtering import (
     FilterSettings,
     check_count,
     log_likelihood_estimate,
@@ -32,11 +34,9 @@ from ssmppl.inference.filtering import (
     repeated_estimates,
     seed_sequence,
 )
-from ssmppl.inference.kalman import kalman_log_likelihood, kalman_model
-from ssmppl.inference.methods import PMMH, MetropolisHastings
-from ssmppl.inference.pilot import Space, find_mode, space_of, tune_particles
+from ssmppl.inference.particles.pilot import Space, find_mode, space_of, tune_particles
+from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.runner import run_tasks
 from ssmppl.inference.sample import sample
 from ssmppl.language.model import Model

@@ -12,8 +12,9 @@ from scipy.special import ndtr, ndtri
 
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
-from ssmppl.inference import kalman
-from ssmppl.inference.filtering import (
+from ssmppl.inference.exact import kalman
+from ssmppl.inference.likelihood import settle
+from ssmppl.inference.particles.filtering import (
     FilterRun,
     FilterSettings,
     check_count,
@@ -21,9 +22,8 @@ from ssmppl.inference.filtering import (
     random_state,
     seed_sequence,
 )
-from ssmppl.inference.likelihood import settle
+from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.runner import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.results import to_dataset

@@ -11,16 +11,16 @@ import numpy as np
 from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.filtering import (
+from ssmppl.inference.exact.kalman import kalman_log_likelihood
+from ssmppl.inference.particles.filtering import (
     FilterSettings,
     check_count,
     estimates_task,
     filter_settings,
     seed_sequence,
 )
-from ssmppl.inference.kalman import kalman_log_likelihood
+from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.runner import run_tasks
 from ssmppl.language.model import Model
 

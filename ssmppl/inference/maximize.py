@@ -12,19 +12,19 @@ import numpy as np
 
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference import direct_optimization, em, particle_em, psaem, score_ascent
-from ssmppl.inference.ascent import Ascent, Setup
-from ssmppl.inference.complete_score import complete_scores
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
-from ssmppl.inference.exact_score import exact_score
-from ssmppl.inference.filtering import FilterSettings, estimates_task, seed_sequence
-from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.exact.exact_score import exact_score
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.maximum import direct_optimization, em, particle_em, psaem, score_ascent
+from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.method_choice import choose_maximiser
 from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
-from ssmppl.inference.particle_score import Smoothing, combine, several_runs
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.particles.complete_score import complete_scores
+from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, seed_sequence
+from ssmppl.inference.particles.particle_score import Smoothing, combine, several_runs
+from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import pose
-from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.runner import run_tasks
 from ssmppl.language.model import Model
 

@@ -12,15 +12,15 @@ import numpy as np
 from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference import gibbs, metropolis, pgas, pmmh
-from ssmppl.inference.filtering import check_count, seed_sequence
+from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh
+from ssmppl.inference.chains.parameter_steps import plan_updates
+from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.method_choice import choose_sampler
 from ssmppl.inference.methods import PGAS, PMMH, Gibbs, Method, MetropolisHastings
-from ssmppl.inference.parameter_steps import plan_updates
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.particles.filtering import check_count, seed_sequence
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import ChainDraws, run_chains, stack
-from ssmppl.inference.sampling import Sampler, Setup
 from ssmppl.language.model import Model
 from ssmppl.results import to_inference_data
 

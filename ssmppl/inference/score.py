@@ -11,13 +11,13 @@ import numpy as np
 
 from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.complete_score import complete_scores
 from ssmppl.inference.estimate import by_name, free_components, table
-from ssmppl.inference.exact_score import ExactScore, exact_score
-from ssmppl.inference.filtering import check_count, seed_sequence
-from ssmppl.inference.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.exact_score import ExactScore, exact_score
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.likelihood import settle
-from ssmppl.inference.particle_score import (
+from ssmppl.inference.particles.complete_score import complete_scores
+from ssmppl.inference.particles.filtering import check_count, seed_sequence
+from ssmppl.inference.particles.particle_score import (
     ParticleScore,
     Smoothing,
     combine,

@@ -19,7 +19,7 @@ from ssmppl.data import (
 )
 from ssmppl.errors import ModelError, SamplingError
 from ssmppl.expressions.expr import topological
-from ssmppl.inference.filtering import (
+from ssmppl.inference.particles.filtering import (
     check_count,
     random_state,
     seed_sequence,

@@ -12,20 +12,25 @@ from scipy.special import ndtri
 
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, listing
-from ssmppl.inference import pgas
-from ssmppl.inference.backward import choose_kernel, draw_paths, particle_system
-from ssmppl.inference.filtering import FilterSettings, check_count, random_state, seed_sequence
+from ssmppl.inference.chains import pgas
+from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.filters import LEVELS, quantile_levels
-from ssmppl.inference.fixed_lag import LAG, lag_moments
-from ssmppl.inference.kalman import KalmanModel, kalman_model
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS, FFBSi, FixedLag, KalmanSmoother, SmoothingMethod
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
+from ssmppl.inference.particles.filtering import (
+    FilterSettings,
+    check_count,
+    random_state,
+    seed_sequence,
+)
+from ssmppl.inference.particles.fixed_lag import LAG, lag_moments
+from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.proposal_choice import choose
 from ssmppl.inference.runner import run_chains
-from ssmppl.inference.sampling import Setup
 from ssmppl.language.model import Model
 from ssmppl.results import to_dataset
 

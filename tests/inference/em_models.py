@@ -9,7 +9,7 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.inference.kalman import kalman_model
+from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
 

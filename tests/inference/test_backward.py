@@ -9,7 +9,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.inference.backward import (
+from ssmppl.inference.particles.backward import (
     ParticleSystem,
     backward_draws,
     choose_kernel,
@@ -17,7 +17,7 @@ from ssmppl.inference.backward import (
     genealogy,
     particle_system,
 )
-from ssmppl.inference.filtering import (
+from ssmppl.inference.particles.filtering import (
     SCHEMES,
     FilterSettings,
     log_likelihood_estimate,

@@ -16,8 +16,8 @@ from ssmppl.data import unpack_parameters
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import NotDifferentiable
-from ssmppl.inference.complete_score import complete_scores
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.particles.complete_score import complete_scores
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.language.trace import trace
 from tests.codegen.models import build

@@ -7,11 +7,11 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters, check_values
 from ssmppl.datasets import load
-from ssmppl.inference.ascent import Setup
-from ssmppl.inference.em import ExactSteps
-from ssmppl.inference.em import climb as climb_em
-from ssmppl.inference.m_step import maximiser
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.em import ExactSteps
+from ssmppl.inference.maximum.em import climb as climb_em
+from ssmppl.inference.maximum.m_step import maximiser
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import pose
 from tests.inference import em_models
 from tests.inference.em_models import simulated

@@ -8,7 +8,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, load
-from ssmppl.inference.bridge import bridge, importance
+from ssmppl.inference.chains.bridge import bridge, importance
 from tests.statistics import models
 from tests.statistics.checks import seed_of
 

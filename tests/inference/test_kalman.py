@@ -13,7 +13,7 @@ from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.codegen.kernels import kalman as kernel
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference.kalman import kalman_filter, kalman_log_likelihood, kalman_model
+from ssmppl.inference.exact.kalman import kalman_filter, kalman_log_likelihood, kalman_model
 from ssmppl.language.model import Model
 from ssmppl.language.trace import trace
 from tests.inference.kalman_models import MODELS, posed

@@ -5,7 +5,7 @@ import pytest
 
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.errors import SamplingError
-from ssmppl.inference.kalman import kalman_model
+from ssmppl.inference.exact.kalman import kalman_model
 from tests.inference.kalman_models import MODELS, posed, scalar
 from tests.statistics.checks import seed_of
 

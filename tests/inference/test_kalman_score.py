@@ -9,8 +9,8 @@ import ssmppl.language.distributions as D
 from ssmppl import datasets
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.inference.differences import jacobian
-from ssmppl.inference.kalman import kalman_model
+from ssmppl.inference.exact.differences import jacobian
+from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.language.model import Model
 from ssmppl.language.trace import trace
 from tests.inference.kalman_models import MODELS, posed, scalar, time_varying

@@ -11,10 +11,10 @@ from ssmppl import datasets
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
 from ssmppl.inference import maximize as verb
-from ssmppl.inference.ascent import Ascent
-from ssmppl.inference.chart import Chart
-from ssmppl.inference.exact_score import ExactScore
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.exact.exact_score import ExactScore
+from ssmppl.inference.maximum.ascent import Ascent
+from ssmppl.inference.maximum.chart import Chart
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import pose
 from tests.statistics import models
 from tests.statistics.checks import seed_of

@@ -10,12 +10,11 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.datasets import ice_varves, load
-from ssmppl.inference.em import ExactSteps
-from ssmppl.inference.filtering import FilterSettings, random_state
-from ssmppl.inference.m_step import fixed_point, maximiser, ratio_weights
-from ssmppl.inference.particle_em import climb as climb_particle_em
-from ssmppl.inference.pgas import Sweeper, start_chain
-from ssmppl.inference.psaem import (
+from ssmppl.inference.chains.pgas import Sweeper, start_chain
+from ssmppl.inference.maximum.em import ExactSteps
+from ssmppl.inference.maximum.m_step import fixed_point, maximiser, ratio_weights
+from ssmppl.inference.maximum.particle_em import climb as climb_particle_em
+from ssmppl.inference.maximum.psaem import (
     State,
     averaged_sweep,
     climb,
@@ -23,6 +22,7 @@ from ssmppl.inference.psaem import (
     saem_block,
     step_size,
 )
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from tests.inference import em_models
 from tests.inference.em_models import simulated
 from tests.inference.test_em import setup_of

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.coordinates import chart, coordinates
-from ssmppl.inference.curvature import fitted_covariance
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.chains.coordinates import chart, coordinates
+from ssmppl.inference.chains.curvature import fitted_covariance
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import pose
 
 SHORT = {"draws": 12, "warmup": 8, "chains": 2, "progress": False, "seed": 1}

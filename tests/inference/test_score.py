@@ -8,7 +8,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.particle_score import Run, combine, run_weights
+from ssmppl.inference.particles.particle_score import Run, combine, run_weights
 from tests.statistics import models
 from tests.statistics.checks import seed_of
 from tests.statistics.exact import DenseGaussian

@@ -7,12 +7,12 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.inference import score_ascent
-from ssmppl.inference.ascent import Setup
-from ssmppl.inference.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximize import choose_method
-from ssmppl.inference.particle_score import Run
-from ssmppl.inference.pilot import space_of
+from ssmppl.inference.maximum import score_ascent
+from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.particles.particle_score import Run
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import pose
 from tests.statistics import models
 from tests.statistics.checks import seed_of

@@ -11,9 +11,9 @@ import ssmppl as ssm
 from ssmppl.codegen.kernels.correlated import hilbert_index, order_of, ordered_systematic
 from ssmppl.codegen.kernels.filter_with_score import carry_back
 from ssmppl.codegen.kernels.random import new_state
-from ssmppl.inference.filtering import FilterSettings
-from ssmppl.inference.kalman import kalman_model
-from ssmppl.inference.particle_likelihood import CorrelatedLikelihood, ScoredLikelihood
+from ssmppl.inference.chains.particle_likelihood import CorrelatedLikelihood, ScoredLikelihood
+from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.problem import pose
 
 from ..statistics import models

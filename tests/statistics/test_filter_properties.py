@@ -13,14 +13,14 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.inference.backward import backward_draws, genealogy, particle_system
-from ssmppl.inference.filtering import (
+from ssmppl.inference.exact.kalman import kalman_filter, kalman_model
+from ssmppl.inference.particles.backward import backward_draws, genealogy, particle_system
+from ssmppl.inference.particles.filtering import (
     FilterSettings,
     full_run,
     log_likelihood_estimate,
     random_state,
 )
-from ssmppl.inference.kalman import kalman_filter, kalman_model
 from ssmppl.inference.problem import pose
 
 from . import models

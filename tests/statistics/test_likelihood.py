@@ -16,9 +16,9 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
-from ssmppl.inference.filtering import FilterSettings, random_state
-from ssmppl.inference.pilot import space_of
-from ssmppl.inference.pmmh import run_filters
+from ssmppl.inference.chains.pmmh import run_filters
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import pose
 
 from . import models

@@ -15,8 +15,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.expressions.expr import constant
-from ssmppl.inference import gibbs
-from ssmppl.inference.parameter_steps import draw_parameters
+from ssmppl.inference.chains import gibbs
+from ssmppl.inference.chains.parameter_steps import draw_parameters
 
 from .checks import MCSE, assert_within, deviations, influence_of_correlation, mcse_mean, seed_of
 from .exact import DenseGaussian

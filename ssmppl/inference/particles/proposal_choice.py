@@ -17,7 +17,7 @@ from ssmppl.codegen.module import PARTICLE, level_of
 from ssmppl.codegen.render import depends, is_small_power, topological_until
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.filtering import FilterSettings, repeated_estimates
+from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
 from ssmppl.inference.problem import Problem
 
 # Nanoseconds per particle, from timings of single passes; what they weigh matters, not the unit.

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data import unpack_parameters
-from ssmppl.inference.filtering import random_state
-from ssmppl.inference.pilot import Space
+from ssmppl.inference.particles.filtering import random_state
+from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block
 

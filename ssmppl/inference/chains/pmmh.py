@@ -14,18 +14,27 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.coordinates import Coordinates, coordinates
-from ssmppl.inference.curvature import fitted_covariance
-from ssmppl.inference.filtering import FilterSettings, check_count, random_state
-from ssmppl.inference.langevin import Langevin
-from ssmppl.inference.methods import PMMH, MetropolisHastings
-from ssmppl.inference.particle_likelihood import (
+from ssmppl.inference.chains.coordinates import Coordinates, coordinates
+from ssmppl.inference.chains.curvature import fitted_covariance
+from ssmppl.inference.chains.langevin import Langevin
+from ssmppl.inference.chains.particle_likelihood import (
     CorrelatedLikelihood,
     ParticleLikelihood,
     ScoredLikelihood,
     run_filters,
 )
-from ssmppl.inference.pilot import (
+from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.walk import (
+    Likelihood,
+    Metropolis,
+    Proposal,
+    RandomWalk,
+    metropolis_block,
+    start_chain,
+)
+from ssmppl.inference.methods import PMMH, MetropolisHastings
+from ssmppl.inference.particles.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.particles.pilot import (
     SCALE_REPEATS,
     TUNING_REPEATS,
     Pilot,
@@ -36,16 +45,7 @@ from ssmppl.inference.pilot import (
     particles_for,
     tune_particles,
 )
-from ssmppl.inference.proposal_choice import choose
-from ssmppl.inference.sampling import Sampler, Setup
-from ssmppl.inference.walk import (
-    Likelihood,
-    Metropolis,
-    Proposal,
-    RandomWalk,
-    metropolis_block,
-    start_chain,
-)
+from ssmppl.inference.particles.proposal_choice import choose
 
 __all__ = ["prepare", "run_filters"]
 

@@ -19,17 +19,17 @@ from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.program import Program
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference import kalman_matrices
-from ssmppl.inference.differences import observed_information
-from ssmppl.inference.kalman_diffuse import check_agreement, diffuse_filter, start_of
-from ssmppl.inference.kalman_moments import (
+from ssmppl.inference.exact import kalman_matrices
+from ssmppl.inference.exact.differences import observed_information
+from ssmppl.inference.exact.kalman_diffuse import check_agreement, diffuse_filter, start_of
+from ssmppl.inference.exact.kalman_moments import (
     Disturbances,
     SmoothedMoments,
     Stopped,
     drawn,
     smoothed,
 )
-from ssmppl.inference.kalman_score import Slopes, check_free, score, slopes
+from ssmppl.inference.exact.kalman_score import Slopes, check_free, score, slopes
 from ssmppl.language.trace import Trace
 
 __all__ = [

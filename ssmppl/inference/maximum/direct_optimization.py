@@ -14,13 +14,13 @@ from scipy.optimize import minimize
 
 from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference import smooth_likelihood
-from ssmppl.inference.ascent import Ascent, Setup
 from ssmppl.inference.estimate import free_components
-from ssmppl.inference.exact_score import exact_score
-from ssmppl.inference.filtering import check_count
-from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.exact.exact_score import exact_score
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.maximum import smooth_likelihood
+from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
+from ssmppl.inference.particles.filtering import check_count
 
 NEWTON_STEPS = 8
 GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.chart import Chart
-from ssmppl.inference.kalman import KalmanModel, kalman_model
-from ssmppl.inference.pilot import Pilot, Space, at, find_mode, finite_point
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.maximum.chart import Chart
+from ssmppl.inference.particles.pilot import Pilot, Space, at, find_mode, finite_point
 from ssmppl.inference.problem import Problem
 
 

@@ -24,14 +24,20 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ssmppl.errors import ArgumentError, SamplingError, listing
-from ssmppl.inference.ascent import Ascent, Setup
-from ssmppl.inference.complete_score import complete_scores
-from ssmppl.inference.filtering import check_count
 from ssmppl.inference.likelihood import settle
+from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import ScoreAscent
-from ssmppl.inference.particle_score import Run, Smoothing, combine, run_weights, several_runs
+from ssmppl.inference.particles.complete_score import complete_scores
+from ssmppl.inference.particles.filtering import check_count
+from ssmppl.inference.particles.particle_score import (
+    Run,
+    Smoothing,
+    combine,
+    run_weights,
+    several_runs,
+)
+from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.progress import Progress
-from ssmppl.inference.proposal_choice import choose
 from ssmppl.language.transforms import transforms
 
 STEPS = ("newton", "paper")

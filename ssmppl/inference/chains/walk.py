@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ssmppl.inference.coordinates import Coordinates
+from ssmppl.inference.chains.coordinates import Coordinates
 from ssmppl.inference.runner import Block
 
 ADAPTATION_POWER = 0.66

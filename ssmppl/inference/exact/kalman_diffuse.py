@@ -18,7 +18,7 @@ from ssmppl.codegen.kernels.kalman import LOG_2PI, OK
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.data import Experiment
 from ssmppl.errors import SamplingError
-from ssmppl.inference.kalman_moments import Stopped
+from ssmppl.inference.exact.kalman_moments import Stopped
 from ssmppl.language.trace import Trace
 
 AGREEMENT = 1e-6  # of log p(y) by two roads; what is worse was lost to rounding

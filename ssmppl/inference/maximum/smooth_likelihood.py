@@ -19,9 +19,9 @@ from scipy.optimize import minimize
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.codegen.smooth import compile_smooth_filter
 from ssmppl.errors import SamplingError
-from ssmppl.inference.ascent import Ascent, Setup
-from ssmppl.inference.filtering import random_state
+from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
+from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import Problem
 
 SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of the likelihood

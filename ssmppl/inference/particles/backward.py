@@ -27,7 +27,7 @@ from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure
 from ssmppl.inference.problem import Problem
 
 __all__ = [

@@ -18,7 +18,7 @@ from ssmppl.analysis.density import terms
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute
-from ssmppl.inference.pilot import Space
+from ssmppl.inference.particles.pilot import Space
 from ssmppl.language.transforms import transforms
 
 STEP = 1e-5  # of the central differences where a prior has no derivative in closed form

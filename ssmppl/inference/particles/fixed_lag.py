@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.inference.backward import ParticleSystem
+from ssmppl.inference.particles.backward import ParticleSystem
 
 LAG = 20
 

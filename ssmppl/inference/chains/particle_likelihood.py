@@ -16,10 +16,10 @@ from ssmppl.codegen.metropolis import (
     scored_filter,
 )
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.filtering import FilterSettings, failure
-from ssmppl.inference.pilot import Space
+from ssmppl.inference.chains.walk import Point, Run
+from ssmppl.inference.particles.filtering import FilterSettings, failure
+from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.walk import Point, Run
 
 
 @dataclass(frozen=True)

@@ -14,18 +14,18 @@ import numpy as np
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.inference.filtering import FilterSettings, check_count, failure
-from ssmppl.inference.methods import PGAS
-from ssmppl.inference.parameter_steps import (
+from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
     log_joint,
     plan_updates,
 )
-from ssmppl.inference.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.methods import PGAS
+from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block
-from ssmppl.inference.sampling import Sampler, Setup
 
 PARTICLES = 25
 PARTICLES_WITHOUT_ANCESTORS = 200

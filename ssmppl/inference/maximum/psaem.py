@@ -26,17 +26,17 @@ import numpy as np
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.ascent import Ascent, Setup
-from ssmppl.inference.filtering import FilterSettings, check_count, failure, random_state
-from ssmppl.inference.m_step import Maximiser, maximiser, run_to_estimate, starts
-from ssmppl.inference.methods import PSAEM
-from ssmppl.inference.pgas import (
+from ssmppl.inference.chains.pgas import (
     PARTICLES,
     PARTICLES_WITHOUT_ANCESTORS,
     Sweeper,
     pgas_proposal,
     start_chain,
 )
+from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
+from ssmppl.inference.methods import PSAEM
+from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure, random_state
 from ssmppl.inference.runner import Block
 
 

@@ -22,9 +22,9 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.inference.backward import backward_draws
-from ssmppl.inference.complete_score import CompleteScores
-from ssmppl.inference.filtering import FilterSettings, random_state
+from ssmppl.inference.particles.backward import backward_draws
+from ssmppl.inference.particles.complete_score import CompleteScores
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.runner import run_tasks
 
 LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave

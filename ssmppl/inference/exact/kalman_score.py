@@ -22,8 +22,8 @@ from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.kalman_matrices import values_of
-from ssmppl.inference.kalman_moments import Stopped
+from ssmppl.inference.exact.kalman_matrices import values_of
+from ssmppl.inference.exact.kalman_moments import Stopped
 from ssmppl.language.trace import Trace
 
 LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",

@@ -12,14 +12,10 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.coordinates import coordinates
-from ssmppl.inference.kalman import KalmanModel, kalman_model
-from ssmppl.inference.methods import MetropolisHastings
-from ssmppl.inference.pilot import dispersed, find_mode
-from ssmppl.inference.pmmh import adapts, settings_of, walk_factor
-from ssmppl.inference.problem import Problem
-from ssmppl.inference.sampling import Sampler, Setup
-from ssmppl.inference.walk import (
+from ssmppl.inference.chains.coordinates import coordinates
+from ssmppl.inference.chains.pmmh import adapts, settings_of, walk_factor
+from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.walk import (
     Metropolis,
     Point,
     RandomWalk,
@@ -27,6 +23,10 @@ from ssmppl.inference.walk import (
     metropolis_block,
     start_chain,
 )
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.methods import MetropolisHastings
+from ssmppl.inference.particles.pilot import dispersed, find_mode
+from ssmppl.inference.problem import Problem
 
 
 def exact_model(problem: Problem, method: str) -> KalmanModel:

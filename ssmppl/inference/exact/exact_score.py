@@ -13,8 +13,8 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.differences import jacobian, observed_information
-from ssmppl.inference.kalman import KalmanModel
+from ssmppl.inference.exact.differences import jacobian, observed_information
+from ssmppl.inference.exact.kalman import KalmanModel
 
 STEP = 1e-2  # the largest of the differences, relative to the parameter
 LEAST = 0.1  # parameters nearer to zero count as this large

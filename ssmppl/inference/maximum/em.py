@@ -32,11 +32,11 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.inference.ascent import Ascent, Setup
-from ssmppl.inference.filtering import check_count
-from ssmppl.inference.kalman import KalmanModel
-from ssmppl.inference.m_step import maximiser
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods import EM
+from ssmppl.inference.particles.filtering import check_count
 from ssmppl.language.trace import Trace, previous, seen
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.inference.coordinates import Coordinates, chart
-from ssmppl.inference.walk import ADAPTATION_POWER, Point, Run
+from ssmppl.inference.chains.coordinates import Coordinates, chart
+from ssmppl.inference.chains.walk import ADAPTATION_POWER, Point, Run
 
 LEAST, MOST = 0.2, 5.0  # eigenvalues of the information, in units of the pilot's
 LONGEST = 1.0  # of the drift, in standard deviations of the step

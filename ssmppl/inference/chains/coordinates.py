@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.inference.pilot import Space
+from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
 from ssmppl.language.trace import Site
 from ssmppl.language.transforms import transforms

@@ -13,18 +13,18 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.inference.kalman import KalmanModel
-from ssmppl.inference.methods import Gibbs
-from ssmppl.inference.metropolis import exact_model
-from ssmppl.inference.parameter_steps import (
+from ssmppl.inference.chains.metropolis import exact_model
+from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
     log_joint,
     plan_updates,
 )
-from ssmppl.inference.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.methods import Gibbs
+from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.runner import Block
-from ssmppl.inference.sampling import Sampler, Setup
 
 
 @dataclass(frozen=True)

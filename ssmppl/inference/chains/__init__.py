@@ -1,0 +1,1 @@
+"""Markov chain methods; each has `prepare(setup, method)`."""

@@ -1,0 +1,1 @@
+"""Linear Gaussian models, without Monte Carlo error."""

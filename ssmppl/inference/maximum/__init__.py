@@ -1,0 +1,1 @@
+"""Methods of maximisation; each has `climb(setup, method)`."""

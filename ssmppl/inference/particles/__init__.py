@@ -1,0 +1,1 @@
+"""Particle filters and smoothers, and what is read off them."""
