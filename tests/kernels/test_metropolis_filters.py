@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.codegen.kernels.correlated import hilbert_index, order_of, ordered_systematic
@@ -103,9 +104,9 @@ def test_estimates_on_given_numbers_are_unbiased(problem, proposal):
 
 @pytest.mark.parametrize("model", ["one", "two"])
 def test_log_z_is_nearly_continuous_in_the_numbers(problem, model):
-    """The variance of the difference of successive estimates is a small share of that of
-    independent ones: less than a tenth for one state component. Neighbours in the plane need not
-    be neighbours on the curve, so that for two it is a good part, yet still well below the whole.
+    """The difference of successive estimates varies less than that of independent ones, beyond
+    what chance can do (F test), and by more than a factor of ten for one state component. For two
+    no such factor is known: neighbours in the plane need not be neighbours on the curve.
     """
     if model == "one":
         parameters = {"phi": 0.8, "tau": 2.0}
@@ -115,17 +116,18 @@ def test_log_z_is_nearly_continuous_in_the_numbers(problem, model):
     else:
         theta = THETA
     rng = stream("continuous", model)
-    share = {}
+    share, repeats = {}, 150
     for rho in (0.0, 0.999):
         likelihood = CorrelatedLikelihood(problem, FilterSettings(100, "bootstrap"), rho)
         differences = []
-        for _ in range(150):
+        for _ in range(repeats):
             run = likelihood.run(theta, None, rng)
             moved = likelihood.run(theta, run, rng)
             differences.append(moved.log_likelihood - run.log_likelihood)
         share[rho] = np.var(differences)
-    print(share)
-    assert share[0.999] < (0.1 if model == "one" else 0.6) * share[0.0], share
+    ratio = share[0.0] / share[0.999]
+    assert stats.f.sf(ratio, repeats - 1, repeats - 1) < LEVEL, share
+    assert model == "two" or ratio > 10.0, share
 
 
 @pytest.mark.parametrize(("d", "bits"), [(1, 5), (2, 4), (3, 3), (4, 2)])

@@ -25,9 +25,9 @@ def test_statistic_knows_uniform_from_not():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STUDIES)
 def test_ranks_are_uniform(name):
-    """Every parameter, and the state in the middle, over 200 data sets from the prior."""
+    """Every parameter, and the state in the middle, over the first 100 data sets."""
     study = STUDIES[name]
-    ranks, thin = calibrate(study, 200)
+    ranks, thin = calibrate(study, 100)
     found = {q: uniform_p(column) for q, column in zip(study.ranked, ranks.T, strict=True)}
     print(f"{name}, thinned by {thin}: " + ", ".join(f"{q}: p={p:.3f}" for q, p in found.items()))
     assert min(found.values()) > LEVEL / QUANTITIES, found
