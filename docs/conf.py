@@ -1,5 +1,6 @@
 """Sphinx configuration; built by `make docs`, with warnings as errors."""
 
+import os
 import re
 from importlib.metadata import version as installed_version
 
@@ -18,6 +19,9 @@ extensions = [
     "sphinx-mathjax-offline",  # the pages ask nobody else for anything
 ]
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+
+# Under another backend than the notebooks' own their figures would not be on the pages.
+os.environ.pop("MPLBACKEND", None)
 
 # Notebooks are Markdown files. All are run anew for every build; an error in one fails it.
 nb_execution_mode = "force"
