@@ -333,10 +333,18 @@ def discrete_prior():
     return declare(prior=prior)
 
 
-@bad("the law of 'x' is Flat, which is improper", "as a prior only")
+@bad("the law of 'x' is Flat, which is improper", "as a prior")
 def flat_state():
-    def initial():
+    def transition(x):
         return {"x": ssm.Flat()}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("the law of 'x' is HalfFlat, which is improper", "as a prior")
+def half_flat_start():
+    def initial():
+        return {"x": ssm.HalfFlat()}  # HERE
 
     return declare(initial=initial)
 

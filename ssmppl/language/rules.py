@@ -98,8 +98,8 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
     if improper and not allowed:
         raise ModelError(
             f"the law of {name!r} is {kind}, which is improper",
-            fix=f"use {kind} as a prior only"
-            + (", and in @initial of a linear Gaussian model" if kind == "Flat" else "")
+            fix=f"use {kind} as a prior"
+            + (", or in @initial of a linear Gaussian model" if kind == "Flat" else "")
             + "; a vague law is one of large spread",
             where=where,
         )
