@@ -59,7 +59,6 @@ MODELS = {
 }
 LINEAR = {  # for the methods with exact likelihood and trajectories
     "stationary": (("phi", "tau"), "x"),
-    "two_states": MODELS["two_states"],
 }
 METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100))
 EXACT = (ssm.Gibbs(), ssm.MetropolisHastings())
