@@ -51,10 +51,10 @@ test: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q -n $(WORKERS)
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
 slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n $(WORKERS) -m slow || test $$? -eq 5
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m slow || test $$? -eq 5
 
 examples: $(VENV)/.installed-run
 	@mkdir -p build
