@@ -1,7 +1,13 @@
 import json
+import signal
 from pathlib import Path
 
 import pytest
+
+# A shell without job control starts its background jobs with Ctrl-C ignored; the tests of
+# interrupts would wait for ever.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
