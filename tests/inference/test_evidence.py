@@ -10,7 +10,7 @@ import ssmppl as ssm
 from ssmppl.datasets import ice_varves, load
 from ssmppl.inference.chains.bridge import bridge, importance
 from tests.statistics import models
-from tests.statistics.checks import seed_of
+from tests.statistics.checks import LEVEL, seed_of
 
 ERRORS = 4.0  # standard errors that an estimate may lie off
 
@@ -40,8 +40,8 @@ def test_the_error_of_a_bridge_is_its_spread(rho):
         scores.append((found.log_constant - 3.0) / found.standard_error)
     scores = np.array(scores)
     assert abs(scores.mean()) < ERRORS / np.sqrt(300)
-    # the estimated effective sample size of short chains adds a little to the spread
-    assert 0.8 < scores.var() < 1.35
+    low, high = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], 299) / 299
+    assert low < scores.var(ddof=1) < high
 
 
 def test_importance_sampling_is_unbiased():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -51,8 +51,15 @@ class ParticleLikelihood:
         return paths_of(point)
 
 
+class _WithFilter:
+    """Leaves the compiled filter out when it is sent to another process, which makes its own."""
+
+    def __getstate__(self) -> dict:
+        return {name: value for name, value in self.__dict__.items() if name != "filter"}
+
+
 @dataclass(frozen=True)
-class ScoredLikelihood:
+class ScoredLikelihood(_WithFilter):
     """A particle filter that estimates score and information too, zero for fixed parameters.
 
     wanted : positions in theta of the free parameters. second : whether the information is wanted.
@@ -76,12 +83,6 @@ class ScoredLikelihood:
                 where=made.where,
             )
         return made
-
-    def __getstate__(self) -> dict:
-        return {f.name: self.__dict__[f.name] for f in fields(self)}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
         entry, p = self.filter.module.filter_with_score, len(self.wanted)
@@ -113,7 +114,7 @@ class ScoredLikelihood:
 
 
 @dataclass(frozen=True)
-class CorrelatedLikelihood:
+class CorrelatedLikelihood(_WithFilter):
     """A particle filter on random numbers that move by v' = rho v + sqrt(1 - rho^2) e.
 
     The move leaves the normal law of the numbers invariant and is reversible, so that they may be
@@ -135,12 +136,6 @@ class CorrelatedLikelihood:
                 where=made.where,
             )
         return made
-
-    def __getstate__(self) -> dict:
-        return {f.name: self.__dict__[f.name] for f in fields(self)}
-
-    def __setstate__(self, state: dict) -> None:
-        self.__dict__.update(state)
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
         old = None if before is None else before.numbers
