@@ -4,6 +4,7 @@
 #   make demo       the ice varves, from the model to its posterior
 #   make test       format, lint, types, tests
 #   make slow       the long statistical checks
+#   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
 #   make docs       the documentation, notebooks executed, warnings are errors
 #   make bench      speed against plain C and other packages
@@ -21,7 +22,7 @@ PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow examples docs bench format clean
+.PHONY: help demo test slow tables examples docs bench format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -55,6 +56,10 @@ test: $(VENV)/.installed-dev
 
 slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m slow || test $$? -eq 5
+
+tables: $(VENV)/.installed-dev
+	SSMPPL_TABLE_REPEATS=2000 $(BIN)/python -m pytest -s -m slow -k table -n $(WORKERS) \
+	    tests/statistics/test_likelihood.py
 
 examples: $(VENV)/.installed-run
 	@mkdir -p build

@@ -4,7 +4,12 @@ Declare priors, initial law, transition and observation as decorated functions o
 verbs below derive and compile the rest.
 """
 
+from ssmppl import plots
 from ssmppl.errors import ArgumentError, DataError, ModelError, SamplingError, SSMError
+from ssmppl.gap.catalogue import effects
+from ssmppl.gap.diagnose import diagnose
+from ssmppl.gap.effect import effect
+from ssmppl.gap.report import GapReport
 from ssmppl.inference.evidence import Evidence, evidence
 from ssmppl.inference.explain import compile, explain
 from ssmppl.inference.filters import kalman_filter, particle_filter
@@ -82,6 +87,7 @@ __all__ = [
     "FixedLag",
     "Flat",
     "Gamma",
+    "GapReport",
     "Gibbs",
     "HalfCauchy",
     "HalfFlat",
@@ -107,12 +113,16 @@ __all__ = [
     "Uniform",
     "Wishart",
     "compile",
+    "diagnose",
+    "effect",
+    "effects",
     "evidence",
     "explain",
     "kalman_filter",
     "log_likelihood",
     "maximize",
     "particle_filter",
+    "plots",
     "primitive",
     "sample",
     "score",

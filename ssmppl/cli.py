@@ -15,6 +15,7 @@ import click
 
 import ssmppl as ssm
 from ssmppl import demo as varves_demo
+from ssmppl.cli_diagnose import diagnose_command
 from ssmppl.errors import DataError, SSMError
 from ssmppl.inference.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments, read_csv
@@ -372,3 +373,6 @@ def _data(paths: tuple[Path, ...]) -> pd.DataFrame | list[pd.DataFrame]:
 
 def _stem(model: str) -> str:
     return Path(model.rpartition(".py")[0] or model).stem
+
+
+main.add_command(diagnose_command(Command, _data))

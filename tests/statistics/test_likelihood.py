@@ -8,6 +8,7 @@ usable mean, so N is taken per cell from a pilot under another seed (see `plan`)
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 
@@ -39,6 +40,8 @@ FEW = (
 )
 
 PILOT, AIM, WANTED, FAULT = 100, 0.7, 0.8, 1.0
+# Repeats of every cell of the whole tables; `make tables` asks for 2,000 and takes over an hour.
+REPEATS = int(os.environ.get("SSMPPL_TABLE_REPEATS", "500"))
 COST = {"bootstrap": 9, "guided": 47, "auxiliary": 72}  # ns per particle step, about
 RESAMPLING = {"systematic": 0, "stratified": 3, "residual": 20, "multinomial": 33}
 
@@ -150,7 +153,7 @@ def length_for(parameters, combination, name, repeats) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("combination", COMBINATIONS, ids=lambda c: "-".join(map(str, c)))
 def test_varves_table(exact_values, combination):
-    """All 144 cells at 2,000 repeats: six points, every filter, scheme and threshold.
+    """All 144 cells: six points, every filter, scheme and threshold.
 
     On all 634 rows where that is affordable, else on the first 200 or 100: the line of each cell
     says which, and the exact value of a shorter series is that of the point-mass filter.
@@ -159,11 +162,13 @@ def test_varves_table(exact_values, combination):
     for key, parameters in points(exact_values).items():
         exact = parameters.pop("exact")
         label = f"varves {key}"
-        steps = length_for(parameters, combination, f"{label} {combination}", 2000)
+        steps = length_for(parameters, combination, f"{label} {combination}", REPEATS)
         y = ice_varves()[:steps]
         if steps < 634:
             exact = varve_log_likelihood(y, **parameters)
-        run_cell(table, label, models.varves, {"y": y}, parameters, exact, combination, 2000, steps)
+        run_cell(
+            table, label, models.varves, {"y": y}, parameters, exact, combination, REPEATS, steps
+        )
     table.judge()
 
 
@@ -282,10 +287,10 @@ def test_vector_observations_and_states():
 @pytest.mark.parametrize("gaps", [False, True], ids=["complete", "gaps"])
 @pytest.mark.parametrize("proposal", FILTERS)
 def test_lgss_table(exact_values, proposal, gaps):
-    """Both series at three values of theta, every combination, 2,000 repeats."""
+    """Both series at three values of theta, every combination."""
     cells = list(lgss_cells(exact_values, gaps))
     combinations = [c for c in COMBINATIONS if c[0] == proposal]
-    gaussian_table(cells, combinations, 2000, 2 * len(cells) * len(COMBINATIONS))
+    gaussian_table(cells, combinations, REPEATS, 2 * len(cells) * len(COMBINATIONS))
 
 
 @pytest.mark.slow
@@ -293,4 +298,4 @@ def test_lgss_table(exact_values, proposal, gaps):
 def test_vector_table(proposal):
     cells = list(vector_cells())
     combinations = [c for c in COMBINATIONS if c[0] == proposal]
-    gaussian_table(cells, combinations, 2000, len(cells) * len(COMBINATIONS))
+    gaussian_table(cells, combinations, REPEATS, len(cells) * len(COMBINATIONS))

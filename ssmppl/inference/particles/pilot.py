@@ -126,13 +126,29 @@ class Pilot:
 
 
 def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "bootstrap") -> Pilot:
-    """Climb the estimated log posterior from the space's own point.
+    """Climb the estimated log posterior from the space's own point, and measure its scale there.
 
     Raises
     ------
     ArgumentError : the likelihood is zero at every point that was tried.
     """
-    estimate = pilot_likelihood(space.problem, proposal)
+    best, value = climb_to_mode(space, seed, pilot_likelihood(space.problem, proposal))
+    if not len(best):
+        return Pilot(best, best, value)
+    averaged = averaged_density(space, seed, proposal, SCALE_REPEATS)
+    return Pilot(best, _scale(best, averaged), value)
+
+
+def climb_to_mode(
+    space: Space, seed: np.random.SeedSequence,
+    estimate: Callable[[np.ndarray, np.random.SeedSequence], float],
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """(z (free,), log p there), the top of a log-likelihood (theta, seed) and the prior.
+
+    Raises
+    ------
+    ArgumentError : the likelihood is zero at every point that was tried.
+    """
 
     def log_density(z: np.ndarray) -> float:
         theta, log_prior = space.parameters(z)
@@ -140,7 +156,7 @@ def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "boots
 
     z = space.z[space.where]
     if not len(z):
-        return Pilot(z, z, log_density(z))
+        return z, log_density(z)
     z = finite_point(z, log_density, np.random.default_rng(seed))
     best, value = z, log_density(z)
     size = 1.0
@@ -157,9 +173,7 @@ def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "boots
         if gain < 1.0:
             break
         size = 0.5
-
-    averaged = averaged_density(space, seed, proposal, SCALE_REPEATS)
-    return Pilot(best, _scale(best, averaged), value)
+    return best, value
 
 
 def pilot_likelihood(

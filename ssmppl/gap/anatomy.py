@@ -1,0 +1,208 @@
+"""What of a traced model effects can be bound to, and what its equations say of each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.calculus import NotDifferentiable, gradient
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, constant, symbol, symbols_of
+from ssmppl.gap.laws import Index, noise_free, scale_of_mean
+from ssmppl.language.distributions import Dirac, Distribution
+from ssmppl.language.trace import Trace, previous, symbols
+
+_POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
+
+
+def label_of(name: str, index: Index) -> str:
+    """`v`, `x[0]`, `A[0, 1]`."""
+    return f"{name}[{', '.join(map(str, index))}]" if index else name
+
+
+@dataclass(frozen=True)
+class Part:
+    """One scalar component of a state, channel, input or parameter.
+
+    symbol : its symbol where it is current (not that of the step before).
+    """
+
+    label: str
+    role: str
+    name: str
+    index: Index
+    symbol: Expr
+
+    def seen_from(self, role: str) -> Expr:
+        """Its symbol in a transition (of the step before) or in another law."""
+        lagging = role == "transition" and self.role != "parameter"
+        return previous(self.symbol) if lagging else self.symbol
+
+
+class Anatomy:
+    """The parts of a traced model by label, and which state is the integral of which.
+
+    integral_of : state -> the state that it integrates (a position's velocity).
+    copies : state -> the quantity that its transition only hands on.
+    """
+
+    def __init__(self, trace: Trace, base: Anatomy | None = None):
+        """base : of the same model before inputs and parameters were changed over time."""
+        self.trace = trace
+        self.parts: dict[str, Part] = {}
+        for role, sites in (("state", trace.initial), ("channel", trace.observations),
+                            ("parameter", trace.parameters)):  # fmt: skip
+            for site in sites.values():
+                for s in site.components:
+                    self._add(role, s)
+        for name, shape in trace.inputs.items():
+            for s in symbols("input", name, shape).ravel():
+                self._add("input", s)
+        self.copies: dict[str, str] = base.copies if base else self._copies()
+        self.integral_of: dict[str, str] = base.integral_of if base else self._integrals()
+
+    def _add(self, role: str, s: Expr) -> None:
+        _, name, index = s.data
+        label = label_of(name, index)
+        self.parts[label] = Part(label, role, name, index, s)
+
+    def of_role(self, role: str) -> list[Part]:
+        """The parts of one role, in the model's order."""
+        return [p for p in self.parts.values() if p.role == role]
+
+    def law(self, part: Part, role: str = "") -> Distribution:
+        """The law of a state (in the transition unless role is "initial") or of a channel."""
+        if part.role == "channel":
+            return self.trace.observations[part.name].distribution
+        sites = self.trace.initial if role == "initial" else self.trace.transition
+        return sites[part.name].distribution
+
+    def mean(self, part: Part, role: str = "") -> Expr | NotApplicable:
+        """The value without noise of a state's or channel's law; why there is none."""
+        d = self.law(part, role)
+        scale = scale_of_mean(d)
+        return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
+
+    def step(self, part: Part) -> Expr | NotApplicable:
+        """mean - x_prev: how far a state moves in a step, without noise."""
+        mean = self.mean(part)
+        if isinstance(mean, NotApplicable):
+            return mean
+        if scale_of_mean(self.law(part)) != "identity":
+            return NotApplicable("its transition is no step from where it was")
+        return mean - previous(part.symbol)
+
+    def position(self, part: Part) -> Part | None:
+        """The state that integrates this one."""
+        found = [p for p, v in self.integral_of.items() if v == part.label]
+        return self.parts[found[0]] if found else None
+
+    def fixed_by_others(self, part: Part) -> str:
+        """Why a state is no rate: what its transition does instead; "" where it is one."""
+        if part.label in self.integral_of:
+            return f"its transition is only the integral of {self.integral_of[part.label]}"
+        if part.label in self.copies:
+            return f"its transition only hands on {self.copies[part.label]}"
+        return ""
+
+    def deterministic(self, part: Part) -> bool:
+        """Whether a state's transition has no noise."""
+        return isinstance(self.law(part), Dirac)
+
+    def second_order(self, part: Part) -> Expr | NotApplicable:
+        """(F'F)_i / 2 of the step x_prev + F(x_prev): what an Euler step leaves out."""
+        step = self.step(part)
+        if isinstance(step, NotApplicable):
+            return step
+        total = constant(0.0)
+        try:
+            for other in self.of_role("state"):
+                slope = gradient(step, [previous(other.symbol)])[0]
+                if slope.op == "const" and slope.data == 0.0:
+                    continue
+                by = self.step(other)
+                if isinstance(by, NotApplicable):
+                    return NotApplicable(f"it depends on {other.label}: {by.reason}")
+                total = total + slope * by
+        except NotDifferentiable as error:
+            return NotApplicable(f"its transition has no derivative: {error.found}")
+        if total.op == "const":
+            return NotApplicable("its transition has no second-order term")
+        return 0.5 * total
+
+    # -- kinematics
+    def _copies(self) -> dict[str, str]:
+        out = {}
+        for part in self.of_role("state"):
+            mean = self.mean(part)
+            if isinstance(mean, Expr) and mean.op == "symbol":
+                if mean is not previous(part.symbol) and mean.data[0] != "parameter":
+                    out[part.label] = label_of(*mean.data[1:])
+        return out
+
+    def _integrals(self) -> dict[str, str]:
+        """x with mean - x_prev = a v_prev + b mean(v), a, b >= 0 the same whatever the parameters.
+
+        Which covers explicit, semi-implicit and trapezoidal steps. The parameters are varied, so
+        that -k x in the equation of v does not make v an integral of x.
+        """
+        states = [p for p in self.of_role("state") if isinstance(self.step(p), Expr)]
+        steps = {p.label: self.step(p) for p in states}
+        rng = np.random.default_rng(1)
+        samples = [_values(self.trace, steps, rng) for _ in range(3)]
+        out: dict[str, str] = {}
+        for p in states:
+            if p.label in self.copies:
+                continue
+            for v in states:
+                if v is not p and all(_is_integral(p.label, v.label, s) for s in samples):
+                    if out.get(v.label) != p.label:
+                        out[p.label] = v.label
+                    break
+        return out
+
+
+def _values(trace: Trace, steps: dict[str, Any], rng: Any) -> dict[str, tuple[Any, Any]]:
+    """Values and steps of the states at random points; inputs and time the same at all of them."""
+    roots = list(steps.values())
+    known = {}
+    for s in symbols_of(roots):
+        fixed = s.data[0] in ("input_prev", "time_prev")
+        known[s] = rng.uniform(0.3, 1.5, None if fixed else _POINTS)
+    for s in trace.state_prev_symbols:
+        known.setdefault(s, rng.uniform(0.3, 1.5, _POINTS))
+    moved = evaluate(roots, known)
+    own = {label_of(*s.data[1:]): known[s] for s in trace.state_prev_symbols}
+    wide = np.zeros(_POINTS)
+    return {k: (own[k], wide + m) for k, m in zip(steps, moved, strict=True)}
+
+
+def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]]) -> bool:
+    moved = values[x][1]
+    own, by = values[v]
+    if not (np.all(np.isfinite(moved)) and np.all(np.isfinite(by))):
+        return False
+    if not np.any(np.abs(moved) > _SMALL):
+        return False
+    basis = np.stack([own, own + by], axis=1)
+    coefficients, *_ = np.linalg.lstsq(basis, moved, rcond=1e-10)
+    rest = moved - basis @ coefficients
+    exact = np.max(np.abs(rest)) <= _SMALL * np.max(np.abs(moved))
+    return bool(exact and np.all(coefficients >= -_SMALL))
+
+
+def time_symbol(role: str) -> Expr:
+    """`t` in a transition, and in another law."""
+    return symbol("time_prev" if role == "transition" else "time", "t")
+
+
+def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> Any:
+    """The symbols of a named quantity seen from a law, a node for a scalar."""
+    site = {"state": trace.initial, "channel": trace.observations,
+            "parameter": trace.parameters}.get(role, {}).get(name)  # fmt: skip
+    value = symbols("input", name, shape) if site is None else site.value
+    return value[()] if array(value).shape == () else value

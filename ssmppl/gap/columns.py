@@ -1,0 +1,184 @@
+"""Score columns: derivatives of the complete-data log density, row by row.
+
+The model with all candidates in it (`augment`) is derived in its own parameters and in the
+candidates' strengths, at strengths of zero. What the derivatives need beyond the states of the
+model - auxiliary states of some effects, sensitivities of deterministic components - is carried as
+further deterministic components of a model whose other laws are the base model's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.score import CompleteScore, Sums
+from ssmppl.codegen.render import identifier
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.calculus import NotDifferentiable, differentiate
+from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol
+from ssmppl.gap.laws import substituted
+from ssmppl.language.distributions import Dirac
+from ssmppl.language.trace import Site, Trace, previous
+
+
+@dataclass(frozen=True)
+class Columns:
+    """F derivatives: those in the P nuisance parameters first, then those in the strengths.
+
+    base : the model. carried : the model over whose states the expressions are; the base itself
+    where nothing has to be carried. follows : role -> (component, value) of what is carried.
+    given : the trace whose parameters the expressions may hold: the base's, then shapes.
+    initial, later : (F) at row 1 and at the others. names : of the strengths.
+    refused : why a strength or parameter has no column.
+    """
+
+    base: Trace
+    carried: Trace
+    given: Trace
+    initial: tuple[Expr, ...]
+    later: tuple[Expr, ...]
+    nuisance: tuple[Expr, ...]
+    names: tuple[str, ...]
+    follows: dict[str, list[tuple[Expr, Expr]]] = field(default_factory=dict)
+    refused: dict[str, NotApplicable] = field(default_factory=dict)
+
+
+def score_columns(
+    base: Trace, superset: Trace, strengths: Collection[str], held: Collection[str],
+    missing: Missing,
+) -> Columns:  # fmt: skip
+    """The columns of a model with candidates; `held` parameters have none.
+
+    superset : the base model with candidates, as of `augment`; the base itself for none.
+    strengths : names of the superset's parameters that are strengths; other further parameters
+        (shapes) stay.
+    """
+    wanted, refused = [], {}
+    own = set(base.parameter_symbols)
+    superset = _linear_in(superset, strengths)
+    free = [s for s in superset.parameter_symbols if s.data[1] not in held]
+    free = [s for s in free if s in own or s.data[1] in strengths]
+    derived = CompleteScore(superset, free, missing)
+    for s in free:
+        reason = derived.obstacle(s)
+        if reason is None:
+            wanted.append(s)
+        else:
+            refused[repr(s)] = reason
+    derived, sums = _gradient(superset, wanted, missing, refused)
+    zero: dict[Expr, Expr] = {
+        s: constant(0.0) for s in superset.parameter_symbols if s.data[1] in strengths
+    }
+    zero |= _plain_names(sums.columns)
+    parts = {role: substitute(list(es), zero) for role, es in sums.parts.items()}
+    initial = [a + b for a, b in zip(parts["initial"], parts["observation"], strict=True)]
+    later = [a + b for a, b in zip(parts["transition"], parts["observation"], strict=True)]
+    further = len(superset.state_symbols) > len(base.state_symbols) or sums.columns
+    given = replace(
+        superset,
+        parameters={n: s for n, s in superset.parameters.items() if n not in strengths},
+    )
+    carried = base
+    follows: dict[str, list[tuple[Expr, Expr]]] = {}
+    if further:
+        carried = _carried(base, given, sums, zero)
+        given = carried
+        known = set(base.state_symbols)
+        for role, sites in (("initial", carried.initial), ("transition", carried.transition)):
+            follows[role] = [
+                (s, e)
+                for site in sites.values()
+                for s, e in zip(
+                    site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True
+                )
+                if s not in known
+            ]
+    return Columns(
+        base, carried, given, tuple(initial), tuple(later),
+        tuple(s for s in derived.parameters if s in own),
+        tuple(s.data[1] for s in derived.parameters if s not in own), follows, refused,
+    )  # fmt: skip
+
+
+def _linear_in(superset: Trace, strengths: Collection[str]) -> Trace:
+    """With the deterministic laws linear in the strengths, which is all that first derivatives at
+    zero see: products of two of them would have to be carried for nothing."""
+    own = [s for s in superset.parameter_symbols if s.data[1] in strengths]
+    zero: dict[Expr, Expr] = {s: constant(0.0) for s in own}
+
+    def linear(site: Site) -> Site:
+        roots = list(array(site.distribution.mean()).ravel())
+        inside = dependent(roots, own)
+        if not isinstance(site.distribution, Dirac) or not inside.intersection(roots):
+            return site
+        values = substitute(roots, zero)
+        for s in own:
+            if dependent(roots, [s]).intersection(roots):
+                slopes = substitute(differentiate(roots, s), zero)
+                values = [v + s * d for v, d in zip(values, slopes, strict=True)]
+        law = Dirac(array(np.array(values, dtype=object).reshape(site.shape)))
+        law.location = site.distribution.location
+        return replace(site, distribution=law)
+
+    return replace(
+        superset,
+        initial={n: linear(s) for n, s in superset.initial.items()},
+        transition={n: linear(s) for n, s in superset.transition.items()},
+    )
+
+
+def _gradient(
+    superset: Trace, wanted: list[Expr], missing: Missing, refused: dict[str, NotApplicable]
+) -> tuple[CompleteScore, Sums]:
+    """The derivatives in closed form; what has none is moved to `refused`."""
+    derived = CompleteScore(superset, wanted, missing)
+    try:
+        return derived, derived.gradient()
+    except NotDifferentiable:
+        kept = []
+        for s in wanted:
+            try:
+                CompleteScore(superset, [s], missing).gradient()
+                kept.append(s)
+            except NotDifferentiable as error:
+                refused[repr(s)] = NotApplicable(f"no derivative in closed form: {error}")
+        derived = CompleteScore(superset, kept, missing)
+        return derived, derived.gradient()
+
+
+def _plain_names(columns: Sequence[Expr]) -> dict[Expr, Expr]:
+    """Sensitivities, which stand under names with blanks, as states that code can name."""
+    out: dict[Expr, Expr] = {}
+    for k, column in enumerate(columns):
+        plain = symbol("state", f"{identifier(column.data[1])}_{k}", ())
+        out[column], out[previous(column)] = plain, previous(plain)
+    return out
+
+
+def _carried(base: Trace, given: Trace, sums: Sums, zero: dict[Expr, Expr]) -> Trace:
+    """The superset at strength zero with the sensitivities as deterministic states."""
+
+    def at_zero(sites: dict[str, Site]) -> dict[str, Site]:
+        return {
+            n: replace(s, distribution=substituted(s.distribution, zero)) for n, s in sites.items()
+        }
+
+    # The model's own laws as they are: at strength zero some are only next to them (tails).
+    initial = {**at_zero(given.initial), **base.initial}
+    transition = {**at_zero(given.transition), **base.transition}
+    location = next(iter(given.transition.values())).distribution.location
+    for role, sites in (("initial", initial), ("transition", transition)):
+        value = dict(sums.follows.get(role, []))
+        for column in sums.columns:
+            (e,) = substitute([value.get(column, constant(0.0))], zero)
+            own = zero[column]
+            law = Dirac(e)
+            law.location = location
+            sites[own.data[1]] = Site(own.data[1], "state", law, array(own), location)
+    return replace(
+        given, initial=initial, transition=transition, observations=base.observations, proposal={}
+    )

@@ -1,0 +1,104 @@
+"""Held-out evidence: one-step predictive densities and free runs of fitted models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.gap.fit import Fit, Fitter
+from ssmppl.gap.smoothing import Pass
+from ssmppl.inference.particles.filtering import random_state
+from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.simulation import feeds_back
+
+RUNS = 8  # of the particle filter
+FREE_RUNS = 100  # simulations behind a free run
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """One-step predictions of the rows that count, all experiments in a row (T rows, K channels).
+
+    log_density : (R, T) of R runs. mean, variance : (T, K), over the runs. observed : (T, K), NaN
+    where missing. starts : first row of each experiment.
+    """
+
+    log_density: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+    observed: np.ndarray
+    starts: tuple[int, ...]
+
+
+def predict(
+    fitter: Fitter, fit: Fit, experiments: Sequence[Experiment], counts: Sequence[np.ndarray],
+    seed: np.random.SeedSequence, runs: int = RUNS,
+) -> Predictions:  # fmt: skip
+    """Filter all rows from the first with the fitted parameters, and keep those that count."""
+
+    def one(r: int) -> list[Pass]:
+        return fitter.smoother.run(experiments, fit.theta, random_state(seed, 6, r))
+
+    repeats = 1 if fitter.exact else runs
+    passes = run_tasks(one, range(repeats))
+
+    def kept(values: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([v[c] for v, c in zip(values, counts, strict=True)])
+
+    density = np.stack([kept([p.log_increments for p in ps]) for ps in passes])
+    means = np.stack([kept([p.prediction[:, 0] for p in ps]) for ps in passes])
+    spread = np.stack([kept([p.prediction[:, 1] for p in ps]) for ps in passes])
+    y = kept([np.where(e.seen == 1.0, e.y, np.nan) for e in experiments])
+    lengths = [int(c.sum()) for c in counts]
+    starts = tuple(np.cumsum([0, *lengths[:-1]]).tolist())
+    if repeats < runs:  # exact: no spread between runs
+        density = np.repeat(density, runs, axis=0)
+    return Predictions(density, means.mean(axis=0), spread.mean(axis=0), y, starts)
+
+
+def gain_of_mean(base: Predictions, other: Predictions) -> float:
+    """Nats that the predictive means gain under the base model's variances: the mean's share."""
+    with np.errstate(all="ignore"):
+        squares = (base.observed - base.mean) ** 2 - (other.observed - other.mean) ** 2
+        return float(np.nansum(0.5 * squares / base.variance))
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """Simulations from the first row on, not looking at the data: mean, low, high (T, K) each."""
+
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def free_run(fitter: Fitter, fit: Fit, e: Experiment, seed: np.random.SeedSequence) -> FreeRun:
+    """Mean and central 95% of simulated observations with the experiment's inputs."""
+    trace, n = fitter.problem.trace, FREE_RUNS
+    d, k = len(trace.state_symbols), len(trace.observation_symbols)
+    feedback = feeds_back(trace)
+    run, stream = fitter.problem.program.entry("simulate"), random_state(seed, 7)
+    drawn = []
+    for _ in range(n if feedback else 1):
+        width = 1 if feedback else n
+        x, out = np.empty((e.steps, d, width)), np.empty((e.steps, k, width))
+        run(fit.theta, np.zeros_like(e.y), np.ones_like(e.seen), e.u, stream, x, out, feedback)
+        drawn.append(out)
+    draws = np.concatenate(drawn, axis=2)
+    with np.errstate(all="ignore"):
+        low, high = np.nanquantile(draws, (0.025, 0.975), axis=2)
+        return FreeRun(draws.mean(axis=2), low, high)
+
+
+def rmse(run: FreeRun, e: Experiment, counts: np.ndarray) -> float:
+    """Root mean square error of a free run over the rows that count, channels in their own units
+    pooled by their standard deviations."""
+    y = np.where(e.seen == 1.0, e.y, np.nan)[counts]
+    with np.errstate(all="ignore"):
+        scale = np.nanstd(y, axis=0)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        error = np.sqrt(np.nanmean(((y - run.mean[counts]) / scale) ** 2))
+    return float(error * np.mean(scale))

@@ -1,0 +1,273 @@
+"""What an unmodelled effect is: a change of one equation of a model, with a strength; 0 = none.
+
+An effect is a Python function in the model's language. Its first argument is the value of what it
+is bound to; the others are bound by name: ``strength``, the row number ``t``, the effect's own
+shape parameters and auxiliary states, the names given by `given`, and the model's quantities.
+
+=============  =================  ================================================================
+kind           bound to           what the function returns
+=============  =================  ================================================================
+"transition"   state              increment of the transition's mean; or, by argument, of several
+                                  states: ``{"x": -over, "other": over}``
+"observation"  channel            increment of the observation's mean; first argument: that mean
+"input"        input              the input that acts in its place (itself at strength 0)
+"noise"        state or channel   increment of the log variance of its law
+"tail"         state or channel   1 / df of Student's t in place of the normal law
+"parameter"    parameter          its value at row t (itself at strength 0)
+"initial"      state              shift of the mean of x_1
+"state"        any but "initial"  an `Auxiliary`: what the kind of its equation returns (a state:
+                                  "transition", a channel: "observation", ...), with the laws of
+                                  further states
+=============  =================  ================================================================
+
+Increments act on the mean of Normal, MvNormal, StudentT, Laplace, Cauchy and Dirac laws, on the
+mean of the log of LogNormal, on the log of the mean of Poisson, NegativeBinomial, Gamma and
+Exponential and on the logit of that of Bernoulli and Binomial laws; of the law inside Truncated.
+
+==================  ===========================================================================
+`on`                which equations it is offered for
+==================  ===========================================================================
+"any"               all that its kind can be bound to
+"rate"              states, unless they are only the integral or a copy of another quantity
+"state"             states, unless they are so without noise: a position that integrates a velocity
+"channel", "input"  observation channels; inputs
+"parameter"         parameters; also "positive parameter" and "other parameter"
+a name or label     that one: "v", "x[0]"
+==================  ===========================================================================
+
+==================  ===========================================================================
+`given`             what the argument is
+==================  ===========================================================================
+"position"          the state that integrates the one it is bound to; where none does, that itself
+"integral"          likewise; not offered where none does
+"moved"             how far that one moves in the step
+"other state"       another state: one candidate for each
+"any input"         an input: one candidate for each
+"second order"      what a second-order step would add to an Euler step: F'F / 2, F the increment
+"profile"           the function of time that `profile` names (`PROFILES`)
+==================  ===========================================================================
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ssmppl.errors import Location, ModelError
+from ssmppl.gap.declared import check
+from ssmppl.language.distributions import Distribution
+from ssmppl.language.model import location_of
+
+_MISSING: Any = None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The values of a shape parameter, relative to a scale that binding turns into numbers.
+
+    unit : "number"; "sd" or "mean" (multiples of them), "quantile" (levels) or "size" (levels of
+        absolute values) of the variable; "rows" (shares of the number of rows, rounded).
+    of : the argument whose variable is meant; "" is the first.
+    """
+
+    unit: str
+    values: tuple[float, ...]
+    of: str = ""
+
+
+def numbers(*values: float) -> Grid:
+    """These values as they are."""
+    return Grid("number", values)
+
+
+def sds(*values: float, of: str = "") -> Grid:
+    """Multiples of the variable's standard deviation."""
+    return Grid("sd", values, of)
+
+
+def means(*values: float, of: str = "") -> Grid:
+    """Multiples of the variable's mean."""
+    return Grid("mean", values, of)
+
+
+def quantiles(*levels: float, of: str = "") -> Grid:
+    """Quantiles of the variable."""
+    return Grid("quantile", levels, of)
+
+
+def sizes(*levels: float, of: str = "") -> Grid:
+    """Quantiles of the variable's absolute value."""
+    return Grid("size", levels, of)
+
+
+def rows(*shares: float) -> Grid:
+    """Shares of the number of rows, rounded to whole rows."""
+    return Grid("rows", shares)
+
+
+@dataclass(frozen=True)
+class Auxiliary:
+    """What an effect of kind "state" returns.
+
+    change : what the effect does to its equation, from the auxiliary states among the arguments.
+    transition, initial : by auxiliary state, its law given the step before, and of x_1; the latter
+        may depend on parameters and inputs only.
+    """
+
+    change: Any
+    transition: Mapping[str, Distribution]
+    initial: Mapping[str, Distribution]
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """An unmodelled effect as declared; see the tables of this module.
+
+    lower, upper : of the strength.
+    shapes : name -> `Grid` or numbers: parameters that exist only when the strength is not 0.
+    given : argument -> what it is (the table of `given`).
+    states : auxiliary state -> the shape parameter that is its length, or None for a scalar.
+    profile : name of the function of time in the argument that is given as "profile".
+    process : "random walk" or "ar1" where the auxiliary state is such a process of mean zero, so
+        that the score in the strength itself is zero.
+    constant : what it is called with its process or profile held at 1; effects that share this
+        name are then the same.
+    requires : "positive" where it makes sense for a variable above 0 only.
+    note : the formula or what it stands for, in words.
+    """
+
+    name: str
+    kind: str
+    function: Callable[..., Any]
+    on: str = "any"
+    form: str = ""
+    lower: float = -math.inf
+    upper: float = math.inf
+    shapes: Mapping[str, Grid] = field(default_factory=dict)
+    given: Mapping[str, str] = field(default_factory=dict)
+    states: Mapping[str, str | None] = field(default_factory=dict)
+    profile: str = ""
+    process: str = ""
+    constant: str = ""
+    requires: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        shapes = {k: g if isinstance(g, Grid) else numbers(*g) for k, g in self.shapes.items()}
+        object.__setattr__(self, "shapes", shapes)
+        check(self)
+
+    @property
+    def where(self) -> Location:
+        """Where its function is written."""
+        return location_of(self.function)
+
+    @property
+    def arguments(self) -> list[str]:
+        """Names of the function's arguments."""
+        return list(inspect.signature(self.function).parameters)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self.function(*args, **kwargs)
+
+    def __repr__(self) -> str:
+        form = f" ({self.form})" if self.form else ""
+        return f"<effect {self.name!r}{form}: {self.kind} on {self.on}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By name where a module holds it in place of its function, as decorated ones are."""
+        fields = {k: getattr(self, k) for k in self.__dataclass_fields__}
+        module, name = self.function.__module__, self.function.__qualname__
+        holder = getattr(sys.modules.get(module), name, None)
+        if holder is self:
+            return _by_name, (module, name)
+        if isinstance(holder, Effect) and holder.function is self.function:  # renamed
+            del fields["function"]
+            return _by_name, (module, name, fields)
+        return _made, (fields,)
+
+
+def _by_name(module: str, name: str, changed: dict[str, Any] | None = None) -> Effect:
+    found: Effect = getattr(importlib.import_module(module), name)
+    return replace(found, **changed) if changed else found
+
+
+def _made(fields: dict[str, Any]) -> Effect:
+    return Effect(**fields)
+
+
+def effect(
+    function: Callable[..., Any] = _MISSING,
+    *,
+    on: str = "any",
+    name: str = "",
+    kind: str = "transition",
+    form: str = "",
+    lower: float | None = None,
+    upper: float | None = None,
+    shapes: Mapping[str, Grid | Iterable[float]] | None = None,
+    given: Mapping[str, str] | None = None,
+    states: Mapping[str, str | None] | Iterable[str] = (),
+    profile: str = "",
+    process: str = "",
+    constant: str = "",
+    requires: str = "",
+    note: str = "",
+) -> Any:
+    """Declare an unmodelled effect that `diagnose` shall look for.
+
+    Parameters
+    ----------
+    on : which equations it is offered for: "rate", "any", or the name of one, ...
+    name : what the report calls it; by default the function's name with spaces.
+    kind : what the function changes; see the tables of this module.
+    lower, upper : bounds of the strength. `lower` alone must be 0.
+    shapes, given, states, profile, process, constant, requires, note : see `Effect`.
+
+    Raises
+    ------
+    ModelError : the declaration does not fit the function; names file and line.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ssmppl as ssm
+    >>> from ssmppl.gap.effect import effect
+    >>> @effect(on="rate", name="quadratic drag", lower=0)
+    ... def quadratic_drag(v, strength):
+    ...     return -strength * v * np.abs(v)
+    >>> quadratic_drag
+    <effect 'quadratic drag': transition on rate>
+    """
+
+    def declare(function: Callable[..., Any]) -> Effect:
+        if not inspect.isfunction(function):
+            raise ModelError(
+                f"@effect stands on {function!r}, which is no function",
+                fix='write @ssm.effect(on="rate") on the line above a def',
+            )
+        doc = " ".join((function.__doc__ or "").split())
+        return Effect(
+            name=name or function.__name__.replace("_", " "),
+            kind=kind,
+            function=function,
+            on=on,
+            form=form,
+            lower=-math.inf if lower is None else float(lower),
+            upper=math.inf if upper is None else float(upper),
+            shapes=dict(shapes or {}),  # type: ignore[arg-type]
+            given=dict(given or {}),
+            states=dict(states if isinstance(states, Mapping) else dict.fromkeys(states)),
+            profile=profile,
+            process=process,
+            constant=constant,
+            requires=requires,
+            note=note or doc,
+        )
+
+    return declare if function is _MISSING else declare(function)

@@ -1,0 +1,296 @@
+"""Fits of a model and of its augmentations: the mode of the posterior, by scoring.
+
+Linear Gaussian models are climbed with their exact score. Others by Newton-like steps on the
+unconstrained scale, z <- z + H^-1 g, with g the particle smoother's score and H an estimate of the
+information, kept up by damped BFGS updates (Nocedal and Wright 2006, procedure 18.2); near the top
+the steps shrink as 1 / k, which averages the smoother's noise out (Robbins and Monro 1951). How far
+the top still is is told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.errors import SamplingError
+from ssmppl.gap.columns import Columns, score_columns
+from ssmppl.gap.smoothing import Settings, Smoother, simulated
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.direct_optimization import climb
+from ssmppl.inference.methods import DirectOptimization
+from ssmppl.inference.particles.backward import particle_system
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
+from ssmppl.inference.particles.pilot import Space, at, climb_to_mode, space_of
+from ssmppl.inference.problem import Problem
+from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.simulation import feeds_back
+
+MOST_STEPS = 20  # of the first phase
+NEAR = 1.0  # nats from the top where the first phase ends
+AVERAGED = 6  # steps of the second phase
+FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
+INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
+PILOT_PARTICLES = 300
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted to experiments (P parameters, F free numbers on the unconstrained scale).
+
+    theta : (P,). z : (F,). log_likelihood : at theta; error : its Monte Carlo standard deviation,
+    0 where exact. information : (F, F), minus the second derivatives of log p(y) in z, about.
+    distance : nats from the top by the last score. converged : whether that is a small number.
+    """
+
+    space: Space
+    theta: np.ndarray
+    z: np.ndarray
+    log_likelihood: float
+    error: float
+    information: np.ndarray
+    distance: float
+    converged: bool
+
+    @property
+    def problem(self) -> Problem:
+        return self.space.problem
+
+    def values(self) -> dict[str, float]:
+        """Values by the text of each component, `k`, `beta[0]`."""
+        symbols = self.problem.trace.parameter_symbols
+        return {repr(s): float(v) for s, v in zip(symbols, self.theta, strict=True)}
+
+
+class Fitter:
+    """Fits one model to any of its data sets."""
+
+    def __init__(
+        self, problem: Problem, fixed: Mapping[str, np.ndarray], settings: Settings,
+        executor: Executor | None = None,
+    ):  # fmt: skip
+        self.problem, self.fixed, self.settings = problem, dict(fixed), settings
+        self.executor = executor
+        self.kalman = kalman_model(problem.trace)
+        trace = problem.trace
+        self.columns: Columns = score_columns(trace, trace, (), self.fixed, problem.program.missing)
+        self.smoother = Smoother(self.columns, problem.program.missing, settings)
+        place = {s: i for i, s in enumerate(trace.parameter_symbols)}
+        self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
+
+    @property
+    def exact(self) -> bool:
+        return isinstance(self.kalman, KalmanModel)
+
+    def fit(
+        self, experiments: Sequence[Experiment], seed: np.random.SeedSequence,
+        start: Mapping[str, np.ndarray], *, searched: bool = False,
+        information: np.ndarray | None = None,
+    ) -> Fit:  # fmt: skip
+        """The mode from `start`, or, unless that was `searched`, from a pilot's mode near it.
+
+        information : (F, F) on the unconstrained scale, to begin with; None: by simulation.
+
+        Raises
+        ------
+        ArgumentError : the likelihood is zero at every point that was tried.
+        SamplingError : the weights of the filter vanish where it starts.
+        """
+        problem = replace(self.problem, experiments=tuple(experiments))
+        space = space_of(problem, self.fixed, dict(start))
+        if isinstance(self.kalman, KalmanModel):
+            return self._exactly(self.kalman, space, dict(start), seed)
+        if not searched:
+
+            def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
+                return self._estimate(problem, theta, PILOT_PARTICLES, random_state(seed))
+
+            z, _ = climb_to_mode(space, seed, estimate)
+            space = at(space, space.parameters(z)[0].copy())
+        return self._climb(space, seed, information)
+
+    def _exactly(
+        self, kalman: KalmanModel, space: Space, start: dict[str, np.ndarray],
+        seed: np.random.SeedSequence,
+    ) -> Fit:  # fmt: skip
+        problem = space.problem
+        setup = Setup(problem, space, "posterior", self.fixed, start, seed)
+        if len(space.where):
+            ascent = climb(setup, DirectOptimization(restarts=1))
+            theta, converged = ascent.theta, bool(ascent.report["converged"])
+        else:
+            theta, converged = space.theta, True
+        z = setup.space_at(theta)
+        value = kalman.log_likelihood(problem.experiments, theta)
+        return Fit(
+            at(space, theta), theta, z, value, 0.0,
+            self._simulated_information(space, theta, seed), 0.0, converged,
+        )  # fmt: skip
+
+    def states(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 16
+    ) -> np.ndarray:
+        """(T, draws, D) draws of each x_t: of trajectories where exact, else filtered."""
+        if isinstance(self.kalman, KalmanModel):
+            return np.swapaxes(self.kalman.draw(e, theta, stream, draws), 0, 1)
+        settings = FilterSettings(self.settings.particles, self.settings.proposal)
+        system = particle_system(self.problem, theta, settings, e, stream)
+        cumulative = np.cumsum(system.weights, axis=1)
+        levels = (np.arange(draws) + 0.5) / draws
+        index = np.stack([np.searchsorted(c, levels * c[-1]) for c in cumulative])
+        return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
+
+    def gradient(
+        self, space: Space, z: np.ndarray, stream: np.ndarray
+    ) -> tuple[float, np.ndarray] | None:
+        """(log p(y) + log prior, its derivatives (F,) in z), estimated; None where none is."""
+        setup = Setup(space.problem, space, "posterior", self.fixed, {}, np.random.SeedSequence(0))
+        point = setup.chart.at(z)
+        if point.log_prior == -np.inf:
+            return None
+        try:
+            passes = self.smoother.run(space.problem.experiments, point.theta, stream)
+        except SamplingError:
+            return None
+        score = np.zeros(len(point.theta))
+        score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
+        slope = point.pull(score) + point.d_log_prior
+        if not np.all(np.isfinite(slope)):
+            return None
+        value = sum(float(p.log_increments.sum()) for p in passes)
+        return value + point.log_prior, slope
+
+    def _climb(
+        self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
+    ) -> Fit:
+        stream = random_state(seed, 1)
+        z = space.z[space.where]
+        if information is None:
+            information = self._simulated_information(space, space.theta, seed)
+        h, found = information, self.gradient(space, z, stream)
+        if found is None:
+            raise SamplingError(
+                f"the model {space.problem.trace.name!r} cannot have produced the data where its "
+                "fit starts",
+                fix="check the data for outliers, or give the parameters priors round plausible "
+                "values",
+            )
+        value, g = found
+        size = 1.0
+        for _ in range(MOST_STEPS):
+            step = _step(h, g)
+            if 0.5 * g @ step < NEAR:
+                break
+            step *= size * min(1.0, FARTHEST / np.max(np.abs(step)))
+            new = self.gradient(space, z + step, stream)
+            if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
+                size *= 0.4
+                if size < 0.01:
+                    break
+                continue
+            h = _update(h, step, g - new[1])
+            z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
+        distance = np.inf
+        for k in range(AVERAGED):
+            step = _step(h, g)
+            distance = 0.5 * float(g @ step)
+            step *= min(1.0, FARTHEST / np.max(np.abs(step))) / (k + 1.0)
+            new = self.gradient(space, z + step, stream)
+            if new is None:
+                break
+            z, (value, g) = z + step, new
+        theta = space.parameters(z)[0].copy()
+        value, error = self.log_likelihood(space.problem.experiments, theta, seed)
+        return Fit(at(space, theta), theta, z, value, error, h, distance, distance < 3.0 * NEAR)
+
+    def log_likelihood(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, seed: np.random.SeedSequence,
+        repeats: int = 8,
+    ) -> tuple[float, float]:  # fmt: skip
+        """log p(y | theta) from the mean of independent estimates, and its standard deviation."""
+        if isinstance(self.kalman, KalmanModel):
+            return self.kalman.log_likelihood(experiments, theta), 0.0
+        problem = replace(self.problem, experiments=tuple(experiments))
+        n = self.settings.particles
+
+        def one(r: int) -> float:
+            return self._estimate(problem, theta, n, random_state(seed, 2, r))
+
+        log_z = np.array(run_tasks(one, range(repeats)))
+        if not np.any(log_z > -np.inf):
+            return -np.inf, 0.0
+        share = np.exp(log_z - log_z.max())
+        error = float(share.std(ddof=1) / share.mean() / np.sqrt(repeats))
+        return float(log_z.max() + np.log(share.mean())), error
+
+    def _estimate(
+        self, problem: Problem, theta: np.ndarray, particles: int, stream: np.ndarray
+    ) -> float:
+        """One estimate of log p(y | theta); -inf where there is none.
+
+        By the variant of the filter that the smoother has compiled already.
+        """
+        settings = FilterSettings(particles, self.settings.proposal)
+        try:
+            return sum(
+                particle_system(problem, theta, settings, e, stream).log_Z
+                for e in problem.experiments
+            )
+        except SamplingError:
+            return -np.inf
+
+    def _simulated_information(
+        self, space: Space, theta: np.ndarray, seed: np.random.SeedSequence
+    ) -> np.ndarray:
+        """(F, F) in z: mean square of the scores of data simulated at theta, prior included."""
+        problem = space.problem
+        setup = Setup(problem, at(space, theta), "posterior", self.fixed, {}, seed)
+        z = setup.space_at(theta)
+        point = setup.chart.at(z)
+        smoother = Smoother(
+            self.columns, problem.program.missing, replace(self.settings, particles=PILOT_PARTICLES)
+        )
+        smoother.__dict__.update(
+            {k: getattr(self.smoother, k) for k in ("program", "module", "problem")}
+        )
+        feedback = feeds_back(problem.trace)
+
+        def one(r: int) -> np.ndarray | None:
+            stream = random_state(seed, 3, r)
+            sets = simulated(problem.program, problem.experiments, theta, stream, feedback)
+            try:
+                passes = smoother.run(sets, theta, stream)
+            except SamplingError:
+                return None
+            score = np.zeros(len(theta))
+            score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
+            return point.pull(score)
+
+        scores = [s for s in run_tasks(one, range(INFORMATION_SETS)) if s is not None]
+        square = np.mean([np.outer(s, s) for s in scores], axis=0)
+        curvature = setup.chart.curvature(z, np.zeros(len(theta)))
+        prior = -curvature.log_prior
+        values, vectors = np.linalg.eigh(0.5 * (prior + prior.T))
+        return square + (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """H^-1 g, with the small eigenvalues of the scaled H lifted."""
+    scale = np.sqrt(np.maximum(np.diagonal(h), 1e-12))
+    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
+    values = np.maximum(values, 1e-3)
+    return (vectors @ ((vectors.T @ (g / scale)) / values)) / scale
+
+
+def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Damped BFGS: H such that H s is about y, positive definite still (procedure 18.2)."""
+    hs = h @ s
+    curvature, along = float(s @ hs), float(s @ y)
+    if along < 0.2 * curvature:
+        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
+        along = float(s @ y)
+    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along

@@ -1,0 +1,259 @@
+"""Where the gap is: which equation and moment, when, and in which region of states and inputs.
+
+A group is the scores of one equation and moment in the strengths of D basis functions. With the
+nuisance scores (and the other groups, or the catalogue) regressed out, its statistic is
+
+    Q = S~' M^-1 S~,    M = (1 - w) V + w m I    in correlation units,
+
+V the bootstrap's covariance, its directions of next to no variance cut, w the shrinkage of Ledoit
+and Wolf (*J. Multivariate Analysis* 88, 2004): with B = 200 sets and D = 12 the small eigenvalues
+of V come out too small, and their inverses would rule Q. Set b is measured by the V of the other
+sets (Sherman and Morrison), as the observed one is; Q in turn is put on the normal scale by its
+simulated law, so that groups of different size compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError
+from ssmppl.gap.efficient import balanced, regress
+from ssmppl.gap.familywise import familywise, tail_p
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RANK_CUT = 1e-3  # of the largest eigenvalue, in units in which every unprojected score has size 1
+KEPT = 0.999  # share of the variance of what is projected out that its components must hold
+SHARE = 4  # one component of what is projected out takes at least this many sets
+
+
+@dataclass(frozen=True)
+class Group:
+    """Efficient scores of D basis functions in one data set, beside their null law.
+
+    score : (D,) S~. covariance : (D, D) V. inverse : (D, D) M^-1, in the directions kept.
+    statistic : Q. z : its normal score. null : (B,) those of the simulated sets. kappa :
+    share of the standard deviation that is left of the scores. rank : directions kept.
+    shrinkage : w.
+    """
+
+    score: np.ndarray
+    covariance: np.ndarray
+    inverse: np.ndarray
+    statistic: float
+    z: float
+    null: np.ndarray
+    kappa: float
+    rank: int
+    shrinkage: float
+
+    @property
+    def p(self) -> float:
+        """Of this group alone."""
+        return tail_p(self.z, self.null)
+
+    @property
+    def estimate(self) -> np.ndarray:
+        """(D,) strengths of the basis functions, V^- S~."""
+        return self.inverse @ self.score
+
+
+def group_score(
+    columns: np.ndarray,
+    observed: np.ndarray,
+    nuisance: np.ndarray,
+    observed_nuisance: np.ndarray,
+    others: np.ndarray | None = None,
+    observed_others: np.ndarray | None = None,
+) -> Group:
+    """A group's statistic with the nuisance scores and `others` projected out.
+
+    Parameters
+    ----------
+    columns, observed : (B, D), (D,) scores of the basis functions.
+    nuisance, observed_nuisance : (B, P), (P,).
+    others, observed_others : (B, K), (K,) of the other groups, or of the catalogue. There may be
+        more of them than sets: their leading principal components stand for them (at most one for
+        `SHARE` sets, at least `KEPT` of their variance where that is fewer).
+    """
+    columns, observed = np.asarray(columns, float), np.asarray(observed, float)
+    x, x0 = np.asarray(nuisance, float), np.asarray(observed_nuisance, float)
+    if columns.ndim != 2 or observed.shape != columns.shape[1:] or len(x) != len(columns):
+        raise ArgumentError(
+            f"scores of shape {columns.shape}, observed {observed.shape}, nuisance {x.shape}",
+            fix="give (B, D), (D,) and (B, P)",
+        )
+    if others is not None and np.shape(others)[1]:
+        rest, rest0 = _components(np.asarray(others, float), np.asarray(observed_others), x, x0)
+        x, x0 = np.hstack([x, rest]), np.hstack([x0, rest0])
+    fit = regress(columns, x)
+    sets, size = len(columns), np.sqrt(np.mean(columns**2, axis=0))
+    inverse_size = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    residuals = fit.residuals * inverse_size
+    score = fit.predict_error(observed, x0)
+    v = residuals.T @ residuals / fit.dof
+    values, vectors = np.linalg.eigh(v)
+    kept = values > RANK_CUT * max(float(values[-1]), 1e-6)
+    rank = int(kept.sum())
+    # In the directions kept, each set as the others predict it, with one scale for all sets.
+    left = fit.left_out * np.sqrt(1.0 - fit.leverage)[:, None] * inverse_size @ vectors[:, kept]
+    new = score * inverse_size @ vectors[:, kept] / np.sqrt(1.0 + fit.leverage_of(x0))
+    c = np.diag(values[kept])
+    w = _shrinkage(left, c) if rank else 0.0
+    m = (1.0 - w) * c + w * (np.trace(c) / max(rank, 1)) * np.eye(rank)
+    inverse = np.linalg.inv(m)
+    q = np.einsum("bi,ij,bj->b", left, inverse, left)
+    # Without set b, the sums of squares and products lack exactly the square of its `left`.
+    own = np.maximum(1.0 - (1.0 - w) / fit.dof * q, 1e-3)
+    q_null = q * (1.0 - 1.0 / fit.dof) / own
+    q_seen = float(new @ inverse @ new)
+    z, null = _normal(q_seen, q_null)
+    full = inverse_size[:, None] * (vectors[:, kept] @ inverse @ vectors[:, kept].T) * inverse_size
+    info = float(np.trace(columns.T @ columns * np.outer(inverse_size, inverse_size))) / sets
+    kappa = float(np.sqrt(min(np.trace(v) / info, 1.0))) if info > 0.0 else 0.0
+    return Group(
+        score, v * np.outer(size, size), full, q_seen, z, null, kappa, rank, w,
+    )  # fmt: skip
+
+
+def localise(
+    groups: Mapping[Hashable, tuple[np.ndarray, np.ndarray]],
+    nuisance: np.ndarray,
+    observed_nuisance: np.ndarray,
+) -> tuple[pd.DataFrame, dict[Hashable, Group]]:
+    """Each group with all others projected out; p family-wise over the groups.
+
+    groups : by key, for instance (equation, moment): columns (B, D) and observed (D,).
+
+    Returns
+    -------
+    Table key, statistic, z, p, kappa, and z_alone, p_alone: with the nuisance scores alone
+    projected out. Where those are large and the former are not, the equations cannot be told apart
+    by these data. And the groups themselves, by key, with the others projected out.
+    """
+    import pandas as pd
+
+    keys = list(groups)
+    alone, apart = [], []
+    for key in keys:
+        columns, observed = groups[key]
+        rest = [groups[k] for k in keys if k != key]
+        alone.append(group_score(columns, observed, nuisance, observed_nuisance))
+        others = np.hstack([c for c, _ in rest]) if rest else None
+        seen = np.hstack([o for _, o in rest]) if rest else None
+        apart.append(group_score(columns, observed, nuisance, observed_nuisance, others, seen))
+
+    def together(found: list[Group]) -> np.ndarray:
+        z, null = np.array([g.z for g in found]), np.stack([g.null for g in found], axis=1)
+        return familywise(z, null, sided=1).p
+
+    table = pd.DataFrame({
+        "key": pd.Series(keys, dtype=object), "statistic": [g.statistic for g in apart],
+        "z": [g.z for g in apart], "p": together(apart), "kappa": [g.kappa for g in apart],
+        "z_alone": [g.z for g in alone], "p_alone": together(alone),
+    })  # fmt: skip
+    return table, dict(zip(keys, apart, strict=True))
+
+
+# --- the curve of what is missing ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Estimated values (G,) of a missing term, their standard errors and a pointwise band.
+
+    Known up to what the parameters of the model could have absorbed: that part is left out.
+    """
+
+    estimate: np.ndarray
+    error: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def z(self) -> np.ndarray:
+        """(G,) estimate over its error."""
+        return np.divide(self.estimate, self.error, out=np.zeros_like(self.error),
+                         where=self.error > 0.0)  # fmt: skip
+
+
+def curve(group: Group, design: np.ndarray, level: float = 0.95) -> Curve:
+    """sum_d coef_d b_d at points whose basis values are design (G, D), coef = V^- S~."""
+    from scipy.special import ndtri
+
+    design = np.asarray(design, float)
+    spread = group.inverse @ group.covariance @ group.inverse
+    error = np.sqrt(np.maximum(np.einsum("gi,ij,gj->g", design, spread, design), 0.0))
+    value, q = design @ group.estimate, float(ndtri(0.5 + 0.5 * level))
+    return Curve(value, error, value - q * error, value + q * error)
+
+
+def regions(
+    group: Group, functions: Any, values: np.ndarray, name: str = "x", count: int = 5
+) -> pd.DataFrame:
+    """Table region, low, high, estimate, se, z: the missing term's mean over parts of a variable.
+
+    Parameters
+    ----------
+    functions : the D basis functions of the variable. values : what it was; the parts are its
+        `count` quantile intervals.
+    """
+    import pandas as pd
+
+    values = np.asarray(values, float).ravel()
+    values = values[np.isfinite(values)]
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))
+    where = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+    shapes = np.stack([np.broadcast_to(f(values), values.shape) for f in functions], axis=1)
+    parts = np.unique(where)
+    found = curve(group, np.stack([shapes[where == i].mean(axis=0) for i in parts]))
+    low, high = edges[parts], edges[np.minimum(parts + 1, len(edges) - 1)]
+    return pd.DataFrame({
+        "region": [f"{name} in {a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True)],
+        "low": low, "high": high, "estimate": found.estimate, "se": found.error, "z": found.z,
+    })  # fmt: skip
+
+
+# --- inside --------------------------------------------------------------------------------------
+
+
+def _normal(value: float, null: np.ndarray) -> tuple[float, np.ndarray]:
+    """A statistic that is large when something is wrong, and its null law, as normal scores."""
+    spread = null.std()
+    if not spread > 0.0:
+        return 0.0, np.zeros_like(null)
+    centre = null.mean()
+    z, out = balanced(np.array([(value - centre) / spread]), ((null - centre) / spread)[:, None],
+                      np.array([True]))  # fmt: skip
+    return float(z[0]), out[:, 0]
+
+
+def _components(
+    others: np.ndarray, seen: np.ndarray, x: np.ndarray, x0: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Principal components (B, R), (R,) of the others' efficient scores in correlation units."""
+    fit = regress(others, x)
+    size = np.sqrt(fit.spread)
+    known = size > 1e-6 * np.sqrt(np.mean(others**2, axis=0))
+    scaled = fit.residuals[:, known] / size[known]
+    _, s, vt = np.linalg.svd(scaled, full_matrices=False)
+    most = max(len(others) // SHARE - x.shape[1], 1)
+    enough = int(np.searchsorted(np.cumsum(s**2), KEPT * np.sum(s**2))) + 1
+    axes = vt[: min(most, enough)].T
+    return scaled @ axes, (fit.predict_error(seen, x0)[known] / size[known]) @ axes
+
+
+def _shrinkage(x: np.ndarray, c: np.ndarray) -> float:
+    """Ledoit and Wolf's weight of the multiple of the identity, rows of x with covariance c."""
+    size = c.shape[0]
+    target = np.trace(c) / size * np.eye(size)
+    distance = float(np.sum((c - target) ** 2))
+    if distance <= 0.0:
+        return 1.0
+    spread = np.sum(np.sum(x**2, axis=1) ** 2) / len(x) - np.sum(c**2)
+    return float(np.clip(spread / len(x) / distance, 0.0, 1.0))

@@ -1,0 +1,109 @@
+"""What each part of the data is used for: screen, choose, confirm; or blocks left out in turn.
+
+A filter runs over all rows before the one that it predicts, so that a part needs no rows to settle
+in: with parameters fitted to earlier rows only, one-step predictions of later ones are honest
+(A. P. Dawid, "Present position and potential developments: some personal views. Statistical theory:
+the prequential approach", *JRSS A* 147, 1984). The gaps between the parts keep a disturbance at
+their border from counting on both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssmppl.data import Experiment
+
+SHARES = (0.4, 0.7)  # of the rows, where screen and choose end
+SHORTEST = 300  # rows in all, below which blocks are left out in turn instead
+GAP = 5  # rows between the parts
+FOLDS = 5
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Rows of each experiment: screen = [0, first), train = [0, second), confirm = [begin, T)."""
+
+    experiments: tuple[Experiment, ...]
+    first: tuple[int, ...]
+    second: tuple[int, ...]
+
+    @property
+    def screen(self) -> tuple[Experiment, ...]:
+        """The first rows of each experiment."""
+        return tuple(head(e, n) for e, n in zip(self.experiments, self.first, strict=True))
+
+    @property
+    def train(self) -> tuple[Experiment, ...]:
+        """Screen and choose."""
+        return tuple(head(e, n) for e, n in zip(self.experiments, self.second, strict=True))
+
+    @property
+    def confirm(self) -> list[np.ndarray]:
+        """For each experiment (T,), whether a row counts in the end."""
+        return [np.arange(e.steps) >= min(n + GAP, e.steps - 1)
+                for e, n in zip(self.experiments, self.second, strict=True)]  # fmt: skip
+
+    @property
+    def chosen(self) -> list[np.ndarray]:
+        """For each experiment (T2,), whether a row of `train` belongs to the choose part."""
+        return [np.arange(b) >= min(a + GAP, b - 1)
+                for a, b in zip(self.first, self.second, strict=True)]  # fmt: skip
+
+
+def head(e: Experiment, rows: int) -> Experiment:
+    """The first rows of an experiment."""
+    return replace(
+        e, y=e.y[:rows], seen=e.seen[:rows], u=e.u[:rows], steps=rows,
+        time=None if e.time is None else e.time[:rows],
+        observed={n: v[:rows] for n, v in e.observed.items()},
+        inputs={n: v[:rows] for n, v in e.inputs.items()},
+    )  # fmt: skip
+
+
+def three_parts(experiments: Sequence[Experiment]) -> Parts:
+    """Every experiment cut at the same shares of its rows."""
+    a, b = SHARES
+    return Parts(
+        tuple(experiments),
+        tuple(max(2, round(a * e.steps)) for e in experiments),
+        tuple(max(3, round(b * e.steps)) for e in experiments),
+    )
+
+
+def long_enough(experiments: Sequence[Experiment]) -> bool:
+    """Whether there are rows for three parts."""
+    return sum(e.steps for e in experiments) >= SHORTEST
+
+
+@dataclass(frozen=True)
+class Fold:
+    """left_out : for each experiment (T,), whether a row is set missing; train : without them."""
+
+    left_out: tuple[np.ndarray, ...]
+    train: tuple[Experiment, ...]
+
+
+def folds(experiments: Sequence[Experiment], count: int = FOLDS) -> list[Fold]:
+    """Contiguous blocks of rows, over all experiments in a row, set missing in turn."""
+    sizes = [e.steps for e in experiments]
+    number = np.minimum(np.arange(sum(sizes)) * count // sum(sizes), count - 1)
+    each = np.split(number, np.cumsum(sizes)[:-1])
+    out = []
+    for k in range(count):
+        left = tuple(n == k for n in each)
+        out.append(
+            Fold(left, tuple(without(e, rows) for e, rows in zip(experiments, left, strict=True)))
+        )
+    return out
+
+
+def without(e: Experiment, rows: np.ndarray) -> Experiment:
+    """An experiment with the observations of these rows missing; rows (T,) bool."""
+    seen = np.where(rows[:, None], 0.0, e.seen)
+    observed = {
+        n: np.where(rows.reshape(-1, *[1] * (v.ndim - 1)), np.nan, v) for n, v in e.observed.items()
+    }
+    return replace(e, seen=seen, y=np.where(seen == 1.0, e.y, 0.0), observed=observed)

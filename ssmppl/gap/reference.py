@@ -1,0 +1,89 @@
+"""The reference that "how far" is measured against: a regularised superset of the model.
+
+The base model with the chosen effects and with smooth functions of the states and inputs wherever
+the screen says that there is something, shrunk by normal priors whose width is an empirical Bayes
+estimate: E z^2 = 1 + tau^2 V of a group of basis functions with strengths of variance tau^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ssmppl.codegen.program import compile_trace
+from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import symbol
+from ssmppl.gap.augment import augment
+from ssmppl.gap.basis import Term, lifted
+from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.efficient import Null, efficient
+from ssmppl.gap.fit import Fit, Fitter
+from ssmppl.gap.refit import Workshop, proposal_of
+from ssmppl.gap.screen import Screen, with_parameters
+from ssmppl.gap.smoothing import Settings
+from ssmppl.inference.problem import Problem
+from ssmppl.language.distributions import Normal
+
+GROUPS = 3  # of basis functions that are taken in, at most
+LEAST = 2.0  # mean z^2 of a group that is taken in
+
+
+def signal(screen: Screen) -> list[tuple[list[Term], float]]:
+    """(terms of one equation, moment and variable, tau) where the basis has signal, best first."""
+    question = screen.question
+    if not question.terms:
+        return []
+    law = Null.of(screen.stacked("basis"), screen.stacked("nuisance"))
+    found = efficient(law, screen.observed.basis, screen.observed.nuisance)
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for i, t in enumerate(question.terms):
+        if not found.status[i]:
+            groups.setdefault((t.equation, t.moment, t.variable), []).append(i)
+    out = []
+    for places in groups.values():
+        size = float(np.mean(found.z[places] ** 2))
+        if size >= LEAST:
+            variance = float(np.mean(found.variance[places]))
+            tau = float(np.sqrt((size - 1.0) / variance))
+            out.append((size, [question.terms[i] for i in places], tau))
+    out.sort(key=lambda g: -g[0])
+    return [(terms, tau) for _, terms, tau in out[:GROUPS]]
+
+
+def fit_reference(
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen,
+    train: Sequence[Experiment], seed: np.random.SeedSequence,
+) -> tuple[Fitter, Fit]:  # fmt: skip
+    """The superset, fitted from the fit of the model with the chosen effects.
+
+    Raises
+    ------
+    ArgumentError, SamplingError : it cannot be fitted.
+    """
+    groups = signal(screen)
+    candidates = [t.candidate for terms, _ in groups for t in terms]
+    made, shapes = lifted([*chosen, *candidates])
+    widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}
+    trace = with_parameters(augment(workshop.trace, made), {**shapes, **widths})
+    parameters = dict(trace.parameters)
+    # A prior may depend on parameters declared before: the widths come first.
+    ordered = {n: parameters.pop(n) for n in widths}
+    for i, (terms, _) in enumerate(groups):
+        for t in terms:
+            site = parameters[t.candidate.strength]
+            law = Normal(0.0, sd=array(symbol("parameter", f"tau_{i}", ())))
+            law.location = site.distribution.location
+            parameters[t.candidate.strength] = replace(site, distribution=law)
+    trace = replace(trace, parameters={**ordered, **parameters})
+    program = compile_trace(trace, workshop.missing)
+    given = {**shapes, **widths}
+    fixed = workshop.fixed | {n: np.asarray(v) for n, v in given.items()}
+    settings = Settings(workshop.settings.particles, proposal_of(program), workshop.settings.lag)
+    fitter = Fitter(Problem(trace, (), program), fixed, settings)
+    values = unpack_parameters(start.problem.trace, start.theta)
+    begin = {n: v for n, v in values.items() if n in trace.parameters and n not in given}
+    begin |= {t.candidate.strength: np.asarray(0.0) for terms, _ in groups for t in terms}
+    return fitter, fitter.fit(train, seed, begin, searched=True)

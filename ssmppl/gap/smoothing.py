@@ -1,0 +1,164 @@
+"""One pass over the data: log-likelihood, smoothed scores row by row, one-step predictions.
+
+Exact draws of the trajectories where the model is linear and Gaussian, else a particle filter with
+fixed-lag smoothing over its genealogy; see `codegen/kernels/row_scores.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import ModuleType
+
+import numpy as np
+from scipy.special import ndtr
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.kernels.random import fill_uniform
+from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.codegen.row_scores import compile_row_scores
+from ssmppl.data import Experiment
+from ssmppl.errors import NotApplicable
+from ssmppl.gap.columns import Columns
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.particles.backward import particle_system
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.problem import Problem
+
+LAG = 40
+DRAWS = 128  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
+
+
+@dataclass(frozen=True)
+class Settings:
+    """particles : N of the filter. proposal : of the filter. lag : of the smoother, in rows."""
+
+    particles: int = 1000
+    proposal: str = "bootstrap"
+    lag: int = LAG
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What one pass tells of one experiment (T rows, F columns, K channels).
+
+    log_increments : (T,) log p(y_t | y_{1:t-1}). rows : (T, F) smoothed scores, row by row.
+    prediction : (T, 4, K) mean, variance, P(Y <= y), P(Y < y) given y_{1:t-1}.
+    """
+
+    log_increments: np.ndarray
+    rows: np.ndarray
+    prediction: np.ndarray
+
+
+class Smoother:
+    """Runs passes for a set of columns; the generated code is made when first asked for."""
+
+    def __init__(self, columns: Columns, missing: Missing, settings: Settings):
+        self.columns, self.missing, self.settings = columns, missing, settings
+
+    def __getstate__(self) -> dict:  # another process finds the generated modules in its cache
+        generated = ("program", "module", "problem")
+        return {k: v for k, v in self.__dict__.items() if k not in generated}
+
+    @cached_property
+    def program(self) -> Program:
+        return compile_trace(self.columns.carried, self.missing)
+
+    @cached_property
+    def module(self) -> ModuleType:
+        c = self.columns
+        return compile_row_scores(c.given, c.initial, c.later, self.missing, c.follows)
+
+    @cached_property
+    def kalman(self) -> KalmanModel | NotApplicable:
+        return kalman_model(self.columns.base)
+
+    @cached_property
+    def problem(self) -> Problem:
+        return Problem(self.columns.carried, (), self.program)
+
+    def run(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
+    ) -> list[Pass]:
+        """A pass over each experiment at theta, the values of `columns.given`'s parameters.
+
+        The stream is advanced in place.
+
+        Raises
+        ------
+        SamplingError : all weights vanish, or are NaN; names the step and the parameters.
+        """
+        return [self._one(e, theta, stream) for e in experiments]
+
+    def _one(self, e: Experiment, theta: np.ndarray, stream: np.ndarray) -> Pass:
+        given, data = theta, (e.y, e.seen, e.u)
+        theta = given[: len(self.columns.base.parameter_symbols)]
+        rows = np.empty((e.steps, len(self.columns.later)))
+        prediction = np.empty((e.steps, 4, e.y.shape[1]))
+        if isinstance(self.kalman, KalmanModel):
+            increments = self._exact(self.kalman, e, theta, prediction)
+            # Antithetic: scores that are linear in the states come out exact.
+            paths = self.kalman.draw(e, theta, stream, DRAWS // 2)
+            paths = np.concatenate([paths, 2.0 * self.kalman.smooth(e, theta).mean - paths])
+            size = len(self.columns.carried.state_symbols)
+            particles = np.zeros((e.steps, size, DRAWS))
+            particles[:, : paths.shape[2]] = np.moveaxis(paths, 0, 2)
+            if self.columns.follows:
+                self.module.complete_rows(given, *data, particles)
+            weights = np.full((e.steps, DRAWS), 1.0 / DRAWS)
+            ancestors = np.broadcast_to(np.arange(DRAWS, dtype=np.int32), weights.shape).copy()
+        else:
+            settings = FilterSettings(self.settings.particles, self.settings.proposal)
+            own = given[: len(self.columns.carried.parameter_symbols)]
+            system = particle_system(self.problem, own, settings, e, stream)
+            particles, weights, ancestors = system.particles, system.weights, system.ancestors
+            increments = system.log_increments
+            self.module.row_predictions(given, *data, particles, weights, stream, prediction)
+        self.module.row_scores(given, *data, particles, weights, ancestors, self.settings.lag, rows)
+        return Pass(increments, rows, prediction)
+
+    def _exact(
+        self, kalman: KalmanModel, e: Experiment, theta: np.ndarray, prediction: np.ndarray
+    ) -> np.ndarray:
+        """Fill the predictions of a linear Gaussian model; returns the increments (T,)."""
+        found = kalman.filter(e, theta)
+        variance = np.diagonal(found.observation_covariance, axis1=1, axis2=2)
+        prediction[:, 0], prediction[:, 1] = found.observation_mean, variance
+        with np.errstate(all="ignore"):
+            below = ndtr((e.y - found.observation_mean) / np.sqrt(variance))
+        prediction[:, 2] = prediction[:, 3] = below
+        return found.log_increments
+
+
+def probability_transforms(
+    passes: Sequence[Pass], experiments: Sequence[Experiment], stream: np.ndarray
+) -> list[np.ndarray]:
+    """PIT values (T, K) of one-step predictions, randomised where a channel is discrete.
+
+    NaN where a value is missing (Czado, Gneiting and Held 2009 for counts).
+    """
+    out = []
+    for p, e in zip(passes, experiments, strict=True):
+        upper, lower = p.prediction[:, 2], p.prediction[:, 3]
+        uniforms = np.empty(upper.size)
+        fill_uniform(stream, uniforms)
+        value = lower + uniforms.reshape(upper.shape) * (upper - lower)
+        out.append(np.where(e.seen == 1.0, value, np.nan))
+    return out
+
+
+def simulated(
+    program: Program, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray,
+    feedback: bool,
+) -> list[Experiment]:  # fmt: skip
+    """Experiments of the same lengths, inputs and gaps with observations drawn from the model."""
+    out = []
+    d, k = len(program.trace.state_symbols), len(program.trace.observation_symbols)
+    for e in experiments:
+        x, drawn = np.empty((e.steps, d, 1)), np.empty((e.steps, k, 1))
+        y = np.zeros((e.steps, k))
+        program.entry("simulate")(theta, y, np.ones_like(e.seen), e.u, stream, x, drawn, feedback)
+        out.append(replace(e, y=np.where(e.seen == 1.0, drawn[:, :, 0], 0.0)))
+    return out

@@ -1,0 +1,334 @@
+"""Expressions as lines of a model file: `Lines` turns nodes into text and local variables.
+
+What it writes gives the same nodes when it is traced: operands keep their order and grouping.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
+
+WIDTH = 78  # of one expression
+
+_NUMPY = """exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
+    arccosh arctanh abs sign floor ceil maximum minimum arctan2 logaddexp where"""
+_SPECIAL = """gammaln ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
+    betainc betaincinv"""
+CALLS = {n: f"np.{n}" for n in _NUMPY.split()} | {n: f"special.{n}" for n in _SPECIAL.split()}
+CALLS |= {"digamma": "special.psi"}
+LINALG = {"cholesky": "np.linalg.cholesky({0})", "inverse": "np.linalg.inv({0})",
+          "det": "np.linalg.det({0})", "logdet": "np.linalg.slogdet({0})[1]"}  # fmt: skip
+# Sign and level of binding, from Python's table of precedence.
+_INFIX = {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "or": ("|", 1),
+          "and": ("&", 2), "add": ("+", 3), "sub": ("-", 3), "mul": ("*", 4), "div": ("/", 4),
+          "mod": ("%", 4), "pow": ("**", 6)}  # fmt: skip
+_NEG, _ATOM = 5, 9
+Text = tuple[str, int]  # and the level at which it binds
+
+
+def number(value: float) -> str:
+    """A number as Python reads it back, whole ones without a point."""
+    if not math.isfinite(value):
+        return {"inf": "np.inf", "-inf": "-np.inf"}.get(str(value), "np.nan")
+    whole = value.is_integer() and abs(value) < 1e15 and not (value == 0 and str(value)[0] == "-")
+    return str(int(value)) if whole else repr(value)
+
+
+def constant_array(values: np.ndarray) -> str:
+    """An array of numbers."""
+    if not np.any(values):
+        return f"np.zeros({_shape(values.shape)})"
+    if values.ndim == 2 and np.array_equal(values, np.eye(len(values))):
+        return f"np.eye({len(values)})"
+    if values.size > 1 and np.all(values == values.flat[0]):
+        return f"np.full({_shape(values.shape)}, {_real(values.flat[0])})"
+    return f"np.array({_nested(values)})"
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return str(shape[0]) if len(shape) == 1 else str(shape)
+
+
+def _real(value: float) -> str:
+    text = number(float(value))
+    return text + ".0" if text.lstrip("-").isdigit() else text
+
+
+def _nested(values: np.ndarray) -> str:
+    if values.ndim == 0:
+        return _real(float(values))
+    return "[" + ", ".join(_nested(v) for v in values) + "]"
+
+
+class Lines:
+    """The body of one law: statements, and texts of expressions that refer to them.
+
+    Parameters
+    ----------
+    roots : all expressions of the law; what occurs several times under them is written once.
+    quantities : name -> its symbols, of its shape, for arrays that are a whole quantity.
+    taken : names that local variables must not have.
+    marks : node -> (name of a local variable, comment), for what stands on a line of its own.
+    wishes : node -> the name of its local variable, where it needs one.
+    primitive : (node of a call) -> the name it is called by.
+    """
+
+    def __init__(
+        self,
+        roots: Iterable[Expr],
+        quantities: dict[str, Any],
+        taken: Iterable[str],
+        marks: dict[Expr, tuple[str, str]] | None = None,
+        wishes: dict[Expr, str] | None = None,
+        primitive: Callable[[Expr], str] | None = None,
+    ):
+        self.statements: list[str] = []
+        self.special = False  # whether scipy.special is needed
+        self._texts: dict[Expr, Text] = {}
+        self._taken = set(taken)
+        self._whole = {tuple(map(id, np.asarray(v, dtype=object).ravel())): n
+                       for n, v in quantities.items() if np.shape(v)}  # fmt: skip
+        self._primitive = primitive
+        roots = list(roots)
+        order = topological(roots)
+        uses = Counter(a for n in order for a in n.args)
+        self._apart, self._wishes = marks or {}, wishes or {}
+        self._shared = {n for n in order if uses[n] + sum(r is n for r in roots) > 1 and _worth(n)}
+        self._shared -= {r for r in roots if not uses[r] and self._is_short(r)}
+
+    @staticmethod
+    def _is_short(node: Expr) -> bool:
+        return len(topological([node])) <= 4
+
+    # -- scalars
+    def text(self, root: Expr) -> str:
+        """The text of an expression."""
+        for node in topological([root]):
+            if node not in self._texts:
+                self._texts[node] = self._write(node)
+        return self._texts[root][0]
+
+    def _write(self, node: Expr) -> Text:
+        if node.op == "symbol":
+            _, name, index = node.data
+            return f"{name}[{', '.join(map(str, index))}]" if index else name, _ATOM
+        if node.op == "const":
+            negative = node.data < 0 or str(node.data)[0] == "-"
+            return number(node.data), _NEG if negative else _ATOM
+        made = self._combined(node)
+        while len(made[0]) > WIDTH and self._split(node):
+            made = self._combined(node)
+        if node in self._apart:
+            return self._local(node, made[0], *self._apart[node])
+        if node in self._shared or node.op in ("cholesky", "inverse"):
+            return self._local(node, made[0])
+        return made
+
+    def _combined(self, node: Expr) -> Text:
+        parts = [self._texts[a] for a in node.args]
+        if node.op in _INFIX:
+            return self._infix(node, parts)
+        if node.op == "neg":
+            text, level = parts[0]
+            plain = level == 6 or level > _NEG or (level == 4 and _product(node.args[0], self))
+            return f"-{text}" if plain else f"-({text})", _NEG
+        if node.op == "not":
+            return f"~({parts[0][0]})", _ATOM
+        if node.op == "item":
+            i, j = node.data
+            return f"{parts[0][0]}[{i}, {j}]", _ATOM
+        if node.op in MATRIX_OPS:
+            matrix = np.array(node.args, dtype=object).reshape(node.data, node.data)
+            return LINALG[node.op].format(self.array(matrix)), _ATOM
+        inside = ", ".join(p[0] for p in parts)
+        if node.op == "call" and self._primitive is not None:
+            return f"{self._primitive(node)}({inside})", _ATOM
+        if node.op not in CALLS:
+            raise ArgumentError(
+                f"the model holds {node!r}, whose operation {node.op!r} has no spelling in Python",
+                fix="use what NumPy and scipy.special offer in the model's laws",
+            )
+        self.special |= CALLS[node.op].startswith("special.")
+        return f"{CALLS[node.op]}({inside})", _ATOM
+
+    def _infix(self, node: Expr, parts: list[Text]) -> Text:
+        sign, level = _INFIX[node.op]
+        (a, la), (b, lb) = parts
+        first = node.args[0]
+        if node.op in ("eq", "ne") and first.op == "const":  # Python would turn it round
+            name = "equal" if node.op == "eq" else "not_equal"
+            return f"np.{name}({a}, {b})", _ATOM
+        if node.op in ("and", "or", "lt", "le", "eq", "ne"):
+            a, b = (f"({t})" if lev < 3 else t for t, lev in parts)
+            return f"{a} {sign} {b}", level
+        if node.op == "pow":
+            a = f"({a})" if la <= level else a
+            b = f"({b})" if lb < _NEG else b
+            return f"{a}**{b}", level
+        a = f"({a})" if la < level or (la == _NEG and first.op == "neg" and level == 4) else a
+        b = f"({b})" if lb <= level else b
+        return f"{a} {sign} {b}", level
+
+    # -- local variables
+    def _split(self, node: Expr) -> bool:
+        """Make a local variable of the longest argument; whether there was one to make."""
+        able = [a for a in node.args if a.args and not self._texts[a][0].isidentifier()]
+        able = [a for a in able if len(self._texts[a][0]) > 12]
+        if not able:
+            return False
+        longest = max(able, key=lambda a: len(self._texts[a][0]))
+        self._texts[longest] = self._local(longest, self._texts[longest][0])
+        return True
+
+    def _local(self, node: Expr, text: str, name: str = "", comment: str = "") -> Text:
+        name = self.name(name or self._wishes.get(node) or _name(node))
+        self.statements += [f"# {comment}"] if comment else []
+        line = f"{name} = {text}"
+        self.statements.append(line if len(line) <= WIDTH + 14 else f"{name} = (\n    {text}\n)")
+        return name, _ATOM
+
+    def name(self, wish: str) -> str:
+        """A name for a local variable that nothing else has."""
+        name, k = wish, 1
+        while name in self._taken:
+            k += 1
+            name = f"{wish}_{k}"
+        self._taken.add(name)
+        return name
+
+    # -- arrays
+    def array(self, values: Any, scalar: bool = False) -> str:
+        """The text of an array of nodes; scalar: one node will do where all are the same."""
+        values = array(values)
+        nodes = list(values.ravel())
+        whole = self._whole.get(tuple(map(id, nodes)))
+        if values.ndim == 0 or (scalar and all(n is nodes[0] for n in nodes)):
+            return self.text(nodes[0])
+        if whole is not None:
+            return whole
+        if all(n.op == "const" for n in nodes):
+            return constant_array(np.array([n.data for n in nodes]).reshape(values.shape))
+        alike = all(n is nodes[0] for n in nodes)  # whose text would be that of a scalar
+        vectorised = None if alike else self._elementwise(values)
+        if vectorised is not None and len(vectorised[0]) <= WIDTH:
+            return vectorised[0]
+        if values.ndim == 2:
+            rows = ["[" + ", ".join(self._short(row)) + "]" for row in values]
+            return _listed("np.block", rows)
+        return _listed("np.stack", [self.array(v) for v in values])
+
+    def _short(self, nodes: Any) -> list[str]:
+        """Texts of the entries of a row, with local variables until they fit on a line."""
+        texts = [self.text(n) for n in nodes]
+        while sum(map(len, texts)) + 2 * len(texts) > WIDTH - 4:
+            node = max((n for n in nodes if n.args), key=lambda n: len(self._texts[n][0]))
+            if self._texts[node][0].isidentifier():
+                break
+            self._texts[node] = self._local(node, self._texts[node][0])
+            texts = [self._texts[n][0] for n in nodes]
+        return texts
+
+    def _elementwise(self, values: Any) -> Text | None:
+        """The text of an array whose elements are made alike: `A @ x + b * u`; None where not."""
+        flat = list(values.ravel())
+        if any(n in self._apart for n in flat):
+            return None
+        if all(n is flat[0] for n in flat):
+            return self.text(flat[0]), self._texts[flat[0]][1]
+        whole = self._whole.get(tuple(map(id, flat)))
+        if whole is not None:
+            return whole, _ATOM
+        product = self._product(values)
+        if product is not None:
+            return product, 4
+        first = flat[0]
+        alike = first.op in _INFIX or first.op in CALLS or first.op == "neg"
+        if not alike or first.op in ("eq", "ne") or any(n.op != first.op for n in flat):
+            return None
+        parts = []
+        for k in range(len(first.args)):
+            part = self._elementwise(_reshaped([n.args[k] for n in flat], values.shape))
+            if part is None:
+                return None
+            parts.append(part)
+        if first.op == "neg":
+            return f"-({parts[0][0]})" if parts[0][1] < _ATOM else f"-{parts[0][0]}", _NEG
+        if first.op in _INFIX:
+            return self._infix(first, parts)
+        self.special |= CALLS[first.op].startswith("special.")
+        return f"{CALLS[first.op]}({', '.join(p[0] for p in parts)})", _ATOM
+
+    def _product(self, values: Any) -> str | None:
+        """A @ x, for a matrix and a vector that are quantities of the model."""
+        if values.ndim != 1:
+            return None
+        columns: list[list[tuple[Expr, Expr]]] = []
+        for node in values:
+            terms = []
+            while node.op == "add":
+                terms.append(node.args[1])
+                node = node.args[0]
+            terms.append(node)
+            if any(t.op != "mul" for t in terms):
+                return None
+            columns.append([(t.args[0], t.args[1]) for t in reversed(terms)])
+        vector = [b for _, b in columns[0]]
+        if len(vector) < 2 or any(
+            list(map(id, (b for _, b in row))) != list(map(id, vector)) for row in columns
+        ):
+            return None
+        matrix = self._whole.get(tuple(id(a) for row in columns for a, _ in row))
+        right = self._whole.get(tuple(map(id, vector)))
+        return f"{matrix} @ {right}" if matrix and right else None
+
+
+def _reshaped(nodes: Sequence[Expr], shape: tuple[int, ...]) -> Any:
+    out = np.empty(len(nodes), dtype=object)
+    out[:] = nodes
+    return array(out.reshape(shape))
+
+
+def _listed(function: str, texts: Sequence[str]) -> str:
+    """function([...]), on one line or with a line for each element."""
+    line = f"{function}([{', '.join(texts)}])"
+    if len(line) <= WIDTH and "\n" not in line:
+        return line
+    inside = "".join(f"        {t},\n".replace("\n", "\n" + " " * 8, t.count("\n")) for t in texts)
+    return f"{function}(\n    [\n{inside}    ]\n)"
+
+
+def _product(node: Expr, lines: Lines) -> bool:
+    """Whether -a * b, for this product a * b, is traced as -(a * b) again."""
+    while node.op == "mul" and lines._texts[node][1] == 4:
+        node = node.args[0]
+    return node.op not in ("div", "mod", "const") or lines._texts[node][1] == _ATOM
+
+
+def _worth(node: Expr) -> bool:
+    """Whether a node that is used again is worth a name."""
+    if node.op in ("const", "symbol", "item", "neg"):
+        return False
+    inner = [a for a in node.args if a.args]
+    plain = node.op in ("add", "sub", "mul", "div", "pow", "lt", "le", "eq", "ne")
+    return bool(inner) or not plain
+
+
+def _name(node: Expr) -> str:
+    """What a node might be called: `sqrt_h1`, `term`."""
+    if node.op in ("cholesky", "inverse"):
+        return {"cholesky": "root", "inverse": "inverse"}[node.op]
+    if len(node.args) == 1 and node.args[0].op == "symbol":
+        _, name, index = node.args[0].data
+        return "_".join([node.op, name, *map(str, index)])
+    if node.op in ("lt", "le", "eq", "ne", "and", "or", "not"):
+        return "holds"
+    return {"where": "chosen", "add": "total", "sub": "total", "mul": "product",
+            "div": "ratio"}.get(node.op, "term")  # fmt: skip

@@ -1,0 +1,227 @@
+"""The tables of a report, from the results of the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.gap.classes import Classes
+from ssmppl.gap.confirm import FreeRun
+from ssmppl.gap.localise import Group, curve, group_score, localise, regions
+from ssmppl.gap.refit import Refit
+from ssmppl.gap.report import tabulate
+from ssmppl.gap.screen import Screen
+from ssmppl.gap.when import bin_edges, when
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CURVE_POINTS = 41
+STANDS_OUT = 3.0  # |z| of a region that is named
+
+
+def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, Group]]:
+    """Equation, moment, stretch of time and region of each group of the basis; by z."""
+    observed, nuisance = screen.observed, screen.stacked("nuisance")
+    columns, terms = screen.stacked("basis"), screen.question.terms
+    keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
+    if not keys:
+        return tabulate("where"), {}
+    places = {k: [i for i, t in enumerate(terms) if (t.equation, t.moment) == k] for k in keys}
+    groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
+    table, found = localise(groups, nuisance, observed.nuisance)
+    alone = {
+        k: group_score(columns[:, p], observed.basis[p], nuisance, observed.nuisance)
+        for k, p in places.items()
+    }
+    sizes = [e.steps for e in screen.experiments]
+    starts = np.cumsum([0, *sizes[:-1]]).tolist()
+    edges = bin_edges(sum(sizes), starts)
+    labels = _labels(screen.experiments)
+    bins, own = screen.stacked("basis_bins"), screen.stacked("nuisance_bins")
+    rows = []
+    for row in table.itertuples():
+        key = row.key
+        p = min(row.p, row.p_alone)
+        stretch = (0, sum(sizes))
+        if p <= alpha and len(edges) > 3:
+            at = when(
+                alone[key], bins[:, :, places[key]], observed.basis_bins[:, places[key]],
+                own, observed.nuisance_bins, edges, alpha=alpha,
+            )  # fmt: skip
+            stretch = (at.first, at.last)
+        rows.append({
+            "equation": key[0], "moment": key[1], "t_from": labels[stretch[0]],
+            "t_to": labels[stretch[1] - 1], "z": max(row.z, row.z_alone), "p": p,
+            "region": _region(screen, key, places[key]) if p <= alpha else "",
+        })  # fmt: skip
+    rows.sort(key=lambda r: (r["p"], -r["z"]))
+    return tabulate("where", rows), found
+
+
+def _labels(experiments: Sequence[Experiment]) -> list[Any]:
+    """A label for each row: its time, else its number in its experiment."""
+    out: list[Any] = []
+    for e in experiments:
+        out += list(e.time) if e.time is not None else list(range(1, e.steps + 1))
+    return out
+
+
+def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
+    """Where the strongest of the variables shows the gap most, in words."""
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, best = screen.stacked("basis"), None
+    for variable in dict.fromkeys(terms[i].variable for i in places):
+        own = [i for i in places if terms[i].variable == variable]
+        group = group_score(
+            columns[:, own], screen.observed.basis[own], nuisance, screen.observed.nuisance
+        )
+        if best is None or group.z > best[0].z:
+            best = group, variable, own
+    if best is None:
+        return ""
+    group, variable, own = best
+    values = screen.question.grid(variable)
+    table = regions(group, [terms[i].at for i in own], values, variable)
+    row = table.iloc[int(np.argmax(np.abs(table["z"].to_numpy())))]
+    return f"where {row['region']}" if abs(row["z"]) >= STANDS_OUT else f"over {variable}"
+
+
+def missing_table(screen: Screen, key: tuple[str, str], others: bool) -> pd.DataFrame:
+    """The estimated missing curve of the mean over each variable of an equation.
+
+    others : whether the catalogue is projected out.
+    """
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, seen = screen.stacked("basis"), screen.observed.basis
+    rest = _catalogue(screen) if others else (None, None)
+    rows = []
+    places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key]
+    for variable in dict.fromkeys(terms[i].variable for i in places):
+        own = [i for i in places if terms[i].variable == variable]
+        group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        values = screen.question.grid(variable)
+        low_end, high_end = np.quantile(values, (0.02, 0.98))
+        grid = np.linspace(float(low_end), float(high_end), CURVE_POINTS)
+        design = np.stack([np.asarray(terms[i].at(grid)) for i in own], axis=1)
+        found = curve(group, design)
+        for x, e, low, high in zip(grid, found.estimate, found.low, found.high, strict=True):
+            rows.append({"equation": key[0], "variable": variable, "value": x, "estimate": e,
+                         "low": low, "high": high})  # fmt: skip
+    return tabulate("missing", rows)
+
+
+def _catalogue(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
+    told = [k for k, s in enumerate(screen.found.status) if not s]
+    plain = [k for k in told if not screen.question.quadratic[k]]
+    return screen.stacked("columns")[:, plain], screen.observed.columns[plain]
+
+
+def residual_group(screen: Screen) -> tuple[float, tuple[str, str] | None]:
+    """(p, key) of what of the basis the catalogue cannot explain, the strongest mean group."""
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, seen = screen.stacked("basis"), screen.observed.basis
+    rest = _catalogue(screen)
+    best: tuple[float, tuple[str, str] | None] = (1.0, None)
+    keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
+    for key in keys:
+        own = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key]
+        group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        p = min(1.0, group.p * len(keys))
+        if p < best[0]:
+            best = p, key
+    return best
+
+
+def causes_table(
+    screen: Screen, refits: Sequence[Refit], found: Classes | None, order: Sequence[int]
+) -> pd.DataFrame:
+    """One row for each group of candidates, the refitted ones first; pairs are not listed."""
+    by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
+    p = dict(zip(screen.family.best.tolist(), screen.family.p.tolist(), strict=True))
+    rows = []
+    for i, k in enumerate(order):
+        c, s = screen.question.candidates[k], screen.found
+        own = by_head.get(k)
+        sided = screen.question.sided[k]
+        strength = float(s.strength[k])
+        if screen.question.quadratic[k]:
+            strength = float(np.sqrt(max(strength, 0.0)))
+        error = 1.0 / np.sqrt(s.variance[k]) if s.variance[k] > 0.0 else np.nan
+        if own is not None:
+            strength, error = own.strengths[0], own.errors[c.strength]
+        shape = ", ".join(f"{n} = {v:g}" for n, v in c.shape)
+        rows.append({
+            "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
+            "equation": c.equation, "z": float(s.z[k]), "p": float(p.get(k, np.nan)),
+            "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
+            "class_id": int(found.class_id[i]) if found is not None else i + 1,
+            "sign": "one-sided" if sided else ("+" if strength > 0 else "-"),
+            "estimate": strength, "se": float(error),
+        })  # fmt: skip
+    return tabulate("causes", rows)
+
+
+def classes_table(
+    screen: Screen, found: Classes, order: Sequence[int], separating: dict[int, str]
+) -> pd.DataFrame:
+    """The members of each class of two or more."""
+    rows = []
+    for number in dict.fromkeys(found.class_id.tolist()):
+        members = found.members(number)
+        for m in members:
+            c = screen.question.candidates[order[m]]
+            rows.append({
+                "class_id": int(number), "effect": c.effect.name, "equation": c.equation,
+                "rho": float(found.rho[m]),
+                "separating_input": separating.get(int(number), "") if len(members) > 1 else "",
+            })  # fmt: skip
+    return tabulate("classes", rows)
+
+
+def map_table(screen: Screen) -> pd.DataFrame:
+    """Standardised smoothed scores of each equation's linear term by window of time."""
+    terms = screen.question.terms
+    sizes = [e.steps for e in screen.experiments]
+    starts = np.cumsum([0, *sizes[:-1]]).tolist()
+    edges = bin_edges(sum(sizes), starts)
+    labels, rows = _labels(screen.experiments), []
+    null, seen = screen.stacked("basis_bins"), screen.observed.basis_bins
+    for equation in dict.fromkeys(t.equation for t in terms if t.moment == "mean"):
+        own = [i for i, t in enumerate(terms) if t.equation == equation and t.moment == "mean"]
+        spread = null[:, :, own].std(axis=0)
+        z = np.divide(seen[:, own], spread, out=np.zeros_like(spread), where=spread > 0.0)
+        strongest = np.argmax(np.abs(z).sum(axis=0))
+        for j in range(len(edges) - 1):
+            rows.append({
+                "equation": equation, "t_from": labels[edges[j]],
+                "t_to": labels[edges[j + 1] - 1], "z": float(z[j, strongest]),
+            })  # fmt: skip
+    return tabulate("residual_map", rows)
+
+
+def run_table(
+    experiments: Sequence[Experiment], channels: Sequence[str], before: Sequence[FreeRun],
+    after: Sequence[FreeRun] | None,
+) -> pd.DataFrame:  # fmt: skip
+    """The data beside free runs of the model before and after."""
+    import pandas as pd
+
+    frames = []
+    for n, e in enumerate(experiments):
+        labels = e.time if e.time is not None else np.arange(1, e.steps + 1)
+        for k, channel in enumerate(channels):
+            nothing = np.full(e.steps, np.nan)
+            b, a = before[n], after[n] if after is not None else None
+            frames.append(pd.DataFrame({
+                "experiment": n + 1, "t": labels, "channel": channel,
+                "observed": np.where(e.seen[:, k] == 1.0, e.y[:, k], np.nan),
+                "before": b.mean[:, k], "before_low": b.low[:, k], "before_high": b.high[:, k],
+                "after": a.mean[:, k] if a else nothing,
+                "after_low": a.low[:, k] if a else nothing,
+                "after_high": a.high[:, k] if a else nothing,
+            }))  # fmt: skip
+    return pd.concat(frames, ignore_index=True)

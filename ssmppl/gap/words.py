@@ -1,0 +1,306 @@
+"""The answers of a report in words, for readers who never heard of a score test.
+
+Every function takes the report and gives plain sentences: what is missing, where, how far adding it
+closes the gap, how sure that is, and what would tell what these data cannot.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from ssmppl.gap.naming import (
+    alternatives,
+    leaders,
+    listed,
+    named,
+    rivals,
+    row_label,
+    rows,
+    sentence,
+    tried,
+)  # fmt: skip
+from ssmppl.gap.numerals import interval, is_number, number, p_text, percent, span, with_error
+
+if TYPE_CHECKING:
+    from ssmppl.gap.report import GapReport
+
+__all__ = [
+    "GLOSSARY", "headline", "how_far", "how_sure", "next_steps", "place", "untold", "where",
+    "which",
+]  # fmt: skip
+
+MOMENTS = {
+    "mean": "the mean of",
+    "scale": "the noise level of",
+    "tails": "the tails of the noise of",
+    "time dependence": "how the noise of one step depends on the last, of",
+}
+
+USE = {
+    "screen": "effects were looked for on",
+    "choose": "chosen among on",
+    "confirm": "the gap was measured on",
+}
+
+GLOSSARY = {
+    "gain": "how much more probable the effect makes the data, on a log scale: 1 nat is 2.7 times "
+    "as probable, 3 nats 20 times, 10 nats 22,000 times",
+    "closable gap": "what the best reference at hand gains over the model as it was, on the same "
+    "data; 100% closed means as good as that reference",
+    "p": "how often the best of everything tried would stand out this much if the model were "
+    "right; everything tried is counted, so one p does not mislead because many were computed",
+    "z": "a distance from what the model expects, in standard deviations",
+    "±": "one standard error; twice that, either way, is about a 95% interval",
+}
+
+
+def share(report: GapReport) -> str:
+    """How much of the gap the chosen model closes, with its interval; "" if not measured."""
+    closed = rows(report.closed)
+    if not closed or not is_number(closed[0]["F"]):
+        return ""
+    first = closed[0]
+    return f"closes {percent(first['F'])} of the closable gap " \
+           f"({interval(first['F_low'], first['F_high'])})"  # fmt: skip
+
+
+def kept_back(report: GapReport) -> str:
+    """Which data took no part in choosing."""
+    if "cross-fitting" in report.parts:
+        blocks = report.parts["cross-fitting"]
+        return f"on {blocks} blocks of the data, each left out in turn"
+    part = report.parts.get("confirm")
+    when = span(*part) if isinstance(part, tuple | list) and len(part) == 2 else str(part or "")
+    return "on data that took no part in the choice" + (f" ({when})" if when else "")
+
+
+# -- the three answers
+def headline(report: GapReport) -> str:
+    """The verdict in a sentence or two, with its number and its uncertainty."""
+    if report.verdict == "no measurable gap":
+        return _no_gap(report)
+    if report.verdict == "none of these":
+        return _none_of_these(report)
+    found = leaders(report) or [{"effect": "something", "equation": "", "p": None}]
+    groups = [alternatives(report, row) for row in found]
+    sure = p_text(found[0].get("p"))
+    if report.mode == "fast":
+        text = f"the screen says that {named(report)} lacks {listed(groups[0], 'or')} ({sure} " \
+               f"with {tried(report)})."  # fmt: skip
+        text += " These data cannot tell which." * (len(groups[0]) > 1)
+        return sentence(f"{text} How much of the gap that closes has not been measured yet")
+    lacks, adding = _lacks(groups)
+    text, measured = f"{named(report)} lacks {lacks}", share(report)
+    if measured:
+        return sentence(f"{text}. {adding} {measured}")
+    return sentence(f"{text} ({sure}), but {kept_back(report)} no gap could be measured")
+
+
+def _lacks(groups: list[list[str]]) -> tuple[str, str]:
+    """What is lacking, one group of names for each effect, and what adding it is called."""
+    many = len(groups) > 1
+    if all(len(g) == 1 for g in groups):
+        return listed([g[0] for g in groups]), "Adding them" if many else "Adding it"
+    if not many:
+        names = listed(groups[0], "or")
+        return f"one of these, and these data cannot tell which: {names}", "Adding the first"
+    numbered = "; ".join(f"({i}) {listed(g, 'or')}" for i, g in enumerate(groups, start=1))
+    text = f"{len(groups)} effects: {numbered} (“or” joins those that these data cannot tell apart)"
+    return text, "Adding the first of each"
+
+
+def _none_of_these(report: GapReport) -> str:
+    first, measured = rows(report.where)[:1], share(report)
+    spot = f" in {place(first[0])} ({p_text(first[0]['p'])})" if first else ""
+    text = f"{named(report)} lacks something{spot}, and none of the {tried(report)} explains it."
+    return sentence(text + (f" A curve estimated from the data {measured}." if measured else ""))
+
+
+def _no_gap(report: GapReport) -> str:
+    best = min(rows(report.causes), key=_by_p, default=None)
+    where = f"No measurable gap between {named(report)} and its data"
+    if best is None:
+        return where + "."
+    if is_number(best["p"]) and best["p"] <= report.settings.get("alpha", 0.05):
+        return f"{where}: {row_label(best)} stood out at first ({p_text(best['p'])}), but " \
+               f"{kept_back(report)} nothing could be gained."  # fmt: skip
+    return f"{where}: none of the {tried(report)} stands out from chance (the best, " \
+           f"{row_label(best)}, has {p_text(best['p'])})."  # fmt: skip
+
+
+def _by_p(row: dict[str, Any]) -> float:
+    return float(row["p"]) if is_number(row["p"]) else 2.0
+
+
+def place(row: dict[str, Any]) -> str:
+    """Equation and moment: "the noise level of y"."""
+    moment = str(row["moment"])
+    return f"{MOMENTS.get(moment, f'the {moment} of')} {row['equation']}"
+
+
+def where(report: GapReport) -> list[str]:
+    """Which equation, which moment, when and in which region: the three strongest places."""
+    alpha = report.settings.get("alpha", 0.05)
+    found = [r for r in rows(report.where) if is_number(r["p"]) and r["p"] <= alpha]
+    if not found:
+        return ["No equation stands out from chance."]
+    out = []
+    for i, r in enumerate(found[:3]):
+        region = r["region"] if isinstance(r["region"], str) else ""
+        when = span(r["t_from"], r["t_to"])
+        spots = [s for s in (f"at {when}" if when else "", region) if s]
+        strongest = f", strongest {' and '.join(spots)}" if spots else ""
+        text = f"{'also ' if i else ''}in {place(r)}{strongest} (z = {number(r['z'], 2)}, " \
+               f"{p_text(r['p'])})"  # fmt: skip
+        out.append(sentence(text))
+    return out
+
+
+def which(report: GapReport) -> list[str]:
+    """The effects that explain it, with their strength, and what they cannot be told from."""
+    if report.verdict == "none of these":
+        text = f"None of the {tried(report)}. What is left over is more than chance"
+        curve = _curve_peak(report)
+        return [sentence(text), *([curve] if curve else [])]
+    found = leaders(report)
+    if not found:
+        return [f"None of the {tried(report)} stands out."]
+    out = []
+    for row in found:
+        form = f", {row['form']}" if isinstance(row.get("form"), str) and row["form"] else ""
+        text = f"{row_label(row)}{form}"
+        if is_number(row.get("estimate")):
+            text += f": strength {with_error(row['estimate'], row.get('se'))}"
+        gains = [row.get("gain_refit"), row.get("gain_screen")]
+        gain = next((g for g in gains if is_number(g)), None)
+        if gain is not None:
+            by = "" if is_number(gains[0]) else "predicted "
+            text += f"; {by}gain {number(gain, 2)} nats, {p_text(row.get('p'))}"
+        out.append(sentence(text))
+        others = rivals(report, row)
+        if others:
+            names = listed([row_label(r) for r in others], "or")
+            rhos = [abs(float(r["rho"])) for r in others if is_number(r["rho"])]
+            close = f" (they leave traces that correlate up to {max(rhos):.2f})" if rhos else ""
+            out.append(sentence(f"these data cannot tell it from {names}{close}"))
+        elif row.get("class_id") in [r["class_id"] for r in rows(report.classes)]:
+            out.append("These data tell it from every other effect tried.")
+    return out
+
+
+def _curve_peak(report: GapReport) -> str:
+    curve = [r for r in rows(report.missing) if is_number(r["estimate"])]
+    sure = [r for r in curve if r["low"] > 0 or r["high"] < 0]
+    if not sure:
+        return ""
+    top = max(sure, key=lambda r: abs(r["estimate"]))
+    text = f"The estimated curve of what is missing in {top['equation']} is largest at " \
+           f"{top['variable']} = {number(top['value'])}: {number(top['estimate'])}"  # fmt: skip
+    return f"{text} (95% band {number(top['low'])} to {number(top['high'])})."
+
+
+def how_far(report: GapReport) -> list[str]:
+    """Share of the gap closed, its gain per sample, and the error of a free run."""
+    if report.mode == "fast":
+        return ["Not measured: fast mode stops after the screen."]
+    closed = rows(report.closed)
+    if not closed:
+        return ["Not measured."]
+    first, out = closed[0], []
+    if is_number(first["F"]):
+        out.append(sentence(f"{kept_back(report)}, {first['effect']} {share(report)}"))
+        if first["F"] < 0:
+            out.append("A share below zero means that it made the predictions worse.")
+    else:
+        out.append(sentence(f"{kept_back(report)}, no gap could be measured"))
+    if report.verdict == "no measurable gap":  # what no effect gained is no finding
+        return out
+    if is_number(first["nats_per_sample"]):
+        nats = float(first["nats_per_sample"])
+        text = f"each sample becomes {number(math.exp(nats))} times as probable on average " \
+               f"({number(nats, 2)} nats per sample"  # fmt: skip
+        if is_number(first["gain_mean"]) and is_number(first["gain_noise"]):
+            text += f"; in all {number(first['gain_mean'], 2)} from better predictions and " \
+                    f"{number(first['gain_noise'], 2)} from a better noise law"  # fmt: skip
+        out.append(sentence(text + ")"))
+    before, after = first["rmse_before"], first["rmse_after"]
+    if is_number(before) and is_number(after):
+        way = "falls" if after < before else "does not fall: it goes"
+        out.append(f"The error of a simulation left to itself {way} from {number(before)} to "
+                   f"{number(after)} (root mean square, units of the data).")  # fmt: skip
+    return out
+
+
+# -- how sure, and what next
+def how_sure(report: GapReport) -> list[str]:
+    """What the numbers rest on: the data used for what, the tests, what stands out at all."""
+    out = []
+    if "cross-fitting" in report.parts:
+        out.append(f"The data were used in turn: {report.parts['cross-fitting']} blocks, each "
+                   "predicted by models chosen and fitted without it.")  # fmt: skip
+    else:
+        used = [(name, span(*report.parts[name])) for name in USE
+                if isinstance(report.parts.get(name), tuple | list)]  # fmt: skip
+        if used:
+            text = listed([f"{USE[name]} {when}" for name, when in used])
+            out.append(sentence(text) + " No row served twice." * (len(used) > 1))
+    out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
+    alpha = report.settings.get("alpha", 0.05)
+    tests = [r for r in rows(report.detection) if is_number(r["p"])]
+    bad = [r for r in tests if r["p"] <= alpha]
+    if bad:
+        names = [f"{r['statistic']} of {r['channel']} ({p_text(r['p'])})" for r in bad[:4]]
+        out.append(f"Before any effect was tried, the one-step predictions failed {len(bad)} of "
+                   f"{len(tests)} checks: {listed(names)}.")  # fmt: skip
+    elif tests:
+        out.append(f"The one-step predictions of the model as it was passed all {len(tests)} "
+                   "checks.")  # fmt: skip
+    if report.verdict == "no measurable gap":
+        out.append("That does not prove the model right: an effect that these data hardly excite "
+                   "leaves no trace in them.")  # fmt: skip
+    return out
+
+
+def untold(report: GapReport) -> list[str]:
+    """What these data could not tell, and the parts that do not apply, with their reasons."""
+    out = []
+    for row in leaders(report):
+        if rivals(report, row):
+            out.append(sentence(f"which it is: {listed(alternatives(report, row), 'or')}"))
+    for r in rows(report.not_applicable):
+        about = f" for {r['equation']}" if isinstance(r["equation"], str) and r["equation"] else ""
+        out.append(sentence(f"{r['part']}{about}: {r['reason']}"))
+    return out
+
+
+def next_steps(report: GapReport) -> list[str]:
+    """What to do now: what to measure, and what to do with the model."""
+    out = []
+    if report.interrupted:
+        out.append("The run was interrupted: run it again, and it goes on from the stages done.")
+    elif report.mode == "fast" and report.verdict != "no measurable gap":
+        out.append("Run it again in full mode: it refits the leading effects and measures how far "
+                   "the gap closes.")  # fmt: skip
+    for row in leaders(report):
+        others = rivals(report, row)
+        if not others:
+            continue
+        inputs = [r["separating_input"] for r in others]
+        inputs = list(dict.fromkeys(i for i in inputs if isinstance(i, str) and i))
+        if inputs:
+            out.append(f"To tell {listed(alternatives(report, row), 'from')}, record data with "
+                       f"{listed(inputs, 'or')}.")  # fmt: skip
+        else:
+            out.append(f"None of the simple inputs considered would tell "
+                       f"{listed(alternatives(report, row), 'from')}; measure another quantity, "
+                       "or look at the machine.")  # fmt: skip
+    if report.verdict == "none of these":
+        out.append("Look at the estimated curve, think what could have its shape, write it as an "
+                   "@ssm.effect and run again with it.")  # fmt: skip
+    elif report.verdict == "no measurable gap":
+        out.append("To look closer, record more data, or drive the system over more of its range.")
+    if report.model_text:
+        out.append("The model with what was found is ready to use: augmented_model.py, an ordinary "
+                   "model file (report.model in Python).")  # fmt: skip
+    return out

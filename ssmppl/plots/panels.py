@@ -1,0 +1,253 @@
+"""The panels of a report, each on axes that are given: the gap, its causes, how far it closes.
+
+Every function takes the report and Matplotlib axes, draws, and gives the axes back. Labels of bars
+stand above them, so that a panel is readable at the width of a phone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError
+from ssmppl.gap.naming import class_letters, leaders, row_label, rows
+from ssmppl.gap.numerals import is_number, number, percent
+from ssmppl.gap.report import GapReport
+from ssmppl.plots.style import AFTER, BEFORE, DATA, FAINT, INK, SIGNED, bare, times
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = [
+    "bars", "curves", "free_run", "gap_closed", "mapped", "missing_term", "ranked_effects",
+    "residual_map", "runs",
+]  # fmt: skip
+
+MOST_EQUATIONS = 12
+MOST_EFFECTS = 8
+STANDS_OUT = 3.0  # |z| of a cell that gets a sign
+LONGEST_NAME = 52  # characters above a bar
+OPAQUE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+SHARES = (-1.0, 2.0)  # what is shown of F at most
+
+
+def mapped(report: GapReport) -> list[str]:
+    """Equations of the residual map, in the order of the table; of many, those that stand out."""
+    table = report.residual_map
+    names = list(dict.fromkeys(table["equation"]))
+    if len(names) > MOST_EQUATIONS:
+        strength = table["z"].abs().groupby(table["equation"]).max().fillna(0.0)
+        first = set(strength.sort_values(ascending=False).index[:MOST_EQUATIONS])
+        names = [n for n in names if n in first]
+    return names
+
+
+def residual_map(report: GapReport, ax: Any) -> Any:
+    """Standardised smoothed score by equation and window of time; a sign where |z| is at least 3.
+
+    Of more than twelve equations, the twelve with the largest |z|.
+    """
+    names = mapped(report)
+    table = report.residual_map[report.residual_map["equation"].isin(names)]
+    largest = float(np.nanmax(np.abs(table["z"].to_numpy(float)), initial=0.0))
+    limit = max(4.0, min(np.ceil(largest), 10.0))
+    ends = times(ax, [*table["t_from"], *table["t_to"]])
+    first, last = ends[: len(table)], ends[len(table) :]
+    mesh = None
+    for i, name in enumerate(names):
+        mine = np.flatnonzero((table["equation"] == name).to_numpy())
+        mine = mine[np.argsort(first[mine], kind="stable")]
+        edges = np.append(first[mine], last[mine[-1]])
+        z = table["z"].to_numpy(float)[mine]
+        mesh = ax.pcolormesh(
+            edges, [i - 0.45, i + 0.45], z[None, :], cmap=SIGNED, vmin=-limit, vmax=limit,
+            edgecolors="white", linewidth=0.4,
+        )  # fmt: skip
+        for j in np.flatnonzero(np.abs(z) >= STANDS_OUT):
+            ax.text((edges[j] + edges[j + 1]) / 2, i, "+" if z[j] > 0 else "−", ha="center",
+                    va="center", color="white" if abs(z[j]) > 0.6 * limit else INK)  # fmt: skip
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.5, -0.5)
+    ax.tick_params(axis="y", length=0)
+    ax.set_xlabel("t")
+    total = report.residual_map["equation"].nunique()
+    if total > len(names):
+        ax.set_title(f"{len(names)} of {total} equations, those with the largest |z|")
+    bare(ax, ["bottom"])
+    if mesh is not None:
+        bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, aspect=12, extend="both")
+        bar.set_label("z")
+        bar.outline.set_visible(False)
+    return ax
+
+
+def _name(text: str) -> str:
+    return text if len(text) <= LONGEST_NAME else text[: LONGEST_NAME - 1] + "…"
+
+
+def bars(report: GapReport) -> list[dict[str, Any]]:
+    """The rows of `causes` that `ranked_effects` shows: one for each effect and equation."""
+    best: dict[tuple[Any, Any], dict[str, Any]] = {}
+    for r in rows(report.causes):
+        best.setdefault((r["effect"], r["equation"]), r)
+    return list(best.values())[:MOST_EFFECTS]
+
+
+def ranked_effects(report: GapReport, ax: Any) -> Any:
+    """Gain of the best effects in nats: filled where refitted, hatched where only predicted.
+
+    The chosen ones are coloured; a letter marks effects that the data cannot tell apart.
+    """
+    letters, chosen, shown = class_letters(report), leaders(report), bars(report)
+    for i, r in enumerate(shown):
+        refit = is_number(r["gain_refit"])
+        gain = float(r["gain_refit"] if refit else r["gain_screen"])
+        gain = gain if is_number(gain) else 0.0
+        colour = AFTER if r in chosen else FAINT
+        ax.barh(
+            i, gain, height=0.42, edgecolor=colour, linewidth=0.8,
+            color=colour if refit else "none", hatch=None if refit else "////",
+        )  # fmt: skip
+        letter = letters.get(r["class_id"], "")
+        end = f" {number(gain, 2)}" + (f"  {letter}" if letter else "")
+        ax.text(max(gain, 0.0), i, end, va="center", weight="bold" if r in chosen else "normal")
+        form = f", {r['form']}" if isinstance(r["form"], str) and r["form"] else ""
+        ax.text(0, i - 0.27, _name(row_label(r) + form), va="bottom", ha="left",
+                transform=ax.get_yaxis_transform(),
+                weight="bold" if r in chosen else "normal")  # fmt: skip
+    low, high = ax.get_xlim()
+    ax.set_xlim(min(low, 0.0), max(high, 1.0) * 1.15)
+    ax.set_ylim(len(shown) - 0.6, -0.9)
+    ax.set_yticks([])
+    ax.axvline(0, color=FAINT, linewidth=0.7)
+    ax.set_xlabel("gain (nats)")
+    bare(ax, ["bottom"])
+    return ax
+
+
+def gap_closed(report: GapReport, ax: Any) -> Any:
+    """Share of the closable gap that each effect closes, with its 95% interval.
+
+    An arrow is where the data do not bound the interval, or where it leaves the axis.
+    """
+    shown = [r for r in rows(report.closed) if is_number(r["F"])][:MOST_EFFECTS]
+    ends = [r[c] for r in shown for c in ("F", "F_low", "F_high") if np.isfinite(r[c])]
+    low = max(min([-0.1, *(e - 0.1 for e in ends)]), SHARES[0])
+    high = min(max([1.1, *(e + 0.1 for e in ends)]), SHARES[1])
+    for i, r in enumerate(shown):
+        colour = AFTER if i == 0 else FAINT
+        if is_number(r["F_low"]) and is_number(r["F_high"]):
+            a, b = max(r["F_low"], low), min(r["F_high"], high)
+            ax.plot([a, b], [i, i], color=colour, linewidth=2.2, solid_capstyle="butt")
+            for end, at, marker in ((r["F_low"], low, "<"), (r["F_high"], high, ">")):
+                if end < low or end > high:
+                    ax.plot(at, i, marker, color=colour, markersize=6, clip_on=False)
+        ax.plot(np.clip(r["F"], low, high), i, "o", color=colour, markersize=7, zorder=3)
+        ax.text(low, i - 0.27, _name(f"{r['effect']}: {percent(r['F'])}"), va="bottom", ha="left",
+                weight="bold" if i == 0 else "normal", bbox=OPAQUE)  # fmt: skip
+    for at in (0.0, 1.0):
+        ax.axvline(at, color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
+    ax.set_xlim(low, high)
+    ax.set_ylim(len(shown) - 0.6, -0.9)
+    ax.set_yticks([])
+    ax.xaxis.set_major_formatter(lambda x, _: percent(x))
+    ax.set_xlabel("share of the closable gap that is closed, 95% interval")
+    bare(ax, ["bottom"])
+    return ax
+
+
+def curves(report: GapReport) -> list[tuple[Any, Any]]:
+    """(equation, variable) of each estimated curve."""
+    if report.missing is None:
+        return []
+    return list(dict.fromkeys(zip(report.missing["equation"], report.missing["variable"],
+                                  strict=True)))  # fmt: skip
+
+
+def missing_term(report: GapReport, ax: Any, equation: Any = None, variable: Any = None) -> Any:
+    """Estimated curve of what an equation lacks, over one variable, with its 95% band.
+
+    Without names, the first curve.
+    """
+    known = curves(report)
+    found = [(e, v) for e, v in known if equation in (None, e) and variable in (None, v)]
+    if not found or report.missing is None:
+        raise ArgumentError(
+            f"the report has no curve of {equation!r} over {variable!r}",
+            fix=f"it has: {', '.join(f'{e} over {v}' for e, v in known) or 'none'}",
+        )
+    equation, variable = found[0]
+    table = report.missing
+    table = table[(table["equation"] == equation) & (table["variable"] == variable)]
+    x = times(ax, table["value"])
+    order = np.argsort(x, kind="stable")
+    low, mid, high = (table[c].to_numpy(float)[order] for c in ("low", "estimate", "high"))
+    ax.axhline(0, color=FAINT, linewidth=0.8, linestyle="--")
+    ax.fill_between(x[order], low, high, color=AFTER, alpha=0.2, linewidth=0)
+    ax.plot(x[order], mid, color=AFTER, linewidth=1.6)
+    ax.margins(x=0)
+    ax.set_xlabel(str(variable))
+    ax.set_ylabel(f"missing in {equation}")
+    bare(ax)
+    return ax
+
+
+def runs(report: GapReport) -> list[tuple[Any, Any]]:
+    """(experiment, channel) of each free run."""
+    table = report.free_run
+    return list(dict.fromkeys(zip(table["experiment"], table["channel"], strict=True)))
+
+
+def _curve(ax: Any, x: np.ndarray, table: pd.DataFrame, name: str, colour: str, style: str,
+           text: str) -> None:  # fmt: skip
+    y = table[name].to_numpy(float)
+    if np.isnan(y).all():
+        return
+    low, high = table[f"{name}_low"].to_numpy(float), table[f"{name}_high"].to_numpy(float)
+    ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+    ax.plot(x, y, style, color=colour, linewidth=1.4, label=text)
+
+
+def _limits(table: pd.DataFrame, drawn: tuple[float, float]) -> tuple[float, float]:
+    """What is drawn, but no further from the data than once their range: some models run away."""
+    seen = table[["observed", "after"]].to_numpy(float)
+    if np.isnan(seen).all():
+        return drawn
+    low, high = float(np.nanmin(seen)), float(np.nanmax(seen))
+    room = high - low or 1.0
+    return max(drawn[0], low - room), min(drawn[1], high + room)
+
+
+def free_run(
+    report: GapReport, ax: Any, experiment: Any = None, channel: Any = None, last: int = 300
+) -> Any:
+    """The data of one channel, and both models simulated without seeing them, with 95% bands.
+
+    Without names, the first channel of the first experiment. `last`: how many rows at the end are
+    drawn, where errors have had the longest time to add up.
+    """
+    known = runs(report)
+    found = [(e, c) for e, c in known if experiment in (None, e) and channel in (None, c)]
+    if not found:
+        raise ArgumentError(
+            f"the report has no free run of channel {channel!r} in experiment {experiment!r}",
+            fix=f"it has: {', '.join(f'{c} in {e}' for e, c in known) or 'none'}",
+        )
+    experiment, channel = found[0]
+    table = report.free_run
+    table = table[(table["experiment"] == experiment) & (table["channel"] == channel)]
+    total, table = len(table), table.tail(last)
+    x = times(ax, table["t"])
+    _curve(ax, x, table, "before", BEFORE, "--", "model as it was")
+    _curve(ax, x, table, "after", AFTER, "-", "with what was found")
+    ax.plot(x, table["observed"].to_numpy(float), ".", color=DATA, markersize=2.5, label="data")
+    notes = [f"experiment {experiment}"] * (len({e for e, _ in known}) > 1)
+    notes += [f"last {last:,} of {total:,} rows"] * (total > last)
+    ax.set_title(", ".join(notes))
+    ax.margins(x=0.01)
+    ax.set_ylim(*_limits(table, ax.get_ylim()))
+    ax.set_xlabel("t")
+    ax.set_ylabel(str(channel))
+    bare(ax)
+    return ax

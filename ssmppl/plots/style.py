@@ -1,0 +1,69 @@
+"""Colours, sizes and the axis of time, shared by the panels.
+
+Colours are those of Okabe and Ito (2008), which the colour-blind can tell apart; line styles and
+hatching say the same again, for print in black and white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+__all__ = ["AFTER", "BEFORE", "DATA", "FAINT", "INK", "RC", "SIGNED", "bare", "times"]
+
+INK = "#222222"
+FAINT = "#8a8a8a"
+DATA = "#333333"
+BEFORE = "#D55E00"  # vermilion, dashed
+AFTER = "#0072B2"  # blue, solid
+SIGNED = "RdBu_r"
+
+RC: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.fontsize": 8.5,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.linewidth": 0.7,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "savefig.facecolor": "white",
+    "hatch.linewidth": 0.6,
+}
+
+
+def bare(ax: Any, keep: Iterable[str] = ("left", "bottom")) -> None:
+    """Only the named sides of the frame."""
+    for side, spine in ax.spines.items():
+        spine.set_visible(side in keep)
+
+
+def times(ax: Any, values: Any) -> np.ndarray:
+    """Row labels as positions on the x axis: numbers, dates, or else their order of appearance."""
+    import pandas as pd
+
+    series = pd.Series(values).reset_index(drop=True)
+    if pd.api.types.is_datetime64_any_dtype(series):
+        from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+
+        locator = AutoDateLocator(maxticks=6)
+        ax.xaxis.set_major_locator(locator)
+        ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        dates: np.ndarray = date2num(series.dt.to_pydatetime())
+        return dates
+    numbers = pd.to_numeric(series, errors="coerce")
+    if numbers.notna().all():
+        return numbers.to_numpy(float)
+    codes, labels = pd.factorize(series)
+    some = np.unique(np.linspace(0, len(labels) - 1, 5).astype(int))
+    ax.set_xticks(some, [str(labels[i]) for i in some])
+    return codes.astype(float)

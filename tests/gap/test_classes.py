@@ -1,0 +1,137 @@
+"""Equivalence classes, cuts and separating inputs, against normal vectors simulated anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ssmppl.errors import ArgumentError
+from ssmppl.gap.classes import (
+    NATS_APART,
+    classes,
+    confidence_set,
+    cuts,
+    likeness,
+    needed_gain,
+    separating_input,
+    told_apart,
+)
+from tests.statistics.checks import LEVEL, seed_of
+
+
+def rng_of(*name):
+    return np.random.default_rng(seed_of("classes", *name))
+
+
+def one_factor(width, rho):
+    return np.full((width, width), rho) + (1 - rho) * np.eye(width)
+
+
+@pytest.mark.parametrize("rho", [0.5, 0.9, -0.8])
+def test_at_the_needed_gain_a_rival_wins_once_in_twenty(rho):
+    rng, times = rng_of("needed", rho), 20_000
+    delta = np.sqrt(2 * needed_gain(rho))
+    root = np.linalg.cholesky(np.array([[1.0, rho], [rho, 1.0]]))
+    z = rng.standard_normal((times, 2)) @ root.T + delta * np.array([1.0, rho])
+    wins = int(np.sum(np.abs(z[:, 1]) > np.abs(z[:, 0])))
+    assert stats.binomtest(wins, times, stats.norm.sf(np.sqrt(NATS_APART))).pvalue > LEVEL
+    assert stats.norm.sf(np.sqrt(NATS_APART)) == pytest.approx(0.05, abs=2e-3)
+
+
+def test_needed_gain():
+    np.testing.assert_allclose(needed_gain(np.array([0.0, 0.9, -0.9, 1.0])), [2.7, 27, 27, np.inf])
+    assert told_apart(27.1, 0.9)
+    assert not told_apart(26.9, -0.9)
+    assert not told_apart(1e9, 1.0)
+
+
+def test_classes_of_a_small_example():
+    """Leader 2 (20 nats) takes what correlates above 1 - 2.7 / 20 = 0.865; then 0 takes 4."""
+    rho = np.eye(5)
+    for (i, j), value in {(1, 2): -0.9, (2, 3): 0.8, (0, 4): 0.7, (0, 3): 0.1}.items():
+        rho[i, j] = rho[j, i] = value
+    gains = np.array([6.0, 15.0, 20.0, 14.0, 3.0])
+    found = classes(rho, gains)
+    np.testing.assert_array_equal(found.class_id, [3, 1, 1, 2, 3])
+    np.testing.assert_array_equal(found.leader, [0, 2, 2, 3, 0])
+    np.testing.assert_allclose(found.rho, [1.0, -0.9, 1.0, 1.0, 0.7])
+    np.testing.assert_array_equal(found.members(1), [2, 1])
+    weaker = classes(rho, gains / 3)  # less is known: 2 takes 3 as well, and so on
+    assert weaker.class_id.max() < found.class_id.max()
+
+
+def test_one_sided_rivals_of_the_wrong_sign_are_no_rivals():
+    rho = np.array([[1.0, -0.95], [-0.95, 1.0]])
+    np.testing.assert_array_equal(likeness(rho, np.array([1, 1])), np.eye(2))
+    np.testing.assert_array_equal(likeness(rho, np.array([1, -1])), np.abs(rho))
+    np.testing.assert_array_equal(likeness(rho, np.array([1, 0])), np.abs(rho))
+    gains = np.array([20.0, 19.0])
+    assert classes(rho, gains, np.array([1, 1])).class_id.tolist() == [1, 2]
+    assert classes(rho, gains).class_id.tolist() == [1, 1]
+
+
+def test_a_cut_of_two_is_enough_for_two():
+    """One rival, correlation 0.9: the excess is at most its part beyond the truth, chi-square."""
+    found = cuts(one_factor(2, 0.9), np.array([20.0, 18.0]), [0, 1])
+    np.testing.assert_allclose(found, 2.0)
+
+
+@pytest.mark.parametrize(("width", "rho"), [(5, 0.9), (60, 0.95), (60, 0.5)])
+def test_the_confidence_set_holds_the_truth(width, rho):
+    """With the cut from the gains of the data themselves, at least 95% at 6 nats."""
+    rng, times, held, fixed = rng_of("set", width, rho), 200, 0, 0
+    matrix = one_factor(width, rho)
+    root = np.linalg.cholesky(matrix)
+    for _ in range(times):
+        z = root @ rng.standard_normal(width) + np.sqrt(12.0) * matrix[0]
+        gain = z**2 / 2
+        cut = cuts(matrix, gain, [0], draws=1000)[0]
+        held += bool(confidence_set(gain, cut)[0])
+        fixed += bool(confidence_set(gain, 2.0)[0])
+    print(f"{width}, {rho}: {held / times:.3f}, with a cut of 2 nats {fixed / times:.3f}")
+    assert stats.binomtest(held, times, 0.95, alternative="less").pvalue > LEVEL
+    if width == 60:
+        assert stats.binomtest(fixed, times, 0.95, alternative="less").pvalue < LEVEL
+
+
+def test_cuts_against_a_direct_simulation():
+    """Three rivals, one-sided, one of them a shape of the truth: the quantile of the definition."""
+    rng = rng_of("direct")
+    rho = np.array([[1.0, 0.7, 0.2, -0.6], [0.7, 1.0, 0.5, -0.2], [0.2, 0.5, 1.0, 0.3],
+                    [-0.6, -0.2, 0.3, 1.0]])  # fmt: skip
+    gains, signs, groups = np.array([3.0, 2.5, 1.0, 2.0]), np.array([1, 0, 1, -1]), [0, 1, 0, 2]
+    drawn = rng.standard_normal((200_000, 4)) @ np.linalg.cholesky(rho).T + np.sqrt(5.0) * rho[0]
+    g = np.where(signs == 0, np.abs(drawn), np.maximum(signs * drawn, 0)) ** 2 / 2
+    excess = g.max(axis=1) - g[:, [0, 2]].max(axis=1)
+    options = {"sided": signs, "groups": np.array(groups), "draws": 100_000}
+    found = cuts(rho, gains, [0], level=0.99, **options)[0]
+    share = np.mean(excess <= found)
+    assert abs(share - 0.99) < 4 * np.sqrt(0.99 * 0.01 * (1 / 200_000 + 1 / 100_000))
+    assert found > 2.0
+
+
+def test_a_confidence_set_with_its_own_cuts():
+    np.testing.assert_array_equal(
+        confidence_set(np.array([10.0, 7.5, 7.5, np.nan]), np.array([2.0, 2.0, 3.0, 2.0])),
+        [True, False, True, False],
+    )
+
+
+def test_the_input_that_separates():
+    """Two members: gain (1 - |rho|) by hand; three: the hardest pair counts."""
+    weak = np.array([[4.0, 3.8], [3.8, 4.0]])
+    strong = np.array([[9.0, 3.0], [3.0, 4.0]])
+    found = separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak, "chirp": strong})
+    assert found.nats["steps"] == pytest.approx(8 * 0.05)
+    assert found.nats["chirp"] == pytest.approx(8 * 0.5)  # the member with less information
+    assert (found.input, found.told_apart) == ("chirp", True)
+    assert not separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak}).told_apart
+    three = np.eye(3)
+    three[0, 2] = three[2, 0] = 0.99
+    found = separating_input([0, 1, 2], np.full(3, 4.0), {"a": three})
+    assert found.nats["a"] == pytest.approx(8 * 0.01)
+    dead = np.diag([1.0, 0.0])
+    assert separating_input([0, 1], np.ones(2), {"a": dead}).nats["a"] == 0.0
+    with pytest.raises(ArgumentError, match="1 members"):
+        separating_input([0], np.ones(2), {"a": dead})

@@ -1,0 +1,164 @@
+"""One pass against exact scores: of the Kalman filter, and of a simulator without noise."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ssmppl.analysis.density import Missing
+from ssmppl.data import bind, check_parameters
+from ssmppl.errors import NotApplicable
+from ssmppl.gap.columns import score_columns
+from ssmppl.gap.smoothing import (
+    Settings,
+    Smoother,
+    probability_transforms,
+)
+from ssmppl.gap.smoothing import (
+    simulated as simulated_sets,
+)
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
+from ssmppl.language.trace import trace
+from tests.gap.models import THETA, build, simulated
+from tests.statistics.checks import LEVEL, seed_of
+
+LINEAR = ("noisy_oscillator", "oscillator")
+PROPOSAL = {"noisy_oscillator": "auxiliary", "oscillator": "bootstrap"}
+
+
+ORDINARY = Settings()
+
+
+def smoother_of(name, settings=ORDINARY, exact=True):
+    model = trace(build(name))
+    missing = Missing(none=True)
+    found = Smoother(score_columns(model, model, (), (), missing), missing, settings)
+    if not exact:
+        found.__dict__["kalman"] = NotApplicable("particles are tested")
+    return model, found
+
+
+def runs_of(smoother, experiments, theta, count, *name):
+    """Sums of the rows (count, F) of independent passes, and their log-likelihoods (count,)."""
+    rows, values = [], []
+    for r in range(count):
+        passes = smoother.run(experiments, theta, random_state(seed_sequence(seed_of(*name)), r))
+        rows.append(sum(p.rows.sum(axis=0) for p in passes))
+        values.append(sum(p.log_increments.sum() for p in passes))
+    return np.array(rows), np.array(values)
+
+
+def off(estimates, exact):
+    """Standardised distance of the mean of estimates (R, F) from exact (F,)."""
+    error = estimates.std(axis=0, ddof=1) / np.sqrt(len(estimates))
+    return (estimates.mean(axis=0) - exact) / error
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_exact_trajectories_give_the_exact_score(name):
+    model, smoother = smoother_of(name)
+    theta = check_parameters(model, {k: 1.1 * v for k, v in THETA[name].items()})
+    experiments = bind(model, simulated(name, 150))
+    assert isinstance(smoother.kalman, KalmanModel)
+    value, exact = smoother.kalman.score(experiments, theta)
+    rows, values = runs_of(smoother, experiments, theta, 40, "exact rows", name)
+    np.testing.assert_allclose(values, value, rtol=1e-10)
+    z = off(rows, exact)
+    assert np.max(np.abs(z)) < stats.t.isf(LEVEL / (2 * len(z)), 39), z
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_particles_come_near_the_exact_score(name):
+    """The genealogy within its error, the bias of N = 500 below a tenth of a standard deviation of
+    the score itself: that is what tests and fits can tell."""
+    model, smoother = smoother_of(name, Settings(500, PROPOSAL[name]), exact=False)
+    theta = check_parameters(model, {k: 1.1 * v for k, v in THETA[name].items()})
+    experiments = bind(model, simulated(name, 150))
+    kalman = smoother_of(name)[1].kalman
+    _, exact = kalman.score(experiments, theta)
+    information = kalman.information(experiments, theta)
+    rows, _ = runs_of(smoother, experiments, theta, 60, "particle rows", name)
+    error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
+    slack = 0.1 * np.sqrt(np.abs(np.diagonal(information)))
+    excess = (np.abs(rows.mean(axis=0) - exact) - slack) / error
+    assert np.max(excess) < stats.t.isf(LEVEL / (2 * len(excess)), 59), (rows.mean(axis=0), exact)
+
+
+def test_a_simulator_without_noise_is_derived_through_its_states():
+    """Deterministic transitions from a known start: the score is that of a regression."""
+    import ssmppl as ssm
+
+    model = ssm.Model("decay", inputs=("u",))
+
+    @model.prior
+    def prior():
+        return {"a": ssm.Uniform(0, 1), "b": ssm.Normal(0, sd=1)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Dirac(1.0)}
+
+    @model.transition
+    def transition(x, u, a, b):
+        return {"x": ssm.Dirac(a * x + b * u)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=0.3)}
+
+    traced, missing = trace(model), Missing(none=True)
+    u = np.sin(np.arange(40.0))
+    y = np.cos(np.arange(40.0))
+    smoother = Smoother(score_columns(traced, traced, (), (), missing), missing, Settings(4))
+
+    def log_likelihood(a, b):
+        x, total = 1.0, 0.0
+        for t in range(40):
+            total += stats.norm.logpdf(y[t], x, 0.3)
+            x = a * x + b * u[t]
+        return total
+
+    h = 1e-5
+    exact = [
+        (log_likelihood(0.8 + h, 0.5) - log_likelihood(0.8 - h, 0.5)) / (2 * h),
+        (log_likelihood(0.8, 0.5 + h) - log_likelihood(0.8, 0.5 - h)) / (2 * h),
+    ]
+    for kalman in (True, False):
+        if not kalman:
+            smoother.__dict__["kalman"] = NotApplicable("particles are tested")
+        (found,) = smoother.run(
+            bind(traced, {"u": u, "y": y}), np.array([0.8, 0.5]), random_state(seed_sequence(1))
+        )
+        np.testing.assert_allclose(found.rows.sum(axis=0), exact, rtol=1e-6)
+        assert found.log_increments.sum() == pytest.approx(log_likelihood(0.8, 0.5), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "noisy_oscillator"])
+def test_predictions_of_simulated_data_are_uniform(name):
+    """PIT values of data from the model, pooled over independent sets, every tenth row."""
+    model, smoother = smoother_of(name, Settings(500, "bootstrap"), exact=False)
+    theta = check_parameters(model, THETA[name])
+    given = bind(model, simulated(name, 100))
+    pits = []
+    for r in range(20):
+        stream = random_state(seed_sequence(seed_of("pit", name)), r)
+        sets = simulated_sets(smoother.program, given, theta, stream, False)
+        passes = smoother.run(sets, theta, stream)
+        pits.append(probability_transforms(passes, sets, stream)[0][5::10].ravel())
+    assert stats.kstest(np.concatenate(pits), "uniform").pvalue > LEVEL
+
+
+def test_missing_values_have_no_transform():
+    name = "noisy_oscillator"
+    model, _ = smoother_of(name)
+    missing = Missing()
+    smoother = Smoother(score_columns(model, model, (), (), missing), missing, Settings(100))
+    data = simulated(name, 30)
+    data["y"][[3, 17]] = np.nan
+    experiments = bind(model, data)
+    theta = check_parameters(model, THETA[name])
+    stream = random_state(seed_sequence(1))
+    passes = smoother.run(experiments, theta, stream)
+    (pit,) = probability_transforms(passes, experiments, stream)
+    assert np.flatnonzero(np.isnan(pit[:, 0])).tolist() == [3, 17]
+    assert np.all(passes[0].log_increments[[3, 17]] == 0.0)
