@@ -1,0 +1,1 @@
+"""The blind benchmark of `ssm.diagnose`: systems, withheld effects, rivals and scoring."""

@@ -1,0 +1,153 @@
+"""F of the chosen effects against the true model, its interval, and F* on fresh data.
+
+    python -m bench.gap.fresh [--half confirm] [--cell one-20] [--method diagnose]
+
+The reference C is the true model, refitted to the first 70% of the rows (its parameters and its
+effects' strengths). F of the report's model and its interval are made by the tool's own
+`ssmppl.gap.closed.closed` on the confirm rows. F* is the same ratio at the same fitted parameters,
+over the confirm parts of 20 fresh runs of the true system with the same inputs. Opens the answers:
+run it after the diagnosis, before `score.py`, which reads `cache/fresh.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import ssmppl as ssm
+from bench.gap.filter import terms
+from bench.gap.fit import fit
+from bench.gap.plan import SPLIT, entries
+from bench.gap.records import CACHE, Record
+from bench.gap.run import SETS
+from bench.gap.score import opened, records
+from bench.gap.truth import SYSTEMS, System
+from ssmppl.gap.closed import closed
+from ssmppl.language.model import Model
+from ssmppl.modelfile import load_model
+
+CONFIRM = 0.7  # share of the rows before the confirm part
+RUNS = 20  # fresh runs
+PARTICLES = 1000
+REPEATS = 4  # runs of the particle filter on the set itself
+
+Rows = Callable[[pd.DataFrame, int], np.ndarray]  # data, repeats -> (repeats, T) log increments
+
+
+def through(model: Model, parameters: dict[str, float]) -> Rows:
+    """One-step log predictive densities of a model by its particle filter."""
+
+    def rows(data: pd.DataFrame, repeats: int) -> np.ndarray:
+        found = ssm.particle_filter(
+            model, data, parameters, particles=PARTICLES, repeats=repeats, seed=1
+        )
+        assert not isinstance(found, list)  # one experiment, one Dataset
+        return np.asarray(found["log_likelihood_increment"].values)
+
+    return rows
+
+
+def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Rows:
+    """The same of the true model, refitted to the first 70% of a set's rows."""
+    keys = tuple(e["key"] for e in answer["effects"])
+    strengths = {e["key"]: e["strength"] for e in answer["effects"]}
+    p = np.array(list(answer["parameters"].values()))
+    found = fit(system, U, Y, keys, p, system.strengths(strengths), int(CONFIRM * len(Y)))
+
+    def rows(data: pd.DataFrame, repeats: int) -> np.ndarray:
+        U, Y = arrays(system, data)
+        ll = terms(system, found.p, found.e, U, Y)[0].sum(axis=1)
+        return np.repeat(ll[None], repeats, axis=0)
+
+    return rows
+
+
+def arrays(system: System, data: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs (T, inputs) and observations (T, channels) of a table."""
+    return (data[list(system.inputs)].to_numpy(float), data[list(system.channels)].to_numpy(float))
+
+
+def share(
+    base: Rows, effect: Rows, true: Rows, system: System, answer: dict, data: pd.DataFrame
+) -> dict[str, float]:
+    """F, its interval and F* of one model (NaN where no gap is measurable)."""
+    cut = int(CONFIRM * len(data))
+    parts = [rows(data, REPEATS)[:, cut:] for rows in (base, effect, true)]
+    found = closed(*parts)
+    p = np.array(list(answer["parameters"].values()))
+    e = system.strengths({x["key"]: x["strength"] for x in answer["effects"]})
+    U, _ = arrays(system, data)
+    total = np.zeros(2)
+    for k in range(RUNS):
+        rng = np.random.default_rng([answer["seed"], 1 + k])
+        _, Y = system.simulate(p, e, U, rng)
+        fresh = data.copy()
+        fresh[list(system.channels)] = Y
+        l0, lk, lc = (rows(fresh, 1)[0, cut:].sum() for rows in (base, effect, true))
+        total += lk - l0, lc - l0
+    return {
+        "F": found.F,
+        "low": found.low,
+        "high": found.high,
+        "F_star": float(total[0] / total[1]) if total[1] else math.nan,
+    }
+
+
+def of_record(record: Record, answer: dict) -> dict[str, float]:
+    """F and F* of the model that a diagnosis handed back."""
+    folder = SETS / record.id
+    data = pd.read_csv(folder / "data.csv")
+    system = SYSTEMS[answer["system"]]
+    with TemporaryDirectory() as scratch:
+        path = Path(scratch) / f"augmented_{record.id}.py"
+        path.write_text(record.model_text)
+        augmented = load_model(str(path))
+        before, after = (
+            {name: pair[0] for name, pair in record.estimates[when].items()}
+            for when in ("before", "after")
+        )
+        return share(
+            through(load_model(str(folder / "model.py")), before),
+            through(augmented, after),
+            reference(system, answer, *arrays(system, data)),
+            system,
+            answer,
+            data,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--half", choices=list(SPLIT["halves"]))
+    parser.add_argument("--cell", choices=list(SPLIT["cells"]))
+    parser.add_argument("--method", default="diagnose")
+    options = parser.parse_args()
+    path = CACHE / "fresh.json"
+    done: dict[str, dict[str, dict[str, Any]]] = (
+        json.loads(path.read_text()) if path.exists() else {}
+    )
+    mine = done.setdefault(options.method, {})
+    kept = records(options.method)
+    for entry in entries():
+        record = kept.get(entry.id)
+        wanted = options.half in (None, entry.half) and options.cell in (None, entry.cell)
+        if not wanted or not entry.effects or record is None or not record.model_text:
+            continue
+        if mine.get(entry.id, {}).get("digest") == record.digest:
+            continue
+        found = of_record(record, opened([entry.id])[entry.id])
+        mine[entry.id] = {**found, "digest": record.digest}
+        path.write_text(json.dumps(done, indent=1))
+        print(entry.id, {k: round(v, 3) for k, v in found.items()}, flush=True)
+
+
+if __name__ == "__main__":
+    main()

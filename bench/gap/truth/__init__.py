@@ -1,0 +1,25 @@
+"""The true systems: generators with effects that are switched on, and never told.
+
+Nothing under `systems/` imports from here; `run.py` does not either.
+"""
+
+from bench.gap.truth import (
+    cart_pole,
+    epidemic,
+    motor_belt,
+    oscillator,
+    pendulum,
+    predator_prey,
+    thermal,
+    two_tanks,
+)
+from bench.gap.truth.system import Effect, System
+
+SYSTEMS: dict[str, System] = {
+    module.SYSTEM.name: module.SYSTEM
+    for module in (
+        oscillator, pendulum, cart_pole, two_tanks, thermal, motor_belt, predator_prey, epidemic,
+    )
+}  # fmt: skip
+
+__all__ = ["SYSTEMS", "Effect", "System"]

@@ -1,0 +1,68 @@
+"""F against the true model and F* on fresh data, where both are known."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.gap.fit import fit
+from bench.gap.fresh import arrays, reference, share, through
+from bench.gap.run import MODELS
+from bench.gap.truth import SYSTEMS
+from ssmppl.modelfile import load_model
+
+SYSTEM = SYSTEMS["thermal"]
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A set with a strong delay: (its table, its answer, base and true models refitted)."""
+    rng = np.random.default_rng(5)
+    p = SYSTEM.drawn_parameters(rng)
+    U = SYSTEM.excite(rng, SYSTEM.steps)
+    _, Y = SYSTEM.simulate(p, SYSTEM.strengths({"delay": 2.0}), U, rng)
+    data = pd.DataFrame(np.hstack([U, Y]), columns=[*SYSTEM.inputs, *SYSTEM.channels])
+    answer = {
+        "parameters": dict(zip(SYSTEM.parameters, p.tolist(), strict=True)),
+        "effects": [{"key": "delay", "strength": 2.0}],
+        "seed": 7,
+    }
+    base = reference(SYSTEM, {**answer, "effects": []}, U, Y)
+    true = reference(SYSTEM, answer, U, Y)
+    return data, answer, base, true
+
+
+def test_the_true_model_closes_all_and_the_base_nothing(case):
+    data, answer, base, true = case
+    all_of_it = share(base, true, true, SYSTEM, answer, data)
+    assert all_of_it["F"] == pytest.approx(1)
+    assert all_of_it["F_star"] == pytest.approx(1)
+    nothing = share(base, base, true, SYSTEM, answer, data)
+    assert nothing["F"] == nothing["F_star"] == 0
+
+
+def test_a_mixture_of_both_closes_part_and_its_interval_holds_the_part(case):
+    data, answer, base, true = case
+
+    def between(rows, repeats):
+        return 0.3 * base(rows, repeats) + 0.7 * true(rows, repeats)
+
+    part = share(base, between, true, SYSTEM, answer, data)
+    assert part["F_star"] == pytest.approx(0.7)
+    assert part["low"] <= 0.7 <= part["high"]
+
+
+@pytest.mark.slow
+def test_a_models_increments_are_those_of_the_exact_filter(case):
+    """Row by row within the particles' error, and a bias of about 1 / (2 N) of their variance."""
+    data, answer, base, _ = case
+    U, Y = arrays(SYSTEM, data)
+    model = load_model(str(MODELS / "thermal.py"))
+    p = np.array(list(answer["parameters"].values()))
+    found = fit(SYSTEM, U, Y, (), p, SYSTEM.strengths({}), int(0.7 * len(Y)))
+    parameters = dict(zip(SYSTEM.parameters, found.p, strict=True))
+    estimates = through(model, parameters)(data, 8)
+    exact = base(data, 1)[0]
+    error = estimates.std(axis=0, ddof=1) / np.sqrt(8)
+    off = np.abs(estimates.mean(axis=0) - exact)
+    # Student's t with 7 degrees of freedom lies beyond 4 in 1 row of 190
+    assert np.mean(off < 4 * error + 0.02) > 0.97
