@@ -25,7 +25,7 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.problem import pose
 from tests.statistics import models
-from tests.statistics.checks import seed_of
+from tests.statistics.checks import seed_of, some
 
 from .smoothing_cases import assert_moments, moments_of, smoothing_case
 
@@ -129,7 +129,7 @@ ENUMERATED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("label", "kernel", "steps", "n"), ENUMERATED)
+@pytest.mark.parametrize(("label", "kernel", "steps", "n"), some(ENUMERATED, 4))
 def test_law_given_the_particles(label, kernel, steps, n):
     problem, theta, experiment, system = short(label, steps, n)
     law = enumerate_law(problem, theta, experiment, system)
@@ -206,7 +206,7 @@ MOMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("label", "proposal", "kernel", "particles"), MOMENTS)
+@pytest.mark.parametrize(("label", "proposal", "kernel", "particles"), some(MOMENTS, 2))
 def test_moments(label, proposal, kernel, particles):
     problem, theta, exact, *_ = smoothing_case(label)
     stream = stream_of("moments", label, kernel)

@@ -105,8 +105,8 @@ def test_estimates_on_given_numbers_are_unbiased(problem, proposal):
 @pytest.mark.parametrize("model", ["one", "two"])
 def test_log_z_is_nearly_continuous_in_the_numbers(problem, model):
     """Successive estimates err alike: the variance of their difference, as a share of that of
-    independent ones, falls with the number of particles, as neighbours among the sorted particles
-    come nearer to each other. Without sorting the share stays where it is.
+    independent ones, is far below a quarter at N = 1000. Without sorting it is above a half for two
+    state components, whatever N (and 0.1 with sorting).
     """
     if model == "one":
         parameters = {"phi": 0.8, "tau": 2.0}
@@ -116,20 +116,18 @@ def test_log_z_is_nearly_continuous_in_the_numbers(problem, model):
     else:
         theta = THETA
     rng = stream("continuous", model)
-    repeats, log_share = 150, []
-    for particles in (100, 1000):
-        variance = {}
-        for rho in (0.0, 0.999):
-            likelihood = CorrelatedLikelihood(problem, FilterSettings(particles, "bootstrap"), rho)
-            differences = []
-            for _ in range(repeats):
-                run = likelihood.run(theta, None, rng)
-                moved = likelihood.run(theta, run, rng)
-                differences.append(moved.log_likelihood - run.log_likelihood)
-            variance[rho] = np.var(differences, ddof=1)
-        log_share.append(np.log(variance[0.999] / variance[0.0]))
-    error = np.sqrt(4 * 2 / (repeats - 1))  # of the difference: four variances of normal numbers
-    assert (log_share[1] - log_share[0]) / error < stats.norm.ppf(LEVEL), np.exp(log_share)
+    repeats, variance = 150, {}
+    for rho in (0.0, 0.999):
+        likelihood = CorrelatedLikelihood(problem, FilterSettings(1000, "bootstrap"), rho)
+        differences = []
+        for _ in range(repeats):
+            run = likelihood.run(theta, None, rng)
+            moved = likelihood.run(theta, run, rng)
+            differences.append(moved.log_likelihood - run.log_likelihood)
+        variance[rho] = np.var(differences, ddof=1)
+    share = variance[0.999] / variance[0.0]
+    error = np.sqrt(2 * 2 / (repeats - 1))  # of its log: two variances of normal numbers
+    assert np.log(share / 0.25) / error < stats.norm.ppf(LEVEL), share
 
 
 @pytest.mark.parametrize(("d", "bits"), [(1, 5), (2, 4), (3, 3), (4, 2)])

@@ -9,10 +9,26 @@ import zlib
 
 import arviz as az
 import numpy as np
+import pytest
 from scipy import stats
 
 LEVEL = 0.001  # chance of a false alarm, over a whole table of checks
 MCSE = 4.0  # Monte Carlo standard errors that a posterior may lie off
+
+
+def some(cases, count):
+    """Cases of a parametrised test, evenly spread, of which all but `count` are left to the slow
+    stage."""
+    cases = list(cases)
+    kept = {round(i * (len(cases) - 1) / max(count - 1, 1)) for i in range(count)}
+    return [c if i in kept else _slow(c) for i, c in enumerate(cases)]
+
+
+def _slow(case):
+    if hasattr(case, "marks"):  # a pytest.param already
+        return pytest.param(*case.values, marks=[*case.marks, pytest.mark.slow], id=case.id)
+    values = case if isinstance(case, tuple) else (case,)
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 def seed_of(*name) -> int:

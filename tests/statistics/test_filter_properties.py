@@ -47,6 +47,7 @@ def slope(x, value, error):
     return np.sum(weight * (u - centre) * v) / spread, spread**-0.5
 
 
+@pytest.mark.slow
 def test_error_of_filter_means_falls_as_one_over_the_root_of_n():
     problem, theta, experiment = problem_of(60)
     exact = kalman_filter(problem.trace, experiment, theta).mean

@@ -278,6 +278,7 @@ def test_lgss_with_gaps(exact_values):
     gaussian_table(cells, FEW, 300, len(FEW) * len(cells))
 
 
+@pytest.mark.slow
 def test_vector_observations_and_states():
     cells = list(vector_cells())
     gaussian_table(cells, FEW, 300, len(FEW) * len(cells))

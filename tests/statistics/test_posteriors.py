@@ -23,6 +23,7 @@ from .checks import (
     influence_of_correlation,
     mcse_mean,
     seed_of,
+    some,
 )
 from .exact import DenseGaussian, GridPosterior
 
@@ -108,6 +109,7 @@ def lgss_quantiles(series):
     return quantiles, mean, np.sqrt(p @ (theta - mean) ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("series", LGSS)
 def test_quadrature_against_reference(exact_values, series):
     exact = exact_values[f"lgss_{series.replace(' ', '_')}"]
@@ -119,7 +121,7 @@ def test_quadrature_against_reference(exact_values, series):
 
 
 @pytest.mark.parametrize("draws", [2_000, pytest.param(25_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("method", LGSS_METHODS, ids=str)
+@pytest.mark.parametrize("method", some(LGSS_METHODS, 3), ids=str)
 @pytest.mark.parametrize("series", LGSS)
 def test_lgss(exact_values, series, method, draws):
     """theta with its vague Gamma prior; c is known. Mean, sd and the quantiles' levels."""
@@ -174,7 +176,7 @@ def test_likelihood_of_several_experiments_is_their_product():
 
 @pytest.mark.parametrize(
     "method",
-    [ssm.PGAS(particles=10), ssm.PMMH(particles=50, proposal="guided"), ssm.Gibbs()],
+    some([ssm.PGAS(particles=10), ssm.PMMH(particles=50, proposal="guided"), ssm.Gibbs()], 1),
     ids=str,
 )
 def test_posterior_of_several_experiments(method):

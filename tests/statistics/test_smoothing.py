@@ -16,7 +16,7 @@ import ssmppl as ssm
 from ssmppl.datasets import lgss_appendix, lgss_main_text
 
 from . import models
-from .checks import assert_moments, assert_within, deviations, seed_of
+from .checks import assert_moments, assert_within, deviations, seed_of, some
 from .exact import DenseGaussian, GridPosterior
 from .test_likelihood import vector_cells, with_gaps
 
@@ -69,7 +69,7 @@ RUNS += [("vehicle", "bootstrap")]  # its observation does not depend on what ha
 
 
 @pytest.mark.parametrize("draws", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("label", "proposal"), RUNS)
+@pytest.mark.parametrize(("label", "proposal"), some(RUNS, 5))
 def test_smoother(label, proposal, draws):
     model, data, parameters, order, exact = cases()[label]
     particles = 200 if label == "vehicle" else 5
