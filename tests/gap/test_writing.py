@@ -43,7 +43,7 @@ def test_augmented_models_are_written_as_they_are(name):
 @pytest.mark.parametrize(("where", "name"), EVERY)
 def test_every_candidate_of_every_model_is_written(where, name):
     t, found = traced(where, name), offered(where, name)[0]
-    for c in found:
+    for c in {c.group: c for c in found}.values():  # shapes are but other numbers
         assert_round_trip(augment(t, [c]))
     assert_round_trip(augment(t, found))
 
