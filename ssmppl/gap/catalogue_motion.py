@@ -151,7 +151,7 @@ def random_walk_load(v, load, strength):
         constant="constant load", shapes={"memory": numbers(0.8, 0.97)}, process="ar1")  # fmt: skip
 def ar1_load(v, load, strength, memory):
     """l w, w an autoregression of standard deviation 1"""
-    noise = math.sqrt(1.0 - memory**2)
+    noise = np.sqrt(1.0 - memory**2)
     return Auxiliary(strength * load, {"load": Normal(memory * load, sd=noise)},
                      {"load": Normal(0, sd=1.0)})  # fmt: skip
 

@@ -92,7 +92,7 @@ def sensor_delay(h, earlier, strength, delay, start):
         constant="sensor bias", shapes={"memory": numbers(0.5, 0.9)}, process="ar1")  # fmt: skip
 def coloured_noise(h, colour, strength, memory):
     """l w, w an autoregression of standard deviation 1"""
-    noise = math.sqrt(1.0 - memory**2)
+    noise = np.sqrt(1.0 - memory**2)
     return Auxiliary(strength * colour, {"colour": Normal(memory * colour, sd=noise)},
                      {"colour": Normal(0, sd=1.0)})  # fmt: skip
 

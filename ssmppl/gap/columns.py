@@ -82,6 +82,8 @@ def score_columns(
         superset,
         parameters={n: s for n, s in superset.parameters.items() if n not in strengths},
     )
+    if not further:
+        given = replace(base, parameters=given.parameters)  # its laws hold no strength
     carried = base
     follows: dict[str, list[tuple[Expr, Expr]]] = {}
     if further:

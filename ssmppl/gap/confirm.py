@@ -12,7 +12,6 @@ from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.smoothing import Pass
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.runner import run_tasks
-from ssmppl.inference.simulation import feeds_back
 
 RUNS = 8  # of the particle filter
 FREE_RUNS = 100  # simulations behind a free run
@@ -77,17 +76,7 @@ class FreeRun:
 
 def free_run(fitter: Fitter, fit: Fit, e: Experiment, seed: np.random.SeedSequence) -> FreeRun:
     """Mean and central 95% of simulated observations with the experiment's inputs."""
-    trace, n = fitter.problem.trace, FREE_RUNS
-    d, k = len(trace.state_symbols), len(trace.observation_symbols)
-    feedback = feeds_back(trace)
-    run, stream = fitter.problem.program.entry("simulate"), random_state(seed, 7)
-    drawn = []
-    for _ in range(n if feedback else 1):
-        width = 1 if feedback else n
-        x, out = np.empty((e.steps, d, width)), np.empty((e.steps, k, width))
-        run(fit.theta, np.zeros_like(e.y), np.ones_like(e.seen), e.u, stream, x, out, feedback)
-        drawn.append(out)
-    draws = np.concatenate(drawn, axis=2)
+    draws = fitter.simulator.observations(e, fit.theta, random_state(seed, 7), FREE_RUNS)
     with np.errstate(all="ignore"):
         low, high = np.nanquantile(draws, (0.025, 0.975), axis=2)
         return FreeRun(draws.mean(axis=2), low, high)

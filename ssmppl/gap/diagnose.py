@@ -5,46 +5,41 @@ The stages are fit, screen, refit and confirm; each has a module of its own.
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ssmppl.data import check_values, unpack_parameters
+from ssmppl.data import Experiment, check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.gap import tables
-from ssmppl.gap.augment import augment
-from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.answer import Results, answer
+from ssmppl.gap.apart import separating
+from ssmppl.gap.attribute import MOST_WORK, Attribution, attribute
 from ssmppl.gap.candidates import Chosen
-from ssmppl.gap.classes import Classes, classes
-from ssmppl.gap.detect import detection
-from ssmppl.gap.familywise import threshold
+from ssmppl.gap.candidates import chosen as chosen_effects
+from ssmppl.gap.checkpoint import Checkpoint, Numbers, digests
+from ssmppl.gap.crossfit import CrossFit
+from ssmppl.gap.expected import Timed, in_words, timed
+from ssmppl.gap.expected import seconds as expected
 from ssmppl.gap.fit import Fit, Fitter
-from ssmppl.gap.parts import Parts, long_enough, three_parts
-from ssmppl.gap.refit import (
-    Refit,
-    Workshop,
-    leading,
-    pairs,
-    proposal_of,
-    refit_all,
-    standard_errors,
-)
-from ssmppl.gap.report import MODES, GapReport, tabulate
+from ssmppl.gap.parts import FOLDS, Parts, long_enough, three_parts
+from ssmppl.gap.profiles import one_off
+from ssmppl.gap.refit import Workshop, proposal_of
+from ssmppl.gap.report import MODES, GapReport
 from ssmppl.gap.scales import Scales
-from ssmppl.gap.screen import Question, Screen, ask
-from ssmppl.gap.share import how_far
+from ssmppl.gap.screen import Question, ask
+from ssmppl.gap.share import HowFar, how_far
 from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.writing import model_text, to_model
 from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
 from ssmppl.inference.problem import pose
 from ssmppl.language.model import Model
 
 SETS = {"fast": 100, "full": 200}  # simulated data sets
 PARTICLES = {"fast": 500, "full": 1000}
-MOST_EFFECTS = 3
 
 
 def diagnose(
@@ -57,7 +52,7 @@ def diagnose(
     fixed: Mapping[str, Any] | None = None,
     particles: int | None = None,
     executor: Executor | None = None,
-    checkpoint: Any = None,
+    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = True,
     seed: int | None = 1,
 ) -> GapReport:
@@ -75,13 +70,15 @@ def diagnose(
     fixed : values of known parameters.
     particles : of the particle filters; None: 500 in fast mode, 1000 in full mode.
     executor : any `concurrent.futures.Executor` that runs in this process; None: threads.
-    checkpoint : reserved.
-    progress : whether to show the stages, on stderr.
+    checkpoint : a file, or a folder, that keeps what is done: the same call again goes on from
+        there and gives the same report. None: nothing is kept.
+    progress : whether to show the stages and the time that they will take, on stderr.
     seed : the same seed gives the same report.
 
     Returns
     -------
-    GapReport
+    GapReport : after Ctrl-C of the stages that are done, with `interrupted` set, if the screen is
+        among them; else KeyboardInterrupt is raised.
 
     Raises
     ------
@@ -94,7 +91,7 @@ def diagnose(
     if particles is not None:
         check_count("particles", particles, 10)
     return _Diagnosis(
-        model, data, effects, mode, alpha, fixed, particles, executor, progress, seed
+        model, data, effects, mode, alpha, fixed, particles, executor, checkpoint, progress, seed
     ).run()
 
 
@@ -104,7 +101,7 @@ class _Diagnosis:
     def __init__(
         self, model: Model, data: Any, effects: Chosen, mode: str, alpha: float,
         fixed: Mapping[str, Any] | None, particles: int | None, executor: Executor | None,
-        progress: bool, seed: int | None,
+        checkpoint: str | os.PathLike[str] | None, progress: bool, seed: int | None,
     ):  # fmt: skip
         self.began = time.perf_counter()
         self.problem = pose(model, data)
@@ -112,183 +109,148 @@ class _Diagnosis:
         self.experiments = self.problem.experiments
         self.fixed = check_values(self.trace, fixed, argument="fixed")
         self.effects, self.mode, self.alpha = effects, mode, alpha
-        self.executor, self.progress = executor, progress
         self.root = seed_sequence(seed)
-        number = particles or PARTICLES[mode]
-        self.settings = Settings(number, proposal_of(self.problem.program))
-        self.workshop = Workshop(
-            self.trace, self.problem.program.missing, self.fixed, self.settings
-        )
-        self.notes: list[str] = []
         self.parts: Parts | None = None
         if mode == "full" and long_enough(self.experiments):
             self.parts = three_parts(self.experiments)
+        missing = self.problem.program.missing
+        if mode == "full" and self.parts is None:  # blocks of rows will be set missing
+            missing = replace(missing, none=False)
+        number = particles or PARTICLES[mode]
+        self.settings = Settings(number, proposal_of(self.problem.program))
+        self.workshop = Workshop(self.trace, missing, self.fixed, self.settings)
+        self.notes: list[str] = []
+        described = {
+            "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,
+            "sets": SETS[mode],
+        }  # fmt: skip
+        made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
+        self.kept = Checkpoint(checkpoint, made_from, executor, progress)
+
+    def run(self) -> GapReport:
+        """All stages, and the report; after an interrupt, of those that are done."""
+        try:
+            results = self._screened()
+            if self.mode == "full":
+                try:
+                    self._explained(results)
+                except KeyboardInterrupt:
+                    results.interrupted = True
+                    self.kept.say("interrupted: the report is of the stages that are done")
+        finally:
+            self.kept.flush()
+        return answer(results, time.perf_counter() - self.began)
 
     # -- stages
-    def run(self) -> GapReport:
-        """All stages, and the report."""
+    def _screened(self) -> Results:
+        """Fit, and screen."""
         base = self.workshop.fitter(())
         training = self.parts.screen if self.parts else self.experiments
-        fit = base.fit(training, self._seed(1), {})
-        self._tell_convergence(fit, "the model")
-        scales = self._scales(base, fit, training)
+        fit = self._fit("fitting", base, training, 1, {}, searched=False)
         question = Question(
-            self.trace, scales, self.problem.program.missing, tuple(self.fixed), self.settings,
-            self.effects,
+            self.trace, self._scales(base, fit, training), self.workshop.missing,
+            tuple(self.fixed), self.settings, self.effects,
         )  # fmt: skip
-        screen = ask(
-            question, training, fit.theta, SETS[self.mode], self._seed(2), self.executor,
-            self.progress, "screening",
+        if not question.candidates:
+            raise ArgumentError(
+                "none of the effects applies to this model: "
+                + "; ".join(map(str, question.refused[:3])),
+                fix="name others in effects=; ssm.effects.names() lists them",
+            )
+        self._tell_time(base, fit, question, training)
+        screen = ask(question, training, fit.theta, SETS[self.mode], self._seed(2), self.kept)
+        settings = {
+            "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
+            "particles": 0 if base.exact else self.settings.particles,
+        }  # fmt: skip
+        return Results(
+            self.trace, self.experiments, self.parts, self.mode, self.alpha, base, fit, screen,
+            settings, self.notes,
         )  # fmt: skip
-        if self.mode == "fast":
-            return self._report(base, fit, screen, [], None)
-        return self._attributed(base, fit, screen)
 
-    def _attributed(self, base: Fitter, fit: Fit, screen: Screen) -> GapReport:
+    def _explained(self, r: Results) -> None:
+        """Refit and choose, tell apart, and measure how far the gap closes; into `r`."""
         train = self.parts.train if self.parts else self.experiments
         if self.parts:
-            fit = base.fit(train, self._seed(3), self._values(fit), searched=True)
-        heads = leading(screen)
-        refits, failed = refit_all(
-            self.workshop, fit, screen, [[k] for k in heads], train, self._seed(4), self.executor,
-            self.progress, "refitting",
-        )  # fmt: skip
-        double, more = refit_all(
-            self.workshop, fit, screen, pairs(screen, refits), train, self._seed(5),
-            self.executor, self.progress, "refitting pairs",
-        )  # fmt: skip
-        self.notes += [f"not refitted: {r.reason}" for r in (*failed, *more)]
-        needed = 0.5 * threshold(screen.family.maxima, self.alpha) ** 2
-        significant = bool(np.min(screen.family.p, initial=1.0) <= self.alpha)
-        chosen: Refit | None = refits[0] if refits and significant else None
-        if double and chosen and double[0].gain - chosen.gain >= needed:
-            chosen = double[0]
-        return self._report(base, fit, screen, refits, chosen)
+            start = unpack_parameters(self.trace, r.fit.theta)
+            r.fit = self._fit("fitting again", r.base, train, 3, start, searched=True)
+        found = Attribution(r.fit)
+        attribute(found, self.workshop, r.screen, train, self._seed(4), self.alpha, self.kept)
+        r.attribution = found
+        self._separated(r)
+        r.far = self._how_far(r)
 
-    # -- the report
-    def _report(
-        self, base: Fitter, fit: Fit, screen: Screen, refits: list[Refit], chosen: Refit | None
-    ) -> GapReport:
-        where, _ = tables.where_table(screen, self.alpha)
-        names = screen.question.detection_names(screen.experiments)
-        observed = type(names)(names.names, screen.observed.detection, names.quadratic)
-        detected = detection(
-            observed, screen.stacked("detection"), screen.observed.nuisance,
-            screen.stacked("nuisance"),
-        )  # fmt: skip
-        order = self._order(screen, refits)
-        found = self._classes(screen, refits, order)
-        verdict, missing = self._verdict(screen, chosen, where)
-        share, runs = tabulate("closed"), None
-        labels = self._labels(chosen.candidates) if chosen else []
-        label = " + ".join(labels) or "smooth functions of states and inputs"
-        if self.mode == "full":
-            full = how_far(
-                self.workshop, self.parts, self.experiments, (base, fit), screen, chosen,
-                label, self._seed(8),
+    def _how_far(self, r: Results) -> HowFar:
+        once = r.chosen is not None and any(one_off(c) for c in r.chosen.candidates)
+        if self.parts and not once:
+            return how_far(
+                self.workshop, self.parts, self.experiments, (r.base, r.fit), r.screen, r.chosen,
+                r.label, self._seed(8), self.kept,
             )  # fmt: skip
-            self.notes += full.notes
-            if full.rows:
-                share, runs = tabulate("closed", full.rows), (full.before, full.after)
-                if verdict == "effect" and not np.isfinite(share["F"].iloc[0]):
-                    verdict = "no measurable gap"
-        augmented, text = None, ""
-        estimates: dict[str, Any] = {"before": self._estimates(base, fit)}
-        if chosen is not None and verdict == "effect":
-            estimates["after"] = self._estimates(chosen.fitter, chosen.fit)
-            augmented, text = self._written(chosen)
-        free = tabulate("free_run")
-        if runs is not None:
-            channels = [repr(s) for s in self.trace.observation_symbols]
-            free = tables.run_table(self.experiments, channels, *runs)
-        return GapReport(
-            verdict=verdict, where=where,
-            causes=tables.causes_table(screen, refits, found, order),
-            classes=tables.classes_table(screen, found, order, {}),
-            closed=share, detection=detected, residual_map=tables.map_table(screen),
-            free_run=free, not_applicable=self._not_applicable(screen), missing=missing,
-            model=augmented, model_text=text, chosen=labels if text else [], estimates=estimates,
-            parts=self._parts(), notes=self.notes,
-            settings={
-                "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
-                "candidates": len(screen.question.candidates),
-                "samples": sum(e.steps for e in self.experiments),
-                "particles": self.settings.particles, "simulated sets": len(screen.null),
-            },
-            seconds=time.perf_counter() - self.began, mode=self.mode,
-        )  # fmt: skip
+        r.blocks = FOLDS
+        workshop, question, base = self.workshop, r.screen.question, (r.base, r.fit)
+        if self.parts:  # the code so far knows no missing rows
+            missing = replace(self.workshop.missing, none=False)
+            workshop = Workshop(self.trace, missing, self.fixed, self.settings)
+            question = Question(
+                self.trace, question.scales, missing, tuple(self.fixed), self.settings,
+                self.effects,
+            )  # fmt: skip
+            fitter = workshop.fitter(())
+            base = fitter, fitter.restored(self.experiments, r.fit.numbers)
+        return CrossFit(workshop, question, base, self.experiments, self.alpha, r.chosen).how_far(
+            r.label, self._seed(8), self.kept
+        )
 
-    def _verdict(self, screen: Screen, chosen: Refit | None, where: Any) -> tuple[str, Any]:
-        """The verdict before the held-out rows have spoken, and the missing curve."""
-        residual, key = tables.residual_group(screen)
-        least = float(np.min(screen.family.p, initial=1.0))
-        if least <= self.alpha and (chosen is not None or self.mode == "fast"):
-            head = where.iloc[0] if len(where) else None
-            if head is not None and head["moment"] == "mean":
-                return "effect", tables.missing_table(screen, (head["equation"], "mean"), False)
-            return "effect", None
-        if residual <= self.alpha and key is not None:
-            moment_is_mean = key[1] == "mean"
-            return "none of these", (
-                tables.missing_table(screen, key, True) if moment_is_mean else None
-            )
-        return "no measurable gap", None
+    def _separated(self, r: Results) -> None:
+        """The input that would separate the class of the best, where there is a class."""
+        order, found = r.classes()
+        members = [order[i] for i in found.members(1)] if len(order) else []
+        work = sum(e.steps for e in r.screen.experiments) * self.settings.particles
+        if r.chosen is None or len(members) < 2 or not self.trace.inputs:
+            return
+        if r.base.exact or work <= MOST_WORK:
+            r.separating[1] = separating(r.screen, members, self._seed(7), self.kept)
 
     # -- small parts
-    def _order(self, screen: Screen, refits: list[Refit]) -> list[int]:
-        """Heads of the groups: the refitted by their gain, then the others by the screen's."""
-        done = [r.index[0] for r in refits if len(r.index) == 1]
-        rest = [int(k) for k in screen.family.best if int(k) not in done]
-        rest = [k for k in rest if not screen.found.status[k]]
-        return done + sorted(rest, key=lambda k: -screen.found.gain[k])
+    def _fit(
+        self, stage: str, base: Fitter, experiments: Sequence[Experiment], seed: int,
+        start: Mapping[str, np.ndarray], *, searched: bool,
+    ) -> Fit:  # fmt: skip
+        if stage not in self.kept:
+            self.kept.say(f"{stage} {self.trace.name!r}")
 
-    def _classes(self, screen: Screen, refits: list[Refit], order: list[int]) -> Classes:
-        gains = {r.index[0]: r.gain for r in refits if len(r.index) == 1}
-        values = [max(gains.get(k, 0.0), 0.0) if gains else screen.found.gain[k] for k in order]
-        rho = screen.found.rho[np.ix_(order, order)]
-        return classes(rho, np.array(values), screen.found.sided[order])
+        def numbers() -> Numbers:
+            return base.fit(experiments, self._seed(seed), start, searched=searched).numbers
 
-    def _labels(self, candidates: tuple[Candidate, ...]) -> list[str]:
-        names = [c.effect.name for c in candidates]
-        return [n if names.count(n) == 1 else f"{n} on {c.equation}"
-                for n, c in zip(names, candidates, strict=True)]  # fmt: skip
-
-    def _written(self, chosen: Refit) -> tuple[Model | None, str]:
-        trace = augment(self.trace, list(chosen.candidates))
-        values = {n: v for n, v in chosen.fit.values().items() if n in trace.parameters}
-        notes = [f"{n} = {v:.6g}" for n, v in values.items()]
-        try:
-            names = " and ".join(self._labels(chosen.candidates))
-            text = model_text(
-                trace, title=f"{self.trace.name} with {names}", notes=["Fitted values:", *notes]
+        fit = base.restored(experiments, self.kept.of(stage, numbers))
+        if not fit.converged:
+            self.notes.append(
+                f"the fit of the model did not settle ({stage}): about {fit.distance:.1f} nats may "
+                "be left"
             )
-            return to_model(trace), text
-        except ArgumentError as error:
-            self.notes.append(f"the augmented model is not written: {error.found}")
-            return None, ""
+        return fit
 
-    def _estimates(self, fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
-        errors = standard_errors(fit, fitter.fixed)
-        return {n: (v, errors[n]) for n, v in fit.values().items()}
-
-    def _not_applicable(self, screen: Screen) -> Any:
-        return tabulate("not_applicable", [
-            {"part": f"{r.effect}{f' ({r.form})' if r.form else ''}", "equation": r.equation,
-             "reason": r.reason}
-            for r in screen.question.refused
-        ])  # fmt: skip
-
-    def _parts(self) -> dict[str, Any]:
-        if self.parts is None:
-            return {"screen": self._span(0, None)}
-        first, second = self.parts.first[0], self.parts.second[0]
-        return {"screen": self._span(0, first), "choose": self._span(first, second),
-                "confirm": self._span(second, None)}  # fmt: skip
-
-    def _span(self, a: int, b: int | None) -> tuple[Any, Any]:
-        e = self.experiments[0]
-        labels = list(e.time) if e.time is not None else list(range(1, e.steps + 1))
-        return labels[a], labels[(b or e.steps) - 1]
+    def _tell_time(
+        self, base: Fitter, fit: Fit, question: Question, experiments: Sequence[Experiment]
+    ) -> None:
+        """What the mode will take, from passes over the data."""
+        done = sum(f"screening/{k}" in self.kept for k in range(SETS[self.mode]))
+        if not self.kept.progress or done > SETS[self.mode] // 2:
+            return
+        whole = question.theta(fit.theta)
+        for_screen, _ = timed(
+            lambda: question.smoother.run(experiments, whole, random_state(self._seed(12)))
+        )
+        for_fit, generating = timed(
+            lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
+        )
+        blocks = 0 if self.parts else FOLDS
+        rest = expected(
+            Timed(for_screen, for_fit, generating), SETS[self.mode], self.mode, blocks,
+            self.kept.executor,
+        )  # fmt: skip
+        self.kept.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
 
     def _scales(self, base: Fitter, fit: Fit, experiments: Any) -> Scales:
         """From filtered states, observations and inputs."""
@@ -298,15 +260,6 @@ class _Diagnosis:
         y = np.concatenate([np.where(e.seen == 1.0, e.y, np.nan) for e in experiments])
         u = np.concatenate([e.u for e in experiments])
         return Scales.of(self.trace, states, y, u, max(e.steps for e in experiments))
-
-    def _values(self, fit: Fit) -> dict[str, np.ndarray]:
-        return unpack_parameters(fit.problem.trace, fit.theta)
-
-    def _tell_convergence(self, fit: Fit, what: str) -> None:
-        if not fit.converged:
-            self.notes.append(
-                f"the fit of {what} did not settle: about {fit.distance:.1f} nats may be left"
-            )
 
     def _seed(self, stage: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(self.root.entropy, spawn_key=(*self.root.spawn_key, stage))

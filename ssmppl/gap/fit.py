@@ -12,13 +12,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from ssmppl.data import Experiment
+from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import SamplingError
 from ssmppl.gap.columns import Columns, score_columns
-from ssmppl.gap.smoothing import Settings, Smoother, simulated
+from ssmppl.gap.simulator import Simulator
+from ssmppl.gap.smoothing import Settings, Smoother
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.direct_optimization import climb
@@ -28,14 +30,17 @@ from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.pilot import Space, at, climb_to_mode, space_of
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import run_tasks
-from ssmppl.inference.simulation import feeds_back
 
 MOST_STEPS = 20  # of the first phase
 NEAR = 1.0  # nats from the top where the first phase ends
 AVERAGED = 6  # steps of the second phase
 FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
+LARGEST = 1e100  # of a score: what is beyond is an overflow
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
 PILOT_PARTICLES = 300
+NUMBERS = (
+    "theta", "z", "log_likelihood", "error", "information", "distance", "converged",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,16 @@ class Fit:
         symbols = self.problem.trace.parameter_symbols
         return {repr(s): float(v) for s, v in zip(symbols, self.theta, strict=True)}
 
+    @property
+    def start(self) -> dict[str, np.ndarray]:
+        """The values by name, for another fit to start at."""
+        return dict(unpack_parameters(self.problem.trace, self.theta))
+
+    @property
+    def numbers(self) -> dict[str, np.ndarray]:
+        """All that a checkpoint has to keep; see `Fitter.restored`."""
+        return {n: np.asarray(getattr(self, n)) for n in NUMBERS}
+
 
 class Fitter:
     """Fits one model to any of its data sets."""
@@ -86,14 +101,33 @@ class Fitter:
     def exact(self) -> bool:
         return isinstance(self.kalman, KalmanModel)
 
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Draws data sets from the model."""
+        return Simulator(self.problem.program, self.problem.program.missing, self.kalman)
+
+    def restored(self, experiments: Sequence[Experiment], numbers: Mapping[str, np.ndarray]) -> Fit:
+        """The fit to `experiments` that had these `Fit.numbers`."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        theta = np.array(numbers["theta"])
+        start = unpack_parameters(problem.trace, theta)
+        space = at(space_of(problem, self.fixed, start), theta)
+        value, error, distance = (
+            float(numbers[n]) for n in ("log_likelihood", "error", "distance")
+        )
+        return Fit(space, theta, np.array(numbers["z"]), value, error,
+                   np.array(numbers["information"]), distance,
+                   bool(numbers["converged"]))  # fmt: skip
+
     def fit(
         self, experiments: Sequence[Experiment], seed: np.random.SeedSequence,
         start: Mapping[str, np.ndarray], *, searched: bool = False,
-        information: np.ndarray | None = None,
+        information: np.ndarray | None = None, quick: bool = False,
     ) -> Fit:  # fmt: skip
         """The mode from `start`, or, unless that was `searched`, from a pilot's mode near it.
 
         information : (F, F) on the unconstrained scale, to begin with; None: by simulation.
+        quick : no information is needed at the end.
 
         Raises
         ------
@@ -103,7 +137,7 @@ class Fitter:
         problem = replace(self.problem, experiments=tuple(experiments))
         space = space_of(problem, self.fixed, dict(start))
         if isinstance(self.kalman, KalmanModel):
-            return self._exactly(self.kalman, space, dict(start), seed)
+            return self._exactly(self.kalman, space, dict(start), seed, quick)
         if not searched:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
@@ -115,7 +149,7 @@ class Fitter:
 
     def _exactly(
         self, kalman: KalmanModel, space: Space, start: dict[str, np.ndarray],
-        seed: np.random.SeedSequence,
+        seed: np.random.SeedSequence, quick: bool,
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Setup(problem, space, "posterior", self.fixed, start, seed)
@@ -126,10 +160,11 @@ class Fitter:
             theta, converged = space.theta, True
         z = setup.space_at(theta)
         value = kalman.log_likelihood(problem.experiments, theta)
-        return Fit(
-            at(space, theta), theta, z, value, 0.0,
-            self._simulated_information(space, theta, seed), 0.0, converged,
-        )  # fmt: skip
+        size = len(space.where)
+        information = np.full((size, size), np.nan)
+        if not quick:
+            information = self._simulated_information(space, theta, seed)
+        return Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged)
 
     def states(
         self, e: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 16
@@ -257,11 +292,11 @@ class Fitter:
         smoother.__dict__.update(
             {k: getattr(self.smoother, k) for k in ("program", "module", "problem")}
         )
-        feedback = feeds_back(problem.trace)
+        simulator = self.simulator
 
         def one(r: int) -> np.ndarray | None:
             stream = random_state(seed, 3, r)
-            sets = simulated(problem.program, problem.experiments, theta, stream, feedback)
+            sets = simulator.sets(problem.experiments, theta, stream)
             try:
                 passes = smoother.run(sets, theta, stream)
             except SamplingError:
@@ -271,6 +306,13 @@ class Fitter:
             return point.pull(score)
 
         scores = [s for s in run_tasks(one, range(INFORMATION_SETS)) if s is not None]
+        scores = [s for s in scores if np.all(np.abs(s) < LARGEST)]
+        if not scores:
+            raise SamplingError(
+                f"no data set simulated from {problem.trace.name!r} at its fit went through the "
+                "filter",
+                fix="give the parameters priors round plausible values, or fix known ones",
+            )
         square = np.mean([np.outer(s, s) for s in scores], axis=0)
         curvature = setup.chart.curvature(z, np.zeros(len(theta)))
         prior = -curvature.log_prior

@@ -19,7 +19,7 @@ from ssmppl.data import Experiment
 SHARES = (0.4, 0.7)  # of the rows, where screen and choose end
 SHORTEST = 300  # rows in all, below which blocks are left out in turn instead
 GAP = 5  # rows between the parts
-FOLDS = 5
+FOLDS = 10
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,12 @@ from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol
 from ssmppl.gap.augment import augment
-from ssmppl.gap.basis import Term, lifted
+from ssmppl.gap.basis import Term
 from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.efficient import Null, efficient
 from ssmppl.gap.fit import Fit, Fitter
-from ssmppl.gap.refit import Workshop, proposal_of
+from ssmppl.gap.refit import Workshop, lift, proposal_of
 from ssmppl.gap.screen import Screen, with_parameters
 from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.problem import Problem
@@ -55,17 +56,29 @@ def signal(screen: Screen) -> list[tuple[list[Term], float]]:
 
 def fit_reference(
     workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen,
-    train: Sequence[Experiment], seed: np.random.SeedSequence,
+    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint,
 ) -> tuple[Fitter, Fit]:  # fmt: skip
     """The superset, fitted from the fit of the model with the chosen effects.
 
     Raises
     ------
-    ArgumentError, SamplingError : it cannot be fitted.
+    SSMError : it cannot be fitted.
     """
+    fitter, begin = superset(workshop, chosen, start, screen)
+
+    def numbers() -> Numbers:
+        return fitter.fit(train, seed, begin, searched=True, quick=True).numbers
+
+    return fitter, fitter.restored(train, kept.of("reference", numbers))
+
+
+def superset(
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen
+) -> tuple[Fitter, dict[str, np.ndarray]]:
+    """The fitter of the superset, and where it starts."""
     groups = signal(screen)
     candidates = [t.candidate for terms, _ in groups for t in terms]
-    made, shapes = lifted([*chosen, *candidates])
+    made, shapes = lift([*chosen, *candidates])
     widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}
     trace = with_parameters(augment(workshop.trace, made), {**shapes, **widths})
     parameters = dict(trace.parameters)
@@ -86,4 +99,4 @@ def fit_reference(
     values = unpack_parameters(start.problem.trace, start.theta)
     begin = {n: v for n, v in values.items() if n in trace.parameters and n not in given}
     begin |= {t.candidate.strength: np.asarray(0.0) for terms, _ in groups for t in terms}
-    return fitter, fitter.fit(train, seed, begin, searched=True)
+    return fitter, begin

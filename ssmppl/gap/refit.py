@@ -8,24 +8,25 @@ expects its top.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import Program, compile_trace
-from ssmppl.data import Experiment, unpack_parameters
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.data import Experiment
+from ssmppl.errors import NotApplicable, SSMError
+from ssmppl.expressions.expr import symbol
 from ssmppl.gap.augment import augment
 from ssmppl.gap.basis import lifted
 from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.checkpoint import Checkpoint, Numbers
+from ssmppl.gap.efficient import Efficient
 from ssmppl.gap.fit import Fit, Fitter
-from ssmppl.gap.screen import Screen, with_parameters
+from ssmppl.gap.screen import Question, Screen, with_parameters
 from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import run_tasks
 from ssmppl.language.trace import Trace
 
 SINGLES, MATES, PAIRS = 5, 3, 3  # candidates refitted, further ones like them, pairs
@@ -72,16 +73,41 @@ class Workshop:
         self, trace: Trace, missing: Missing, fixed: Mapping[str, np.ndarray], settings: Settings,
     ):  # fmt: skip
         self.trace, self.missing, self.fixed, self.settings = trace, missing, dict(fixed), settings
+        self._made: dict[tuple[tuple[str, str], ...], Fitter] = {}
 
     def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         """The fitter of the model with these effects; shapes are fixed parameters, so that the
         generated code is the same for all data."""
-        made, shapes = lifted(list(candidates))
+        key = tuple((c.key, c.strength) for c in candidates)
+        if key not in self._made:
+            self._made[key] = self._fitter(candidates)
+        return self._made[key]
+
+    def _fitter(self, candidates: Sequence[Candidate]) -> Fitter:
+        made, shapes = lift(candidates)
         trace = with_parameters(augment(self.trace, made), shapes) if made else self.trace
         program = compile_trace(trace, self.missing)
         fixed = self.fixed | {n: np.asarray(v) for n, v in shapes.items()}
         settings = Settings(self.settings.particles, proposal_of(program), self.settings.lag)
         return Fitter(Problem(trace, (), program), fixed, settings)
+
+
+def lift(candidates: Sequence[Candidate]) -> tuple[list[Candidate], dict[str, float]]:
+    """Candidates whose shapes are symbols, dates among them, and the values of these."""
+    made, values = lifted(list(candidates))
+    out = []
+    for c in made:
+        lengths = {n for n in c.effect.states.values() if n is not None}
+        shape = []
+        for name, value in c.shape:
+            if c.effect.profile and not c.held and name not in lengths:
+                own = f"{c.strength}_{name}"
+                values = {**values, own: float(value)}
+                shape.append((name, symbol("parameter", own, ())))
+            else:
+                shape.append((name, value))
+        out.append(replace(c, shape=tuple(shape)))
+    return out, dict(values)
 
 
 def proposal_of(program: Program) -> str:
@@ -94,29 +120,36 @@ def proposal_of(program: Program) -> str:
 
 def refit(
     workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
-    train: Sequence[Experiment], seed: np.random.SeedSequence,
+    train: Sequence[Experiment], seed: np.random.SeedSequence, given: Sequence[Candidate] = (),
+    quick: bool = False,
 ) -> Refit | NotApplicable:  # fmt: skip
-    """Fit the model with the screen's candidates at `index` to `train`."""
-    question = screen.question
-    candidates = tuple(question.candidates[k] for k in index)
+    """Fit the model with the effects of `given`, as in `base`, and the screen's at `index`.
+
+    quick : as in `Fitter.fit`; there are no standard errors then.
+    """
+    candidates = (*given, *(screen.question.candidates[k] for k in index))
     try:
         fitter = workshop.fitter(candidates)
-        start = _start(base, screen, index)
-        fit = fitter.fit(train, seed, start, searched=True)
-    except (ArgumentError, SamplingError) as error:
+        start = start_at(base, screen.question, screen.found, index)
+        fit = fitter.fit(train, seed, start, searched=True, quick=quick)
+    except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
+    if not np.isfinite(fit.log_likelihood):
+        return NotApplicable(f"{' and '.join(map(str, candidates))}: the likelihood is zero")
     return Refit(tuple(index), candidates, fitter, fit, fit.log_likelihood - base.log_likelihood)
 
 
-def _start(base: Fit, screen: Screen, index: Sequence[int]) -> dict[str, np.ndarray]:
+def start_at(
+    base: Fit, question: Question, found: Efficient, index: Sequence[int]
+) -> dict[str, np.ndarray]:
     """Where the quadratic expects the top: the strengths jointly, the parameters as they are."""
-    found, at = screen.found, list(index)
+    at = list(index)
     v = found.covariance[np.ix_(at, at)]
     strengths = np.linalg.lstsq(v, found.score[at], rcond=1e-6)[0]
-    out = unpack_parameters(base.problem.trace, base.theta)
+    out = base.start
     for k, value in zip(at, strengths, strict=True):
-        c = screen.question.candidates[k]
-        if screen.question.quadratic[k]:
+        c = question.candidates[k]
+        if question.quadratic[k]:
             value = np.sqrt(max(float(value), 1e-12))
         e = c.effect
         if np.isfinite(e.upper):  # between two bounds: well inside
@@ -166,16 +199,27 @@ def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
 
 def refit_all(
     workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
-    train: Sequence[Experiment], seed: np.random.SeedSequence, executor: Executor | None,
-    progress: bool, title: str,
-) -> tuple[list[Refit], list[NotApplicable]]:  # fmt: skip
+    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
+    given: Sequence[Candidate] = (), *, quick: bool = False,
+) -> tuple[list[Refit], list[str]]:  # fmt: skip
     """The refits that came to an end, best first, and why the others did not."""
 
-    def one(k: int) -> Refit | NotApplicable:
+    def one(k: int) -> Numbers:
         own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-        return refit(workshop, base, screen, sets[k], train, own)
+        found = refit(workshop, base, screen, sets[k], train, own, given, quick)
+        if isinstance(found, NotApplicable):
+            return {"reason": np.array(found.reason)}
+        return found.fit.numbers
 
-    results = run_tasks(one, range(len(sets)), executor=executor, progress=progress, title=title)
-    done = [r for r in results if isinstance(r, Refit)]
+    done, reasons = [], []
+    for index, numbers in zip(sets, kept.each(stage, len(sets), one), strict=True):
+        if "reason" in numbers:
+            reasons.append(str(numbers["reason"]))
+            continue
+        candidates = (*given, *(screen.question.candidates[k] for k in index))
+        fitter = workshop.fitter(candidates)
+        fit = fitter.restored(train, numbers)
+        gain = fit.log_likelihood - base.log_likelihood
+        done.append(Refit(tuple(index), candidates, fitter, fit, gain))
     done.sort(key=lambda r: -r.gain)
-    return done, [r for r in results if isinstance(r, NotApplicable)]
+    return done, reasons

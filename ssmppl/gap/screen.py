@@ -7,7 +7,6 @@ every statistic of the report that is not a refit takes its null law from them (
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,15 +20,16 @@ from ssmppl.gap.augment import augment
 from ssmppl.gap.basis import Term, basis, lifted
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import Chosen, Refused, offers
+from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.columns import score_columns
 from ssmppl.gap.efficient import Efficient, Null, efficient
 from ssmppl.gap.familywise import FamilyWise, familywise
+from ssmppl.gap.profiles import Profiles, dated
 from ssmppl.gap.scales import Scales
-from ssmppl.gap.smoothing import Pass, Settings, Smoother, probability_transforms, simulated
+from ssmppl.gap.simulator import Simulator
+from ssmppl.gap.smoothing import Pass, Settings, Smoother, probability_transforms
 from ssmppl.gap.when import bin_edges, binned
 from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.runner import run_tasks
-from ssmppl.inference.simulation import feeds_back
 from ssmppl.language.distributions import Flat
 from ssmppl.language.trace import Site, Trace, symbols
 
@@ -57,11 +57,19 @@ class Question:
 
     def __init__(
         self, trace: Trace, scales: Scales, missing: Missing, held: Sequence[str],
-        settings: Settings, effects: Chosen = None,
+        settings: Settings, effects: Chosen = None, *,
+        candidates: Sequence[Candidate] | None = None,
     ):  # fmt: skip
+        """candidates : these instead of what the catalogue offers, and no basis."""
         self.trace, self.settings, self.scales = trace, settings, scales
-        offered, self.refused = offers(trace, scales, effects)
-        self.terms: list[Term] = basis(trace, scales)
+        self.refused: list[Refused] = []
+        self.terms: list[Term] = []
+        if candidates is None:
+            offered, self.refused = offers(trace, scales, effects)
+            offered = dated(offered, scales.rows)
+            self.terms = basis(trace, scales)
+        else:
+            offered = list(candidates)
         unique: dict[str, Candidate] = {}
         for c in offered:
             unique.setdefault(c.increment.key, c.increment)
@@ -86,6 +94,18 @@ class Question:
                 self.place.append(found)
         self.terms = [t for t in self.terms if t.candidate.strength in place]
         self.basis_place = [place[t.candidate.strength] for t in self.terms]
+        self._timed = [k for k, c in enumerate(self.candidates)
+                       if c.effect.profile and not c.process]  # fmt: skip
+        self._profiles = Profiles(
+            tuple(self.candidates[k] for k in self._timed),
+            tuple(self.place[k] for k in self._timed),
+        )
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Draws data sets from the model."""
+        s = self.smoother
+        return Simulator(s.program, s.missing, s.kalman)
 
     def grid(self, variable: str) -> np.ndarray:
         """Values of a state or input at its quantiles, as the data have them."""
@@ -127,18 +147,15 @@ class Question:
 
     def _of_candidates(self, rows: np.ndarray, starts: list[int]) -> np.ndarray:
         out = np.empty(len(self.candidates))
-        lengths = np.diff([*starts, len(rows)])
         for k, (c, at) in enumerate(zip(self.candidates, self.place, strict=True)):
-            own = rows[:, at]
+            own = rows[:, at, None]
             if c.process == "random walk":
-                out[k] = series.random_walk(own[:, None], starts)[0]
+                out[k] = series.random_walk(own, starts)[0]
             elif c.process == "ar1":
-                memory = dict(c.shape)["memory"]
-                out[k] = series.autoregressive(own[:, None], [memory], starts)[0, 0]
-            elif c.effect.profile:
-                out[k] = np.concatenate([c.weights(n) for n in lengths]) @ own
-            else:
+                out[k] = series.autoregressive(own, [dict(c.shape)["memory"]], starts)[0, 0]
+            elif not c.effect.profile:
                 out[k] = own.sum()
+        out[np.array(self._timed, dtype=int)] = self._profiles.statistics(rows, starts)
         return out
 
     def _detection(
@@ -161,88 +178,99 @@ class Question:
 class Screen:
     """The data's statistics beside those of B simulated sets.
 
-    observed : means over passes. null : the simulated ones. found, family : of the candidates.
+    observed : means over passes. null : (B, ...) of the simulated ones, by name. found, family : of
+    the candidates. law : what they were compared with.
     """
 
     question: Question
     theta: np.ndarray
     observed: Statistics
-    null: tuple[Statistics, ...]
+    null: Statistics
     found: Efficient
     family: FamilyWise
-    rows: np.ndarray
+    law: Null
     experiments: tuple[Experiment, ...]
 
     def stacked(self, name: str) -> np.ndarray:
         """(B, ...) one statistic of all simulated sets."""
-        return np.stack([getattr(s, name) for s in self.null])
+        values: np.ndarray = getattr(self.null, name)
+        return values
 
     @property
-    def information(self) -> np.ndarray:
-        """(P, P) of the nuisance parameters, by the simulated sets."""
-        s = self.stacked("nuisance")
-        return s.T @ s / len(s)
+    def sets(self) -> int:
+        """B, the simulated sets that went through."""
+        return len(self.null.nuisance)
+
+    @property
+    def significant(self) -> np.ndarray:
+        """(K,) family-wise p of the group of each candidate."""
+        return self.family.of_columns(self.groups)
+
+    @property
+    def groups(self) -> np.ndarray:
+        """(K,) labels of the candidates' groups."""
+        return groups_of(self.question.candidates)
+
+
+def groups_of(candidates: Sequence[Candidate]) -> np.ndarray:
+    """(K,) a number for each group: candidates that differ in their shape only."""
+    labels = {g: i for i, g in enumerate(dict.fromkeys(c.group for c in candidates))}
+    return np.array([labels[c.group] for c in candidates], dtype=int)
 
 
 def ask(
     question: Question, experiments: Sequence[Experiment], theta: np.ndarray, sets: int,
-    seed: np.random.SeedSequence, executor: Executor | None = None, progress: bool = False,
-    title: str = "screening",
+    seed: np.random.SeedSequence, kept: Checkpoint, stage: str = "screening",
 ) -> Screen:  # fmt: skip
     """Simulate, smooth, and put the data's statistics beside the simulated ones.
 
-    theta : (P,) the fitted parameters.
+    theta : (P,) the fitted parameters. kept : takes every set as soon as it is done, as `stage`.
 
     Raises
     ------
     ArgumentError : too few simulated sets went through the filter.
     """
     smoother, whole = question.smoother, question.theta(theta)
-    feedback = feeds_back(question.trace)
-    _ = smoother.program, smoother.module  # generated once, before threads ask for them
+    _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
+    carried = whole[: len(question.columns.carried.parameter_symbols)]
 
-    def one(number: int) -> tuple[Statistics, np.ndarray | None] | None:
+    def one(number: int) -> Numbers:
         stream = random_state(seed, number)
         data = list(experiments)
-        if number >= OWN_RUNS:
-            carried = whole[: len(question.columns.carried.parameter_symbols)]
-            data = simulated(smoother.program, experiments, carried, stream, feedback)
         try:
+            if number >= OWN_RUNS:
+                data = question.simulator.sets(experiments, carried, stream)
             passes = smoother.run(data, whole, stream)
         except SamplingError:
             if number < OWN_RUNS:
                 raise
-            return None
-        rows = np.concatenate([p.rows for p in passes])
-        if not np.all(np.isfinite(rows)):
-            return None
-        kept = rows if number < OWN_RUNS else None
-        return question.statistics(data, passes, stream), kept
+            return {}
+        if not all(np.all(np.isfinite(p.rows)) for p in passes):
+            return {}
+        return dict(vars(question.statistics(data, passes, stream)))
 
-    results = run_tasks(
-        one, range(OWN_RUNS + sets), executor=executor, progress=progress, title=title
-    )
-    own = [r for r in results[:OWN_RUNS] if r is not None]
-    null = [r[0] for r in results[OWN_RUNS:] if r is not None]
+    results = kept.each(stage, OWN_RUNS + sets, one)
+    own = [r for r in results[:OWN_RUNS] if r]
+    null = [r for r in results[OWN_RUNS:] if r]
     if not own or len(null) < min(FEWEST, sets):
         raise ArgumentError(
             f"{len(null)} of {sets} data sets simulated at the fit went through the smoother",
             fix="use more particles, or check the fit: the model may leave its domain",
         )
-    fields = Statistics.__dataclass_fields__
-    each = {n: np.stack([getattr(s, n) for s, _ in own]) for n in fields}
+    names = Statistics.__dataclass_fields__
+    each = {n: np.stack([s[n] for s in own]) for n in names}
     observed = Statistics(**{n: v.mean(axis=0) for n, v in each.items()})
+    simulated = Statistics(**{n: np.stack([s[n] for s in null]) for n in names})
     noise = each["columns"].var(axis=0, ddof=1) if len(own) > 1 else 0.0
     law = Null.of(
-        np.stack([s.columns for s in null]), np.stack([s.nuisance for s in null]),
-        quadratic=question.quadratic, sided=question.sided, noise=noise,
+        simulated.columns, simulated.nuisance, quadratic=question.quadratic, sided=question.sided,
+        noise=noise,
     )  # fmt: skip
     found = efficient(law, observed.columns, observed.nuisance)
-    labels = {g: i for i, g in enumerate(dict.fromkeys(c.group for c in question.candidates))}
-    groups = np.array([labels[c.group] for c in question.candidates])
-    family = familywise(found.statistic, found.null, sided=found.sided, groups=groups)
-    rows = np.mean([r for _, r in own if r is not None], axis=0)
-    return Screen(question, theta, observed, tuple(null), found, family, rows, tuple(experiments))
+    family = familywise(
+        found.statistic, found.null, sided=found.sided, groups=groups_of(question.candidates)
+    )
+    return Screen(question, theta, observed, simulated, found, family, law, tuple(experiments))
 
 
 def with_parameters(trace: Trace, values: Mapping[str, float]) -> Trace:
@@ -257,4 +285,4 @@ def with_parameters(trace: Trace, values: Mapping[str, float]) -> Trace:
     return replace(trace, parameters=parameters)
 
 
-__all__ = ["Question", "Screen", "Statistics", "ask", "with_parameters"]
+__all__ = ["Question", "Screen", "Statistics", "ask", "groups_of", "with_parameters"]

@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.gap.closed import closed
+from ssmppl.errors import SSMError
+from ssmppl.gap.checkpoint import Checkpoint
+from ssmppl.gap.closed import Closed, closed
 from ssmppl.gap.confirm import FreeRun, free_run, gain_of_mean, predict, rmse
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import Parts
 from ssmppl.gap.reference import fit_reference
 from ssmppl.gap.refit import Refit, Workshop
 from ssmppl.gap.screen import Screen
+
+SAME = 1e-6  # relative difference of two gains that are the same model's
 
 
 @dataclass
@@ -28,32 +31,33 @@ class HowFar:
     after: list[FreeRun] | None = None
     notes: list[str] = field(default_factory=list)
 
+    def runs(
+        self, base: tuple[Fitter, Fit], experiments: Sequence[Experiment], chosen: Refit | None,
+        seed: np.random.SeedSequence,
+    ) -> None:  # fmt: skip
+        """Simulate freely before and after."""
+        self.before = [free_run(*base, e, seed) for e in experiments]
+        if chosen is not None:
+            self.after = [free_run(chosen.fitter, chosen.fit, e, seed) for e in experiments]
+
 
 def how_far(
-    workshop: Workshop, parts: Parts | None, experiments: Sequence[Experiment],
+    workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
     base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, label: str,
-    seed: np.random.SeedSequence,
+    seed: np.random.SeedSequence, kept: Checkpoint,
 ) -> HowFar:  # fmt: skip
     """The chosen model, or, where none was chosen, the reference itself, against the base model."""
     out = HowFar()
-    out.before = [free_run(*base, e, seed) for e in experiments]
-    if chosen is not None:
-        out.after = [free_run(chosen.fitter, chosen.fit, e, seed) for e in experiments]
-    if parts is None:
-        out.notes.append(
-            f"with {sum(e.steps for e in experiments)} rows none were held out: the share of the "
-            "gap that is closed is not given"
-        )
-        return out
+    out.runs(base, experiments, chosen, seed)
     counts = parts.confirm
     plain = predict(*base, experiments, counts, seed)
     try:
         reference = fit_reference(
             workshop, chosen.candidates if chosen else (), chosen.fit if chosen else base[1],
-            screen, parts.train, seed,
+            screen, parts.train, seed, kept,
         )  # fmt: skip
         best = predict(*reference, experiments, counts, seed)
-    except (ArgumentError, SamplingError) as error:
+    except SSMError as error:
         out.notes.append(f"no reference to measure the gap against: {error.found}")
         return out
     model = (chosen.fitter, chosen.fit) if chosen else reference
@@ -65,16 +69,31 @@ def how_far(
         "effect": label, "F": share.F, "F_low": share.low, "F_high": share.high,
         "nats_per_sample": share.gain.nats_per_sample, "gain_mean": mean,
         "gain_noise": share.gain.nats - mean,
-        "rmse_before": _rmse(out.before, experiments, counts),
-        "rmse_after": _rmse(runs, experiments, counts),
+        "rmse_before": pooled(out.before, experiments, counts),
+        "rmse_after": pooled(runs, experiments, counts),
     })  # fmt: skip
-    if share.reason:
-        out.notes.append(share.reason)
+    out.notes += notes_of(share, chosen is not None)
     return out
 
 
-def _rmse(
+def notes_of(share: Closed, chosen: bool) -> list[str]:
+    """What has to be known beside the share."""
+    if share.reason:
+        return [share.reason]
+    same = abs(share.gain.nats - share.reference.nats) <= SAME * abs(share.reference.nats)
+    if not same:
+        return []
+    low, high = (share.gain.nats + s * 1.96 * share.gain.error for s in (-1.0, 1.0))
+    what = "nothing beyond the chosen effect was found" if chosen else "no effect was chosen"
+    return [
+        f"{what}, so that the share is of its own gain: {share.gain.nats:.1f} nats on held-out "
+        f"rows (95% interval {low:.1f} to {high:.1f})"
+    ]
+
+
+def pooled(
     runs: Sequence[FreeRun], experiments: Sequence[Experiment], counts: Sequence[np.ndarray]
 ) -> float:
+    """Root mean square error over the rows that count of all experiments."""
     each = [rmse(r, e, c) for r, e, c in zip(runs, experiments, counts, strict=True)]
     return float(np.sqrt(np.mean(np.square(each))))

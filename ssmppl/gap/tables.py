@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.classes import Classes
 from ssmppl.gap.confirm import FreeRun
 from ssmppl.gap.localise import Group, curve, group_score, localise, regions
+from ssmppl.gap.profiles import one_off
 from ssmppl.gap.refit import Refit
 from ssmppl.gap.report import tabulate
 from ssmppl.gap.screen import Screen
@@ -137,11 +139,16 @@ def residual_group(screen: Screen) -> tuple[float, tuple[str, str] | None]:
 
 
 def causes_table(
-    screen: Screen, refits: Sequence[Refit], found: Classes | None, order: Sequence[int]
-) -> pd.DataFrame:
-    """One row for each group of candidates, the refitted ones first; pairs are not listed."""
+    screen: Screen, refits: Sequence[Refit], found: Classes, order: Sequence[int],
+    tested: Mapping[int, float],
+) -> pd.DataFrame:  # fmt: skip
+    """One row for each group of candidates, the refitted ones first; pairs are not listed.
+
+    tested : p of refits whose own gain was tested, by column.
+    """
     by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
-    p = dict(zip(screen.family.best.tolist(), screen.family.p.tolist(), strict=True))
+    significant = screen.significant
+    times = screen.experiments[0].time
     rows = []
     for i, k in enumerate(order):
         c, s = screen.question.candidates[k], screen.found
@@ -153,16 +160,25 @@ def causes_table(
         error = 1.0 / np.sqrt(s.variance[k]) if s.variance[k] > 0.0 else np.nan
         if own is not None:
             strength, error = own.strengths[0], own.errors[c.strength]
-        shape = ", ".join(f"{n} = {v:g}" for n, v in c.shape)
+        shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in c.shape)
+        p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
             "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
-            "equation": c.equation, "z": float(s.z[k]), "p": float(p.get(k, np.nan)),
+            "equation": c.equation, "z": float(s.z[k]), "p": p,
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
-            "class_id": int(found.class_id[i]) if found is not None else i + 1,
+            "class_id": int(found.class_id[i]),
             "sign": "one-sided" if sided else ("+" if strength > 0 else "-"),
             "estimate": strength, "se": float(error),
         })  # fmt: skip
     return tabulate("causes", rows)
+
+
+def _when(c: Candidate, shape: str, value: float, times: Any) -> str:
+    """The label of the row that a date is."""
+    if shape != "date" or not one_off(c) or times is None or not 1 <= value <= len(times):
+        return ""
+    label = times[int(value) - 1]
+    return f" ({label:g})" if isinstance(label, float | np.floating) else f" ({label})"
 
 
 def classes_table(

@@ -1,0 +1,197 @@
+"""From the results of the stages to the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.errors import SSMError
+from ssmppl.gap import tables
+from ssmppl.gap.apart import heads, told
+from ssmppl.gap.attribute import Attribution
+from ssmppl.gap.augment import augment
+from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.classes import Classes
+from ssmppl.gap.detect import Statistics, detection
+from ssmppl.gap.fit import Fit, Fitter
+from ssmppl.gap.parts import Parts
+from ssmppl.gap.refit import Refit, standard_errors
+from ssmppl.gap.report import GapReport, tabulate
+from ssmppl.gap.screen import Screen
+from ssmppl.gap.share import HowFar
+from ssmppl.gap.writing import model_text, to_model
+from ssmppl.language.model import Model
+from ssmppl.language.trace import Trace
+
+CURVES = "smooth functions of states and inputs"
+
+
+@dataclass
+class Results:
+    """What is known so far. attribution, far : None where that stage is not done.
+
+    blocks : left out in turn, 0 for three parts. separating : by class, the input that would
+    separate it.
+    """
+
+    trace: Trace
+    experiments: Sequence[Experiment]
+    parts: Parts | None
+    mode: str
+    alpha: float
+    base: Fitter
+    fit: Fit
+    screen: Screen
+    settings: dict[str, Any]
+    notes: list[str]
+    attribution: Attribution | None = None
+    far: HowFar | None = None
+    blocks: int = 0
+    separating: dict[int, str] = field(default_factory=dict)
+    interrupted: bool = False
+
+    @property
+    def refits(self) -> list[Refit]:
+        return self.attribution.refits if self.attribution else []
+
+    @property
+    def chosen(self) -> Refit | None:
+        return self.attribution.chosen if self.attribution else None
+
+    @property
+    def label(self) -> str:
+        """Of what the share that is closed is about."""
+        return " + ".join(labels(self.chosen.candidates)) if self.chosen else CURVES
+
+    def classes(self) -> tuple[list[int], Classes]:
+        """The leading shapes of all groups, best first, and their classes."""
+        order = heads(self.screen, self.refits)
+        return order, told(self.screen, self.refits, order)
+
+
+def answer(r: Results, seconds: float) -> GapReport:
+    """The report of what is done."""
+    screen, notes = r.screen, list(r.notes)
+    where, _ = tables.where_table(screen, r.alpha)
+    order, found = r.classes()
+    verdict, missing = _verdict(r, where)
+    share, runs = tabulate("closed"), None
+    if r.attribution:
+        notes += r.attribution.notes
+    if r.far is not None:
+        notes += r.far.notes
+        runs = (r.far.before, r.far.after)
+        if r.far.rows:
+            share = tabulate("closed", r.far.rows)
+            # Few blocks leave the share open where the test of the effect does not.
+            if verdict == "effect" and not r.blocks and not np.isfinite(share["F"].iloc[0]):
+                verdict = "no measurable gap"
+    augmented, text = None, ""
+    estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}
+    if r.chosen is not None and verdict == "effect":
+        estimates["after"] = _estimates(r.chosen.fitter, r.chosen.fit)
+        augmented, text = _written(r.trace, r.chosen, notes)
+    free = tabulate("free_run")
+    if runs is not None:
+        channels = [repr(s) for s in r.trace.observation_symbols]
+        free = tables.run_table(r.experiments, channels, *runs)
+    return GapReport(
+        verdict=verdict, where=where,
+        causes=tables.causes_table(
+            screen, r.refits, found, order, r.attribution.p if r.attribution else {}
+        ),
+        classes=tables.classes_table(screen, found, order, r.separating),
+        closed=share, detection=_detection(screen), residual_map=tables.map_table(screen),
+        free_run=free, not_applicable=_not_applicable(screen), missing=missing,
+        model=augmented, model_text=text,
+        chosen=labels(r.chosen.candidates) if text and r.chosen else [], estimates=estimates,
+        parts=_parts(r), notes=notes,
+        settings={**r.settings, "candidates": len(set(screen.groups.tolist())),
+                  "shapes": len(screen.question.candidates),
+                  "samples": sum(e.steps for e in r.experiments), "simulated sets": screen.sets},
+        seconds=seconds, mode=r.mode, interrupted=r.interrupted,
+    )  # fmt: skip
+
+
+def labels(candidates: Sequence[Candidate]) -> list[str]:
+    """Names of effects, with their equations where one name comes twice."""
+    names = [c.effect.name for c in candidates]
+    return [n if names.count(n) == 1 else f"{n} on {c.equation}"
+            for n, c in zip(names, candidates, strict=True)]  # fmt: skip
+
+
+def _verdict(r: Results, where: Any) -> tuple[str, Any]:
+    """The verdict before the held-out rows have spoken, and the missing curve."""
+    residual, key = tables.residual_group(r.screen)
+    tested = r.attribution.p.values() if r.attribution else ()
+    least = min([float(np.min(r.screen.family.p, initial=1.0)), *tested])
+    asked = r.attribution is not None and r.mode == "full"
+    if least <= r.alpha and (r.chosen is not None or not asked):
+        head = where.iloc[0] if len(where) else None
+        if head is not None and head["moment"] == "mean":
+            return "effect", tables.missing_table(r.screen, (head["equation"], "mean"), False)
+        return "effect", None
+    if residual <= r.alpha and key is not None:
+        moment_is_mean = key[1] == "mean"
+        return "none of these", (
+            tables.missing_table(r.screen, key, True) if moment_is_mean else None
+        )
+    return "no measurable gap", None
+
+
+def _detection(screen: Screen) -> Any:
+    names = screen.question.detection_names(screen.experiments)
+    return detection(
+        Statistics(names.names, screen.observed.detection, names.quadratic),
+        screen.stacked("detection"), screen.observed.nuisance, screen.stacked("nuisance"),
+    )  # fmt: skip
+
+
+def _written(trace: Trace, chosen: Refit, notes: list[str]) -> tuple[Model | None, str]:
+    try:
+        added = augment(trace, list(chosen.candidates))
+        values = {n: v for n, v in chosen.fit.values().items() if n.split("[")[0] in
+                  added.parameters}  # fmt: skip
+        text = model_text(
+            added, title=f"{trace.name} with {' and '.join(labels(chosen.candidates))}",
+            notes=["Fitted values:", *(f"{n} = {v:.6g}" for n, v in values.items())],
+        )  # fmt: skip
+        return to_model(added), text
+    except SSMError as error:
+        notes.append(f"the augmented model is not written: {error.found}")
+        return None, ""
+
+
+def _estimates(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
+    errors = standard_errors(fit, fitter.fixed)
+    return {n: (v, errors[n]) for n, v in fit.values().items()}
+
+
+def _not_applicable(screen: Screen) -> Any:
+    return tabulate("not_applicable", [
+        {"part": f"{r.effect}{f' ({r.form})' if r.form else ''}", "equation": r.equation,
+         "reason": r.reason}
+        for r in screen.question.refused
+    ])  # fmt: skip
+
+
+def _parts(r: Results) -> dict[str, Any]:
+    if r.parts is None:
+        if r.blocks:
+            return {"cross-fitting": r.blocks}
+        return {"screen": _span(r.experiments[0], 0, None)}
+    first, second = r.parts.first[0], r.parts.second[0]
+    e = r.experiments[0]
+    out: dict[str, Any] = {"screen": _span(e, 0, first), "choose": _span(e, first, second)}
+    if r.blocks:
+        return {**out, "cross-fitting": r.blocks}
+    return {**out, "confirm": _span(e, second, None)}
+
+
+def _span(e: Experiment, a: int, b: int | None) -> tuple[Any, Any]:
+    labels = list(e.time) if e.time is not None else list(range(1, e.steps + 1))
+    return labels[a], labels[(b or e.steps) - 1]

@@ -1,0 +1,150 @@
+"""What these data cannot tell apart among the leading candidates, and what input would.
+
+The class of the best is its confidence set: the refits that lie no further behind than the truth
+would by chance, and candidates whose scores are so like the best one's that its gain does not
+separate them. See `classes.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.gap.checkpoint import Checkpoint, Numbers
+from ssmppl.gap.classes import (
+    NATS_APART,
+    Classes,
+    classes,
+    confidence_set,
+    cuts,
+    likeness,
+    separating_input,
+    told_apart,
+)
+from ssmppl.gap.efficient import Null, efficient
+from ssmppl.gap.refit import Refit
+from ssmppl.gap.screen import Screen
+from ssmppl.inference.particles.filtering import random_state
+
+SETS = 40  # simulated under each input
+SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
+
+
+def heads(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """Best shape of each group: the refitted by their gain, then the others by the screen's."""
+    done = [r.index[0] for r in refits if len(r.index) == 1]
+    rest = [int(k) for k in screen.family.best if int(k) not in done]
+    groups = screen.groups
+    known = {int(groups[k]) for k in done}
+    rest = [k for k in rest if not screen.found.status[k] and int(groups[k]) not in known]
+    return done + sorted(rest, key=lambda k: -screen.found.gain[k])
+
+
+def told(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
+    """Classes of the candidates in `order` (of `heads`); one of its own for whatever is weak."""
+    refitted = {r.index[0]: max(r.gain, 0.0) for r in refits if len(r.index) == 1}
+    at = np.array(order, dtype=int)
+    rho, sided = screen.found.rho[np.ix_(at, at)], screen.found.sided[at]
+    gains = np.array([refitted.get(int(k), screen.found.gain[k]) for k in at])
+    strong = np.array([int(k) in refitted or screen.found.gain[k] >= NATS_APART for k in at], bool)
+    class_id, leader = np.zeros(len(at), int), np.arange(len(at))
+    if refitted:
+        first = _of_the_best(rho, gains, sided, len(refitted), strong)
+        class_id[first], leader[first] = 1, 0
+    rest = np.flatnonzero(strong & (class_id == 0))
+    if len(rest):
+        found = classes(rho[np.ix_(rest, rest)], gains[rest], sided[rest])
+        class_id[rest] = found.class_id + class_id.max()
+        leader[rest] = rest[found.leader]
+    weak = np.flatnonzero(class_id == 0)
+    class_id[weak] = class_id.max(initial=0) + 1 + np.arange(len(weak))
+    return Classes(class_id, leader, rho[leader, np.arange(len(at))])
+
+
+def _of_the_best(
+    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray, refitted: int, strong: np.ndarray
+) -> np.ndarray:
+    """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
+    among those that were not."""
+    own = slice(0, refitted)
+    cut = cuts(rho[own, own], gains[own], range(refitted), sided=sided[own])
+    out = np.zeros(len(gains), bool)
+    out[own] = confidence_set(gains[own], cut)
+    alike = ~told_apart(gains[0], likeness(rho, sided)[0]) & strong
+    out[refitted:] = alike[refitted:]
+    return out
+
+
+# -- another input
+def separating(
+    screen: Screen, members: Sequence[int], seed: np.random.SeedSequence, kept: Checkpoint
+) -> str:
+    """The simple input that would separate these candidates best; "" if none would.
+
+    The base model is simulated under each, and its scores say how alike the candidates would be.
+    """
+    question, columns = screen.question, np.array(members, dtype=int)
+    inputs = simple_inputs(screen.experiments)
+    whole = question.theta(screen.theta)
+    carried = whole[: len(question.columns.carried.parameter_symbols)]
+    names = list(inputs)
+
+    def one(k: int) -> Numbers:
+        number, which = divmod(k, len(names))
+        stream = random_state(seed, which, number)
+        try:
+            data = question.simulator.sets(inputs[names[which]], carried, stream)
+            passes = question.smoother.run(data, whole, stream)
+        except SamplingError:
+            return {}
+        if not all(np.all(np.isfinite(p.rows)) for p in passes):
+            return {}
+        found = question.statistics(data, passes, stream)
+        return {"columns": found.columns[columns], "nuisance": found.nuisance}
+
+    results = kept.each("trying inputs", SETS * len(names), one)
+    covariances = {}
+    for which, name in enumerate(names):
+        done = [r for r in results[which :: len(names)] if r]
+        if not done:
+            continue
+        law = Null.of(
+            np.stack([r["columns"] for r in done]), np.stack([r["nuisance"] for r in done]),
+            quadratic=question.quadratic[columns], sided=question.sided[columns],
+        )  # fmt: skip
+        try:
+            nothing = np.zeros(len(columns)), np.zeros(law.nuisance.shape[1])
+            covariances[name] = efficient(law, *nothing).covariance
+        except ArgumentError:  # too few sets for so many parameters
+            continue
+    if not covariances:
+        return ""
+    best = separating_input(
+        range(len(columns)), screen.found.strength[columns], covariances,
+        screen.found.sided[columns],
+    )  # fmt: skip
+    return best.input if best.told_apart else ""
+
+
+def simple_inputs(experiments: Sequence[Experiment]) -> dict[str, list[Experiment]]:
+    """The experiments under other inputs of the same length, each in the units of its own."""
+    out: dict[str, list[Experiment]] = {}
+    for e in experiments:
+        t = np.arange(e.steps)[:, None]
+        low, high, mean = e.u.min(axis=0), e.u.max(axis=0), e.u.mean(axis=0)
+        size = np.sqrt(2.0) * e.u.std(axis=0)
+        stair = np.minimum(t * LEVELS // e.steps, LEVELS - 1) / (LEVELS - 1.0)
+        made = {
+            "the same input at twice the size": 2.0 * e.u,
+            "the same input at half the size": 0.5 * e.u,
+            "a slow sine": mean + size * np.sin(2.0 * np.pi * t / (SLOW * e.steps)),
+            "a fast sine": mean + size * np.sin(2.0 * np.pi * t / FAST),
+            "a staircase over the same range": low + (high - low) * stair,
+        }
+        for name, u in made.items():
+            out.setdefault(name, []).append(replace(e, u=np.ascontiguousarray(u)))
+    return out

@@ -1,0 +1,112 @@
+"""Whether the best refit gains more than chance would: its law by parametric bootstrap.
+
+Where noise has grown to swallow what is missing, the score at the fit is far smaller than what a
+refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). In
+short records, where a fit is quick, the gain itself is therefore tested: data sets simulated at
+theta-hat are fitted, screened and refitted as the data were. The test stops as soon as it cannot
+reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.errors import SSMError
+from ssmppl.gap.checkpoint import Checkpoint, Numbers
+from ssmppl.gap.efficient import efficient
+from ssmppl.gap.familywise import tail_p
+from ssmppl.gap.fit import Fit
+from ssmppl.gap.refit import Refit, Workshop, start_at
+from ssmppl.gap.screen import Screen
+from ssmppl.inference.particles.filtering import random_state
+
+LAX = 4.0  # times alpha, where the gain is tested
+TRIED = 2  # candidates refitted in each set, the best by the score
+SETS, CHUNK = 99, 10
+MOST_WORK = 1.5e5  # rows times particles, beyond which the fits would take too long
+
+
+def worth_testing(screen: Screen, refits: Sequence[Refit], alpha: float) -> bool:
+    """Whether a refit gains what would be worth a look in the screen, had its score been as large.
+
+    The screen's law says this roughly only; `refit_p` tells.
+    """
+    gain = best_of_tried(screen, refits)
+    return gain > 0.0 and tail_p(np.sqrt(2.0 * gain), screen.family.maxima) <= LAX * alpha
+
+
+def best_of_tried(screen: Screen, refits: Sequence[Refit]) -> float:
+    """The largest gain among the refits of the `TRIED` best by the score."""
+    tried = _best(screen, screen.found.gain, np.array([bool(s) for s in screen.found.status]))
+    return max((r.gain for r in refits if r.index[0] in tried), default=0.0)
+
+
+def refit_p(
+    workshop: Workshop, base: Fit, screen: Screen, refits: Sequence[Refit], alpha: float,
+    seed: np.random.SeedSequence, kept: Checkpoint,
+) -> float:  # fmt: skip
+    """p of the largest gain among the `TRIED` best; 1 / (sets + 1) at least.
+
+    base : the model's fit to the screen's experiments.
+    """
+    gain, beyond, done = best_of_tried(screen, refits), 0, 0
+
+    def one(k: int) -> Numbers:
+        return {"gain": np.asarray(_gain(workshop, base, screen, random_state(seed, k), seed, k))}
+
+    for last in range(CHUNK, SETS + CHUNK, CHUNK):
+        found = kept.each("refitting simulated data", min(last, SETS), one)
+        gains = np.array([float(f["gain"]) for f in found])
+        done = int(np.sum(np.isfinite(gains)))
+        beyond = int(np.sum(gains >= gain))
+        if (beyond + 1.0) / (SETS + 1.0) > alpha:
+            break
+    return (beyond + 1.0) / (done + 1.0)
+
+
+def _gain(
+    workshop: Workshop, base: Fit, screen: Screen, stream: np.ndarray,
+    seed: np.random.SeedSequence, k: int,
+) -> float:  # fmt: skip
+    """Of one simulated data set; NaN where a fit failed."""
+    question, plain = screen.question, workshop.fitter(())
+    whole = question.theta(screen.theta)
+    carried = whole[: len(question.columns.carried.parameter_symbols)]
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 100, k))
+    try:
+        data = question.simulator.sets(screen.experiments, carried, stream)
+        fit = plain.fit(data, own, base.start, searched=True, quick=True)
+        at = question.theta(fit.theta)
+        passes = question.smoother.run(data, at, stream)
+        seen = question.statistics(data, passes, stream)
+        found = efficient(screen.law, seen.columns, seen.nuisance)
+        out = []
+        for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
+            fitter = workshop.fitter((question.candidates[j],))
+            start = start_at(fit, screen.question, found, [j])
+            again = fitter.fit(data, own, start, searched=True, quick=True)
+            out.append(again.log_likelihood - fit.log_likelihood)
+    except SSMError:
+        return float("nan")
+    return float(np.max(out, initial=0.0))
+
+
+def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
+    """Columns: the best shape of each of the best groups."""
+    groups, out, seen = screen.groups, [], set()
+    for k in np.argsort(-np.where(silent, -1.0, gain), kind="stable"):
+        if groups[k] not in seen:
+            seen.add(groups[k])
+            out.append(int(k))
+        if len(out) == TRIED:
+            break
+    return out
+
+
+def quick_enough(workshop: Workshop, experiments: Sequence[Experiment]) -> bool:
+    """Whether the fits of the test can be afforded."""
+    work = sum(e.steps for e in experiments) * workshop.settings.particles
+    return workshop.fitter(()).exact or work <= MOST_WORK

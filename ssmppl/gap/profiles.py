@@ -1,0 +1,90 @@
+"""Effects that are functions of time: their dates, and their statistics from one column each.
+
+The column of an increment held at 1 gives the statistic of any function of time as a weighted sum
+over its rows, so that every date of a break or of a pulse can be tried: it costs a sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.series import segments
+
+ALL_DATES = 300  # rows up to which every date is tried
+DATES = 60  # beyond
+EDGE = 0.1  # share of the rows at either end where no break can be told from a shift
+LEAST_EDGE = 2  # rows at either end without a pulse
+ONE_OFF = ("step", "pulse")  # profiles that have a date
+
+
+def one_off(candidate: Candidate) -> bool:
+    """Whether it happens once: a break or a pulse."""
+    return candidate.effect.profile in ONE_OFF
+
+
+def dated(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
+    """With a candidate for every date (about `DATES` of them in long records) where there is one.
+
+    rows : of the longest experiment.
+    """
+    out: list[Candidate] = []
+    seen: set[str] = set()
+    for c in candidates:
+        if not one_off(c) or "date" not in dict(c.shape):
+            out.append(c)
+            continue
+        rest = [f"{n}={v}" for n, v in c.shape if n != "date"]
+        family = " | ".join([c.group, *rest])
+        if family not in seen:
+            seen.add(family)
+            out += [c.with_shape(date=float(d)) for d in dates(rows, c.effect.profile)]
+    return out
+
+
+def dates(rows: int, profile: str) -> np.ndarray:
+    """Rows from 1 on at which a break or a pulse is tried."""
+    edge = LEAST_EDGE if profile == "pulse" else max(LEAST_EDGE, round(EDGE * rows))
+    first, last = 1 + edge, rows - edge
+    if last < first:
+        return np.array([max(1, rows // 2)])
+    count = last - first + 1 if rows <= ALL_DATES else min(DATES, last - first + 1)
+    return np.unique(np.linspace(first, last, count).round().astype(int))
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Candidates with a function of time, and the column (F) of each."""
+
+    candidates: tuple[Candidate, ...]
+    columns: tuple[int, ...]
+
+    def statistics(self, rows: np.ndarray, starts: Sequence[int]) -> np.ndarray:
+        """(K,) sums of the columns of rows (T, F), weighted by the functions of time."""
+        out = np.zeros(len(self.candidates))
+        places = np.array(self.columns, dtype=int)
+        index = np.array([_index(c) for c in self.candidates], dtype=int)
+        kind = np.array([c.effect.profile if one_off(c) else "" for c in self.candidates])
+        for s in segments(len(rows), starts):
+            part, n = rows[s], s.stop - s.start
+            onwards = np.concatenate(
+                [np.cumsum(part[::-1], axis=0)[::-1], np.zeros((1, len(part.T)))]
+            )
+            step, pulse = kind == "step", kind == "pulse"
+            at = np.clip(index, 0, n)
+            out[step] += onwards[at[step], places[step]]
+            inside = pulse & (index < n)
+            out[inside] += part[at[inside], places[inside]]
+            for k in np.flatnonzero(kind == ""):
+                out[k] += self.candidates[k].weights(n) @ part[:, places[k]]
+        return out
+
+
+def _index(c: Candidate) -> int:
+    """The row, from 0, in which a dated candidate begins: see `Candidate.weights`."""
+    if not one_off(c):
+        return 0
+    return int(dict(c.shape)["date"]) - 1 + (c.change == "transition")
