@@ -41,7 +41,7 @@ FEW = (
 
 PILOT, AIM, WANTED, FAULT = 100, 0.7, 0.8, 1.0
 # Repeats of every cell of the whole tables; `make tables` asks for 2,000 and takes over an hour.
-REPEATS = int(os.environ.get("SSMPPL_TABLE_REPEATS", "500"))
+REPEATS = int(os.environ.get("SSMPPL_TABLE_REPEATS", "300"))
 COST = {"bootstrap": 9, "guided": 47, "auxiliary": 72}  # ns per particle step, about
 RESAMPLING = {"systematic": 0, "stratified": 3, "residual": 20, "multinomial": 33}
 
