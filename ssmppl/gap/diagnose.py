@@ -239,10 +239,11 @@ class _Diagnosis:
         if not self.kept.progress or done > SETS[self.mode] // 2:
             return
         whole = question.theta(fit.theta)
-        for_screen, _ = timed(
+        # A refit's code is about as much to compile as the screen's.
+        for_screen, generating = timed(
             lambda: question.smoother.run(experiments, whole, random_state(self._seed(12)))
         )
-        for_fit, generating = timed(
+        for_fit, _ = timed(
             lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
         )
         blocks = 0 if self.parts else FOLDS

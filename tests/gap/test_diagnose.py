@@ -93,7 +93,7 @@ def test_the_augmented_model_has_the_gain_of_the_refit(jump):
     assert after - before == pytest.approx(jump.causes.iloc[0]["gain_refit"], abs=1e-6)
 
 
-@pytest.mark.parametrize("stage", ["refit", "share"])
+@pytest.mark.parametrize("stage", ["refit", pytest.param("share", marks=pytest.mark.slow)])
 def test_an_interrupt_keeps_the_stages_that_are_done(jump, tmp_path, monkeypatch, stage):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
