@@ -228,7 +228,8 @@ def _counts():
 
 
 @pytest.mark.parametrize(
-    "case", [_vector, _simulator, _several, pytest.param(_counts, marks=pytest.mark.slow)]
+    "case",
+    [_several, *(pytest.param(c, marks=pytest.mark.slow) for c in (_vector, _simulator, _counts))],
 )
 def test_any_model_is_screened(case):
     """Several states with missing values and known parameters; a simulator without process noise;
