@@ -60,6 +60,7 @@ def jump():
         return run(level(), levels(80, BREAK))
 
 
+@pytest.mark.slow
 def test_a_jump_is_found_with_its_date_and_size(jump):
     assert jump.verdict == "effect"
     assert jump.chosen == ["level break"]
@@ -71,6 +72,7 @@ def test_a_jump_is_found_with_its_date_and_size(jump):
     assert jump.parts == {"cross-fitting": BLOCKS}
 
 
+@pytest.mark.slow
 def test_the_share_is_of_rows_left_out(jump):
     (row,) = jump.closed.to_dict("records")
     assert row["effect"] == "level break"
@@ -84,6 +86,7 @@ def test_the_share_is_of_rows_left_out(jump):
     )
 
 
+@pytest.mark.slow
 def test_the_augmented_model_has_the_gain_of_the_refit(jump):
     data = levels(80, BREAK)
     value = {when: {n: v for n, (v, _) in found.items() if not n.endswith("_date")}
@@ -93,6 +96,7 @@ def test_the_augmented_model_has_the_gain_of_the_refit(jump):
     assert after - before == pytest.approx(jump.causes.iloc[0]["gain_refit"], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["refit", pytest.param("share", marks=pytest.mark.slow)])
 def test_an_interrupt_keeps_the_stages_that_are_done(jump, tmp_path, monkeypatch, stage):
     def interrupted(*args, **kwargs):
