@@ -4,6 +4,7 @@
 #   make demo       the ice varves, from the model to its posterior
 #   make test       format, lint, types, tests
 #   make slow       the long statistical checks
+#   make exhaustive the same with whole tables and very long chains: hours
 #   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
 #   make docs       the documentation, notebooks executed, warnings are errors
@@ -22,7 +23,7 @@ PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow tables examples docs bench format clean
+.PHONY: help demo test slow exhaustive tables examples docs bench format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -55,10 +56,15 @@ test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal
 
 slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m slow || test $$? -eq 5
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m 'slow and not exhaustive' \
+	    --durations 40 --durations-min 20
+
+exhaustive: $(VENV)/.installed-dev
+	SSMPPL_SBC_SETS=100 $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal \
+	    -m 'exhaustive or slow' --durations 40
 
 tables: $(VENV)/.installed-dev
-	SSMPPL_TABLE_REPEATS=2000 $(BIN)/python -m pytest -s -m slow -k table -n $(WORKERS) \
+	SSMPPL_TABLE_REPEATS=2000 $(BIN)/python -m pytest -s -m 'slow or exhaustive' -k table -n $(WORKERS) \
 	    tests/statistics/test_likelihood.py
 
 examples: $(VENV)/.installed-run

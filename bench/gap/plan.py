@@ -23,7 +23,16 @@ SPLIT = json.loads((Path(__file__).parent / "split.json").read_text())
 ONE, TWO, OUTSIDE = ("one-20", "one-50"), "two-50", "outside-50"
 NONE = ("none", "none-start", "none-noise")
 # Effects that no strength brings to 50 nats: the stronger they are the less moves that shows them.
-UNREACHABLE: frozenset[str] = frozenset()
+UNREACHABLE: frozenset[str] = frozenset(
+    {
+        "cart_pole/dead zone",
+        "cart_pole/drag",
+        "cart_pole/outliers",
+        "oscillator/coloured",
+        "predator_prey/saturation",
+        "two_tanks/saturation",
+    }
+)
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,12 @@ from ssmppl.gap.refit import Refit, standard_errors
 from ssmppl.gap.report import GapReport, tabulate
 from ssmppl.gap.screen import Screen
 from ssmppl.gap.share import HowFar
+from ssmppl.gap.words import CURVES
 from ssmppl.gap.writing import model_text, to_model
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace
 
-CURVES = "smooth functions of states and inputs"
+CLEARLY = 2.0  # standard errors
 
 
 @dataclass
@@ -88,12 +89,14 @@ def answer(r: Results, seconds: float) -> GapReport:
         if r.far.rows:
             share = tabulate("closed", r.far.rows)
             # Few blocks leave the share open where the test of the effect does not.
-            if verdict == "effect" and not r.blocks and not np.isfinite(share["F"].iloc[0]):
-                verdict = "no measurable gap"
+            if not r.blocks and not np.isfinite(share["F"].iloc[0]):
+                verdict, missing = "no measurable gap", None
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}
     if r.chosen is not None and verdict == "effect":
-        estimates["after"] = _estimates(r.chosen.fitter, r.chosen.fit)
+        values = _estimates(r.chosen.fitter, r.chosen.fit)
+        own = augment(r.trace, list(r.chosen.candidates)).parameter_symbols
+        estimates["after"] = {repr(s): values[repr(s)] for s in own}
         augmented, text = _written(r.trace, r.chosen, notes)
     free = tabulate("free_run")
     if runs is not None:
@@ -125,22 +128,36 @@ def labels(candidates: Sequence[Candidate]) -> list[str]:
 
 
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
-    """The verdict before the held-out rows have spoken, and the missing curve."""
-    residual, key = tables.residual_group(r.screen)
+    """The verdict but for whether a gap can be measured at all, and the missing curve."""
     tested = r.attribution.p.values() if r.attribution else ()
     least = min([float(np.min(r.screen.family.p, initial=1.0)), *tested])
     asked = r.attribution is not None and r.mode == "full"
+    if r.far is not None and _curves_beat(r.far):
+        best = r.chosen or (r.refits[0] if r.refits else None)
+        tried = list(best.candidates) if best else []
+        residual, key = tables.residual_group(r.screen, tried)
+        if residual <= r.alpha and key is not None:
+            return "none of these", _curve(r.screen, key, tried)
     if least <= r.alpha and (r.chosen is not None or not asked):
         head = where.iloc[0] if len(where) else None
         if head is not None and head["moment"] == "mean":
-            return "effect", tables.missing_table(r.screen, (head["equation"], "mean"), False)
+            return "effect", _curve(r.screen, (head["equation"], "mean"), ())
         return "effect", None
-    if residual <= r.alpha and key is not None:
-        moment_is_mean = key[1] == "mean"
-        return "none of these", (
-            tables.missing_table(r.screen, key, True) if moment_is_mean else None
-        )
+    if not asked:  # nothing is held out: what all of the catalogue leaves
+        tried = tables.catalogue(r.screen)
+        residual, key = tables.residual_group(r.screen, tried)
+        if residual <= r.alpha and key is not None:
+            return "none of these", _curve(r.screen, key, tried)
     return "no measurable gap", None
+
+
+def _curves_beat(far: HowFar) -> bool:
+    """Whether smooth curves predict the held-out rows better than the best of the catalogue."""
+    return far.beyond is not None and far.beyond.nats > CLEARLY * far.beyond.error
+
+
+def _curve(screen: Screen, key: tuple[str, str], others: Sequence[Candidate]) -> Any:
+    return tables.missing_table(screen, key, others) if key[1] == "mean" else None
 
 
 def _detection(screen: Screen) -> Any:

@@ -69,9 +69,11 @@ def attribute(
     )
     out.notes += [f"not refitted: {reason}" for reason in failed]
     out.refits = refits
-    significant = bool(np.min(screen.family.p, initial=1.0) <= alpha)
-    if not significant and not always and _testable(workshop, screen, train):
-        significant = _by_refit(out, workshop, screen, _seed(seed, 4), alpha, kept)
+    testable = not always and _testable(workshop, screen, train)
+    own = alpha / 2 if testable else alpha  # of two tests, each has half
+    significant = bool(np.min(screen.family.p, initial=1.0) <= own)
+    if not significant and testable:
+        significant = _by_refit(out, workshop, screen, _seed(seed, 4), own, kept)
     if not refits or not (significant or always):
         return
     needed = needed_gain(screen, alpha)

@@ -1,13 +1,15 @@
-"""The basis in which a missing term is written, as candidates: smooth functions of each variable.
+"""The basis in which a missing term is written, as candidates that need no form to be guessed.
 
-For every equation with noise: increments of its mean by functions of each state and input, and of
-the log of its variance likewise. Their scores tell where the gap is, whatever its form.
+For every equation with noise: increments of its mean by smooth functions of each state and input,
+by products of two of them, and by the past of what moves the system; and increments of the log of
+its variance by smooth functions. Their scores tell where the gap is, whatever its form.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 from ssmppl.errors import NotApplicable
@@ -16,76 +18,140 @@ from ssmppl.gap.anatomy import Anatomy, Part
 from ssmppl.gap.bases import Smooth, bases
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import Scales, slug
-from ssmppl.gap.effect import Effect, numbers
+from ssmppl.gap.effect import Auxiliary, Effect, numbers
 from ssmppl.gap.laws import has_scale, scale_of_mean
+from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Trace
 
 MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
 CURVES = bases((0.0, 1.0), MEAN + 1)[1:]  # of a standardised variable, without the constant
+# Degrees of the functions in a product of two variables; with more than `FEW` of these the first.
+DEGREES, FEW = ((1, 1), (2, 1), (1, 2)), 3
+PAST = ("past_1", "past_2", "past_3")  # low-passes in a row
+REACH = 6.0  # the time constant of each, in rows
 
 
 @dataclass(frozen=True)
 class Term:
-    """One basis function of one variable in one equation. moment : "mean" or "scale"."""
+    """One basis function in one equation.
+
+    moment : "mean" or "scale". variable : what it is a function of, in words. function : of a
+    single variable, with its centre and width; None of products and of what is past.
+    """
 
     candidate: Candidate
     equation: str
     moment: str
     variable: str
-    function: Smooth
-    centre: float
-    width: float
+    function: Smooth | None = None
+    centre: float = 0.0
+    width: float = 1.0
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether it is a function of the present value of one variable."""
+        return self.function is not None
 
     def at(self, values: Any) -> Any:
-        """The function at values of the variable."""
+        """The function at values of the variable; of curves alone."""
+        assert self.function is not None
         return self.function((values - self.centre) / self.width)
 
 
 def basis(trace: Trace, scales: Scales) -> list[Term]:
     """The terms of all equations that have noise."""
     anatomy = Anatomy(trace)
-    variables = [*anatomy.of_role("state"), *anatomy.of_role("input")]
-    out = []
-    for part in [*anatomy.of_role("state"), *anatomy.of_role("channel")]:
-        if part.role == "state" and anatomy.deterministic(part):
-            continue
-        for moment, kind, count in (
-            ("mean", "transition" if part.role == "state" else "observation", MEAN),
-            ("scale", "noise", SCALE),
-        ):
-            law = anatomy.law(part)
-            found = scale_of_mean(law) if moment == "mean" else has_scale(law)
-            if isinstance(found, NotApplicable):
-                continue
-            for variable in variables:
-                scale = scales.scale[variable.label]
-                if not scale.sd > 0.0 or (part.role == "channel" and variable.role == "input"):
-                    continue
-                out += [
-                    _term(part, moment, kind, variable, k, scale.mean, scale.sd)
-                    for k in range(count)
-                ]
+    states, inputs = anatomy.of_role("state"), anatomy.of_role("input")
+    varying = [p for p in [*states, *inputs] if scales.scale[p.label].sd > 0.0]
+    noisy = [p for p in states if not anatomy.deterministic(p)]
+    out: list[Term] = []
+    for part in [*noisy, *anatomy.of_role("channel")]:
+        state = part.role == "state"
+        own = [v for v in varying if state or v.role != "input"]
+        law = anatomy.law(part)
+        if not isinstance(scale_of_mean(law), NotApplicable):
+            kind = "transition" if state else "observation"
+            out += [_curve(part, "mean", kind, v, k, scales) for v in own for k in range(MEAN)]
+            if state:
+                out += _products(part, own, scales)
+                moving = [v for v in own if v in noisy or v.role == "input"]
+                out += [_past(part, v, k, scales) for v in moving for k in range(len(PAST))]
+        if not isinstance(has_scale(law), NotApplicable):
+            out += [_curve(part, "scale", "noise", v, k, scales) for v in own for k in range(SCALE)]
     return out
 
 
-def _term(
-    part: Part, moment: str, kind: str, variable: Part, k: int, centre: float, width: float
-) -> Term:
+def _curve(
+    part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales
+) -> Term:  # fmt: skip
     curve = CURVES[k]
 
     def term(own, z, strength, centre, width):
         return strength * curve((z - centre) / width)
 
+    label, scale = variable.label, scales.scale[variable.label]
     effect = Effect(
-        name=f"curve {k + 1} of {variable.label}", kind=kind, function=term, on=part.label,
-        shapes={"centre": numbers(centre), "width": numbers(width)},
+        name=f"curve {k + 1} of {label}", kind=kind, function=term, on=part.label,
+        shapes={"centre": numbers(scale.mean), "width": numbers(scale.sd)},
         given={"z": "other state"},
     )  # fmt: skip
     candidate = Candidate(
-        effect, part.label, (("centre", centre), ("width", width)), (("z", variable.label),),
-        part.role, slug(f"curve {k + 1} {moment} {part.label} {variable.label}"),
+        effect, part.label, (("centre", scale.mean), ("width", scale.sd)), (("z", label),),
+        part.role, slug(f"curve {k + 1} {moment} {part.label} {label}"),
     )  # fmt: skip
-    return Term(candidate, part.label, moment, variable.label, curve, centre, width)
+    return Term(candidate, part.label, moment, label, curve, scale.mean, scale.sd)
+
+
+def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Term]:
+    """Of functions of two variables each."""
+    degrees = DEGREES if len(variables) <= FEW else DEGREES[:1]
+    out = []
+    for a, b in combinations(variables, 2):
+        for i, j in degrees:
+            x, y = scales.scale[a.label], scales.scale[b.label]
+            shape = {"centre": x.mean, "width": x.sd, "centre_w": y.mean, "width_w": y.sd}
+            effect = Effect(
+                name=f"product {i} {j} of {a.label} and {b.label}", kind="transition",
+                function=_product(CURVES[i - 1], CURVES[j - 1]), on=part.label,
+                shapes={n: numbers(v) for n, v in shape.items()},
+                given={"z": "other state", "w": "other state"},
+            )  # fmt: skip
+            candidate = Candidate(
+                effect, part.label, tuple(shape.items()), (("z", a.label), ("w", b.label)),
+                part.role, slug(f"product {i} {j} {part.label} {a.label} {b.label}"),
+            )  # fmt: skip
+            out.append(Term(candidate, part.label, "mean", f"{a.label} and {b.label}"))
+    return out
+
+
+def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
+    def term(own, z, w, strength, centre, width, centre_w, width_w):
+        return strength * first((z - centre) / width) * second((w - centre_w) / width_w)
+
+    return term
+
+
+def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
+    """By the variable through k + 1 low-passes in a row: B. de Vries and J. Principe, *Neural
+    Networks* 5, 1992. All k of a variable share these states."""
+
+    def term(own, z, past_1, past_2, past_3, strength, centre, width):
+        past = past_1, past_2, past_3
+        before = (z - centre) / width, past_1, past_2
+        laws = {n: Dirac(p + (b - p) / REACH) for n, p, b in zip(PAST, past, before, strict=True)}
+        return Auxiliary(strength * past[k], laws, {n: Dirac(0.0) for n in PAST})
+
+    label, scale = variable.label, scales.scale[variable.label]
+    effect = Effect(
+        name=f"past {k + 1} of {label}", kind="state", function=term, on=part.label,
+        shapes={"centre": numbers(scale.mean), "width": numbers(scale.sd)},
+        given={"z": "other state"}, states=dict.fromkeys(PAST),
+    )  # fmt: skip
+    candidate = Candidate(
+        effect, part.label, (("centre", scale.mean), ("width", scale.sd)), (("z", label),),
+        part.role, slug(f"past {k + 1} {part.label} {label}"), shares=slug(f"past {label}"),
+    )  # fmt: skip
+    return Term(candidate, part.label, "mean", f"the past of {label}")
 
 
 def lifted(
@@ -104,7 +170,7 @@ def lifted(
             if name in fixed:
                 shape.append((name, value))
                 continue
-            own = f"{c.strength}_{name}"
+            own = f"{c.shares or c.strength}_{name}"
             values[own] = value
             shape.append((name, symbol("parameter", own, ())))
         out.append(replace(c, shape=tuple(shape)))

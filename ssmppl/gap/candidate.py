@@ -29,6 +29,7 @@ class Candidate:
     strength : name of its parameter; 0 gives the model back.
     role : what the equation is: "state", "channel", "input" or "parameter".
     held : its process is held at 1: see `increment`.
+    shares : candidates of the same text here have the same shapes, which then are one parameter.
     """
 
     effect: Effect
@@ -38,6 +39,7 @@ class Candidate:
     role: str = "state"
     strength: str = "strength"
     held: bool = False
+    shares: str = ""
 
     @property
     def kind(self) -> str:

@@ -173,7 +173,8 @@ def level_break(x, pulse, strength):
     return strength * pulse
 
 
-@effect(on="any", name="coarse discretisation", given={"second_order": "second order"})
+@effect(on="any", name="coarse discretisation", lower=0, upper=2,
+        given={"second_order": "second order"})  # fmt: skip
 def coarse_discretisation(x, second_order, strength):
     """l F'F / 2: the second-order term of the step; 1 adds it whole"""
     return strength * second_order

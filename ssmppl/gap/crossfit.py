@@ -66,6 +66,8 @@ class CrossFit:
             return out
         table = {n: np.stack([v[n] for v in each], axis=-1) for n in each[0]}
         share = closed(table["base"], table["effect"], table["reference"], block=1)
+        best, rival = table["reference"], table["effect" if self.chosen else "base"]
+        out.beyond = closed(rival, best, best, block=1).gain
         size = table["rows"] / table["rows"].sum()
         mean = float(table["gain_mean"].sum())
         out.rows.append({

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 EDGE = 1e-9  # a PIT value nearer to 0 or 1 counts as this near: |z| stays below 6
 LAGS, DELAYS = 5, 3
+LONG = 40  # lags of the sums of squares that look for what rings on
 FEWEST = 8  # pairs of values without which a statistic is left out (0 in every data set)
 
 
@@ -67,8 +68,9 @@ def statistics(
     """What is wrong with one-step predictions, channel by channel.
 
     mean, variance, tails : sqrt(n) times the mean of the Hermite polynomials of degree 1, 2 and 4
-    of z, which are uncorrelated for normal z. autocorrelation at each lag, and jointly (Box and
-    Pierce 1970). Correlation of z_t with u_{t-k} (mean) and of z_t^2 with u_{t-k}^2 (scale).
+    of z, which are uncorrelated for normal z. autocorrelation at each lag, and of `LONG` lags
+    jointly (Box and Pierce 1970). Correlation of z_t with u_{t-k} (mean), also of `LONG` of them
+    jointly, and of z_t^2 with u_{t-k}^2 (scale).
 
     Parameters
     ----------
@@ -96,18 +98,19 @@ def statistics(
         for name, values in (("mean", e), ("variance", (e**2 - 1.0) / np.sqrt(2.0)),
                              ("tails", (e**4 - 6.0 * e**2 + 3.0) / np.sqrt(24.0))):  # fmt: skip
             found[channel, name] = _sum(values)
-        at_lags = [_sum(_lagged(e, e, k, parts)) for k in range(1, lags + 1)]
-        for k, value in enumerate(at_lags, start=1):
+        at_lags = [_sum(_lagged(e, e, k, parts)) for k in range(1, LONG + 1)]
+        for k, value in enumerate(at_lags[:lags], start=1):
             found[channel, f"autocorrelation at lag {k}"] = value
-        if at_lags:
-            found[channel, "autocorrelation, all lags"] = float(np.sum(np.square(at_lags)))
+        found[channel, f"autocorrelation, {LONG} lags"] = float(np.sum(np.square(at_lags)))
         for name, u in zip(input_names, given.T, strict=True):
             for k in range(delays + 1):
                 when = name if k == 0 else f"{name}, {k} step{'s' * (k > 1)} before"
                 found[channel, f"mean with {when}"] = _sum(_lagged(e, _standard(u), k, parts))
                 scale = _lagged((e**2 - 1.0) / np.sqrt(2.0), _standard(u**2), k, parts)
                 found[channel, f"variance with {when} squared"] = _sum(scale)
-    quadratic = np.array([name.endswith("all lags") for _, name in found], bool)
+            before = [_sum(_lagged(e, _standard(u), k, parts)) for k in range(LONG + 1)]
+            found[channel, f"mean with {name}, {LONG} lags"] = float(np.sum(np.square(before)))
+    quadratic = np.array([name.endswith(f"{LONG} lags") for _, name in found], bool)
     return Statistics(tuple(found), np.array(list(found.values())), quadratic)
 
 

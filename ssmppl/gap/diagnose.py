@@ -185,7 +185,7 @@ class _Diagnosis:
         if self.parts and not once:
             return how_far(
                 self.workshop, self.parts, self.experiments, (r.base, r.fit), r.screen, r.chosen,
-                r.label, self._seed(8), self.kept,
+                r.refits[0] if r.refits else None, r.label, self._seed(8), self.kept,
             )  # fmt: skip
         r.blocks = FOLDS
         workshop, question, base = self.workshop, r.screen.question, (r.base, r.fit)

@@ -32,13 +32,16 @@ GROUPS = 3  # of basis functions that are taken in, at most
 LEAST = 2.0  # mean z^2 of a group that is taken in
 
 
-def signal(screen: Screen) -> list[tuple[list[Term], float]]:
-    """(terms of one equation, moment and variable, tau) where the basis has signal, best first."""
+def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term], float]]:
+    """(terms of one equation, moment and variable, tau) where the basis has signal beyond what was
+    chosen, best first."""
     question = screen.question
     if not question.terms:
         return []
-    law = Null.of(screen.stacked("basis"), screen.stacked("nuisance"))
-    found = efficient(law, screen.observed.basis, screen.observed.nuisance)
+    own, own_seen = screen.columns_of(chosen)
+    taken = np.concatenate([screen.stacked("nuisance"), own], axis=1)
+    seen = np.concatenate([screen.observed.nuisance, own_seen])
+    found = efficient(Null.of(screen.stacked("basis"), taken), screen.observed.basis, seen)
     groups: dict[tuple[str, str, str], list[int]] = {}
     for i, t in enumerate(question.terms):
         if not found.status[i]:
@@ -76,7 +79,7 @@ def superset(
     workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen
 ) -> tuple[Fitter, dict[str, np.ndarray]]:
     """The fitter of the superset, and where it starts."""
-    groups = signal(screen)
+    groups = signal(screen, chosen)
     candidates = [t.candidate for terms, _ in groups for t in terms]
     made, shapes = lift([*chosen, *candidates])
     widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}

@@ -196,6 +196,13 @@ class Screen:
         values: np.ndarray = getattr(self.null, name)
         return values
 
+    def columns_of(self, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
+        """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
+        whose statistic is a sum of scores."""
+        keys = {c.key for c in chosen}
+        own = [k for k, c in enumerate(self.question.candidates) if c.key in keys and c.first_order]
+        return self.stacked("columns")[:, own], self.observed.columns[own]
+
     @property
     def sets(self) -> int:
         """B, the simulated sets that went through."""

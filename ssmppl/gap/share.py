@@ -11,7 +11,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.errors import SSMError
 from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.closed import Closed, closed
+from ssmppl.gap.closed import Closed, Gain, closed
 from ssmppl.gap.confirm import FreeRun, free_run, gain_of_mean, predict, rmse
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import Parts
@@ -24,9 +24,13 @@ SAME = 1e-6  # relative difference of two gains that are the same model's
 
 @dataclass
 class HowFar:
-    """Rows of the report's table, free runs of each experiment before and after, and notes."""
+    """Rows of the report's table, free runs of each experiment before and after, and notes.
+
+    beyond : what the reference gains over the best of the catalogue, chosen or not.
+    """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
+    beyond: Gain | None = None
     before: list[FreeRun] = field(default_factory=list)
     after: list[FreeRun] | None = None
     notes: list[str] = field(default_factory=list)
@@ -43,10 +47,13 @@ class HowFar:
 
 def how_far(
     workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
-    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, label: str,
-    seed: np.random.SeedSequence, kept: Checkpoint,
+    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, leader: Refit | None,
+    label: str, seed: np.random.SeedSequence, kept: Checkpoint,
 ) -> HowFar:  # fmt: skip
-    """The chosen model, or, where none was chosen, the reference itself, against the base model."""
+    """The chosen model, or, where none was chosen, the reference itself, against the base model.
+
+    leader : the best refit, chosen or not.
+    """
     out = HowFar()
     out.runs(base, experiments, chosen, seed)
     counts = parts.confirm
@@ -63,6 +70,12 @@ def how_far(
     model = (chosen.fitter, chosen.fit) if chosen else reference
     found = predict(*model, experiments, counts, seed)
     share = closed(plain.log_density, found.log_density, best.log_density, starts=plain.starts)
+    rival = found
+    if chosen is None:
+        rival = predict(leader.fitter, leader.fit, experiments, counts, seed) if leader else plain
+    out.beyond = closed(
+        rival.log_density, best.log_density, best.log_density, starts=plain.starts
+    ).gain
     runs = out.after or [free_run(*model, e, seed) for e in experiments]
     mean = gain_of_mean(plain, found)
     out.rows.append({

@@ -27,7 +27,7 @@ from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.problem import Problem
 
 LAG = 40
-DRAWS = 128  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
+DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
 
 
 @dataclass(frozen=True)

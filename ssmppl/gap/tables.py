@@ -11,6 +11,7 @@ from ssmppl.data import Experiment
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.classes import Classes
 from ssmppl.gap.confirm import FreeRun
+from ssmppl.gap.familywise import familywise
 from ssmppl.gap.localise import Group, curve, group_score, localise, regions
 from ssmppl.gap.profiles import one_off
 from ssmppl.gap.refit import Refit
@@ -86,22 +87,26 @@ def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
     if best is None:
         return ""
     group, variable, own = best
+    if not terms[own[0]].is_curve:
+        return f"with {variable}"
     values = screen.question.grid(variable)
     table = regions(group, [terms[i].at for i in own], values, variable)
     row = table.iloc[int(np.argmax(np.abs(table["z"].to_numpy())))]
     return f"where {row['region']}" if abs(row["z"]) >= STANDS_OUT else f"over {variable}"
 
 
-def missing_table(screen: Screen, key: tuple[str, str], others: bool) -> pd.DataFrame:
+def missing_table(
+    screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
+) -> pd.DataFrame:
     """The estimated missing curve of the mean over each variable of an equation.
 
-    others : whether the catalogue is projected out.
+    others : candidates that are projected out.
     """
     terms, nuisance = screen.question.terms, screen.stacked("nuisance")
     columns, seen = screen.stacked("basis"), screen.observed.basis
-    rest = _catalogue(screen) if others else (None, None)
+    rest = screen.columns_of(others)
     rows = []
-    places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key]
+    places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key and t.is_curve]
     for variable in dict.fromkeys(terms[i].variable for i in places):
         own = [i for i in places if terms[i].variable == variable]
         group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
@@ -116,26 +121,33 @@ def missing_table(screen: Screen, key: tuple[str, str], others: bool) -> pd.Data
     return tabulate("missing", rows)
 
 
-def _catalogue(screen: Screen) -> tuple[np.ndarray, np.ndarray]:
-    told = [k for k, s in enumerate(screen.found.status) if not s]
-    plain = [k for k in told if not screen.question.quadratic[k]]
-    return screen.stacked("columns")[:, plain], screen.observed.columns[plain]
+def catalogue(screen: Screen) -> list[Candidate]:
+    """The candidates that the screen could tell anything about."""
+    candidates = screen.question.candidates
+    return [c for c, s in zip(candidates, screen.found.status, strict=True) if not s]
 
 
-def residual_group(screen: Screen) -> tuple[float, tuple[str, str] | None]:
-    """(p, key) of what of the basis the catalogue cannot explain, the strongest mean group."""
+def residual_group(
+    screen: Screen, others: Sequence[Candidate]
+) -> tuple[float, tuple[str, str] | None]:
+    """(family-wise p, equation and moment) of what of the basis stands out most with `others`
+    projected out: the functions of one variable, or of one pair, are a group."""
     terms, nuisance = screen.question.terms, screen.stacked("nuisance")
     columns, seen = screen.stacked("basis"), screen.observed.basis
-    rest = _catalogue(screen)
-    best: tuple[float, tuple[str, str] | None] = (1.0, None)
-    keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
+    rest = screen.columns_of(others)
+    keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
+    if not keys:
+        return 1.0, None
+    groups = []
     for key in keys:
-        own = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key]
-        group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
-        p = min(1.0, group.p * len(keys))
-        if p < best[0]:
-            best = p, key
-    return best
+        own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
+        groups.append(
+            group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        )
+    z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
+    p = familywise(z, null, sided=1).p
+    best = int(np.argmax(z))
+    return float(p[best]), keys[best][:2]
 
 
 def causes_table(
@@ -155,9 +167,10 @@ def causes_table(
         own = by_head.get(k)
         sided = screen.question.sided[k]
         strength = float(s.strength[k])
-        if screen.question.quadratic[k]:
-            strength = float(np.sqrt(max(strength, 0.0)))
         error = 1.0 / np.sqrt(s.variance[k]) if s.variance[k] > 0.0 else np.nan
+        if screen.question.quadratic[k]:  # told of is the square
+            strength = float(np.sqrt(max(strength, 0.0)))
+            error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
         if own is not None:
             strength, error = own.strengths[0], own.errors[c.strength]
         shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in c.shape)

@@ -30,6 +30,7 @@ __all__ = [
     "which",
 ]  # fmt: skip
 
+CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
 MOMENTS = {
     "mean": "the mean of",
     "scale": "the noise level of",
@@ -114,7 +115,18 @@ def _none_of_these(report: GapReport) -> str:
     first, measured = rows(report.where)[:1], share(report)
     spot = f" in {place(first[0])} ({p_text(first[0]['p'])})" if first else ""
     text = f"{named(report)} lacks something{spot}, and none of the {tried(report)} explains it."
-    return sentence(text + (f" A curve estimated from the data {measured}." if measured else ""))
+    if measured and _best_tried(report):
+        text += f" The best of them, {_best_tried(report)}, {measured}: curves estimated from " \
+                "the data do clearly better."  # fmt: skip
+    elif measured:
+        text += f" A curve estimated from the data {measured}."
+    return sentence(text)
+
+
+def _best_tried(report: GapReport) -> str:
+    """What of the catalogue was chosen, where that is not enough; "" for nothing."""
+    closed = rows(report.closed)
+    return str(closed[0]["effect"]) if closed and closed[0]["effect"] != CURVES else ""
 
 
 def _no_gap(report: GapReport) -> str:

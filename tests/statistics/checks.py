@@ -16,19 +16,19 @@ LEVEL = 0.001  # chance of a false alarm, over a whole table of checks
 MCSE = 4.0  # Monte Carlo standard errors that a posterior may lie off
 
 
-def some(cases, count):
-    """Cases of a parametrised test, evenly spread, of which all but `count` are left to the slow
-    stage."""
+def some(cases, count, mark=pytest.mark.slow):
+    """Cases of a parametrised test, all but `count` of them, evenly spread, with a mark that
+    leaves them to another stage."""
     cases = list(cases)
     kept = {round(i * (len(cases) - 1) / max(count - 1, 1)) for i in range(count)}
-    return [c if i in kept else _slow(c) for i, c in enumerate(cases)]
+    return [c if i in kept else _marked(c, mark) for i, c in enumerate(cases)]
 
 
-def _slow(case):
+def _marked(case, mark):
     if hasattr(case, "marks"):  # a pytest.param already
-        return pytest.param(*case.values, marks=[*case.marks, pytest.mark.slow], id=case.id)
+        return pytest.param(*case.values, marks=[*case.marks, mark], id=case.id)
     values = case if isinstance(case, tuple) else (case,)
-    return pytest.param(*values, marks=pytest.mark.slow)
+    return pytest.param(*values, marks=mark)
 
 
 def seed_of(*name) -> int:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
 from .checks import LEVEL
 from .sbc import BINS, KEPT, STUDIES, calibrate, histogram, uniform_p
 
+SETS = int(os.environ.get("SSMPPL_SBC_SETS", "40"))  # `make exhaustive` asks for 100
 QUANTITIES = sum(len(study.ranked) for study in STUDIES.values())
 
 
@@ -25,9 +28,9 @@ def test_statistic_knows_uniform_from_not():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STUDIES)
 def test_ranks_are_uniform(name):
-    """Every parameter, and the state in the middle, over the first 100 data sets."""
+    """Every parameter, and the state in the middle, over the first data sets."""
     study = STUDIES[name]
-    ranks, thin = calibrate(study, 100)
+    ranks, thin = calibrate(study, SETS)
     found = {q: uniform_p(column) for q, column in zip(study.ranked, ranks.T, strict=True)}
     print(f"{name}, thinned by {thin}: " + ", ".join(f"{q}: p={p:.3f}" for q, p in found.items()))
     assert min(found.values()) > LEVEL / QUANTITIES, found

@@ -23,7 +23,7 @@ from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import pose
 
 from . import models
-from .checks import LEVEL, mean_one_p, seed_of
+from .checks import LEVEL, mean_one_p, seed_of, some
 from .exact import DenseGaussian, varve_log_likelihood
 
 FILTERS = ("bootstrap", "guided", "auxiliary")
@@ -39,6 +39,7 @@ FEW = (
     ("auxiliary", "systematic", 0.5),
 )
 
+EXHAUSTIVE = pytest.mark.exhaustive
 PILOT, AIM, WANTED, FAULT = 100, 0.7, 0.8, 1.0
 # Repeats of every cell of the whole tables; `make tables` asks for 2,000 and takes over an hour.
 REPEATS = int(os.environ.get("SSMPPL_TABLE_REPEATS", "300"))
@@ -151,7 +152,10 @@ def length_for(parameters, combination, name, repeats) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("combination", COMBINATIONS, ids=lambda c: "-".join(map(str, c)))
+@pytest.mark.parametrize(
+    "combination",
+    some([pytest.param(c, id="-".join(map(str, c))) for c in COMBINATIONS], 4, EXHAUSTIVE),
+)
 def test_varves_table(exact_values, combination):
     """All 144 cells: six points, every filter, scheme and threshold.
 
@@ -285,8 +289,9 @@ def test_vector_observations_and_states():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gaps", [False, True], ids=["complete", "gaps"])
-@pytest.mark.parametrize("proposal", FILTERS)
+@pytest.mark.parametrize(
+    ("proposal", "gaps"), some([(p, g) for p in FILTERS for g in (False, True)], 2, EXHAUSTIVE)
+)
 def test_lgss_table(exact_values, proposal, gaps):
     """Both series at three values of theta, every combination."""
     cells = list(lgss_cells(exact_values, gaps))
@@ -295,7 +300,7 @@ def test_lgss_table(exact_values, proposal, gaps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("proposal", FILTERS)
+@pytest.mark.parametrize("proposal", some(FILTERS, 1, EXHAUSTIVE))
 def test_vector_table(proposal):
     cells = list(vector_cells())
     combinations = [c for c in COMBINATIONS if c[0] == proposal]

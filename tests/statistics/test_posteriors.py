@@ -120,7 +120,7 @@ def test_quadrature_against_reference(exact_values, series):
         assert quantiles[float(level)] == pytest.approx(value, rel=2e-3)
 
 
-@pytest.mark.parametrize("draws", [2_000, pytest.param(25_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [2_000, pytest.param(25_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("method", some(LGSS_METHODS, 3), ids=str)
 @pytest.mark.parametrize("series", LGSS)
 def test_lgss(exact_values, series, method, draws):

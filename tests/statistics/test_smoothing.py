@@ -68,7 +68,7 @@ RUNS = [(label, proposal) for label in LABELS for proposal in ("bootstrap", "aux
 RUNS += [("vehicle", "bootstrap")]  # its observation does not depend on what has noise
 
 
-@pytest.mark.parametrize("draws", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [2_000, pytest.param(20_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("label", "proposal"), some(RUNS, 5))
 def test_smoother(label, proposal, draws):
     model, data, parameters, order, exact = cases()[label]
@@ -88,7 +88,7 @@ PARAMETERS_OF_DIRAC = {
 }
 
 
-@pytest.mark.parametrize("draws", [1_500, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [1_500, pytest.param(10_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("label", PARAMETERS_OF_DIRAC)
 def test_parameter_inside_a_deterministic_law(label, draws):
     model, matrices, name, value, (mean, sd), (lower, upper) = PARAMETERS_OF_DIRAC[label]

@@ -22,10 +22,10 @@ def prior():
         "c": ssm.LogNormal(np.log(0.6 * GUESS), sd=1.0),
         "g": ssm.LogNormal(np.log(6.0 * GUESS), sd=1.0),
         "d": ssm.LogNormal(np.log(0.4 * GUESS), sd=1.0),
-        "q": ssm.LogNormal(np.log(0.02 * NOISE), sd=1.0),
-        "qw": ssm.LogNormal(np.log(0.02 * NOISE), sd=1.0),
-        "rx": ssm.LogNormal(np.log(0.02 * NOISE), sd=1.0),
-        "rth": ssm.LogNormal(np.log(0.015 * NOISE), sd=1.0),
+        "q": ssm.LogNormal(np.log(0.01 * NOISE), sd=1.0),
+        "qw": ssm.LogNormal(np.log(0.01 * NOISE), sd=1.0),
+        "rx": ssm.LogNormal(np.log(0.01 * NOISE), sd=1.0),
+        "rth": ssm.LogNormal(np.log(0.0075 * NOISE), sd=1.0),
     }
 
 

@@ -13,7 +13,7 @@ from bench.gap.truth import forms as f
 from bench.gap.truth.system import Effect, System
 
 DT = 0.04
-STEPS = 500
+STEPS = 600
 
 
 @njit
@@ -56,7 +56,7 @@ def excite(rng, T):
 SYSTEM = System(
     "cart_pole",
     STEPS,
-    {"b": 1.0, "c": 0.8, "g": 5.0, "d": 0.5, "q": 0.01, "qw": 0.01, "rx": 0.01, "rth": 0.01},
+    {"b": 1.0, "c": 0.8, "g": 5.0, "d": 0.5, "q": 0.005, "qw": 0.005, "rx": 0.005, "rth": 0.005},
     ("u",),
     ("yx", "yth"),
     ("x", "v", "th", "w", "bristle", "noise"),

@@ -1,6 +1,7 @@
 """Prey that is fed and predators that eat it, as logarithms; both are counted with error.
 
-Outside the catalogue: predators that are sated, so that what they take levels off.
+Outside the catalogue: predators that hunt together where prey is plenty, and take more than in
+proportion.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ PARTS = 8
 
 @njit
 def rates(n, m, u, t, r, a, g, k, e):
-    sated = 1 + e[f.OUTSIDE] * np.exp(n) / (1 + np.exp(-6 * (n + 0.3)))
+    apart = 1 + e[f.OUTSIDE] * np.exp(n) / (1 + np.exp(-6 * (n + 0.3)))
     crowded = r * (1 + 0.4 * u) * (1 - np.exp(n) / 3.0)
     forced = e[f.PERIODIC] * f.triangle(t / 41.3)
     death = k * (1 + e[f.DRIFT] * f.logistic((t / STEPS - 0.5) * 9))
     death *= 1 + e[f.BREAK] * f.logistic((t - 0.45 * STEPS) / 3)
-    dn = crowded - a * np.exp(m) / sated + forced
-    dm = g * np.exp(n) / sated - death
+    dn = crowded - a * np.exp(m) / apart + forced
+    dm = g * np.exp(n) / apart - death
     return dn, dm
 
 
@@ -86,6 +87,6 @@ SYSTEM = System(
         "missing": Effect("missing", "missing input", ("n",), 0.18),
         "coloured": Effect("coloured", "coloured noise", ("y2",), 0.11),
         "outliers": Effect("outliers", "outliers", ("y1",), 0.025),
-        "sated": Effect("outside", None, ("n", "m"), 0.35),
+        "packs": Effect("outside", None, ("n", "m"), -0.3),
     },
 )

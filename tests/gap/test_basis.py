@@ -1,0 +1,142 @@
+"""The basis: what it holds for a model, and that its scores find products and what is past."""
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.data import check_parameters
+from ssmppl.gap import tables
+from ssmppl.gap.augment import augment
+from ssmppl.gap.basis import CURVES, REACH, basis, lifted
+from ssmppl.gap.checkpoint import Checkpoint
+from ssmppl.gap.reference import signal
+from ssmppl.gap.scales import Scales
+from ssmppl.gap.screen import Question, ask
+from ssmppl.gap.smoothing import Settings
+from ssmppl.inference.particles.filtering import seed_sequence
+from ssmppl.inference.problem import missing_of, pose
+from tests.statistics.checks import seed_of
+
+STEPS = 120
+THETA = {"phi": 0.8, "b": 0.5, "q": 0.2, "r": 0.1}
+
+
+def driven():
+    """A level that is driven by an input and measured well."""
+    model = ssm.Model("driven", inputs=("u",))
+
+    @model.prior
+    def prior():
+        return {"phi": ssm.Uniform(-1, 1), "b": ssm.Normal(0, sd=1), "q": ssm.HalfNormal(sd=1),
+                "r": ssm.HalfNormal(sd=1)}  # fmt: skip
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x, u, phi, b, q):
+        return {"x": ssm.Normal(phi * x + b * u, sd=q)}
+
+    @model.observation
+    def observation(x, r):
+        return {"y": ssm.Normal(x, sd=r)}
+
+    return model
+
+
+def simulated(missing, name):
+    """Data of `driven` with missing(x, w, u) added to the transition, w the input's mean over
+    `REACH` rows, exponentially weighted."""
+    rng = np.random.default_rng(seed_of(name))
+    u = rng.standard_normal(STEPS)
+    x, w, out = rng.standard_normal(), 0.0, []
+    for t in range(STEPS):
+        out.append(x + 0.1 * rng.standard_normal())
+        x, w = (0.8 * x + 0.5 * u[t] + missing(x, w, u[t]) + 0.2 * rng.standard_normal(),
+                w + (u[t] - w) / REACH)  # fmt: skip
+    return {"u": u, "y": np.array(out)}
+
+
+def asked(data, sets=100):
+    problem = pose(driven(), data)
+    e = problem.experiments[0]
+    scales = Scales.of(problem.trace, e.y[:, None, :].repeat(4, 1).reshape(-1, 1), e.y, e.u, STEPS)
+    missing = missing_of(problem.experiments)
+    question = Question(problem.trace, scales, missing, tuple(THETA), Settings(), ["constant load"])
+    theta = check_parameters(problem.trace, THETA)
+    return ask(question, problem.experiments, theta, sets, seed_sequence(5), Checkpoint(None, {}))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return asked(simulated(lambda x, w, u: 0.0, "plain"), sets=60)
+
+
+def test_what_it_holds(plain):
+    terms = plain.question.terms
+    found = {(t.equation, t.moment, t.variable): 0 for t in terms}
+    for t in terms:
+        found[t.equation, t.moment, t.variable] += 1
+    assert found == {
+        ("x", "mean", "x"): 4, ("x", "mean", "u"): 4, ("x", "mean", "x and u"): 3,
+        ("x", "mean", "the past of x"): 3, ("x", "mean", "the past of u"): 3,
+        ("x", "scale", "x"): 2, ("x", "scale", "u"): 2,
+        ("y", "mean", "x"): 4, ("y", "scale", "x"): 2,
+    }  # fmt: skip
+    assert all(t.is_curve == (t.variable in ("x", "u")) for t in terms)
+
+
+def test_what_is_past_shares_its_states_and_its_scale(plain):
+    trace, scales = plain.question.trace, plain.question.scales
+    past = [t.candidate for t in basis(trace, scales) if t.variable == "the past of u"]
+    made, shapes = lifted(past)
+    assert len(shapes) == 2
+    assert len(augment(trace, made).state_symbols) == len(trace.state_symbols) + 3
+
+
+def test_the_score_of_what_is_past_is_the_exact_one(plain):
+    """In a linear model, of a function of the input: r' S^-1 (y - m), r the response of y."""
+    question, e = plain.question, plain.experiments[0]
+    (k,) = [i for i, t in enumerate(question.terms) if t.candidate.effect.name == "past 2 of u"]
+    scale = question.scales.scale["u"]
+    u, y = e.u[:, 0], e.y[:, 0]
+    t = np.arange(STEPS)
+    first, second, response, mean, cov = 0.0, 0.0, [0.0], [0.0], np.eye(STEPS)
+    for row in range(STEPS - 1):
+        response.append(0.8 * response[-1] + second)
+        mean.append(0.8 * mean[-1] + 0.5 * u[row])
+        z = (u[row] - scale.mean) / scale.sd
+        first, second = first + (z - first) / REACH, second + (first - second) / REACH
+    var = np.array([0.8 ** (2 * s) + 0.04 * (1 - 0.8 ** (2 * s)) / (1 - 0.64) for s in t])
+    cov = np.minimum.outer(t, t)
+    cov = var[cov] * 0.8 ** np.abs(np.subtract.outer(t, t)) + 0.01 * np.eye(STEPS)
+    exact = np.array(response) @ np.linalg.solve(cov, y - np.array(mean))
+    assert plain.observed.basis[k] == pytest.approx(exact, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("variable", "missing"),
+    [("x and u", lambda x, w, u: 0.15 * x * u), ("the past of u", lambda x, w, u: 0.3 * w)],
+    ids=["product", "past"],
+)
+def test_what_no_curve_can_be_is_found(variable, missing):
+    screen = asked(simulated(missing, variable))
+    p, key = tables.residual_group(screen, ())
+    assert p <= 0.05
+    assert key == ("x", "mean")
+    assert variable in {t.variable for terms, _ in signal(screen, ()) for t in terms}
+    assert tables.missing_table(screen, key, ())["variable"].isin(["x", "u"]).all()
+
+
+def test_nothing_stands_out_of_a_right_model(plain):
+    """Not a claim about the level, which `test_familywise` has: that the size is that of chance."""
+    p, _ = tables.residual_group(plain, ())
+    assert p > 0.001
+
+
+def test_the_curves_are_orthonormal_for_normal_values():
+    nodes, weights = np.polynomial.hermite_e.hermegauss(60)
+    values = np.stack([c(nodes) for c in CURVES])
+    np.testing.assert_allclose(values @ np.diag(weights / weights.sum()) @ values.T, np.eye(4),
+                               atol=1e-9)  # fmt: skip
