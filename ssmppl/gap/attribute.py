@@ -8,7 +8,7 @@ as long as one stands out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.gap.byrefit import quick_enough, refit_p, worth_testing
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.familywise import threshold
+from ssmppl.gap.familywise import tail_p, threshold
 from ssmppl.gap.fit import Fit
 from ssmppl.gap.refit import Refit, Workshop, leading, pairs, refit_all
 from ssmppl.gap.screen import Question, Screen, ask
@@ -25,6 +25,7 @@ from ssmppl.gap.screen import Question, Screen, ask
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is asked
 FOLLOWERS = 3  # refits after a second screen
+ASKED_AGAIN = 12  # groups in a second screen, those of which the first promises most
 
 
 @dataclass
@@ -89,6 +90,21 @@ def attribute(
     out.chosen = chosen
     if significant and steps > 1:
         _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
+    if not quick:
+        _measure(out, _seed(seed, 5), kept)
+
+
+def _measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) -> None:
+    """Standard errors of what was chosen, from scores simulated at its fit."""
+    old = out.chosen
+    assert old is not None
+    numbers = kept.of(
+        "standard errors",
+        lambda: {"information": old.fitter.measured(old.fit, seed).information},
+    )
+    new = replace(old, fit=replace(old.fit, information=np.array(numbers["information"])))
+    out.chosen = new
+    out.refits = [new if r is old else r for r in out.refits]
 
 
 def _testable(workshop: Workshop, screen: Screen, train: Sequence[Experiment]) -> bool:
@@ -122,7 +138,7 @@ def _forward(
     chosen = out.chosen
     while chosen is not None and len(chosen.candidates) < steps:
         number = len(chosen.candidates)
-        rest = _others(screen, chosen.candidates)
+        rest = _others(screen, chosen)
         work = sum(e.steps for e in train) * workshop.settings.particles
         if not rest:
             return
@@ -137,14 +153,15 @@ def _forward(
         except ArgumentError as error:
             out.notes.append(f"whether a further effect is missing is not known: {error.found}")
             return
-        if float(np.min(again.family.p, initial=1.0)) > alpha:
+        largest = float(np.max(again.family.height, initial=0.0))
+        if tail_p(largest, screen.family.maxima) > alpha:  # few were asked, out of all
             return
         heads = leading(again)[:FOLLOWERS]
         more, _ = refit_all(
             workshop, chosen.fit, again, [[k] for k in heads], train, _seed(seed, 10 + number),
             own, "refitting", chosen.candidates,
         )  # fmt: skip
-        if not more or more[0].gain < needed_gain(again, alpha):
+        if not more or more[0].gain < needed_gain(screen, alpha):
             return
         best = more[0]
         strengths = {c.key: k for k, c in enumerate(screen.question.candidates)}
@@ -153,10 +170,26 @@ def _forward(
         out.chosen = chosen
 
 
-def _others(screen: Screen, chosen: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates that are not shapes of what was chosen."""
-    groups = {c.group for c in chosen}
-    return [c for c in screen.question.candidates if c.group not in groups]
+def _others(screen: Screen, chosen: Refit) -> list[Candidate]:
+    """The candidates of the groups that promise most beside what was chosen.
+
+    By the quadratic of the first screen: S~_j - V_jC V_CC^-1 S~_C and its variance.
+    """
+    groups, found = {c.group for c in chosen.candidates}, screen.found
+    at = list(chosen.index)
+    v, size = found.covariance, np.maximum(found.variance, 1e-300)
+    slopes = np.linalg.lstsq(v[np.ix_(at, at)], v[at], rcond=1e-6)[0]  # (C, K)
+    left = found.score - slopes.T @ found.score[at]
+    variance = size - np.einsum("ck,ck->k", slopes, v[at])
+    variance = np.maximum(variance, 0.02 * size)  # next to nothing: as good as the same effect
+    best: dict[str, float] = {}
+    for k, c in enumerate(screen.question.candidates):
+        if c.group in groups or found.status[k]:
+            continue
+        if found.sided[k] * left[k] >= 0.0:
+            best[c.group] = max(best.get(c.group, 0.0), float(left[k] ** 2 / variance[k]))
+    kept = sorted(best, key=lambda g: -best[g])[:ASKED_AGAIN]
+    return [c for c in screen.question.candidates if c.group in kept]
 
 
 def _screen_again(

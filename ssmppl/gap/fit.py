@@ -23,7 +23,7 @@ from ssmppl.gap.simulator import Simulator
 from ssmppl.gap.smoothing import Settings, Smoother
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.maximum.direct_optimization import climb
+from ssmppl.inference.maximum.direct_optimization import climb, observed_information
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
@@ -126,7 +126,7 @@ class Fitter:
     ) -> Fit:  # fmt: skip
         """The mode from `start`, or, unless that was `searched`, from a pilot's mode near it.
 
-        information : (F, F) on the unconstrained scale, to begin with; None: by simulation.
+        information : (P, P) of the parameters where it starts, about; None: by simulation.
         quick : no information is needed at the end.
 
         Raises
@@ -138,6 +138,8 @@ class Fitter:
         space = space_of(problem, self.fixed, dict(start))
         if isinstance(self.kalman, KalmanModel):
             return self._exactly(self.kalman, space, dict(start), seed, quick)
+        if information is not None:
+            information = self._unconstrained(space, space.theta, information, seed)
         if not searched:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
@@ -162,8 +164,10 @@ class Fitter:
         value = kalman.log_likelihood(problem.experiments, theta)
         size = len(space.where)
         information = np.full((size, size), np.nan)
-        if not quick:
-            information = self._simulated_information(space, theta, seed)
+        if not quick and size:
+            information = observed_information(setup, kalman, z)
+            if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] <= 0.0:
+                information = self._simulated_information(space, theta, seed)
         return Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged)
 
     def states(
@@ -188,7 +192,9 @@ class Fitter:
         if point.log_prior == -np.inf:
             return None
         try:
-            passes = self.smoother.run(space.problem.experiments, point.theta, stream)
+            passes = self.smoother.run(
+                space.problem.experiments, point.theta, stream, predicted=False
+            )
         except SamplingError:
             return None
         score = np.zeros(len(point.theta))
@@ -278,14 +284,31 @@ class Fitter:
         except SamplingError:
             return -np.inf
 
+    def measured(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
+        """The fit with an information matrix worth its name: that of scores simulated at it, where
+        its own was built up on the way."""
+        if self.exact:
+            return fit
+        return replace(fit, information=self._simulated_information(fit.space, fit.theta, seed))
+
+    def _unconstrained(
+        self, space: Space, theta: np.ndarray, information: np.ndarray,
+        seed: np.random.SeedSequence,
+    ) -> np.ndarray:  # fmt: skip
+        """(F, F) in z of a matrix (P, P) in theta, the prior's curvature included."""
+        setup = Setup(space.problem, at(space, theta), "posterior", self.fixed, {}, seed)
+        z = setup.space_at(theta)
+        jacobian = setup.chart.at(z).jacobian
+        curvature = setup.chart.curvature(z, np.zeros(len(theta)))
+        prior = -curvature.log_prior
+        values, vectors = np.linalg.eigh(0.5 * (prior + prior.T))
+        return jacobian.T @ information @ jacobian + (vectors * np.maximum(values, 0.0)) @ vectors.T
+
     def _simulated_information(
         self, space: Space, theta: np.ndarray, seed: np.random.SeedSequence
     ) -> np.ndarray:
         """(F, F) in z: mean square of the scores of data simulated at theta, prior included."""
         problem = space.problem
-        setup = Setup(problem, at(space, theta), "posterior", self.fixed, {}, seed)
-        z = setup.space_at(theta)
-        point = setup.chart.at(z)
         smoother = Smoother(
             self.columns, problem.program.missing, replace(self.settings, particles=PILOT_PARTICLES)
         )
@@ -298,12 +321,12 @@ class Fitter:
             stream = random_state(seed, 3, r)
             sets = simulator.sets(problem.experiments, theta, stream)
             try:
-                passes = smoother.run(sets, theta, stream)
+                passes = smoother.run(sets, theta, stream, predicted=False)
             except SamplingError:
                 return None
             score = np.zeros(len(theta))
             score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
-            return point.pull(score)
+            return score
 
         scores = [s for s in run_tasks(one, range(INFORMATION_SETS)) if s is not None]
         scores = [s for s in scores if np.all(np.abs(s) < LARGEST)]
@@ -314,10 +337,7 @@ class Fitter:
                 fix="give the parameters priors round plausible values, or fix known ones",
             )
         square = np.mean([np.outer(s, s) for s in scores], axis=0)
-        curvature = setup.chart.curvature(z, np.zeros(len(theta)))
-        prior = -curvature.log_prior
-        values, vectors = np.linalg.eigh(0.5 * (prior + prior.T))
-        return square + (vectors * np.maximum(values, 0.0)) @ vectors.T
+        return self._unconstrained(space, theta, square, seed)
 
 
 def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:

@@ -131,12 +131,33 @@ def refit(
     try:
         fitter = workshop.fitter(candidates)
         start = start_at(base, screen.question, screen.found, index)
-        fit = fitter.fit(train, seed, start, searched=True, quick=quick)
+        information = None if fitter.exact else _information(fitter, screen, index, train)
+        fit = fitter.fit(train, seed, start, searched=True, information=information, quick=quick)
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
     if not np.isfinite(fit.log_likelihood):
         return NotApplicable(f"{' and '.join(map(str, candidates))}: the likelihood is zero")
     return Refit(tuple(index), candidates, fitter, fit, fit.log_likelihood - base.log_likelihood)
+
+
+def _information(
+    fitter: Fitter, screen: Screen, index: Sequence[int], train: Sequence[Experiment]
+) -> np.ndarray | None:
+    """(P, P) of the fitter's parameters, from the simulated sets of the screen; None where a
+    strength scales a process, whose score at zero tells nothing."""
+    at, question = list(index), screen.question
+    if np.any(question.quadratic[at]):
+        return None
+    names = [repr(s) for s in question.columns.nuisance]
+    names += [question.candidates[k].strength for k in at]
+    scores = np.concatenate([screen.stacked("nuisance"), screen.stacked("columns")[:, at]], axis=1)
+    rows = [sum(e.steps for e in es) for es in (train, screen.experiments)]
+    found = scores.T @ scores / len(scores) * rows[0] / rows[1]
+    place = {repr(s): i for i, s in enumerate(fitter.problem.trace.parameter_symbols)}
+    own = np.array([place[n] for n in names])
+    out = np.zeros((len(place), len(place)))
+    out[np.ix_(own, own)] = found
+    return out
 
 
 def start_at(

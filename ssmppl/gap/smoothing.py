@@ -80,23 +80,25 @@ class Smoother:
         return Problem(self.columns.carried, (), self.program)
 
     def run(
-        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
-    ) -> list[Pass]:
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray,
+        *, predicted: bool = True,
+    ) -> list[Pass]:  # fmt: skip
         """A pass over each experiment at theta, the values of `columns.given`'s parameters.
 
-        The stream is advanced in place.
+        The stream is advanced in place. predicted : whether the predictions are wanted, which are
+        NaN where they are not and cost something.
 
         Raises
         ------
         SamplingError : all weights vanish, or are NaN; names the step and the parameters.
         """
-        return [self._one(e, theta, stream) for e in experiments]
+        return [self._one(e, theta, stream, predicted) for e in experiments]
 
-    def _one(self, e: Experiment, theta: np.ndarray, stream: np.ndarray) -> Pass:
+    def _one(self, e: Experiment, theta: np.ndarray, stream: np.ndarray, predicted: bool) -> Pass:
         given, data = theta, (e.y, e.seen, e.u)
         theta = given[: len(self.columns.base.parameter_symbols)]
         rows = np.empty((e.steps, len(self.columns.later)))
-        prediction = np.empty((e.steps, 4, e.y.shape[1]))
+        prediction = np.full((e.steps, 4, e.y.shape[1]), np.nan)
         if isinstance(self.kalman, KalmanModel):
             increments = self._exact(self.kalman, e, theta, prediction)
             # Antithetic: scores that are linear in the states come out exact.
@@ -115,7 +117,8 @@ class Smoother:
             system = particle_system(self.problem, own, settings, e, stream)
             particles, weights, ancestors = system.particles, system.weights, system.ancestors
             increments = system.log_increments
-            self.module.row_predictions(given, *data, particles, weights, stream, prediction)
+            if predicted:
+                self.module.row_predictions(given, *data, particles, weights, stream, prediction)
         self.module.row_scores(given, *data, particles, weights, ancestors, self.settings.lag, rows)
         return Pass(increments, rows, prediction)
 

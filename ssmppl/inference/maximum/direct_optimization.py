@@ -157,13 +157,22 @@ class ExactClimb:
         return gap
 
     def _curvature(self, z: np.ndarray) -> np.ndarray:
-        """Minus the second derivatives of the objective in z, (F, F)."""
-        point = self.setup.chart.at(z)
-        _, gradient = self.exact.score(point.theta)
-        information = self.exact.information(point.theta)
-        second = self.setup.chart.curvature(z, gradient)
-        out = point.jacobian.T @ information @ point.jacobian - second.theta
-        return out - second.log_prior if self.setup.with_prior else out
+        return _curvature(self.setup, self.exact, z)
+
+
+def observed_information(setup: Setup, kalman: KalmanModel, z: np.ndarray) -> np.ndarray:
+    """Minus the second derivatives of the objective in z (F,), (F, F), by the exact score."""
+    free = free_components(setup.problem.trace, setup.held)
+    theta = setup.chart.at(z).theta
+    return _curvature(setup, exact_score(kalman, setup.problem.experiments, free, theta), z)
+
+
+def _curvature(setup: Setup, exact: Any, z: np.ndarray) -> np.ndarray:
+    point = setup.chart.at(z)
+    _, gradient = exact.score(point.theta)
+    second = setup.chart.curvature(z, gradient)
+    out = point.jacobian.T @ exact.information(point.theta) @ point.jacobian - second.theta
+    return out - second.log_prior if setup.with_prior else out
 
 
 def _lowest(matrix: np.ndarray) -> float:
