@@ -1,13 +1,14 @@
-"""Effects that are functions of time: their dates, and their statistics from one column each.
+"""Effects that are functions of time: their dates and periods, their statistics from one column.
 
 The column of an increment held at 1 gives the statistic of any function of time as a weighted sum
-over its rows, so that every date of a break or of a pulse can be tried: it costs a sum.
+over its rows, so that every date of a break or of a pulse can be tried, and every period of a wave:
+it costs a sum.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,6 +20,9 @@ DATES = 60  # beyond
 EDGE = 0.1  # share of the rows at either end where no break can be told from a shift
 LEAST_EDGE = 2  # rows at either end without a pulse
 ONE_OFF = ("step", "pulse")  # profiles that have a date
+SHORTEST = 4.0  # period in rows
+WAVES = 100  # periods at most, the longest first
+PHASES = 3  # that are tried: a wave between two of them keeps three quarters of its nats
 
 
 def one_off(candidate: Candidate) -> bool:
@@ -27,13 +31,20 @@ def one_off(candidate: Candidate) -> bool:
 
 
 def dated(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
-    """With a candidate for every date (about `DATES` of them in long records) where there is one.
+    """With a candidate for every date (about `DATES` of them in long records) and for every period
+    and phase where there is one.
 
     rows : of the longest experiment.
     """
     out: list[Candidate] = []
     seen: set[str] = set()
     for c in candidates:
+        if c.effect.profile == "wave" and {"period", "phase"} <= set(dict(c.shape)):
+            if c.group not in seen:
+                seen.add(c.group)
+                out += [c.with_shape(period=float(p), phase=k * np.pi / PHASES)
+                        for p in periods(rows) for k in range(PHASES)]  # fmt: skip
+            continue
         if not one_off(c) or "date" not in dict(c.shape):
             out.append(c)
             continue
@@ -55,12 +66,39 @@ def dates(rows: int, profile: str) -> np.ndarray:
     return np.unique(np.linspace(first, last, count).round().astype(int))
 
 
+def periods(rows: int) -> np.ndarray:
+    """In rows: frequencies a half of the record's resolution apart, from one turn on."""
+    turns = np.arange(1.0, rows / SHORTEST, 0.5)[:WAVES]
+    return rows / turns if len(turns) else np.array([float(rows)])
+
+
+def sharpened(c: Candidate, column: np.ndarray, starts: Sequence[int], rows: int) -> Candidate:
+    """A wave with period and phase by the column (T,) of more rows than those it was found on.
+
+    rows : of the longest experiment it was found on, whose resolution is how far the frequency can
+    be off.
+    """
+    period = dict(c.shape)["period"]
+    longest = max(s.stop - s.start for s in segments(len(column), starts))
+    near = 1.0 / period + np.arange(-1.0, 1.0 + 1e-9, rows / (8.0 * longest)) / rows
+    near = near[(near >= 0.5 / longest) & (near <= 1.0 / SHORTEST)]
+    total = np.zeros(len(near), dtype=complex)
+    for s in segments(len(column), starts):
+        t = np.arange(1.0, s.stop - s.start + 1.0) - (c.change == "transition")
+        total += np.exp(2j * np.pi * np.outer(near, t)) @ column[s]
+    if not len(near):
+        return c
+    best = int(np.argmax(np.abs(total)))
+    return c.with_shape(period=1.0 / near[best], phase=float(np.angle(total[best])))
+
+
 @dataclass(frozen=True)
 class Profiles:
     """Candidates with a function of time, and the column (F) of each."""
 
     candidates: tuple[Candidate, ...]
     columns: tuple[int, ...]
+    known: dict[int, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     def statistics(self, rows: np.ndarray, starts: Sequence[int]) -> np.ndarray:
         """(K,) sums of the columns of rows (T, F), weighted by the functions of time."""
@@ -78,9 +116,17 @@ class Profiles:
             out[step] += onwards[at[step], places[step]]
             inside = pulse & (index < n)
             out[inside] += part[at[inside], places[inside]]
-            for k in np.flatnonzero(kind == ""):
-                out[k] += self.candidates[k].weights(n) @ part[:, places[k]]
+            other = np.flatnonzero(kind == "")
+            if len(other):
+                out[other] += np.sum(self._weights(n) * part[:, places[other]], axis=0)
         return out
+
+    def _weights(self, n: int) -> np.ndarray:
+        """(n, K) of those that are no one-off event."""
+        if n not in self.known:
+            plain = [c for c in self.candidates if not one_off(c)]
+            self.known[n] = np.stack([c.weights(n) for c in plain], axis=1)
+        return self.known[n]
 
 
 def _index(c: Candidate) -> int:

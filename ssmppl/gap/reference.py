@@ -30,6 +30,9 @@ from ssmppl.language.distributions import Normal
 
 GROUPS = 3  # of basis functions that are taken in, at most
 LEAST = 2.0  # mean z^2 of a group that is taken in
+ASTRAY = 1.0  # nats below the model without the groups, beyond Monte Carlo noise
+
+Values = dict[str, np.ndarray]
 
 
 def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term], float]]:
@@ -63,23 +66,33 @@ def fit_reference(
 ) -> tuple[Fitter, Fit]:  # fmt: skip
     """The superset, fitted from the fit of the model with the chosen effects.
 
+    A fit that comes out below where it started has gone astray (a feedback of what is past that
+    makes the model unstable): then with the best group alone, and at last with none.
+
     Raises
     ------
     SSMError : it cannot be fitted.
     """
-    fitter, begin = superset(workshop, chosen, start, screen)
+    groups = signal(screen, chosen)
+    for count in dict.fromkeys((len(groups), min(1, len(groups)))):
+        fitter, begin = superset(workshop, chosen, start, groups[:count])
 
-    def numbers() -> Numbers:
-        return fitter.fit(train, seed, begin, searched=True, quick=True).numbers
+        def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:
+            return fitter.fit(train, seed, begin, searched=True, quick=True).numbers
 
-    return fitter, fitter.restored(train, kept.of("reference", numbers))
+        stage = "reference" if count == len(groups) else "reference with one group"
+        fit = fitter.restored(train, kept.of(stage, numbers))
+        noise = 3.0 * np.hypot(fit.error, start.error)
+        if fit.log_likelihood >= start.log_likelihood - ASTRAY - noise:
+            return fitter, fit
+    return workshop.fitter(chosen), start
 
 
 def superset(
-    workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen
-) -> tuple[Fitter, dict[str, np.ndarray]]:
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit,
+    groups: Sequence[tuple[list[Term], float]],
+) -> tuple[Fitter, Values]:  # fmt: skip
     """The fitter of the superset, and where it starts."""
-    groups = signal(screen, chosen)
     candidates = [t.candidate for terms, _ in groups for t in terms]
     made, shapes = lift([*chosen, *candidates])
     widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}

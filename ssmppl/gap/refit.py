@@ -23,9 +23,11 @@ from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.efficient import Efficient
 from ssmppl.gap.fit import Fit, Fitter
+from ssmppl.gap.profiles import sharpened
 from ssmppl.gap.screen import Question, Screen, with_parameters
 from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import Problem
 from ssmppl.language.trace import Trace
 
@@ -120,14 +122,15 @@ def proposal_of(program: Program) -> str:
 
 def refit(
     workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
-    train: Sequence[Experiment], seed: np.random.SeedSequence, given: Sequence[Candidate] = (),
+    train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
     quick: bool = False,
 ) -> Refit | NotApplicable:  # fmt: skip
-    """Fit the model with the effects of `given`, as in `base`, and the screen's at `index`.
+    """Fit the model with the effects of `candidates`, of which the last are the screen's at
+    `index`, and the others are in `base`.
 
     quick : as in `Fitter.fit`; there are no standard errors then.
     """
-    candidates = (*given, *(screen.question.candidates[k] for k in index))
+    candidates = tuple(candidates)
     try:
         fitter = workshop.fitter(candidates)
         start = start_at(base, screen.question, screen.found, index)
@@ -173,6 +176,8 @@ def start_at(
         if question.quadratic[k]:
             value = np.sqrt(max(float(value), 1e-12))
         e = c.effect
+        if e.profile == "wave":  # its phase has been chosen so
+            value = abs(float(value))
         if np.isfinite(e.upper):  # between two bounds: well inside
             width = e.upper - e.lower
             value = np.clip(value, e.lower + 0.02 * width, e.upper - 0.02 * width)
@@ -224,23 +229,51 @@ def refit_all(
     given: Sequence[Candidate] = (), *, quick: bool = False,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
     """The refits that came to an end, best first, and why the others did not."""
+    shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
+    added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
     def one(k: int) -> Numbers:
         own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-        found = refit(workshop, base, screen, sets[k], train, own, given, quick)
+        found = refit(workshop, base, screen, sets[k], train, own, added[k], quick)
         if isinstance(found, NotApplicable):
             return {"reason": np.array(found.reason)}
         return found.fit.numbers
 
     done, reasons = [], []
-    for index, numbers in zip(sets, kept.each(stage, len(sets), one), strict=True):
+    results = kept.each(stage, len(sets), one)
+    for index, candidates, numbers in zip(sets, added, results, strict=True):
         if "reason" in numbers:
             reasons.append(str(numbers["reason"]))
             continue
-        candidates = (*given, *(screen.question.candidates[k] for k in index))
         fitter = workshop.fitter(candidates)
         fit = fitter.restored(train, numbers)
         gain = fit.log_likelihood - base.log_likelihood
         done.append(Refit(tuple(index), candidates, fitter, fit, gain))
     done.sort(key=lambda r: -r.gain)
     return done, reasons
+
+
+def _shaped(
+    base: Fit, screen: Screen, index: Sequence[int], train: Sequence[Experiment],
+    seed: np.random.SeedSequence,
+) -> dict[int, Candidate]:  # fmt: skip
+    """The candidates at `index`; waves among them with their period and phase by all rows that the
+    refits see, where a frequency that was near enough in the screen would lose its step."""
+    question = screen.question
+    out = {k: question.candidates[k] for k in index}
+    waves = [k for k, c in out.items() if c.effect.profile == "wave" and "period" in dict(c.shape)]
+    if not waves:
+        return out
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 9))
+    try:
+        passes = question.smoother.run(
+            train, question.theta(base.theta), random_state(own), predicted=False
+        )
+    except SSMError:
+        return out
+    rows = np.concatenate([p.rows for p in passes])
+    starts = np.cumsum([0, *(e.steps for e in train[:-1])]).tolist()
+    longest = max(e.steps for e in screen.experiments)
+    for k in waves:
+        out[k] = sharpened(out[k], rows[:, question.place[k]], starts, longest)
+    return out

@@ -173,7 +173,8 @@ def causes_table(
             error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
         if own is not None:
             strength, error = own.strengths[0], own.errors[c.strength]
-        shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in c.shape)
+        shaped = own.candidates[0].shape if own is not None else c.shape
+        shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in shaped)
         p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
             "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
