@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 
 from ssmppl.gap.candidates import offers
-from ssmppl.gap.profiles import ALL_DATES, DATES, Profiles, dated, dates, one_off
+from ssmppl.gap.profiles import (
+    ALL_DATES,
+    DATES,
+    PHASES,
+    SHORTEST,
+    WAVES,
+    Profiles,
+    dated,
+    dates,
+    one_off,
+    periods,
+    sharpened,
+)
 from ssmppl.language.trace import trace
 from tests.gap.harness import scales
 from tests.gap.small import level
@@ -56,3 +68,38 @@ def test_what_has_no_date_stays():
     drifts = [c for c in candidates if c.effect.name == "parameter drift"]
     assert len(drifts) == 2
     assert not any(map(one_off, drifts))
+
+
+@pytest.mark.parametrize("rows", [20, 100, 1000])
+def test_periods_leave_no_wave_unseen(rows):
+    """Of a wave of any period from `SHORTEST` (where all are tried) to the record's length and any
+    phase, some wave that is tried keeps half of the square of its correlation."""
+    found = periods(rows)
+    assert len(found) <= WAVES
+    assert found[0] == rows
+    assert found[-1] >= SHORTEST
+    rng = np.random.default_rng(seed_of("periods", rows))
+    t = np.arange(rows)
+    phases = np.pi / PHASES * np.arange(PHASES)
+    tried = np.cos(2 * np.pi * t / found[:, None, None] - phases[:, None]).reshape(-1, rows)
+    tried /= np.linalg.norm(tried, axis=1, keepdims=True)
+    for _ in range(50):
+        frequency = rng.uniform(1.0 / rows, 1.0 / found[-1])
+        wave = np.cos(2 * np.pi * frequency * t - rng.uniform(0, 2 * np.pi))
+        assert np.max(np.abs(tried @ wave)) ** 2 >= 0.5 * wave @ wave
+
+
+@pytest.mark.parametrize("starts", [[0], [0, 250]])
+def test_more_rows_sharpen_a_wave(starts):
+    (c,) = [c for c in offered(200) if c.effect.name == "periodic forcing"
+            and dict(c.shape) == {"period": 40.0, "phase": 0.0}]  # fmt: skip
+    truth = c.with_shape(period=38.3, phase=0.7)
+    ends = [*starts, 600]
+    column = np.concatenate([truth.weights(n) for n in np.diff(ends)])
+    column += np.random.default_rng(seed_of("sharpened")).standard_normal(600)
+    found = sharpened(c, column, starts, 200)
+    kept = np.concatenate([found.weights(n) for n in np.diff(ends)])
+    plain = np.concatenate([truth.weights(n) for n in np.diff(ends)])
+    assert np.corrcoef(kept, plain)[0, 1] > 0.95
+    coarse = np.concatenate([c.weights(n) for n in np.diff(ends)])
+    assert np.corrcoef(coarse, plain)[0, 1] < 0.8  # what the screen's own would have kept

@@ -154,7 +154,7 @@ def length_for(parameters, combination, name, repeats) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "combination",
-    some([pytest.param(c, id="-".join(map(str, c))) for c in COMBINATIONS], 4, EXHAUSTIVE),
+    some([pytest.param(c, id="-".join(map(str, c))) for c in COMBINATIONS], 3, EXHAUSTIVE),
 )
 def test_varves_table(exact_values, combination):
     """All 144 cells: six points, every filter, scheme and threshold.
@@ -290,7 +290,7 @@ def test_vector_observations_and_states():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("proposal", "gaps"), some([(p, g) for p in FILTERS for g in (False, True)], 2, EXHAUSTIVE)
+    ("proposal", "gaps"), some([(p, g) for p in FILTERS for g in (False, True)], 1, EXHAUSTIVE)
 )
 def test_lgss_table(exact_values, proposal, gaps):
     """Both series at three values of theta, every combination."""
