@@ -5,6 +5,7 @@
 #   make test       format, lint, types, tests
 #   make slow       the long statistical checks
 #   make exhaustive the same with whole tables and very long chains: hours
+#   make gap        the blind benchmark of the diagnosis on 24 of its sets, fast mode
 #   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
 #   make docs       the documentation, notebooks executed, warnings are errors
@@ -23,7 +24,7 @@ PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow exhaustive tables examples docs bench format clean
+.PHONY: help demo test slow exhaustive tables gap examples docs bench format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -66,6 +67,12 @@ exhaustive: $(VENV)/.installed-dev
 tables: $(VENV)/.installed-dev
 	SSMPPL_TABLE_REPEATS=2000 $(BIN)/python -m pytest -s -m 'slow or exhaustive' -k table -n $(WORKERS) \
 	    tests/statistics/test_likelihood.py
+
+gap: $(VENV)/.installed-dev
+	$(BIN)/python -m bench.gap.generate --subset ci
+	$(BIN)/python -m bench.gap.run --subset ci --mode fast --workers $(WORKERS)
+	$(BIN)/python -m bench.gap.score --subset ci --methods diagnose-fast \
+	    --require failed "false alarm"
 
 examples: $(VENV)/.installed-run
 	@mkdir -p build

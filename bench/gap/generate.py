@@ -1,6 +1,6 @@
 """The data sets and their sealed answers.
 
-    python -m bench.gap.generate [--ids t000 c013] [--check]
+    python -m bench.gap.generate [--ids t000 c013] [--subset ci] [--check]
 
 `sets/<id>/` holds what a user has: `data.csv` and `model.py`. `answers/<id>.txt` holds the sealed
 answer. `digests.csv` (committed) holds the digests of both; `--check` makes the sets again and
@@ -120,11 +120,14 @@ def read_digests() -> dict[str, tuple[str, str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ids", nargs="*")
+    parser.add_argument("--subset", choices=["ci"])
     parser.add_argument("--check", action="store_true", help="compare with the committed digests")
     options = parser.parse_args()
     table, known, lacking, differing = load(), read_digests(), [], []
     for entry in entries():
         if options.ids and entry.id not in options.ids:
+            continue
+        if options.subset and not entry.ci:
             continue
         try:
             name, data, answer = write(entry, table)

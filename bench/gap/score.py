@@ -1,7 +1,7 @@
 """Open the answers and score the records: the table of measures with binomial intervals.
 
     python -m bench.gap.score [--half confirm] [--subset ci] [--methods diagnose aic correlation]
-        [-o results.csv]
+        [-o results.csv] [--require "false alarm" failed]
 
 A rate misses its target if its 95% interval (Clopper and Pearson 1934) excludes it. Sets on which
 a method failed count as wrong, never as absent; sets not yet run are left out and counted.
@@ -279,6 +279,9 @@ def main() -> None:
     parser.add_argument("--subset", choices=["ci"])
     parser.add_argument("--methods", nargs="+", default=["diagnose"])
     parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument(
+        "--require", nargs="*", default=[], help="measures whose missed target is an error"
+    )
     options = parser.parse_args()
     ids = [
         e.id
@@ -298,6 +301,11 @@ def main() -> None:
     if options.output:
         frame = pd.DataFrame([{**vars(r), "missed": r.missed} for r in rows])
         frame.to_csv(options.output, index=False)
+    lacking = [r for r in rows if r.measure in options.require and (r.missed or not r.sets)]
+    unknown = set(options.require) - {r.measure for r in rows}
+    if lacking or unknown:
+        named = ", ".join([f"{r.method}: {r.measure}" for r in lacking] + sorted(unknown))
+        raise SystemExit(f"missed, or not measured: {named}")
 
 
 if __name__ == "__main__":
