@@ -70,7 +70,7 @@ tables: $(VENV)/.installed-dev
 
 gap: $(VENV)/.installed-dev
 	$(BIN)/python -m bench.gap.generate --subset ci
-	$(BIN)/python -m bench.gap.run --subset ci --mode fast --workers $(WORKERS)
+	$(BIN)/python -m bench.gap.run --subset ci --mode fast --workers $(WORKERS) --minutes 8
 	$(BIN)/python -m bench.gap.score --subset ci --methods diagnose-fast \
 	    --require failed "false alarm"
 

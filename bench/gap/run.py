@@ -1,7 +1,7 @@
 """Run the diagnosis on the data sets alone; what is done is kept, so that it can be resumed.
 
     python -m bench.gap.run [--half tuning] [--cell one-50] [--subset ci] [--mode full]
-        [--ids t000 c013] [--workers 2] [--limit 10]
+        [--ids t000 c013] [--workers 2] [--limit 10] [--minutes 60]
 
 A record stands under the digest of the method (the text of `ssmppl`) and of its set: a change of
 either makes it anew. Of the plan only ids are used here, to select; the answers are not opened.
@@ -10,6 +10,7 @@ either makes it anew. Of the plan only ids are used here, to select; the answers
 from __future__ import annotations
 
 import argparse
+import math
 import time
 import traceback
 from collections.abc import Callable
@@ -85,6 +86,10 @@ def diagnosed(
     return record
 
 
+def _before(stop: float, id: str, mode: str, method: str) -> Record | None:
+    return diagnosed(id, mode, method) if time.time() < stop else None
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--half", choices=list(SPLIT["halves"]))
@@ -94,6 +99,8 @@ def main() -> None:
     parser.add_argument("--mode", default="full", choices=["full", "fast"])
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--limit", type=int, help="stop after so many sets")
+    parser.add_argument("--minutes", type=float, default=math.inf,
+                        help="begin no set after so many minutes")  # fmt: skip
     options = parser.parse_args()
     ids = selected(options.half, options.cell, options.subset, options.ids)
     missing = [id for id in ids if not (SETS / id / "data.csv").exists()]
@@ -102,10 +109,13 @@ def main() -> None:
     ids = [id for id in ids if id not in missing][: options.limit]
     method = method_digest()
     print(f"method {method[:12]}, {len(ids)} sets, {options.mode} mode", flush=True)
+    stop = time.time() + 60.0 * options.minutes
     with ProcessPoolExecutor(options.workers) as pool:
-        jobs = [pool.submit(diagnosed, id, options.mode, method) for id in ids]
+        jobs = [pool.submit(_before, stop, id, options.mode, method) for id in ids]
         for k, job in enumerate(jobs):
             r = job.result()
+            if r is None:
+                continue
             first = f"{r.ranked[0].effect} on {r.ranked[0].equation}" if r.ranked else ""
             what = r.failed.splitlines()[-1] if r.failed else f"{r.verdict}: {first}"
             print(f"{k + 1}/{len(jobs)} {r.id} {r.seconds:6.1f} s  {what}", flush=True)

@@ -13,14 +13,15 @@ from itertools import combinations
 from typing import Any
 
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.expr import symbol
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import symbol, symbols_of
 from ssmppl.gap.anatomy import Anatomy, Part
 from ssmppl.gap.bases import Smooth, bases
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import Scales, slug
 from ssmppl.gap.effect import Auxiliary, Effect, numbers
 from ssmppl.gap.laws import has_scale, scale_of_mean
-from ssmppl.language.distributions import Dirac
+from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.trace import Trace
 
 MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
@@ -71,7 +72,8 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
         law = anatomy.law(part)
         if not isinstance(scale_of_mean(law), NotApplicable):
             kind = "transition" if state else "observation"
-            out += [_curve(part, "mean", kind, v, k, scales) for v in own for k in range(MEAN)]
+            read = own if state else _measured(anatomy.law(part), own)
+            out += [_curve(part, "mean", kind, v, k, scales) for v in read for k in range(MEAN)]
             if state:
                 out += _products(part, own, scales)
                 moving = [v for v in own if v in noisy or v.role == "input"]
@@ -79,6 +81,12 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
         if not isinstance(has_scale(law), NotApplicable):
             out += [_curve(part, "scale", "noise", v, k, scales) for v in own for k in range(SCALE)]
     return out
+
+
+def _measured(law: Distribution, states: Sequence[Part]) -> list[Part]:
+    """The states that a channel's law depends on; all of them where it depends on none."""
+    inside = symbols_of([e for p in law.parameters.values() for e in array(p).ravel()])
+    return [s for s in states if s.seen_from("observation") in inside] or list(states)
 
 
 def _curve(

@@ -34,6 +34,7 @@ from ssmppl.inference.runner import run_tasks
 MOST_STEPS = 20  # of the first phase
 NEAR = 1.0  # nats from the top where the first phase ends
 AVERAGED = 6  # steps of the second phase
+CLIFF = 30.0  # nats that a step of it may lose: Monte Carlo noise seldom explains more
 FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
 LARGEST = 1e100  # of a score: what is beyond is an overflow
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
@@ -235,14 +236,15 @@ class Fitter:
                 continue
             h = _update(h, step, g - new[1])
             z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
-        distance = np.inf
+        distance, size = np.inf, 1.0
         for k in range(AVERAGED):
             step = _step(h, g)
             distance = 0.5 * float(g @ step)
-            step *= min(1.0, FARTHEST / np.max(np.abs(step))) / (k + 1.0)
+            step *= size * min(1.0, FARTHEST / np.max(np.abs(step))) / (k + 1.0)
             new = self.gradient(space, z + step, stream)
-            if new is None:
-                break
+            if new is None or new[0] < value - CLIFF:
+                size *= 0.4
+                continue
             z, (value, g) = z + step, new
         theta = space.parameters(z)[0].copy()
         value, error = self.log_likelihood(space.problem.experiments, theta, seed)

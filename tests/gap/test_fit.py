@@ -94,3 +94,65 @@ def test_a_flat_start_is_fitted_as_a_vague_one():
         found.append(fitter.fit(problem.experiments, seed_sequence(1), {}))
     np.testing.assert_allclose(found[0].theta, found[1].theta, rtol=1e-4)
     np.testing.assert_allclose(found[0].information, found[1].information, rtol=1e-2)
+
+
+def second_derivatives(f, z, h=1e-3):
+    """(F, F) by central differences."""
+    size = len(z)
+    e = h * np.eye(size)
+    return np.array([
+        [(f(z + e[i] + e[j]) - f(z + e[i] - e[j]) - f(z - e[i] + e[j]) + f(z - e[i] - e[j]))
+         / (4 * h * h) for j in range(size)] for i in range(size)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_the_information_of_an_exact_fit_is_the_curvature_at_its_mode(name):
+    problem, exact = fitter_of(name, exact=True)
+    top = exact.fit(problem.experiments, seed_sequence(1), {})
+    curvature = -second_derivatives(lambda z: log_posterior(exact, top, z), top.z)
+    np.testing.assert_allclose(top.information, curvature, rtol=1e-3, atol=1e-3)
+
+
+def test_a_fit_may_start_with_an_information_matrix():
+    """That of the parameters, here the exact one: the mode is the same, and nothing is simulated
+    until the errors are asked for."""
+    problem, exact = fitter_of("level", exact=True)
+    _, particles = fitter_of("level", exact=False)
+    seed = seed_sequence(seed_of("information"))
+    top = exact.fit(problem.experiments, seed, {})
+    setup = Setup(top.problem, top.space, "posterior", {}, {}, np.random.SeedSequence(0))
+    back = np.linalg.inv(setup.chart.at(top.z).jacobian)
+    information = back.T @ top.information @ back
+    found = particles.fit(
+        problem.experiments, seed, top.start, searched=True, information=information
+    )
+    assert "simulator" not in particles.__dict__
+    lost = log_posterior(exact, top, top.z) - log_posterior(exact, top, found.z)
+    assert lost < 1.0
+    measured = particles.measured(found, seed)
+    assert "simulator" in particles.__dict__
+    # Expected, not observed: against that of the exact scores, each by 24 simulated sets.
+    expected = exact._simulated_information(top.space, top.theta, seed)
+    scale = 0.5 * np.log(np.diagonal(measured.information) / np.diagonal(expected))
+    assert np.all(np.abs(scale) < stats.norm.isf(LEVEL / 4) * np.sqrt(2 * 0.5 / 24))
+
+
+@pytest.mark.parametrize("after", [1, 3, 5])
+def test_a_step_over_a_cliff_is_taken_back(monkeypatch, after):
+    """Where the particles lose the data, the score sends the search to nowhere."""
+    problem, particles = fitter_of("level", exact=False)
+    seed = seed_sequence(seed_of("cliff"))
+    start = particles.fit(problem.experiments, seed, {}).start
+    whole, calls = particles.gradient, []
+
+    def gradient(space, z, stream):
+        calls.append(z)
+        value, slope = whole(space, z, stream)
+        return (value - 1e5, 1e5 * slope) if len(calls) == after + 1 else (value, slope)
+
+    monkeypatch.setattr(particles, "gradient", gradient)
+    found = particles.fit(problem.experiments, seed, start, searched=True)
+    assert len(calls) > after
+    assert np.max(np.abs(found.z - calls[0])) < 2.0
+    assert found.log_likelihood > -200.0
