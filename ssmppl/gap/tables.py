@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CURVE_POINTS = 41
+AT_BOUND = 1e-3  # standard errors of the screen, below which a one-sided strength is none
 STANDS_OUT = 3.0  # |z| of a region that is named
 
 
@@ -172,7 +173,10 @@ def causes_table(
             strength = float(np.sqrt(max(strength, 0.0)))
             error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
         if own is not None:
+            least = AT_BOUND * error
             strength, error = own.strengths[0], own.errors[c.strength]
+            if sided and abs(strength) < least:  # the search runs towards the bound for ever
+                strength, error = 0.0, np.nan
         shaped = own.candidates[0].shape if own is not None else c.shape
         shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in shaped)
         p = min(float(significant[k]), tested.get(k, 1.0))

@@ -1,0 +1,59 @@
+"""Rows of the report's tables that need care."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.catalogue_motion import periodic_forcing, quadratic_drag, random_walk_load
+from ssmppl.gap.tables import causes_table
+
+DRAG = Candidate(quadratic_drag, "v", strength="drag")
+LOAD = Candidate(random_walk_load, "v", strength="load")
+WAVE = Candidate(periodic_forcing, "v", (("period", 10.0), ("phase", 0.0)), strength="wave")
+
+
+def table(candidate, strength, variance, refits=(), *, sided=False, quadratic=False):
+    screen = SimpleNamespace(
+        question=SimpleNamespace(
+            candidates=[candidate], sided=np.array([int(sided)]), quadratic=np.array([quadratic])
+        ),
+        found=SimpleNamespace(
+            strength=np.array([strength]), variance=np.array([variance]), z=np.array([2.0]),
+            gain=np.array([2.0]),
+        ),
+        significant=np.array([0.2]), experiments=[SimpleNamespace(time=None)],
+    )  # fmt: skip
+    classes = SimpleNamespace(class_id=np.array([1]))
+    return causes_table(screen, refits, classes, [0], {}).iloc[0]
+
+
+def refitted(candidate, strength, error):
+    return SimpleNamespace(
+        index=(0,), candidates=(candidate,), strengths=[strength], gain=0.0,
+        errors={candidate.strength: error},
+    )  # fmt: skip
+
+
+def test_a_refit_at_its_bound_is_none():
+    row = table(DRAG, 0.5, 4.0, [refitted(DRAG, 1e-14, 1e-28)], sided=True)
+    assert row["estimate"] == 0.0
+    assert np.isnan(row["se"])
+    row = table(DRAG, 0.5, 4.0, [refitted(DRAG, 0.3, 0.1)], sided=True)
+    assert (row["estimate"], row["se"]) == (0.3, 0.1)
+
+
+def test_of_a_process_the_square_is_told():
+    """Strength sqrt(s) with error se(s) / (2 sqrt(s)); at s = 0 what one error of s would be."""
+    row = table(LOAD, 0.25, 100.0, sided=True, quadratic=True)
+    assert row["estimate"] == pytest.approx(0.5)
+    assert row["se"] == pytest.approx(0.1)
+    row = table(LOAD, 0.0, 100.0, sided=True, quadratic=True)
+    assert row["se"] == pytest.approx(np.sqrt(0.1))
+
+
+def test_shapes_are_those_of_the_refit():
+    found = refitted(WAVE.with_shape(period=9.5, phase=1.0), 0.2, 0.1)
+    assert table(WAVE, 0.2, 4.0, [found])["form"] == "period = 9.5, phase = 1"
+    assert table(WAVE, 0.2, 4.0)["form"] == "period = 10, phase = 0"
