@@ -17,7 +17,12 @@ import textwrap
 import tokenize
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any
+
+# Python's own parser counts its depth for all threads together: two at once can fail with "AST
+# constructor recursion depth mismatch" (python/cpython issue 106905).
+_ONE_AT_A_TIME = Lock()
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,11 @@ class Specialised:
 
 def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]) -> Specialised:
     """The text of `function`, renamed, without the parameters in `bound`, which stand for text."""
+    with _ONE_AT_A_TIME:
+        return _specialised(function, name, bound)
+
+
+def _specialised(function: Callable[..., Any], name: str, bound: Mapping[str, str]) -> Specialised:
     plain = getattr(function, "py_func", inspect.unwrap(function))
     source = _decided(inspect.getsource(plain), plain.__globals__, bound)
     tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))

@@ -1,5 +1,9 @@
 """Kernels' text with a model's names in it, and without the branches that the model decides."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+from ssmppl.codegen import specialise as module
 from ssmppl.codegen.specialise import specialise
 
 NONE, SOME = 0, 1
@@ -58,3 +62,22 @@ def test_what_is_not_needed_is_not_in_the_text():
     assert "total += 7" in made
     assert "# before" in made
     assert text("SOME", "(2, 9)").count("if") == 1
+
+
+def test_threads_do_not_parse_at_the_same_time(monkeypatch):
+    """Python's parser fails now and then where they do, in 3.11."""
+    inside, most, decided = [], [], module._decided
+
+    def watched(*args):
+        inside.append(1)
+        time.sleep(0.005)
+        most.append(len(inside))
+        out = decided(*args)
+        inside.pop()
+        return out
+
+    monkeypatch.setattr(module, "_decided", watched)
+    with ThreadPoolExecutor(4) as pool:
+        texts = list(pool.map(lambda _: text("NONE", "(0, 7)"), range(8)))
+    assert len(set(texts)) == 1
+    assert max(most) == 1
