@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ssmppl.data import check_parameters
 from ssmppl.gap import reference
@@ -16,6 +17,7 @@ from tests.gap.test_basis import THETA, asked, simulated
 FIXED = {n: np.asarray(v) for n, v in THETA.items() if n != "phi"}
 
 
+@pytest.mark.slow
 def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     screen = asked(simulated(lambda x, w, u: 0.15 * x * u, "x and u"))
     trace, missing = screen.question.trace, screen.question.smoother.missing
