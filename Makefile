@@ -5,7 +5,7 @@
 #   make test       format, lint, types, tests
 #   make slow       the long statistical checks
 #   make exhaustive the same with whole tables and very long chains: hours
-#   make gap        the blind benchmark of the diagnosis on 24 of its sets, fast mode
+#   make gap        the blind benchmark of the diagnosis: of 24 sets what eight minutes allow
 #   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
 #   make docs       the documentation, notebooks executed, warnings are errors

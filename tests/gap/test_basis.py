@@ -102,15 +102,16 @@ def test_the_score_of_what_is_past_is_the_exact_one(plain):
     scale = question.scales.scale["u"]
     u, y = e.u[:, 0], e.y[:, 0]
     t = np.arange(STEPS)
-    first, second, response, mean, cov = 0.0, 0.0, [0.0], [0.0], np.eye(STEPS)
+    first, second, response, mean = 0.0, 0.0, [0.0], [0.0]
     for row in range(STEPS - 1):
         response.append(0.8 * response[-1] + second)
         mean.append(0.8 * mean[-1] + 0.5 * u[row])
         z = (u[row] - scale.mean) / scale.sd
         first, second = first + (z - first) / REACH, second + (first - second) / REACH
     var = np.array([0.8 ** (2 * s) + 0.04 * (1 - 0.8 ** (2 * s)) / (1 - 0.64) for s in t])
-    cov = np.minimum.outer(t, t)
-    cov = var[cov] * 0.8 ** np.abs(np.subtract.outer(t, t)) + 0.01 * np.eye(STEPS)
+    cov = var[np.minimum.outer(t, t)] * 0.8 ** np.abs(np.subtract.outer(t, t)) + 0.01 * np.eye(
+        STEPS
+    )
     exact = np.array(response) @ np.linalg.solve(cov, y - np.array(mean))
     assert plain.observed.basis[k] == pytest.approx(exact, rel=1e-6)
 
@@ -124,13 +125,14 @@ def test_what_no_curve_can_be_is_found(variable, missing):
     screen = asked(simulated(missing, variable))
     p, key = tables.residual_group(screen, ())
     assert p <= 0.05
-    assert key == ("x", "mean")
+    assert key[0] == "x"  # its mean or, since q is held, its scale: which, hangs on the data set
     assert variable in {t.variable for terms, _ in signal(screen, ()) for t in terms}
-    assert tables.missing_table(screen, key, ())["variable"].isin(["x", "u"]).all()
+    curves = tables.missing_table(screen, ("x", "mean"), ())
+    assert set(curves["variable"]) == {"x", "u"}
 
 
 def test_nothing_stands_out_of_a_right_model(plain):
-    """Not a claim about the level, which `test_familywise` has: that the size is that of chance."""
+    """No claim about the level: only that it does not cry out."""
     p, _ = tables.residual_group(plain, ())
     assert p > 0.001
 

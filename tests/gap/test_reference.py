@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.data import check_parameters
 from ssmppl.gap import reference
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.fit import Fitter
@@ -25,7 +24,6 @@ def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     start = {n: np.asarray(v) for n, v in THETA.items()}
     base = workshop.fitter(())
     train = list(screen.experiments)
-    check_parameters(trace, THETA)
     fit = base.fit(train, seed_sequence(1), start, searched=True)
     groups = reference.signal(screen, ())
     assert groups

@@ -157,7 +157,7 @@ def length_for(parameters, combination, name, repeats) -> int:
     some([pytest.param(c, id="-".join(map(str, c))) for c in COMBINATIONS], 3, EXHAUSTIVE),
 )
 def test_varves_table(exact_values, combination):
-    """All 144 cells: six points, every filter, scheme and threshold.
+    """144 cells with all combinations: six points, every filter, scheme and threshold.
 
     On all 634 rows where that is affordable, else on the first 200 or 100: the line of each cell
     says which, and the exact value of a shorter series is that of the point-mass filter.
