@@ -18,7 +18,7 @@ CONSTANT, THETA, STEP, PARTICLE = 0, 1, 2, 3
 LEVELS = {
     "parameter": THETA, "time": STEP, "time_prev": STEP, "input": STEP, "input_prev": STEP,
     "observation": STEP, "observation_prev": STEP, "seen": STEP,
-    "state": PARTICLE, "state_prev": PARTICLE,
+    "guide": STEP, "state": PARTICLE, "state_prev": PARTICLE, "noise": PARTICLE,
 }  # fmt: skip
 
 
@@ -37,16 +37,19 @@ class Target:
 
 
 class Layout:
-    """Where each symbol of a trace stands in the arrays that the kernels pass round."""
+    """Where each symbol of a trace stands in the arrays that the kernels pass round.
 
-    def __init__(self, trace: Trace):
+    guide : symbols of the twisted proposal's guide, which stand behind the inputs of a row.
+    """
+
+    def __init__(self, trace: Trace, guide: Sequence[Expr] = ()):
         self.trace = trace
         self.place: dict[tuple[str, Expr], int] = {}
         order = {
             "parameter": trace.parameter_symbols,
             "state": trace.state_symbols,
             "observation": trace.observation_symbols,
-            "input": trace.input_symbols,
+            "input": (*trace.input_symbols, *guide),
         }
         self.index: dict[tuple[str, tuple], int] = {
             (kind, s.data[1:]): i for kind, symbols in order.items() for i, s in enumerate(symbols)
@@ -60,6 +63,7 @@ class Layout:
         if kind == "time_prev":
             return f"{row} + 0.0"
         base = kind.removesuffix("_prev")
+        base = {"guide": "input"}.get(base, base)
         column = self.index[("observation" if base == "seen" else base, (name, index))]
         if base == "parameter":
             return f"theta[{column}]"
@@ -102,7 +106,7 @@ class Section:
         """A function that loops over particles and writes `targets` for each.
 
         accumulate : name of the array that targets with guards add up in; it starts at 0.
-        scalars : state symbols bound to array elements instead of to the particles' rows.
+        scalars : symbols bound to array elements instead of to the particles' rows.
         """
         scalars = scalars or {}
         if accumulate:
@@ -169,7 +173,7 @@ class Section:
     ) -> None:  # fmt: skip
         """Name the rows of the particles' arrays that the loop reads."""
         for node in topological_until(roots, names):
-            if node.op != "symbol" or not node.data[0].startswith("state"):
+            if node.op != "symbol" or level_of(node) != PARTICLE:
                 continue
             if node in scalars:
                 names[node] = reserved.fresh(symbol_name(node))

@@ -11,6 +11,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,6 +20,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.structure import check_start, deterministic_memory
+from ssmppl.analysis.twisted import twisted
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
 from ssmppl.codegen.kernels.backward_pairs import (
@@ -42,6 +44,7 @@ from ssmppl.codegen.kits import (
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.codegen.twisted import TwistedFilter, compile_twisted
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.trace import Trace
 
@@ -62,6 +65,11 @@ class Program:
     def __reduce__(self):  # another process generates the module again, or finds it in its cache
         return compile_trace, (self.trace, self.missing)
 
+    @cached_property
+    def twisted(self) -> TwistedFilter | NotApplicable:
+        """The twisted filter, in a module of its own; generated when it is first asked for."""
+        return compile_twisted(self.trace, self.missing)
+
     def source(self) -> str:
         """The generated Python module, commented with the user's lines."""
         return self.text
@@ -78,6 +86,8 @@ class Program:
         ------
         ArgumentError : it belongs to a proposal that could not be derived; gives the reason.
         """
+        if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
+            return self.twisted.entry(name.removesuffix("_twisted"))
         if not hasattr(self.module, name):
             for proposal, found in self.proposals.items():
                 if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
@@ -104,7 +114,7 @@ def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
     program = _programs.get(key)
     if program is None:
         check_start(trace)
-        proposals = derive(trace, missing)
+        proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
         text = _write(trace, missing, proposals)
         module = cache.load(identifier(trace.name), text)
         program = Program(trace, missing, proposals, text, module)
@@ -127,7 +137,7 @@ def _write(trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotAp
     out.add("simulation", simulation)
     out.algorithm(simulate, "simulate", simulation, "entry")
     for name, proposal in proposals.items():
-        if isinstance(proposal, NotApplicable) or not trace.observations:
+        if isinstance(proposal, NotApplicable) or not trace.observations or name == "twisted":
             continue
         section = filter_kit(layout, proposal)
         conditional_passes(trace, layout, section, plain)

@@ -90,14 +90,14 @@ def separating(
     question, columns = screen.question, np.array(members, dtype=int)
     inputs = simple_inputs(screen.experiments)
     whole = question.theta(screen.theta)
-    carried = whole[: len(question.columns.carried.parameter_symbols)]
+    own = whole[: len(question.columns.base.parameter_symbols)]
     names = list(inputs)
 
     def one(k: int) -> Numbers:
         number, which = divmod(k, len(names))
         stream = random_state(seed, which, number)
         try:
-            data = question.simulator.sets(inputs[names[which]], carried, stream)
+            data = question.simulator.sets(inputs[names[which]], own, stream)
             passes = question.smoother.run(data, whole, stream)
         except SamplingError:
             return {}

@@ -74,10 +74,10 @@ def _gain(
     """Of one simulated data set; NaN where a fit failed."""
     question, plain = screen.question, workshop.fitter(())
     whole = question.theta(screen.theta)
-    carried = whole[: len(question.columns.carried.parameter_symbols)]
+    given = whole[: len(question.columns.base.parameter_symbols)]
     own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 100, k))
     try:
-        data = question.simulator.sets(screen.experiments, carried, stream)
+        data = question.simulator.sets(screen.experiments, given, stream)
         fit = plain.fit(data, own, base.start, searched=True, quick=True)
         at = question.theta(fit.theta)
         passes = question.smoother.run(data, at, stream)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ssmppl.inference.runner import run_tasks
 
 RUNS = 8  # of the particle filter
 FREE_RUNS = 100  # simulations behind a free run
+STRETCH, MOST_STRETCHES = 5, 40  # rows, number: what is told apart of the held-out rows
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,14 @@ def predict(
     """Filter all rows from the first with the fitted parameters, and keep those that count."""
 
     def one(r: int) -> list[Pass]:
-        return fitter.smoother.run(experiments, fit.theta, random_state(seed, 6, r))
+        stream = random_state(seed, 6, r)
+        passes = fitter.smoother.run(experiments, fit.theta, stream)
+        if fitter.exact or fitter.settings.proposal != "twisted":
+            return passes
+        return [
+            replace(p, log_increments=stretches(fitter, fit, e, c, stream))
+            for p, e, c in zip(passes, experiments, counts, strict=True)
+        ]
 
     repeats = 1 if fitter.exact else runs
     passes = run_tasks(one, range(repeats))
@@ -56,6 +65,30 @@ def predict(
     if repeats < runs:  # exact: no spread between runs
         density = np.repeat(density, runs, axis=0)
     return Predictions(density, means.mean(axis=0), spread.mean(axis=0), y, starts)
+
+
+def stretches(
+    fitter: Fitter, fit: Fit, e: Experiment, counts: np.ndarray, stream: np.ndarray
+) -> np.ndarray:
+    """(T,) log predictive densities of stretches of the rows that count, spread evenly over each.
+
+    The twisted filter tells log p(y_{1:t}) well for the t up to which it looks ahead, and for no
+    other: so it is run up to the end of every stretch.
+    """
+    out = np.zeros(e.steps)
+    length = max(STRETCH, -(-int(counts.sum()) // MOST_STRETCHES))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], counts, [False]])))
+    for first, last in edges.reshape(-1, 2):
+        ends = [*range(first, last, length), last]
+        log_z = [fitter.estimate(_until(e, end), fit.theta, stream) if end else 0.0
+                 for end in ends]  # fmt: skip
+        for (a, b), gained in zip(pairwise(ends), np.diff(log_z), strict=True):
+            out[a:b] = gained / (b - a)
+    return out
+
+
+def _until(e: Experiment, end: int) -> list[Experiment]:
+    return [replace(e, y=e.y[:end], seen=e.seen[:end], u=e.u[:end], steps=int(end))]
 
 
 def gain_of_mean(base: Predictions, other: Predictions) -> float:

@@ -40,6 +40,7 @@ from ssmppl.language.model import Model
 
 SETS = {"fast": 100, "full": 200}  # simulated data sets
 PARTICLES = {"fast": 500, "full": 1000}
+TWISTED_PARTICLES = {"fast": 150, "full": 200}  # a few that know where to go do more
 
 
 def diagnose(
@@ -68,7 +69,8 @@ def diagnose(
         augmented model.
     alpha : family-wise error rate of every verdict.
     fixed : values of known parameters.
-    particles : of the particle filters; None: 500 in fast mode, 1000 in full mode.
+    particles : of the particle filters; None: 500 in fast mode, 1000 in full mode, 150 and 200
+        where the twisted proposal applies.
     executor : any `concurrent.futures.Executor` that runs in this process; None: threads.
     checkpoint : a file, or a folder, that keeps what is done: the same call again goes on from
         there and gives the same report. None: nothing is kept.
@@ -116,8 +118,9 @@ class _Diagnosis:
         missing = self.problem.program.missing
         if mode == "full" and self.parts is None:  # blocks of rows will be set missing
             missing = replace(missing, none=False)
-        number = particles or PARTICLES[mode]
-        self.settings = Settings(number, proposal_of(self.problem.program))
+        proposal = proposal_of(self.problem.program)
+        number = particles or (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)[mode]
+        self.settings = Settings(number, proposal)
         self.workshop = Workshop(self.trace, missing, self.fixed, self.settings)
         self.notes: list[str] = []
         described = {

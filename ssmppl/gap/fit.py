@@ -39,6 +39,7 @@ FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordi
 LARGEST = 1e100  # of a score: what is beyond is an overflow
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
 PILOT_PARTICLES = 300
+PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
 NUMBERS = (
     "theta", "z", "log_likelihood", "error", "information", "distance", "converged",
 )  # fmt: skip
@@ -99,6 +100,11 @@ class Fitter:
         self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
 
     @property
+    def few(self) -> int:
+        """Particles where a rough answer will do."""
+        return min(PILOT_PARTICLES, self.settings.particles)
+
+    @property
     def exact(self) -> bool:
         return isinstance(self.kalman, KalmanModel)
 
@@ -144,7 +150,7 @@ class Fitter:
         if not searched:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
-                return self._estimate(problem, theta, PILOT_PARTICLES, random_state(seed))
+                return self._estimate(problem, theta, self.few, random_state(seed))
 
             z, _ = climb_to_mode(space, seed, estimate)
             space = at(space, space.parameters(z)[0].copy())
@@ -177,9 +183,8 @@ class Fitter:
         """(T, draws, D) draws of each x_t: of trajectories where exact, else filtered."""
         if isinstance(self.kalman, KalmanModel):
             return np.swapaxes(self.kalman.draw(e, theta, stream, draws), 0, 1)
-        settings = FilterSettings(self.settings.particles, self.settings.proposal)
-        system = particle_system(self.problem, theta, settings, e, stream)
-        cumulative = np.cumsum(system.weights, axis=1)
+        system, weights = self.smoother.system(e, theta, stream)
+        cumulative = np.cumsum(weights, axis=1)
         levels = (np.arange(draws) + 0.5) / draws
         index = np.stack([np.searchsorted(c, levels * c[-1]) for c in cumulative])
         return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
@@ -258,17 +263,29 @@ class Fitter:
         if isinstance(self.kalman, KalmanModel):
             return self.kalman.log_likelihood(experiments, theta), 0.0
         problem = replace(self.problem, experiments=tuple(experiments))
-        n = self.settings.particles
+        value, error = -np.inf, 0.0
+        for doubling in range(DOUBLINGS + 1):
+            n = self.settings.particles * 2**doubling
 
-        def one(r: int) -> float:
-            return self._estimate(problem, theta, n, random_state(seed, 2, r))
+            def one(r: int, n: int = n, doubling: int = doubling) -> float:
+                return self._estimate(problem, theta, n, random_state(seed, 2, r, doubling))
 
-        log_z = np.array(run_tasks(one, range(repeats)))
-        if not np.any(log_z > -np.inf):
-            return -np.inf, 0.0
-        share = np.exp(log_z - log_z.max())
-        error = float(share.std(ddof=1) / share.mean() / np.sqrt(repeats))
-        return float(log_z.max() + np.log(share.mean())), error
+            log_z = np.array(run_tasks(one, range(repeats)))
+            if not np.any(log_z > -np.inf):
+                return -np.inf, 0.0
+            share = np.exp(log_z - log_z.max())
+            error = float(share.std(ddof=1) / share.mean() / np.sqrt(repeats))
+            value = float(log_z.max() + np.log(share.mean()))
+            if error <= PRECISE:
+                break
+        return value, error
+
+    def estimate(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
+    ) -> float:
+        """One estimate of log p(y | theta), -inf where there is none."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        return self._estimate(problem, theta, self.settings.particles, stream)
 
     def _estimate(
         self, problem: Problem, theta: np.ndarray, particles: int, stream: np.ndarray
@@ -312,7 +329,7 @@ class Fitter:
         """(F, F) in z: mean square of the scores of data simulated at theta, prior included."""
         problem = space.problem
         smoother = Smoother(
-            self.columns, problem.program.missing, replace(self.settings, particles=PILOT_PARTICLES)
+            self.columns, problem.program.missing, replace(self.settings, particles=self.few)
         )
         smoother.__dict__.update(
             {k: getattr(self.smoother, k) for k in ("program", "module", "problem")}

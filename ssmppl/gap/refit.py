@@ -113,11 +113,15 @@ def lift(candidates: Sequence[Candidate]) -> tuple[list[Candidate], dict[str, fl
 
 
 def proposal_of(program: Program) -> str:
-    """The proposal of a program's filters: with an exact look-ahead where there is one."""
+    """The proposal of a program's filters: the user's, the twisted one, or the best there is."""
+    if "user" in program.proposals:
+        return "user"
+    if not isinstance(program.proposals.get("twisted"), NotApplicable):
+        return "twisted"
     found = program.proposals.get("auxiliary")
     if found is not None and not isinstance(found, NotApplicable) and found.exact_look_ahead:
         return "auxiliary"
-    return "user" if "user" in program.proposals else "bootstrap"
+    return "bootstrap"
 
 
 def refit(

@@ -239,14 +239,14 @@ def ask(
     """
     smoother, whole = question.smoother, question.theta(theta)
     _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
-    carried = whole[: len(question.columns.carried.parameter_symbols)]
+    given = whole[: len(question.columns.base.parameter_symbols)]
 
     def one(number: int) -> Numbers:
         stream = random_state(seed, number)
         data = list(experiments)
         try:
             if number >= OWN_RUNS:
-                data = question.simulator.sets(experiments, carried, stream)
+                data = question.simulator.sets(experiments, given, stream)
             passes = smoother.run(data, whole, stream)
         except SamplingError:
             if number < OWN_RUNS:

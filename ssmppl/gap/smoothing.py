@@ -1,7 +1,8 @@
 """One pass over the data: log-likelihood, smoothed scores row by row, one-step predictions.
 
-Exact draws of the trajectories where the model is linear and Gaussian, else a particle filter with
-fixed-lag smoothing over its genealogy; see `codegen/kernels/row_scores.py`.
+Exact draws of the trajectories where the model is linear and Gaussian, else a particle filter,
+twisted where the model allows it, with fixed-lag smoothing over its genealogy; see
+`codegen/kernels/row_scores.py`.
 """
 
 from __future__ import annotations
@@ -15,19 +16,21 @@ import numpy as np
 from scipy.special import ndtr
 
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen.kernels.random import fill_uniform
+from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.codegen.row_scores import compile_row_scores
+from ssmppl.codegen.twisted import TwistedFilter
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
 from ssmppl.gap.columns import Columns
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
-from ssmppl.inference.particles.backward import particle_system
+from ssmppl.inference.particles.backward import ParticleSystem, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.problem import Problem
 
 LAG = 40
 DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
+PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
 
 
 @dataclass(frozen=True)
@@ -64,12 +67,12 @@ class Smoother:
 
     @cached_property
     def program(self) -> Program:
-        return compile_trace(self.columns.carried, self.missing)
+        return compile_trace(self.columns.base, self.missing)
 
     @cached_property
     def module(self) -> ModuleType:
         c = self.columns
-        return compile_row_scores(c.given, c.initial, c.later, self.missing, c.follows)
+        return compile_row_scores(c.given, c.base, c.initial, c.later, self.missing, c.follows)
 
     @cached_property
     def kalman(self) -> KalmanModel | NotApplicable:
@@ -77,7 +80,7 @@ class Smoother:
 
     @cached_property
     def problem(self) -> Problem:
-        return Problem(self.columns.carried, (), self.program)
+        return Problem(self.columns.base, (), self.program)
 
     def run(
         self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray,
@@ -96,31 +99,74 @@ class Smoother:
 
     def _one(self, e: Experiment, theta: np.ndarray, stream: np.ndarray, predicted: bool) -> Pass:
         given, data = theta, (e.y, e.seen, e.u)
-        theta = given[: len(self.columns.base.parameter_symbols)]
+        own = given[: len(self.columns.base.parameter_symbols)]
         rows = np.empty((e.steps, len(self.columns.later)))
         prediction = np.full((e.steps, 4, e.y.shape[1]), np.nan)
         if isinstance(self.kalman, KalmanModel):
-            increments = self._exact(self.kalman, e, theta, prediction)
+            increments = self._exact(self.kalman, e, own, prediction)
             # Antithetic: scores that are linear in the states come out exact.
-            paths = self.kalman.draw(e, theta, stream, DRAWS // 2)
-            paths = np.concatenate([paths, 2.0 * self.kalman.smooth(e, theta).mean - paths])
-            size = len(self.columns.carried.state_symbols)
-            particles = np.zeros((e.steps, size, DRAWS))
-            particles[:, : paths.shape[2]] = np.moveaxis(paths, 0, 2)
-            if self.columns.follows:
-                self.module.complete_rows(given, *data, particles)
+            paths = self.kalman.draw(e, own, stream, DRAWS // 2)
+            paths = np.concatenate([paths, 2.0 * self.kalman.smooth(e, own).mean - paths])
+            found = np.moveaxis(paths, 0, 2)
             weights = np.full((e.steps, DRAWS), 1.0 / DRAWS)
             ancestors = np.broadcast_to(np.arange(DRAWS, dtype=np.int32), weights.shape).copy()
         else:
-            settings = FilterSettings(self.settings.particles, self.settings.proposal)
-            own = given[: len(self.columns.carried.parameter_symbols)]
-            system = particle_system(self.problem, own, settings, e, stream)
-            particles, weights, ancestors = system.particles, system.weights, system.ancestors
-            increments = system.log_increments
+            system, weights = self.system(e, own, stream)
+            found, ancestors, increments = system.particles, system.ancestors, system.log_increments
             if predicted:
-                self.module.row_predictions(given, *data, particles, weights, stream, prediction)
+                before = self._before_prediction(system, weights, e, own, stream)
+                self.module.row_predictions(given, *data, *before, stream, prediction)
+        particles = np.zeros((e.steps, len(self.columns.carried.state_symbols), found.shape[2]))
+        particles[:, : found.shape[1]] = found
+        if self.columns.follows:
+            self.module.complete_rows(given, *data, particles, ancestors)
         self.module.row_scores(given, *data, particles, weights, ancestors, self.settings.lag, rows)
         return Pass(increments, rows, prediction)
+
+    def system(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray
+    ) -> tuple[ParticleSystem, np.ndarray]:
+        """All particles of one run at theta (P,), and weights (T, N) for smoothing.
+
+        Under the twisted proposal those by which the next generation was drawn, which know all the
+        data: the filter's own tell what was known at a row, and few particles matter to them.
+        """
+        settings = FilterSettings(self.settings.particles, self.settings.proposal)
+        system = particle_system(self.problem, theta, settings, e, stream)
+        if self.settings.proposal != "twisted":
+            return system, system.weights
+        n = settings.particles
+        offspring = [np.bincount(a, minlength=n) / n for a in system.ancestors[1:]]
+        return system, np.array([*offspring, system.weights[-1]])
+
+    def _before_prediction(
+        self, system: ParticleSystem, weights: np.ndarray, e: Experiment, theta: np.ndarray,
+        stream: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Particles (T, D, N) and weights (T, N) that tell what was known at each row.
+
+        Of the filter itself; under the twisted proposal, whose particles know what comes later,
+        draws from the extended Kalman filter, in pairs mirrored at its mean.
+        """
+        if self.settings.proposal != "twisted":
+            return system.particles, system.weights
+        moments = self._twisted.filtered(theta, e.y, e.seen, e.u)
+        if moments is None:
+            return system.particles, system.weights
+        mean, covariance = moments
+        values, vectors = np.linalg.eigh(covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        normals = np.empty(mean.size * (PREDICTIVE // 2))
+        fill_normal(stream, normals)
+        away = root @ normals.reshape(*mean.shape, -1)
+        drawn = mean[:, :, None] + np.concatenate([away, -away], axis=2)
+        return drawn, np.full((e.steps, PREDICTIVE), 1.0 / PREDICTIVE)
+
+    @property
+    def _twisted(self) -> TwistedFilter:
+        found = self.program.twisted
+        assert isinstance(found, TwistedFilter)
+        return found
 
     def _exact(
         self, kalman: KalmanModel, e: Experiment, theta: np.ndarray, prediction: np.ndarray

@@ -77,20 +77,21 @@ class Normal(Distribution):
         sd = self.sd()
         return self.mean_ + _each(self, lambda i: sd[i] * draws.normal())
 
-    def _standard(self, value: Any) -> ExprArray:
+    def standard(self, value: Any) -> ExprArray:
+        """The standard normal draw behind a value."""
         return array((array(value) - self.mean_) / self.sd())
 
     def cdf(self, value):
-        return array(ew("ndtr", self._standard(value)))
+        return array(ew("ndtr", self.standard(value)))
 
     def survival(self, value):
-        return array(ew("ndtr", -self._standard(value)))
+        return array(ew("ndtr", -self.standard(value)))
 
     def log_cdf(self, value):
-        return array(ew("log_ndtr", self._standard(value)))
+        return array(ew("log_ndtr", self.standard(value)))
 
     def log_survival(self, value):
-        return array(ew("log_ndtr", -self._standard(value)))
+        return array(ew("log_ndtr", -self.standard(value)))
 
     def quantile(self, p):
         return self.mean_ + self.sd() * ew("ndtri", p)
@@ -102,7 +103,7 @@ class Normal(Distribution):
         self, lower: ExprArray, upper: ExprArray
     ) -> tuple[ExprArray | bool, ExprArray, ExprArray]:
         """(flip, a, b): the interval, standardised, mirrored where it lies above the mean."""
-        a, b = self._standard(lower), self._standard(upper)
+        a, b = self.standard(lower), self.standard(upper)
         whole_left, whole_right = self.open_sides(lower, upper)
         if whole_left:
             return False, a, b
@@ -167,6 +168,10 @@ class LogNormal(Distribution):
 
     def sample(self, draws):
         return array(ew("exp", self._log.sample(draws)))
+
+    def standard(self, value: Any) -> ExprArray:
+        """The standard normal draw behind a value."""
+        return self._log.standard(_log_of_positive(value))
 
     def mean(self):
         return array(ew("exp", self.mean_ + 0.5 * self.sd**2))

@@ -116,6 +116,13 @@ class MvNormal(_Joint):
             return cholesky(m)
         return array(lower_inverse(cholesky(m)).T)  # P = K K', so (K^-T)(K^-T)' = P^-1
 
+    def standard(self, value: Any) -> ExprArray:
+        """The standard normal draws (d,) behind a value."""
+        away = array(array(value) - self.mean_)
+        if self.spread == "precision":
+            return array(array(cholesky(self.parameters["precision"])).T @ away)
+        return array(lower_inverse(self.factor()) @ away)
+
     def sample(self, draws):
         z = array([draws.normal() for _ in range(len(self.mean_))])
         return array(self.mean_ + self.factor() @ z)

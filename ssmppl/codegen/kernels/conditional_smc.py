@@ -27,7 +27,10 @@ import numpy as np
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import (
     APPROXIMATE,
+    GUIDED,
+    GUIDED_SHARE,
     NO_LOOK_AHEAD,
+    PLAIN_SHARE,
     add,
     any_finite,
     copy,
@@ -141,7 +144,9 @@ def conditional_smc(
                 if status != OK:
                     copy(w, p)
                 elif ahead == APPROXIMATE:
-                    mix(p, w)
+                    mix(p, w, PLAIN_SHARE)
+                elif ahead == GUIDED:
+                    mix(p, w, GUIDED_SHARE)
             else:
                 copy(w, p)
             conditional_systematic(rng, p, keep, ancestors)
@@ -223,7 +228,9 @@ def filtered_path(
                 if status != OK:
                     copy(w, p)
                 elif ahead == APPROXIMATE:
-                    mix(p, w)
+                    mix(p, w, PLAIN_SHARE)
+                elif ahead == GUIDED:
+                    mix(p, w, GUIDED_SHARE)
             systematic(rng, p, ancestors)
             gather(history[t - 1], ancestors, x_prev)
             if sizes[5] > 0:

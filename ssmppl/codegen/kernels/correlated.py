@@ -20,7 +20,10 @@ from ssmppl.codegen.kernels.conditional_smc import draw_index
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import (
     APPROXIMATE,
+    GUIDED,
+    GUIDED_SHARE,
     NO_LOOK_AHEAD,
+    PLAIN_SHARE,
     add,
     any_finite,
     copy,
@@ -165,7 +168,9 @@ def correlated_path(
                 if status != OK:
                     copy(w, p)
                 elif ahead == APPROXIMATE:
-                    mix(p, w)
+                    mix(p, w, PLAIN_SHARE)
+                elif ahead == GUIDED:
+                    mix(p, w, GUIDED_SHARE)
             order_of(history[t - 1], order)
             ordered_systematic(to_uniform(points[t]), p, order, ancestors)
             gather(history[t - 1], ancestors, x_prev)

@@ -22,7 +22,10 @@ from ssmppl.codegen.kernels.conditional_smc import draw_index
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import (
     APPROXIMATE,
+    GUIDED,
+    GUIDED_SHARE,
     NO_LOOK_AHEAD,
+    PLAIN_SHARE,
     add,
     any_finite,
     copy,
@@ -133,7 +136,9 @@ def filter_with_score(
                 if status != OK:
                     copy(w, p)
                 elif ahead == APPROXIMATE:
-                    mix(p, w)
+                    mix(p, w, PLAIN_SHARE)
+                elif ahead == GUIDED:
+                    mix(p, w, GUIDED_SHARE)
             systematic(rng, p, ancestors)
             gather(history[t - 1], ancestors, x_prev)
             if sizes[5] > 0:

@@ -25,10 +25,11 @@ from ssmppl.codegen.kernels.resampling import PADDING, resample, systematic
 from ssmppl.codegen.kernels.summaries import summarise
 from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise
 
-NO_LOOK_AHEAD, APPROXIMATE, EXACT = 0, 1, 2
+NO_LOOK_AHEAD, APPROXIMATE, EXACT, GUIDED = 0, 1, 2, 3
 # Resampling by a look-ahead that is too sharp would leave unbounded weights: with this share of
 # the plain weights mixed in, w / p <= 1 / share.
 PLAIN_SHARE = 0.1
+GUIDED_SHARE = 0.02  # where the look-ahead knows all that is to come, and steers the moves too
 
 
 @kernel
@@ -62,10 +63,10 @@ def add(log_v, log_base):
 
 
 @kernel
-def mix(p, w):
+def mix(p, w, share):
     """p = (1 - share) p + share w."""
     for i in range(p.size):
-        p[i] = (1.0 - PLAIN_SHARE) * p[i] + PLAIN_SHARE * w[i]
+        p[i] = (1.0 - share) * p[i] + share * w[i]
 
 
 @kernel
@@ -144,7 +145,9 @@ def particle_filter(
                     copy(w, p)
                     current_ess = ess[t - 1]
                 elif ahead == APPROXIMATE:
-                    mix(p, w)
+                    mix(p, w, PLAIN_SHARE)
+                elif ahead == GUIDED:
+                    mix(p, w, GUIDED_SHARE)
             else:
                 p, w = w, p
             if ess_threshold >= 1.0 or current_ess < ess_threshold * n:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.filter_with_score import carry_back
 from ssmppl.codegen.kernels.flags import exact
-from ssmppl.codegen.kernels.particle_filter import copy
+from ssmppl.codegen.kernels.particle_filter import copy, gather
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
 
 
@@ -105,13 +105,19 @@ def row_predictions(
 
 
 @exact
-def complete_rows(begin, follow, prepare, step, sizes, theta, y, seen, u, particles):
-    """Set the components of trajectories that follow from the others; particles (T, D, N)."""
+def complete_rows(begin, follow, prepare, step, sizes, theta, y, seen, u, particles, ancestors):
+    """Set the components that follow from the others, along the ancestors (T, N).
+
+    particles (T, D, N) : all components of a particle system.
+    """
+    n_steps, d, n = particles.shape
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    x_prev = np.empty((d, n))
     prepare(theta, c)
-    for t in range(particles.shape[0]):
+    for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
         if t == 0:
             begin(theta, c, s, particles[0])
         else:
-            follow(theta, c, s, particles[t - 1], particles[t])
+            gather(particles[t - 1], ancestors[t], x_prev)
+            follow(theta, c, s, x_prev, particles[t])

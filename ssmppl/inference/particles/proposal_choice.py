@@ -48,6 +48,7 @@ STEP = 2.6  # normalise, resample, gather
 NORMAL, UNIFORM = 1.5, 0.6
 LOOK_AHEAD = 4.0  # one more normalisation and the second-stage weights
 PILOT_PARTICLES, PILOT_REPEATS, PILOT_STEPS = 100, 24, 400
+ENOUGH = 1.0  # sd of log Z in the pilot up to which the twisted proposal is not tried
 
 
 @dataclass(frozen=True)
@@ -104,11 +105,12 @@ def choose(problem: Problem, theta: np.ndarray, kalman: bool = True) -> Choice:
     candidates = {
         n: p for n, p in problem.program.proposals.items() if not isinstance(p, NotApplicable)
     }
-    if len(candidates) == 1:
+    twisted = {n: candidates.pop(n) for n in ("twisted",) if n in candidates}
+    if len(candidates) == 1 and not twisted:
         return Choice("bootstrap", {})
     key = (problem.program.path, _digest(problem), theta.tobytes())
     if key not in _choices:
-        _choices[key] = _pilot(problem, theta, candidates)
+        _choices[key] = _pilot(problem, theta, candidates, twisted)
     return _choices[key]
 
 
@@ -120,8 +122,26 @@ def _digest(problem: Problem) -> bytes:
     return digest.digest()
 
 
-def _pilot(problem: Problem, theta: np.ndarray, candidates: dict[str, Proposal]) -> Choice:
-    figures = {}
+def _pilot(
+    problem: Problem, theta: np.ndarray, candidates: dict[str, Proposal],
+    last_resort: dict[str, Proposal],
+) -> Choice:  # fmt: skip
+    """The best of the candidates, and of the last resort, which takes seconds to compile, where
+    none of them tells log Z to `ENOUGH`."""
+    figures: dict[str, tuple[float, float]] = {}
+    _try(problem, theta, candidates, figures)
+    if min((s for s, _ in figures.values()), default=np.inf) > ENOUGH:
+        _try(problem, theta, last_resort, figures)
+    score = {n: s**2 * c for n, (s, c) in figures.items() if np.isfinite(s)}
+    best = min(score, key=lambda n: score[n]) if score else "bootstrap"
+    return Choice(best, figures)
+
+
+def _try(
+    problem: Problem, theta: np.ndarray, candidates: dict[str, Proposal],
+    figures: dict[str, tuple[float, float]],
+) -> None:  # fmt: skip
+    """Add the figures of these proposals."""
     shortened = _beginning(problem)
     for name, proposal in candidates.items():
         settings = FilterSettings(PILOT_PARTICLES, name)
@@ -133,9 +153,6 @@ def _pilot(problem: Problem, theta: np.ndarray, candidates: dict[str, Proposal])
         finite = np.isfinite(log_z)
         sd = float(np.std(log_z[finite], ddof=1)) if finite.mean() > 0.9 else float("inf")
         figures[name] = (sd, cost(proposal))
-    score = {n: s**2 * c for n, (s, c) in figures.items() if np.isfinite(s)}
-    best = min(score, key=lambda n: score[n]) if score else "bootstrap"
-    return Choice(best, figures)
 
 
 def _beginning(problem: Problem) -> Problem:

@@ -1,0 +1,273 @@
+"""The generated module of the twisted particle filter, and the guide that it goes by.
+
+The guide is computed anew for every theta and data set and handed to the filter as further columns
+of the inputs, so that the filter's kernels are the same as for any other proposal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache as once
+from functools import cached_property
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals import Proposal, bootstrap
+from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.analysis.twisted import Guided, guide_order, guided, jacobian, twisted
+from ssmppl.codegen import cache
+from ssmppl.codegen.kernels import guide, guide_back
+from ssmppl.codegen.kernels.conditional_smc import conditional_smc, filtered_path
+from ssmppl.codegen.kernels.particle_filter import particle_filter
+from ssmppl.codegen.kernels.prediction import predict_step
+from ssmppl.codegen.kits import conditional_passes, filter_kit, prediction_kit
+from ssmppl.codegen.module import Layout, Section, Target
+from ssmppl.codegen.render import identifier
+from ssmppl.codegen.specialise import specialise
+from ssmppl.codegen.text import ModuleText
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr
+from ssmppl.language.trace import Trace
+
+MOST_STEPS = 12  # forward passes that improve the reference
+CLOSE = 0.05  # nats of improvement with which they end
+SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
+
+
+@dataclass
+class TwistedFilter:
+    """The twisted filter of a model: `entry` gives its kernels, `guide` what they go by.
+
+    found : what the guide is made from.
+    """
+
+    trace: Trace
+    found: Guided
+    module: ModuleType = field(repr=False)
+
+    def entry(self, name: str, horizon: int = 0) -> Callable[..., Any]:
+        """`filter`, `filtered_path` or `conditional_smc`, called like those of other proposals.
+
+        horizon : rows after which the guide starts anew and so is blind to what comes later; 0:
+        never. Up to the last row of each stretch the particles are worth most as a sample of
+        what is known by then.
+        """
+        run = getattr(self.module, f"{name}_twisted")
+
+        def call(theta: Any, y: Any, seen: Any, u: Any, *rest: Any) -> Any:
+            return run(theta, y, seen, self.guide(theta, y, seen, u, horizon), *rest)
+
+        return call
+
+    def guide(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, horizon: int = 0
+    ) -> np.ndarray:
+        """The inputs (T, U), and behind them each row's guide: precision, slope, centre.
+
+        A guide that nothing can be computed of is flat: the particles move by the transition.
+        """
+        given = (theta, y, seen, u)
+        steps, d = len(y), len(self.trace.state_symbols)
+        size = len(self.found.transition.noise), len(self.found.initial.noise)
+        out = np.zeros((steps, u.shape[1] + len(self.order)))
+        out[:, : u.shape[1]] = u
+        ones = [k for k, s in enumerate(self.order) if _on_diagonal(s)]
+        out[0, u.shape[1] + np.array(ones, dtype=int)] = 1.0
+        reference = _Reference.empty(steps, d, *size)
+        covariance = np.empty((steps, d, d))
+        where = reference.x, covariance, *reference.derivatives
+        if not self.module.follow_filter(*given, *where):
+            return out
+        reference = self._climbed(given, reference)
+        back = _Back.empty(steps, d, max(size))
+        if _look_back()(reference.x, *reference.derivatives, horizon, *back.arrays):
+            found = out.copy()
+            spread = reference.derivatives[3]
+            where = back.precision, back.pull, reference.x, u, back.aim[0], spread, found
+            if _write_guide()(*where) and np.all(np.isfinite(found)):
+                return found
+        return out
+
+    @cached_property
+    def order(self) -> list[Expr]:
+        """The guide's symbols, in the order of its columns."""
+        return guide_order(len(self.trace.state_symbols), len(self.found.initial.noise))
+
+    def filtered(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Means (T, D) and covariances (T, D, D) of the extended Kalman filter; None where it
+        comes to no number."""
+        steps, d = len(y), len(self.trace.state_symbols)
+        size = len(self.found.transition.noise), len(self.found.initial.noise)
+        found, covariance = _Reference.empty(steps, d, *size), np.empty((steps, d, d))
+        where = found.x, covariance, *found.derivatives
+        fine = self.module.follow_filter(theta, y, seen, u, *where)
+        return (found.x, covariance) if fine else None
+
+    def _climbed(self, given: tuple[np.ndarray, ...], first: _Reference) -> _Reference:
+        """The mode of the noise, from a first trajectory that need not follow the model."""
+        best, value = first, -np.inf
+        widest = first.e.shape[1]
+        for k in range(MOST_STEPS):
+            back = _Back.empty(len(best.x), best.x.shape[1], widest)
+            if not _look_back()(best.x, *best.derivatives, 0, *back.arrays):
+                break
+            for share in SHARES if k else (1.0,):
+                new = best.like()
+                now = self.module.follow_gains(
+                    *given, share, best.x, best.e, back.aim, back.gain, new.x, new.e,
+                    *new.derivatives,
+                )  # fmt: skip
+                if now > value:
+                    break
+            else:
+                break
+            gained, best, value = now - value, new, now
+            if gained < CLOSE:
+                break
+        return best
+
+
+def _on_diagonal(node: Expr) -> bool:
+    _, name, index = node.data
+    return name == "start_factor" and index[0] == index[1]
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """A trajectory x (T, D) of noise e (T, R'), and the model's derivatives along it."""
+
+    x: np.ndarray
+    e: np.ndarray
+    derivatives: tuple[np.ndarray, ...]
+
+    @classmethod
+    def empty(cls, steps: int, d: int, r: int, r_initial: int) -> _Reference:
+        shapes = [(steps, d), (steps, d, d), (steps, d, r), (d, r_initial)]
+        shapes += [(steps, d), (steps, d, d)]
+        noise = np.zeros((steps, max(r, r_initial)))
+        return cls(np.zeros((steps, d)), noise, tuple(np.zeros(s) for s in shapes))
+
+    def like(self) -> _Reference:
+        """An empty one of the same sizes."""
+        empty = tuple(np.zeros_like(a) for a in self.derivatives)
+        return _Reference(np.zeros_like(self.x), np.zeros_like(self.e), empty)
+
+
+@dataclass(frozen=True)
+class _Back:
+    """What a backward pass writes; see `kernels/guide.py`."""
+
+    precision: np.ndarray
+    pull: np.ndarray
+    aim: np.ndarray
+    gain: np.ndarray
+
+    @classmethod
+    def empty(cls, steps: int, d: int, widest: int) -> _Back:
+        shapes = (steps, d, d), (steps, d), (steps, widest), (steps, widest, d)
+        return cls(*(np.zeros(s) for s in shapes))
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        return self.precision, self.pull, self.aim, self.gain
+
+
+def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplicable:
+    """Generate, write and import the twisted filter; the reason where there is none."""
+    found, proposal = guided(trace, missing), twisted(trace, missing)
+    if isinstance(found, NotApplicable):
+        return found
+    assert isinstance(proposal, Proposal)
+    layout = Layout(trace, guide_order(len(trace.state_symbols), len(found.initial.noise)))
+    out = ModuleText(layout)
+    section = guide_kit(layout, trace, found)
+    out.add("the guide", section)
+    own = {"flat": str(found.flat)}
+    out.algorithm(guide.look_at, "look_at", section, "exact", own)
+    own["look_at"] = "look_at"
+    for kernel in (guide.follow_filter, guide.follow_gains):
+        out.algorithm(kernel, kernel.__name__, section, "entry", own)
+    prediction = prediction_kit(trace, layout, bootstrap(trace, missing))
+    out.add("one-step predictions", prediction)
+    out.algorithm(predict_step, "predict", prediction, "exact")
+    section = filter_kit(layout, proposal)
+    conditional_passes(trace, layout, section, bootstrap(trace, missing))
+    out.add(f"particle filter, {proposal.explanation}", section)
+    memory = deterministic_memory(trace)
+    own = {"ahead": "GUIDED", "predict": "predict"}
+    out.algorithm(particle_filter, "filter_twisted", section, "entry", own)
+    own = {"ahead": "GUIDED", "horizon": "-1" if memory is None else str(memory)}
+    out.algorithm(filtered_path, "filtered_path_twisted", section, "entry", own)
+    out.algorithm(conditional_smc, "conditional_smc_twisted", section, "entry", own)
+    lines = [f"Generated by ssmppl: the twisted particle filter of the model {trace.name!r}."]
+    module = cache.load(identifier(trace.name) + "_twisted", out.finish(lines))
+    return TwistedFilter(trace, found, module)
+
+
+def guide_kit(layout: Layout, trace: Trace, found: Guided) -> Section:
+    """The functions by which the guide's kernels know the model; all of one particle."""
+    section = Section(layout, "guide")
+    d = len(trace.state_symbols)
+
+    def listed(values: Any) -> list[Target]:
+        return [Target(f"out[{k}, i]", e) for k, e in enumerate(values)]
+
+    for role, form, arguments in (
+        ("begin", found.initial, "theta, c, s, noise, states"),
+        ("follow", found.transition, "theta, c, s, states_prev, noise, states"),
+    ):
+        given: dict[Expr, str] = {e: f"noise[{k}]" for k, e in enumerate(form.noise)}
+        targets = [Target(f"states[{k}, i]", e) for k, e in enumerate(form.value)]
+        section.particle_pass(role, "x by the noise that drives it.", arguments, targets,
+                              scalars=given)  # fmt: skip
+    first, later = found.initial, found.transition
+    section.particle_pass(
+        "linear_initial", "x_1 without noise, and its derivatives in the noise.",
+        "theta, c, s, states, out", listed([*first.at_rest(), *first.spread().ravel()]),
+    )  # fmt: skip
+    section.particle_pass(
+        "linear", "x_t without noise, its derivatives in x_{t-1} and in the noise.",
+        "theta, c, s, states_prev, states, out",
+        listed([*later.at_rest(), *jacobian(later, trace).ravel(), *later.spread().ravel()]),
+    )  # fmt: skip
+    lower = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
+    section.particle_pass(
+        "look", "log g(y_t | x_t), its slope, minus its curvature.", "theta, c, s, states, out",
+        listed([found.observed, *found.slope, *lower]),
+    )  # fmt: skip
+    return section
+
+
+HEAD = '''"""Generated by ssmppl: backward passes of the guide, the same for all models."""
+
+import math
+
+import numba
+import numpy as np
+
+'''
+
+
+@once
+def _backward() -> ModuleType:
+    """The kernels that know no model, compiled once for all."""
+    made = [specialise(k, k.__name__, {}) for k in (guide_back.look_back, guide_back.write_guide)]
+    names = {n: home for m in made for n, home in m.imports.items() if n != "exact"}
+    lines = [f"from {home} import {n}" for n, home in sorted(names.items())]
+    lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]
+    texts = [m.text.replace("@exact", "@entry", 1) for m in made]
+    return cache.load("guide", HEAD + "\n".join(lines) + "\n\n".join(texts))
+
+
+def _look_back() -> Callable[..., Any]:
+    return _backward().look_back
+
+
+def _write_guide() -> Callable[..., Any]:
+    return _backward().write_guide
