@@ -76,6 +76,35 @@ def load(name: str, text: str) -> ModuleType:
         return module
 
 
+def kept(name: str, suffix: str) -> str | None:
+    """A text that was kept under this name in this environment; None where there is none."""
+    found = kept_bytes(f"{name}_{digest_of('')}", suffix)
+    return None if found is None else found.decode()
+
+
+def keep(name: str, suffix: str, text: str) -> None:
+    """Keep a text for other processes; where the folder cannot be written it is not kept."""
+    keep_bytes(f"{name}_{digest_of('')}", suffix, text.encode())
+
+
+def kept_bytes(name: str, suffix: str) -> bytes | None:
+    """What was kept under a name, whole; None where there is nothing, or half of it."""
+    try:
+        found = (cache_folder() / f"{name}{suffix}").read_bytes()
+    except OSError:
+        return None
+    body, digest = found[:-32], found[-32:]
+    return body if hashlib.sha256(body).digest() == digest else None
+
+
+def keep_bytes(name: str, suffix: str, content: bytes) -> None:
+    """Keep bytes, with their digest behind them."""
+    folder = cache_folder()
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        _write_atomically(folder / f"{name}{suffix}", content + hashlib.sha256(content).digest())
+
+
 def _write(file: str, text: str) -> Path:
     folder = cache_folder()
     path = folder / file
@@ -93,11 +122,11 @@ def _write(file: str, text: str) -> Path:
     return path
 
 
-def _write_atomically(path: Path, text: str) -> None:
+def _write_atomically(path: Path, content: str | bytes) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     try:
-        with os.fdopen(handle, "w") as out:
-            out.write(text)
+        with os.fdopen(handle, "wb") as out:
+            out.write(content.encode() if isinstance(content, str) else content)
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):

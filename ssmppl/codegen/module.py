@@ -22,6 +22,10 @@ LEVELS = {
 }  # fmt: skip
 
 
+# What every section has, and the arguments.
+OUTER = {"prepare": "theta, c", "step": "theta, c, y_data, seen_data, u_data, t, s"}
+
+
 def level_of(node: Expr) -> int:
     """Binding time of a symbol or a random draw."""
     return PARTICLE if node.op == "random" else LEVELS[node.data[0]]
@@ -84,6 +88,7 @@ class Section:
 
     suffix : ends the name of each function.
     fits : what is computed once per particle and kept in the rows of `fits`.
+    roles : the functions, and the arguments of each.
     """
 
     layout: Layout
@@ -92,6 +97,7 @@ class Section:
     s: dict[Expr, int] = field(default_factory=dict)
     fits: dict[Expr, int] = field(default_factory=dict)
     functions: list[str] = field(default_factory=list)
+    roles: dict[str, str] = field(default_factory=lambda: dict(OUTER))
     normals: int = 0
     uniforms: int = 0
 
@@ -109,6 +115,7 @@ class Section:
         scalars : symbols bound to array elements instead of to the particles' rows.
         """
         scalars = scalars or {}
+        self.roles[role] = arguments
         if accumulate:
             targets = [_summed(group) for group in _grouped(targets)]
         roots = [t.expression for t in targets] + [t.guard for t in targets if t.guard is not None]
@@ -218,11 +225,10 @@ class Section:
 
     def finish(self) -> str:
         """The functions with `prepare` and `step`, which compute `c` and `s`."""
-        step = self._straight(
-            "step", "theta, c, y_data, seen_data, u_data, t, s",
-            "What depends on theta and time.", self.s, "s",
-        )  # fmt: skip
-        prepare = self._straight("prepare", "theta, c", "What depends on theta alone.", self.c, "c")
+        step = self._straight("step", OUTER["step"], "What depends on theta and time.", self.s, "s")
+        prepare = self._straight(
+            "prepare", OUTER["prepare"], "What depends on theta alone.", self.c, "c"
+        )
         return "\n\n".join([prepare, step, *self.functions])
 
     def _straight(

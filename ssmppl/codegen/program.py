@@ -21,7 +21,6 @@ from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.analysis.twisted import twisted
-from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
 from ssmppl.codegen.kernels.backward_pairs import (
     backward_mcmc,
@@ -41,6 +40,7 @@ from ssmppl.codegen.kits import (
     prediction_kit,
     simulation_kit,
 )
+from ssmppl.codegen.loading import Loaded, load
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
@@ -61,6 +61,7 @@ class Program:
     proposals: dict[str, Proposal | NotApplicable]
     text: str
     module: ModuleType = field(repr=False)
+    loaded: Loaded = field(repr=False)
 
     def __reduce__(self):  # another process generates the module again, or finds it in its cache
         return compile_trace, (self.trace, self.missing)
@@ -88,6 +89,8 @@ class Program:
         """
         if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
             return self.twisted.entry(name.removesuffix("_twisted"))
+        if name == "simulate":  # many a model is simulated a few times only
+            return self.loaded.simulate
         if not hasattr(self.module, name):
             for proposal, found in self.proposals.items():
                 if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
@@ -115,16 +118,18 @@ def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
     if program is None:
         check_start(trace)
         proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
-        text = _write(trace, missing, proposals)
-        module = cache.load(identifier(trace.name), text)
-        program = Program(trace, missing, proposals, text, module)
+        out, lines = _write(trace, missing, proposals)
+        loaded = load(out, identifier(trace.name), lines)
+        program = Program(trace, missing, proposals, out.finish(lines), loaded.module, loaded)
         _programs[key] = program
         while len(_programs) > _MOST_PROGRAMS:
             _programs.popitem(last=False)
     return program
 
 
-def _write(trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotApplicable]) -> str:
+def _write(
+    trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotApplicable]
+) -> tuple[ModuleText, list[str]]:
     layout = Layout(trace)
     plain = bootstrap(trace, missing)
     memory = deterministic_memory(trace)
@@ -155,7 +160,7 @@ def _write(trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotAp
     out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
     if trace.parameters:
         out.add_function("parameters", parameter_functions(trace, layout))
-    return out.finish(_introduction(trace, proposals))
+    return out, _introduction(trace, proposals)
 
 
 def _backward(out: ModuleText, trace: Trace, layout: Layout, plain: Proposal) -> None:

@@ -6,6 +6,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from ssmppl.codegen.kernels import particle_filter as kernels
@@ -28,17 +29,35 @@ MODULES = {
 OPTIONAL = ("fit", "look_ahead")  # functions that some sections lack, and then are not called
 
 
+@dataclass(frozen=True)
+class Algorithm:
+    """A kernel over a section's functions. sizes : what its parameter of that name stands for.
+    decorator : "entry" where Python calls it."""
+
+    function: Callable[..., Any]
+    section: Section
+    decorator: str
+    sizes: tuple[int, ...]
+    bound: dict[str, str]
+
+
 class ModuleText:
-    """The parts of a generated module, in order, and the names that they import."""
+    """The parts of a generated module, in order, and the names that they import.
+
+    algorithms : by name. texts : of each section's own functions.
+    """
 
     def __init__(self, layout: Layout):
         self.n_states = len(layout.trace.state_symbols)
         self.parts: list[str] = []
+        self.algorithms: dict[str, Algorithm] = {}
+        self.texts: dict[int, str] = {}
         self.imports: dict[str, str] = {}
 
     def add(self, title: str, section: Section) -> None:
         """A section's own functions, under a title."""
-        self.parts += [heading(title), section.finish()]
+        self.texts[id(section)] = section.finish()
+        self.parts += [heading(title), self.texts[id(section)]]
 
     def add_function(self, title: str, text: str) -> None:
         """A single entry point."""
@@ -53,6 +72,7 @@ class ModuleText:
             len(section.c), len(section.s), self.n_states, section.normals, section.uniforms,
             len(section.fits),
         )  # fmt: skip
+        self.algorithms[name] = Algorithm(function, section, decorator, counts, bound or {})
         parameters = inspect.signature(getattr(function, "py_func", function)).parameters
         roles = [p for p in parameters if f"def {section.name(p)}(" in "\n".join(section.functions)]
         names = {role: section.name(role) for role in [*OPTIONAL, "prepare", "step", *roles]}

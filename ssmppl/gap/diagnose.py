@@ -40,7 +40,7 @@ from ssmppl.language.model import Model
 
 SETS = {"fast": 100, "full": 200}  # simulated data sets
 PARTICLES = {"fast": 500, "full": 1000}
-TWISTED_PARTICLES = {"fast": 150, "full": 200}  # a few that know where to go do more
+TWISTED_PARTICLES = {"fast": 100, "full": 100}  # a few that know where to go do more
 
 
 def diagnose(
@@ -69,7 +69,7 @@ def diagnose(
         augmented model.
     alpha : family-wise error rate of every verdict.
     fixed : values of known parameters.
-    particles : of the particle filters; None: 500 in fast mode, 1000 in full mode, 150 and 200
+    particles : of the particle filters; None: 500 in fast mode, 1000 in full mode, 100
         where the twisted proposal applies.
     executor : any `concurrent.futures.Executor` that runs in this process; None: threads.
     checkpoint : a file, or a folder, that keeps what is done: the same call again goes on from

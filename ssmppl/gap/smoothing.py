@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import ModuleType
 
 import numpy as np
 from scipy.special import ndtr
 
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
+from ssmppl.codegen.loading import Loaded
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.codegen.row_scores import compile_row_scores
 from ssmppl.codegen.twisted import TwistedFilter
@@ -70,7 +70,7 @@ class Smoother:
         return compile_trace(self.columns.base, self.missing)
 
     @cached_property
-    def module(self) -> ModuleType:
+    def module(self) -> Loaded:
         c = self.columns
         return compile_row_scores(c.given, c.base, c.initial, c.later, self.missing, c.follows)
 

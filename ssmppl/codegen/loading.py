@@ -1,0 +1,79 @@
+"""A generated module with its algorithms: by native code where the text can be translated.
+
+Numba's type inference takes most of the time that a new model costs, and the algorithms are the
+same for all models: so a model's own functions are translated to LLVM directly, and the algorithms
+call them by address. What cannot be translated (matrices, the user's primitives) is compiled by
+Numba from the very same text.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+from numba import config
+
+from ssmppl.codegen import cache
+from ssmppl.codegen.kernels.guide import look_at
+from ssmppl.codegen.native.build import addresses
+from ssmppl.codegen.native.entries import entry
+from ssmppl.codegen.native.translate import Untranslatable
+from ssmppl.codegen.text import ModuleText
+
+HELPERS: dict[str, Any] = {"look_at": look_at}  # specialised functions that kernels call
+# Arguments of a filter that only its compiled variant knows: what is not None needs Numba's.
+SCHEME, MOMENTS = 5, 10
+
+
+class Loaded:
+    """A generated module; its algorithms are looked up by name.
+
+    module : the text, imported. why : by algorithm, why Numba compiles it.
+    """
+
+    def __init__(self, out: ModuleText, name: str, module: ModuleType):
+        self.module, self.why = module, dict[str, str]()
+        self._out, self._name = out, name
+        self._made: dict[str, Callable[..., Any]] = {}
+        self._lock = threading.RLock()
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        algorithm = self._out.algorithms.get(name)
+        if algorithm is None or algorithm.decorator != "entry":
+            return getattr(self.module, name)
+        with self._lock:
+            if name not in self._made:
+                self._made[name] = self._algorithm(name)
+            return self._made[name]
+
+    def _algorithm(self, name: str) -> Callable[..., Any]:
+        algorithm, numba_made = self._out.algorithms[name], getattr(self.module, name)
+        if config.DISABLE_JIT:  # type: ignore[attr-defined]
+            return numba_made
+        section = algorithm.section
+        helpers = tuple((HELPERS[n], n) for n in algorithm.bound if n in HELPERS)
+        try:
+            found = addresses(f"{self._name}_{section.suffix}", self._out.texts[id(section)])
+            places = {r: found[section.name(r)] for r in section.roles}
+            run = entry(algorithm, places, helpers)
+        except Untranslatable as reason:
+            self.why[name] = reason.found
+            return numba_made
+        if "predict" not in algorithm.bound:
+            return run
+
+        def call(*args: Any) -> Any:
+            """The filter; with moments or another scheme by Numba's variant."""
+            plain = args[SCHEME] is None and args[MOMENTS] is None
+            return (run if plain else numba_made)(*args)
+
+        return call
+
+
+def load(out: ModuleText, name: str, lines: list[str]) -> Loaded:
+    """Write and import a generated module; `lines` is its docstring."""
+    return Loaded(out, name, cache.load(name, out.finish(lines)))

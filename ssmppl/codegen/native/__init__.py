@@ -1,0 +1,10 @@
+"""Generated functions compiled without Numba's type inference, which is where its time goes.
+
+    translate.py  the text of a generated function -> LLVM IR, a statement at a time
+    arithmetic.py its expressions
+    library.py    the scalar functions that such text calls, as Numba compiles them, once for all
+    build.py      IR -> machine code, kept on disk -> addresses
+    calls.py      Numba kernels, compiled once for all models, that call functions by address
+
+The text stays the one definition: what cannot be translated is compiled by Numba as it stands.
+"""

@@ -1,0 +1,106 @@
+"""LLVM IR -> machine code, kept on disk beside the generated modules -> addresses."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from functools import cache as once
+from typing import Any
+
+import llvmlite.binding as llvm
+
+from ssmppl.codegen import cache
+from ssmppl.codegen.native.library import function_ir
+from ssmppl.codegen.native.translate import Untranslatable, translate
+
+_lock = threading.Lock()
+_kept: list[Any] = []  # engines own the code that addresses point to
+_built: dict[str, Mapping[str, int]] = {}
+
+# Iterations of a loop over particles do not depend on each other.
+METADATA = """
+!GROUP = distinct !{}
+"""
+
+
+def addresses(name: str, text: str) -> Mapping[str, int]:
+    """Address of each function of a generated text, compiled or found on disk.
+
+    Raises
+    ------
+    Untranslatable : the text holds something that only Numba compiles.
+    """
+    key = f"{name}_{cache.digest_of(text + _machine())}"
+    with _lock:
+        if key not in _built:
+            _built[key] = _load(key, text)
+        return _built[key]
+
+
+def _load(key: str, text: str) -> Mapping[str, int]:
+    names, code = None, cache.kept_bytes(key, ".o")
+    if code is None:
+        code, names = _compiled(text)
+        cache.keep_bytes(key, ".o", code)
+    if names is None:
+        names = [line[4 : line.index("(")] for line in text.splitlines() if line.startswith("def ")]
+    module = llvm.parse_assembly(f'target triple = "{llvm.get_process_triple()}"\n')
+    engine = llvm.create_mcjit_compiler(module, _target())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _kept.append(engine)
+    return {n: engine.get_function_address(n) for n in names}
+
+
+def _compiled(text: str) -> tuple[bytes, list[str]]:
+    found = translate(text)
+    libraries = [function_ir(*call) for call in sorted(found.calls)]
+    declared = [_declaration(*call) for call in sorted(found.calls)]
+    machine = _target()
+    head = f'target triple = "{llvm.get_process_triple()}"\n'
+    head += f'target datalayout = "{machine.target_data}"\n'
+    body = found.text.replace("!GROUP", "!0").replace("!LOOP", "!1")
+    metadata = (
+        '!0 = distinct !{}\n!1 = distinct !{!1, !2}\n!2 = !{!"llvm.loop.parallel_accesses", !0}\n'
+    )
+    try:
+        module = llvm.parse_assembly(
+            "\n".join([head, "declare double @llvm.fabs.f64(double)", *declared, body, metadata])
+        )
+        for ir in libraries:
+            other = llvm.parse_assembly(ir)
+            module.link_in(other)
+        module.verify()
+    except RuntimeError as error:  # an LLVM that reads another dialect
+        raise Untranslatable(f"LLVM refuses the text: {error}", fix="") from None
+    own = set(found.names)
+    for f in module.functions:
+        if f.name not in own and not f.is_declaration:
+            f.linkage = llvm.Linkage.internal
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = True
+    options.slp_vectorization = False
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    return machine.emit_object(module), found.names
+
+
+def _declaration(name: str, arity: int, draws: bool) -> str:
+    numbers = ["ptr", "i64"] * draws + ["double"] * arity
+    return f"declare double @lib_{name}({', '.join(numbers)})"
+
+
+@once
+def _target() -> Any:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3,
+        jit=True,
+    )  # fmt: skip
+
+
+def _machine() -> str:
+    """What compiled code depends on beside its text."""
+    return f"{llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
