@@ -14,22 +14,26 @@ import numpy as np
 
 from ssmppl.codegen.program import compile_trace
 from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol
 from ssmppl.gap.augment import augment
 from ssmppl.gap.basis import Term
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
+from ssmppl.gap.confirm import predict
 from ssmppl.gap.efficient import Null, efficient
 from ssmppl.gap.fit import Fit, Fitter
+from ssmppl.gap.parts import Parts
 from ssmppl.gap.refit import Workshop, lift, proposal_of
 from ssmppl.gap.screen import Screen, with_parameters
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.tables import residual_groups
 from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import Normal
 
 GROUPS = 3  # of basis functions that are taken in, at most
-LEAST = 2.0  # mean z^2 of a group that is taken in
+CHANCE = 0.1  # family-wise p up to which a group is taken in: others would only add noise
 ASTRAY = 1.0  # nats below the model without the groups, beyond Monte Carlo noise
 
 Values = dict[str, np.ndarray]
@@ -37,7 +41,7 @@ Values = dict[str, np.ndarray]
 
 def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term], float]]:
     """(terms of one equation, moment and variable, tau) where the basis has signal beyond what was
-    chosen, best first."""
+    chosen, best first; none where chance explains it."""
     question = screen.question
     if not question.terms:
         return []
@@ -49,10 +53,10 @@ def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term]
     for i, t in enumerate(question.terms):
         if not found.status[i]:
             groups.setdefault((t.equation, t.moment, t.variable), []).append(i)
-    out = []
-    for places in groups.values():
+    out, residual = [], residual_groups(screen, chosen)
+    for key, places in groups.items():
         size = float(np.mean(found.z[places] ** 2))
-        if size >= LEAST:
+        if residual[key].p <= CHANCE and size > 1.0:
             variance = float(np.mean(found.variance[places]))
             tau = float(np.sqrt((size - 1.0) / variance))
             out.append((size, [question.terms[i] for i in places], tau))
@@ -63,17 +67,26 @@ def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term]
 def fit_reference(
     workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen,
     train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint,
+    parts: Parts | None = None,
 ) -> tuple[Fitter, Fit]:  # fmt: skip
     """The superset, fitted from the fit of the model with the chosen effects.
 
     A fit that comes out below where it started has gone astray (a feedback of what is past that
-    makes the model unstable): then with the best group alone, and at last with none.
+    makes the model unstable): then with the best group alone, and at last with none. Where there
+    are `parts`, the curves have to predict the rows of the choose part, fitted to the screen part,
+    better than the model without them does: what only bends through the noise is left out.
 
     Raises
     ------
     SSMError : it cannot be fitted.
     """
     groups = signal(screen, chosen)
+    if groups and parts is not None:
+        gained = kept.of(
+            "reference on other rows",
+            lambda: {"nats": _gained(workshop, chosen, start, groups, parts, seed)},
+        )
+        groups = groups if float(gained["nats"]) > 0.0 else []
     for count in dict.fromkeys((len(groups), min(1, len(groups)))):
         fitter, begin = superset(workshop, chosen, start, groups[:count])
 
@@ -86,6 +99,23 @@ def fit_reference(
         if fit.log_likelihood >= start.log_likelihood - ASTRAY - noise:
             return fitter, fit
     return workshop.fitter(chosen), start
+
+
+def _gained(
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit,
+    groups: Sequence[tuple[list[Term], float]], parts: Parts, seed: np.random.SeedSequence,
+) -> np.ndarray:  # fmt: skip
+    """() nats by which the superset predicts the choose part better; -inf where it has no fit."""
+    told = []
+    for wanted in ([], groups):
+        fitter, begin = superset(workshop, chosen, start, wanted)
+        try:
+            fit = fitter.fit(parts.screen, seed, begin, searched=True, quick=True)
+            found = predict(fitter, fit, parts.train, parts.chosen, seed)
+        except SSMError:
+            return np.asarray(-np.inf)
+        told.append(found.log_density.sum(axis=1).mean())
+    return np.asarray(told[1] - told[0])
 
 
 def superset(

@@ -61,14 +61,15 @@ def how_far(
     try:
         reference = fit_reference(
             workshop, chosen.candidates if chosen else (), chosen.fit if chosen else base[1],
-            screen, parts.train, seed, kept,
+            screen, parts.train, seed, kept, parts,
         )  # fmt: skip
         best = predict(*reference, experiments, counts, seed)
     except SSMError as error:
         out.notes.append(f"no reference to measure the gap against: {error.found}")
         return out
     model = (chosen.fitter, chosen.fit) if chosen else reference
-    found = predict(*model, experiments, counts, seed)
+    same = reference[1] is model[1]  # nothing was found beyond the chosen effects
+    found = best if same else predict(*model, experiments, counts, seed)
     share = closed(plain.log_density, found.log_density, best.log_density, starts=plain.starts)
     rival = found
     if chosen is None:

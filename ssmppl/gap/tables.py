@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -132,13 +133,33 @@ def residual_group(
     screen: Screen, others: Sequence[Candidate]
 ) -> tuple[float, tuple[str, str] | None]:
     """(family-wise p, equation and moment) of what of the basis stands out most with `others`
-    projected out: the functions of one variable, or of one pair, are a group."""
+    projected out."""
+    groups = residual_groups(screen, others)
+    if not groups:
+        return 1.0, None
+    best = max(groups, key=lambda key: groups[key].z)
+    return groups[best].p, best[:2]
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How much a group of the basis stands out: z, and its family-wise p."""
+
+    z: float
+    p: float
+
+
+def residual_groups(
+    screen: Screen, others: Sequence[Candidate]
+) -> dict[tuple[str, str, str], Residual]:
+    """Each group of the basis with `others` projected out, by equation, moment and variable: the
+    functions of one variable, or of one pair, are a group."""
     terms, nuisance = screen.question.terms, screen.stacked("nuisance")
     columns, seen = screen.stacked("basis"), screen.observed.basis
     rest = screen.columns_of(others)
     keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
     if not keys:
-        return 1.0, None
+        return {}
     groups = []
     for key in keys:
         own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
@@ -147,8 +168,7 @@ def residual_group(
         )
     z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
     p = familywise(z, null, sided=1).p
-    best = int(np.argmax(z))
-    return float(p[best]), keys[best][:2]
+    return {k: Residual(float(z[i]), float(p[i])) for i, k in enumerate(keys)}
 
 
 def causes_table(

@@ -13,14 +13,10 @@ from ssmppl.codegen import cache
 from ssmppl.codegen.native.library import function_ir
 from ssmppl.codegen.native.translate import Untranslatable, translate
 
+OLDEST = 16  # LLVM from which pointers have no type, as in the text that is written here
 _lock = threading.Lock()
 _kept: list[Any] = []  # engines own the code that addresses point to
 _built: dict[str, Mapping[str, int]] = {}
-
-# Iterations of a loop over particles do not depend on each other.
-METADATA = """
-!GROUP = distinct !{}
-"""
 
 
 def addresses(name: str, text: str) -> Mapping[str, int]:
@@ -30,11 +26,16 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
     ------
     Untranslatable : the text holds something that only Numba compiles.
     """
-    key = f"{name}_{cache.digest_of(text + _machine())}"
+    if llvm.llvm_version_info[0] < OLDEST:
+        raise Untranslatable(f"LLVM {llvm.llvm_version_info[0]} has typed pointers", fix="")
     with _lock:
-        if key not in _built:
-            _built[key] = _load(key, text)
-        return _built[key]
+        try:
+            key = f"{name}_{cache.digest_of(text + _machine())}"
+            if key not in _built:
+                _built[key] = _load(key, text)
+            return _built[key]
+        except RuntimeError as error:  # an LLVM that knows another dialect, or not this machine
+            raise Untranslatable(f"LLVM refuses: {error}", fix="") from None
 
 
 def _load(key: str, text: str) -> Mapping[str, int]:
@@ -49,7 +50,11 @@ def _load(key: str, text: str) -> Mapping[str, int]:
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _kept.append(engine)
-    return {n: engine.get_function_address(n) for n in names}
+    found = {n: engine.get_function_address(n) for n in names}
+    lost = [n for n, address in found.items() if not address]
+    if lost:
+        raise Untranslatable(f"the machine code lacks {lost[0]}", fix="")
+    return found
 
 
 def _compiled(text: str) -> tuple[bytes, list[str]]:
@@ -63,16 +68,11 @@ def _compiled(text: str) -> tuple[bytes, list[str]]:
     metadata = (
         '!0 = distinct !{}\n!1 = distinct !{!1, !2}\n!2 = !{!"llvm.loop.parallel_accesses", !0}\n'
     )
-    try:
-        module = llvm.parse_assembly(
-            "\n".join([head, "declare double @llvm.fabs.f64(double)", *declared, body, metadata])
-        )
-        for ir in libraries:
-            other = llvm.parse_assembly(ir)
-            module.link_in(other)
-        module.verify()
-    except RuntimeError as error:  # an LLVM that reads another dialect
-        raise Untranslatable(f"LLVM refuses the text: {error}", fix="") from None
+    fabs = "declare double @llvm.fabs.f64(double)"
+    module = llvm.parse_assembly("\n".join([head, fabs, *declared, body, metadata]))
+    for ir in libraries:
+        module.link_in(llvm.parse_assembly(ir))
+    module.verify()
     own = set(found.names)
     for f in module.functions:
         if f.name not in own and not f.is_declaration:
