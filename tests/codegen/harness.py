@@ -2,6 +2,8 @@
 
 import ast
 import types
+from copy import copy
+from pathlib import Path
 
 import numpy as np
 
@@ -57,11 +59,29 @@ def run_plainly(text, namespace):
     return space
 
 
+def plain_module(module):
+    """The functions of a generated module in plain Python, as attributes; what they import stays
+    compiled."""
+    module = getattr(module, "module", module)  # the text behind algorithms of native code
+    tree = ast.parse(Path(module.__file__).read_text())
+    own = [n for n in tree.body if not _compiles(n)]
+    space = run_plainly(ast.unparse(ast.Module(own, [])), {"entry": lambda f: f})
+    return types.SimpleNamespace(**space)
+
+
+def _compiles(node):
+    """Whether a statement binds a decorator of Numba's."""
+    if isinstance(node, ast.ImportFrom):
+        return node.module.endswith(".flags")
+    return isinstance(node, ast.Assign) and node.targets[0].id == "entry"
+
+
 class Numbers:
     """Random values of everything that a trace's laws depend on."""
 
     def __init__(self, traced, rng, missing=False):
         self.traced = traced
+        self.guide = [{}] * STEPS
         self.layout = Layout(traced)
         draw = numpy_draws(rng)
         values = {}
@@ -118,10 +138,19 @@ class Numbers:
             at += n
         self.y *= self.seen
 
+    def guided(self, order, rng):
+        """A copy with random values of a guide's symbols, in this order behind the inputs."""
+        out = copy(self)
+        out.guide = [random_guide(order, rng) for _ in range(STEPS)]
+        columns = np.array([[row[s] for s in order] for row in out.guide])
+        out.u = np.hstack([self.u, columns])
+        return out
+
     def values(self, t):
         """Symbol -> value at step t, one per particle where states are involved."""
         traced, before = self.traced, max(t - 1, 0)
         out = dict(zip(traced.parameter_symbols, self.theta, strict=True))
+        out |= self.guide[t]
         out[symbol("time", "t")], out[symbol("time_prev", "t")] = t + 1.0, float(t)
         for k, s in enumerate(traced.input_symbols):
             out[s], out[previous(s)] = self.u[t, k], self.u[before, k]
@@ -134,6 +163,21 @@ class Numbers:
         return out
 
 
+def random_guide(order, rng):
+    """Symbol -> value of a twisted proposal's guide: a precision of one rank less than full, where
+    that is any, and a lower factor with a positive diagonal."""
+    places = [(s, s.data[1], s.data[2]) for s in order]
+    d = sum(name == "pull" for _, name, _ in places)
+    half = rng.normal(size=(d, max(d - 1, 1)))
+    precision = half @ half.T
+    return {
+        s: precision[index] if name == "precision"
+        else rng.uniform(0.8, 2.0) if name == "start_factor" and index[0] == index[1]
+        else rng.normal()
+        for s, name, index in places
+    }  # fmt: skip
+
+
 def noise_of(roots, rng):
     """Buffers of normals and uniforms, and the value of each such node; in the kernels' order."""
     buffers, nodes = {"normal": [], "uniform": []}, {}
@@ -141,6 +185,8 @@ def noise_of(roots, rng):
         if node.op == "random" and node.data[0] in buffers:
             kind = node.data[0]
             value = rng.standard_normal(PARTICLES) if kind == "normal" else rng.random(PARTICLES)
+            if kind == "uniform":
+                value[0] *= 0.01  # a mixture's smaller share, too
             buffers[kind].append(value)
             nodes[node] = value
     flat = {k: np.concatenate([*v, np.zeros(ROOM)]) for k, v in buffers.items()}

@@ -266,6 +266,48 @@ def pendulum():
 
 
 @register
+def prey():
+    """Multiplicative noise, more of it at the start, and a state that follows."""
+
+    def prior():
+        return {"r": D.Uniform(0.5, 2), "s": D.Uniform(0.1, 0.6)}
+
+    def initial(s):
+        return {"n": D.LogNormal(1, sd=s), "before": D.LogNormal(0.5, sd=0.3)}
+
+    def transition(n, before, r, s):
+        return {"n": D.LogNormal(np.log(n) + r - 0.2 * n, sd=s / (1 + before)),
+                "before": D.Dirac(n)}  # fmt: skip
+
+    def observation(n, before):
+        return {"y": D.Poisson(n + 0.5 * before)}
+
+    return declare("prey", prior=prior, initial=initial, transition=transition,
+                   observation=observation)  # fmt: skip
+
+
+@register
+def seven_noises():
+    """More noises than a factorisation is written out for, of a spread that varies."""
+
+    def prior():
+        return {"q": D.Uniform(0.2, 0.8)}
+
+    def initial(q):
+        return {"x": D.Normal(np.zeros(7), sd=q)}
+
+    def transition(x, q):
+        lagged = np.concatenate([x[1:], x[:1]])
+        return {"x": D.Normal(0.5 * x + 0.3 * np.tanh(lagged), sd=q / (1 + lagged**2))}
+
+    def observation(x):
+        return {"y": D.Normal(np.sum(x), sd=1), "m": D.Poisson(np.exp(x[0] * x[6]))}
+
+    return declare("seven noises", prior=prior, initial=initial, transition=transition,
+                   observation=observation)  # fmt: skip
+
+
+@register
 def switching():
     """np.where, comparisons, clipping, indexing by a state, integer powers."""
 

@@ -5,6 +5,7 @@ import pytest
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals import bootstrap
+from ssmppl.analysis.twisted import guided, jacobian
 from ssmppl.codegen.kits import observation_draws
 from ssmppl.codegen.program import compile_trace
 from ssmppl.errors import NotApplicable
@@ -46,10 +47,17 @@ def close(found, expected, what):
 
 
 class Generated:
-    """The functions of one section at one time step."""
+    """The functions of one section at one time step.
+
+    Those of the twisted filter stand in a module of their own, and read a guide behind the inputs.
+    """
 
     def __init__(self, program, numbers, suffix, t):
-        self.program, self.numbers, self.suffix = program, numbers, suffix
+        self.module, self.suffix = program.module, suffix
+        if suffix in ("twisted", "guide"):
+            self.module = program.twisted.module
+            numbers = numbers.guided(program.twisted.order, np.random.default_rng([8, t]))
+        self.numbers = numbers
         self.c, self.s = np.full(ROOM, np.nan), np.full(ROOM, np.nan)
         self.call("prepare", numbers.theta, self.c)
         self.call(
@@ -57,7 +65,7 @@ class Generated:
         )  # fmt: skip
 
     def call(self, role, *args):
-        return plain(self.program.entry(f"{role}_{self.suffix}"), **STAND_INS)(*args)
+        return plain(getattr(self.module, f"{role}_{self.suffix}"), **STAND_INS)(*args)
 
     def pass_(self, role, *args):
         return self.call(role, self.numbers.theta, self.c, self.s, *args)
@@ -65,10 +73,10 @@ class Generated:
 
 def fitted(generated, t):
     """What the proposal computes once per particle, as the arguments of a pass; or nothing."""
-    if not hasattr(generated.program.module, f"weigh_{generated.suffix}"):
+    if not hasattr(generated.module, f"weigh_{generated.suffix}"):
         return []  # a section that only simulates
     fits = np.full((ROOM, PARTICLES), np.nan)
-    if hasattr(generated.program.module, f"fit_{generated.suffix}"):
+    if hasattr(generated.module, f"fit_{generated.suffix}"):
         generated.pass_("fit", generated.numbers.states[t - 1], fits)
     return [fits]
 
@@ -114,7 +122,7 @@ def test_particle_filters(case):
             if p.look_ahead is not None:
                 log_v = np.full(PARTICLES, np.nan)
                 generated.pass_("look_ahead", numbers.states[t - 1], *fitted(generated, t), log_v)
-                expected = evaluate(p.look_ahead, numbers.values(t))
+                expected = evaluate(p.look_ahead, generated.numbers.values(t))
                 close(log_v, expected, f"{name} look_ahead t={t}")
 
 
@@ -146,6 +154,42 @@ def test_joining_a_reference(case):
                 mean = array(site.distribution.mean()).ravel()[place[s]]
                 expected = evaluate(mean, known)
             close(joined[k], expected, f"{name} connect {s!r}")
+
+
+def test_guide_of_the_twisted_filter(case):
+    """The model by its noise, with its derivatives, of one particle at a time."""
+    program, numbers = case
+    found = guided(program.trace, program.missing)
+    if isinstance(found, NotApplicable):
+        assert isinstance(program.twisted, NotApplicable)
+        return
+    rng, d = np.random.default_rng(9), len(program.trace.state_symbols)
+    lower = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
+    seen = [found.observed, *found.slope, *lower]
+    for t in range(STEPS):
+        generated = Generated(program, numbers, "guide", t)
+        form, suffix = (found.transition, "") if t else (found.initial, "_initial")
+        e = rng.normal(size=len(form.noise))
+        noise = dict(zip(form.noise, e, strict=True))
+        before = [numbers.states[t - 1]] if t else []
+        out = np.full((d, PARTICLES), np.nan)
+        generated.pass_("follow" if t else "begin", *before, e, out)
+        check_rows(generated, out, form.value, t, "by noise", noise)
+        derivatives = [*form.at_rest()]
+        derivatives += [*jacobian(form, program.trace).ravel()] if t else []
+        derivatives += [*form.spread().ravel()]
+        out = np.full((len(derivatives), PARTICLES), np.nan)
+        generated.pass_(f"linear{suffix}", *before, numbers.states[t], out)
+        check_rows(generated, out, derivatives, t, "linear")
+        out = np.full((len(seen), PARTICLES), np.nan)
+        generated.pass_("look", numbers.states[t], out)
+        check_rows(generated, out, seen, t, "look")
+
+
+def check_rows(generated, out, expressions, t, what, more=None):
+    expected = evaluate(list(expressions), {**generated.numbers.values(t), **(more or {})})
+    for k, (row, e) in enumerate(zip(out, expected, strict=True)):
+        close(row, e, f"{what} {k} t={t}")
 
 
 def test_simulation_and_prediction(case):

@@ -21,7 +21,6 @@ from ssmppl.language.trace import trace
 from tests.codegen.harness import PARTICLES, ROOM, STEPS, Numbers, plain_module
 from tests.codegen.models import MODELS, build
 
-
 pytestmark = pytest.mark.skipif(
     native_build.llvm.llvm_version_info[0] < native_build.OLDEST,
     reason="this LLVM has typed pointers, and Numba compiles everything",
@@ -143,11 +142,13 @@ def _compiled(name):
     return getattr(module, name)
 
 
-@pytest.mark.parametrize(
-    "statement",
-    ["while a < 1.0: a = 2.0", "x = [a]", "states[0, 0], b = 1.0, 2.0", "b = a ** 2.0",
-     "b = c.real", "for i in range(1, 3): a = 1.0", "b = unknown", "b = a < 1.0 < 2.0", "other(states)"],
-)  # fmt: skip
+STATEMENTS = [
+    "while a < 1.0: a = 2.0", "x = [a]", "states[0, 0], b = 1.0, 2.0", "b = a ** 2.0", "b = c.real",
+    "for i in range(1, 3): a = 1.0", "b = unknown", "b = a < 1.0 < 2.0", "other(states)",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("statement", STATEMENTS)
 def test_what_is_not_the_small_language(statement):
     """It is named, not translated into something else."""
     with pytest.raises(Untranslatable) as caught:

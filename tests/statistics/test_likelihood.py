@@ -26,10 +26,11 @@ from . import models
 from .checks import LEVEL, mean_one_p, seed_of, some
 from .exact import DenseGaussian, varve_log_likelihood
 
-FILTERS = ("bootstrap", "guided", "auxiliary")
+FILTERS = ("bootstrap", "guided", "auxiliary", "twisted")
 SCHEMES = ("systematic", "stratified", "residual", "multinomial")
 THRESHOLDS = (1.0, 0.5)
 COMBINATIONS = tuple(product(FILTERS, SCHEMES, THRESHOLDS))
+STEERED = COMBINATIONS[-len(SCHEMES) * len(THRESHOLDS) :]  # those of the twisted filter
 FEW = (
     ("bootstrap", "systematic", 1.0),
     ("bootstrap", "multinomial", 0.5),
@@ -40,10 +41,11 @@ FEW = (
 )
 
 EXHAUSTIVE = pytest.mark.exhaustive
+TWISTED = pytest.param("twisted", marks=pytest.mark.slow)  # takes longest to compile
 PILOT, AIM, WANTED, FAULT = 100, 0.7, 0.8, 1.0
 # Repeats of every cell of the whole tables; `make tables` asks for 2,000 and takes over an hour.
 REPEATS = int(os.environ.get("SSMPPL_TABLE_REPEATS", "300"))
-COST = {"bootstrap": 9, "guided": 47, "auxiliary": 72}  # ns per particle step, about
+COST = {"bootstrap": 9, "guided": 47, "auxiliary": 72, "twisted": 50}  # ns per particle step, about
 RESAMPLING = {"systematic": 0, "stratified": 3, "residual": 20, "multinomial": 33}
 
 
@@ -117,7 +119,7 @@ def test_point_mass_filter_against_reference(exact_values):
         assert found == pytest.approx(point["exact"], abs=1e-8), key
 
 
-@pytest.mark.parametrize("proposal", FILTERS)
+@pytest.mark.parametrize("proposal", [*FILTERS[:-1], pytest.param("twisted", marks=EXHAUSTIVE)])
 def test_varves(exact_values, proposal):
     """Every scheme, at two points, on the first 100 rows."""
     y = ice_varves()[:100]
@@ -151,13 +153,20 @@ def length_for(parameters, combination, name, repeats) -> int:
     return shortest
 
 
+def named(combinations):
+    return [pytest.param(c, id="-".join(map(str, c))) for c in combinations]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "combination",
-    some([pytest.param(c, id="-".join(map(str, c))) for c in COMBINATIONS], 3, EXHAUSTIVE),
+    [
+        *some(named(c for c in COMBINATIONS if c not in STEERED), 3, EXHAUSTIVE),
+        *some(named(STEERED), 1, EXHAUSTIVE),
+    ],
 )
 def test_varves_table(exact_values, combination):
-    """144 cells with all combinations: six points, every filter, scheme and threshold.
+    """192 cells with all combinations: six points, every filter, scheme and threshold.
 
     On all 634 rows where that is affordable, else on the first 200 or 100: the line of each cell
     says which, and the exact value of a shorter series is that of the point-mass filter.
@@ -180,9 +189,16 @@ FEW_POINTS = ({"phi": -0.5, "tau": 20.0}, {"phi": 0.9, "tau": 100.0})
 CALM = np.array([20.0, 30.0, 22.0, 35.0, 24.0])  # thickness of varves, in no year
 
 
-@pytest.mark.parametrize("repeats", [2000, pytest.param(20_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("particles", [2, 10])
-@pytest.mark.parametrize("proposal", FILTERS)
+@pytest.mark.parametrize(
+    ("proposal", "repeats"),
+    [
+        *((p, 2000) for p in FILTERS[:-1]),
+        *(pytest.param(p, 20_000, marks=pytest.mark.slow) for p in FILTERS[:-1]),
+        pytest.param("twisted", 2000, marks=pytest.mark.slow),
+        pytest.param("twisted", 20_000, marks=EXHAUSTIVE),
+    ],
+)
 def test_very_few_particles(proposal, particles, repeats):
     """N = 2 and 10 on five calm rows: so few leave sd(log Z) usable there."""
     y = CALM
@@ -198,7 +214,7 @@ def test_very_few_particles(proposal, particles, repeats):
     table.judge()
 
 
-@pytest.mark.parametrize("proposal", FILTERS)
+@pytest.mark.parametrize("proposal", [*FILTERS[:-1], TWISTED])
 def test_filters_inside_of_pmmh(proposal):
     """The kernel that keeps a path makes the same estimate as the one behind `log_likelihood`."""
     problem = pose(models.varves, {"y": CALM})
@@ -286,6 +302,13 @@ def test_lgss_with_gaps(exact_values):
 def test_vector_observations_and_states():
     cells = list(vector_cells())
     gaussian_table(cells, FEW, 300, len(FEW) * len(cells))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cell", some([2, 1, 0], 1, EXHAUSTIVE))
+def test_vector_observations_and_states_of_the_twisted_filter(cell):
+    cells = [list(vector_cells())[cell]]
+    gaussian_table(cells, STEERED[1::3], 300, 3 * len(STEERED[1::3]))
 
 
 @pytest.mark.slow

@@ -83,6 +83,7 @@ LGSS_METHODS = [
     ssm.PMMH(),
     ssm.PMMH(particles=500, proposal="bootstrap"),
 ]
+STEERED = [ssm.PGAS(particles=5, proposal="twisted"), ssm.PMMH(particles=20, proposal="twisted")]
 
 
 @cache
@@ -121,7 +122,9 @@ def test_quadrature_against_reference(exact_values, series):
 
 
 @pytest.mark.parametrize("draws", [2_000, pytest.param(25_000, marks=pytest.mark.exhaustive)])
-@pytest.mark.parametrize("method", some(LGSS_METHODS, 3), ids=str)
+@pytest.mark.parametrize(
+    "method", [*some(LGSS_METHODS, 3), *some(STEERED, 0, pytest.mark.exhaustive)], ids=str
+)
 @pytest.mark.parametrize("series", LGSS)
 def test_lgss(exact_values, series, method, draws):
     """theta with its vague Gamma prior; c is known. Mean, sd and the quantiles' levels."""

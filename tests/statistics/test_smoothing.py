@@ -66,10 +66,14 @@ def stacked(posterior, order):
 LABELS = ["lgss", "gaps", "one channel of two", "machine", "ar2", "echo"]
 RUNS = [(label, proposal) for label in LABELS for proposal in ("bootstrap", "auxiliary")]
 RUNS += [("vehicle", "bootstrap")]  # its observation does not depend on what has noise
+STEERED = [("gaps", "twisted"), ("machine", "twisted")]
 
 
 @pytest.mark.parametrize("draws", [2_000, pytest.param(20_000, marks=pytest.mark.exhaustive)])
-@pytest.mark.parametrize(("label", "proposal"), some(RUNS, 5))
+@pytest.mark.parametrize(
+    ("label", "proposal"),
+    [*some(RUNS, 5), *some(STEERED[:1], 0), *some(STEERED[1:], 0, pytest.mark.exhaustive)],
+)
 def test_smoother(label, proposal, draws):
     model, data, parameters, order, exact = cases()[label]
     particles = 200 if label == "vehicle" else 5
@@ -79,7 +83,7 @@ def test_smoother(label, proposal, draws):
     )  # fmt: skip
     assert idata["posterior"].attrs["ancestor_sampling"] == (label != "vehicle")
     found = stacked(idata["posterior"], order)
-    assert_moments(found, exact, f"{label} {proposal} {draws}", len(RUNS))
+    assert_moments(found, exact, f"{label} {proposal} {draws}", len(RUNS) + len(STEERED))
 
 
 PARAMETERS_OF_DIRAC = {
