@@ -94,7 +94,7 @@ from ssmppl.codegen.kernels.random import new_state
 from ssmppl.language.trace import trace
 from tests.codegen.models import build
 program = compile_trace(trace(build("linear_scalar")))
-run = program.entry("simulate")
+run = program.module.simulate  # the variant that Numba compiles and keeps
 y = np.zeros((3, 1))
 out = np.empty((3, 1, 2)), np.empty((3, 1, 2))
 run(np.array([0.5, 1.0, 1.0]), y, y + 1, np.zeros((3, 0)), new_state(np.random.SeedSequence(1)),
