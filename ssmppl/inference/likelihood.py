@@ -51,7 +51,7 @@ def log_likelihood(
     proposal : "auto", "kalman", "bootstrap", "guided", "auxiliary", "twisted", or "user" where the
         model has a @proposal. "auto" is exact on linear Gaussian models, else the proposal with
         the least variance for its cost in a pilot; "twisted", which looks ahead to the end of the
-        data, is tried where the others tell log Z to no better than 1 at 100 particles.
+        data, is tried where the others tell log Z to no better than 3 at 100 particles.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.

@@ -297,7 +297,7 @@ def test_a_last_resort_where_nothing_else_is_derived(pilot):
     """Particles could only move by the transition; so there is a pilot after all."""
     problem = pose(pendulum, {"y": [0.8, 0.7, 0.6]})
     assert pilot(problem, np.empty(0), {"bootstrap": 0.5 * ENOUGH})[0] == ["bootstrap"]
-    tried, choice = pilot(problem, np.empty(0), {"bootstrap": 3.0, "twisted": 0.2})
+    tried, choice = pilot(problem, np.empty(0), {"bootstrap": 2 * ENOUGH, "twisted": 0.2})
     assert (tried, choice.name) == (["bootstrap", "twisted"], "twisted")
 
 

@@ -48,7 +48,7 @@ STEP = 2.6  # normalise, resample, gather
 NORMAL, UNIFORM = 1.5, 0.6
 LOOK_AHEAD = 4.0  # one more normalisation and the second-stage weights
 PILOT_PARTICLES, PILOT_REPEATS, PILOT_STEPS = 100, 24, 400
-ENOUGH = 1.0  # sd of log Z in the pilot up to which the twisted proposal is not tried
+ENOUGH = 3.0  # sd of log Z in the pilot up to which the twisted proposal is not tried
 
 
 @dataclass(frozen=True)
