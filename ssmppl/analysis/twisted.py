@@ -149,9 +149,13 @@ def guided(trace: Trace, missing: Missing) -> Guided | NotApplicable:
         return NotApplicable("no state is observed", site.distribution.location)
     try:
         slope, curvature = array(gradient(total, states)), array(-hessian(total, states))
-        initial.spread(), transition.spread(), jacobian(transition, trace)
     except NotDifferentiable as error:
-        return NotApplicable(f"a law is not differentiable: {error.found}", where)
+        reason = f"the observation is not twice differentiable: {error.found}"
+        return NotApplicable(reason, site.distribution.location)
+    try:
+        jacobian(transition, trace)
+    except NotDifferentiable as error:
+        return NotApplicable(f"the transition is not differentiable: {error.found}", where)
     same = not any(depends_on(e, states) for e in curvature.ravel())
     return Guided(initial, transition, total, slope, curvature, same)
 

@@ -29,6 +29,7 @@ from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import Problem
+from ssmppl.language.distributions import LogNormal
 from ssmppl.language.trace import Trace
 
 SINGLES, MATES, PAIRS = 5, 3, 3  # candidates refitted, further ones like them, pairs
@@ -116,12 +117,22 @@ def proposal_of(program: Program) -> str:
     """The proposal of a program's filters: the user's, the twisted one, or the best there is."""
     if "user" in program.proposals:
         return "user"
-    if not isinstance(program.proposals.get("twisted"), NotApplicable):
+    if _steerable(program):
         return "twisted"
     found = program.proposals.get("auxiliary")
     if found is not None and not isinstance(found, NotApplicable) and found.exact_look_ahead:
         return "auxiliary"
     return "bootstrap"
+
+
+def _steerable(program: Program) -> bool:
+    """Whether the twisted proposal applies, and its extended Kalman filter can be trusted: it may
+    step out of the support of a LogNormal state, where its guide and its predictions are lost."""
+    laws = [s.distribution for s in program.trace.transition.values()]
+    twisted = program.proposals.get("twisted", NotApplicable("there is none"))
+    return not isinstance(twisted, NotApplicable) and not any(
+        isinstance(d, LogNormal) for d in laws
+    )
 
 
 def refit(

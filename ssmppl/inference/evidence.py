@@ -191,7 +191,7 @@ def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedS
     if proposal == "auto" or particles is None:
         theta, _ = space.parameters(find_mode(space, root).z)
         if proposal == "auto":
-            proposal = choose(problem, theta, kalman=False).name
+            proposal = choose(problem, theta, kalman=False, whole=True).name
         problem.proposal(proposal)
         if particles is None:
             particles = tune_particles(problem, theta, proposal, TARGET_SD, root).particles

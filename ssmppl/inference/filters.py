@@ -50,6 +50,10 @@ def particle_filter(
 ) -> xr.Dataset | list[xr.Dataset]:
     """Run the particle filter and tell what it found; arguments as in `log_likelihood`.
 
+    With proposal="twisted" the particles know what comes later: their sum of log-likelihood
+    increments is worth most, while few of them tell the moments at single rows. "auto" leaves it
+    out here.
+
     Returns
     -------
     Dataset, or a list of them for several experiments

@@ -70,7 +70,7 @@ def log_likelihood(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
-    settings = settle(problem, theta, particles, proposal, resampling, ess_threshold)
+    settings = settle(problem, theta, particles, proposal, resampling, ess_threshold, whole=True)
     if settings.proposal == "kalman":
         exact = kalman_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
@@ -87,11 +87,16 @@ def settle(
     proposal: str,
     resampling: str = "systematic",
     ess_threshold: float = 1.0,
+    *,
+    whole: bool = False,
 ) -> FilterSettings:
-    """The settings of a call with "auto" resolved, checked against what could be derived."""
+    """The settings of a call with "auto" resolved, checked against what could be derived.
+
+    whole : as in `choose`.
+    """
     settings = filter_settings(particles, proposal, resampling, ess_threshold)
     if proposal == "auto":
-        chosen = choose(problem, theta).name
+        chosen = choose(problem, theta, whole=whole).name
         return filter_settings(particles, chosen, resampling, ess_threshold)
     if proposal == "kalman":
         found = linear_gaussian(problem.trace)

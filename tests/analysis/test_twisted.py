@@ -259,7 +259,11 @@ REASONS = {
         (lambda: {"y": D.Normal(0.0, sd=1)},), "no state is observed", "D.Normal(0.0",
     ),
     "no derivative": (
-        (see, None, in_shape), "a law is not differentiable", "",
+        (see, None, in_shape), "the transition is not differentiable", "",
+    ),
+    "no derivative of the observation": (
+        (lambda p: {"y": D.Truncated(D.Gamma(np.exp(p), rate=1), lower=1)},),
+        "the observation is not twice differentiable", "D.Truncated(D.Gamma(",
     ),
 }  # fmt: skip
 

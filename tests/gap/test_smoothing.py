@@ -1,14 +1,22 @@
 """One pass against exact scores: of the Kalman filter, and of a simulator without noise."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
 
+import ssmppl as ssm
 from ssmppl.analysis.density import Missing
+from ssmppl.codegen.program import compile_trace
 from ssmppl.data import bind, check_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.gap.columns import score_columns
+from ssmppl.gap.confirm import stretches
+from ssmppl.gap.fit import Fitter
+from ssmppl.gap.refit import proposal_of
 from ssmppl.gap.smoothing import (
+    PREDICTIVE,
     Settings,
     Smoother,
     probability_transforms,
@@ -18,6 +26,7 @@ from ssmppl.gap.smoothing import (
 )
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
+from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
 from tests.gap.models import THETA, build, simulated
 from tests.statistics.checks import LEVEL, seed_of
@@ -68,27 +77,69 @@ def test_exact_trajectories_give_the_exact_score(name):
     assert np.max(np.abs(z)) < stats.t.isf(LEVEL / (2 * len(z)), 39), z
 
 
-@pytest.mark.parametrize("name", LINEAR)
-def test_particles_come_near_the_exact_score(name):
-    """The genealogy within its error, the bias of N = 500 below a tenth of a standard deviation of
-    the score itself: that is what tests and fits can tell."""
-    model, smoother = smoother_of(name, Settings(500, PROPOSAL[name]), exact=False)
+@pytest.mark.parametrize(
+    ("name", "proposal", "particles"),
+    [*((n, PROPOSAL[n], 500) for n in LINEAR), *((n, "twisted", 100) for n in LINEAR)],
+)
+def test_particles_come_near_the_exact_score(name, proposal, particles):
+    """The genealogy within its error, the bias below a tenth of a standard deviation of the score
+    itself: that is what tests and fits can tell. A hundred steered particles do as well."""
+    model, smoother = smoother_of(name, Settings(particles, proposal), exact=False)
     theta = check_parameters(model, {k: 1.1 * v for k, v in THETA[name].items()})
     experiments = bind(model, simulated(name, 150))
     kalman = smoother_of(name)[1].kalman
     _, exact = kalman.score(experiments, theta)
     information = kalman.information(experiments, theta)
-    rows, _ = runs_of(smoother, experiments, theta, 60, "particle rows", name)
+    rows, _ = runs_of(smoother, experiments, theta, 60, "particle rows", name, proposal)
     error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
     slack = 0.1 * np.sqrt(np.abs(np.diagonal(information)))
     excess = (np.abs(rows.mean(axis=0) - exact) - slack) / error
     assert np.max(excess) < stats.t.isf(LEVEL / (2 * len(excess)), 59), (rows.mean(axis=0), exact)
 
 
+@pytest.mark.parametrize("name", LINEAR)
+def test_predictions_beside_steered_particles(name):
+    """Of an extended Kalman filter, which in a linear model is the exact one."""
+    model, smoother = smoother_of(name, Settings(50, "twisted"), exact=False)
+    theta = check_parameters(model, THETA[name])
+    experiments = bind(model, simulated(name, 150))
+    (found,) = smoother.run(experiments, theta, random_state(seed_sequence(3)))
+    (exact,) = smoother_of(name)[1].run(experiments, theta, random_state(seed_sequence(4)))
+    mean, variance = exact.prediction[:, 0], exact.prediction[:, 1]
+    # the observation's own part of the variance is not drawn, so that these bounds are wide
+    z = (found.prediction[:, 0] - mean) / np.sqrt(variance / PREDICTIVE)
+    assert np.max(np.abs(z)) < stats.norm.isf(LEVEL / (2 * z.size)), z
+    # two draws of a mirrored pair count for one here
+    z = (found.prediction[:, 1] - variance) / (variance * np.sqrt(2.0 / (PREDICTIVE // 2)))
+    assert np.max(np.abs(z)) < stats.norm.isf(LEVEL / (2 * z.size)), z
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_held_out_stretches_have_their_density(name):
+    """Sums over the stretches of rows that count, against the exact filter's."""
+    model, _ = smoother_of(name)
+    problem = pose(build(name), simulated(name, 60))
+    fitter = Fitter(problem, {}, Settings(50, "twisted"))
+    theta = check_parameters(model, THETA[name])
+    (e,) = problem.experiments
+    counts = np.zeros(60, dtype=bool)
+    counts[:7], counts[40:] = True, True
+    fit = SimpleNamespace(theta=theta)
+    runs = np.array([
+        stretches(fitter, fit, e, counts, random_state(seed_sequence(seed_of(name, str(r)))))
+        for r in range(30)
+    ])  # fmt: skip
+    assert np.all(runs[:, ~counts] == 0.0)
+    exact = fitter.kalman.filter(e, theta).log_increments
+    parts = [slice(a, b) for a, b in ((0, 5), (5, 7), (40, 45), (45, 50), (50, 55), (55, 60))]
+    for rows in parts:  # one figure for each stretch, spread evenly
+        assert np.all(runs[:, rows] == runs[:, rows][:, :1])
+    z = off(*(np.stack([v[..., p].sum(axis=-1) for p in parts], axis=-1) for v in (runs, exact)))
+    assert np.max(np.abs(z)) < stats.t.isf(LEVEL / (2 * len(z)), 29), z
+
+
 def test_a_simulator_without_noise_is_derived_through_its_states():
     """Deterministic transitions from a known start: the score is that of a regression."""
-    import ssmppl as ssm
-
     model = ssm.Model("decay", inputs=("u",))
 
     @model.prior
@@ -163,3 +214,20 @@ def test_missing_values_have_no_transform():
     (pit,) = probability_transforms(passes, experiments, stream)
     assert np.flatnonzero(np.isnan(pit[:, 0])).tolist() == [3, 17]
     assert np.all(passes[0].log_increments[[3, 17]] == 0.0)
+
+
+def test_positive_states_are_left_to_the_transition():
+    """The extended Kalman filter may step out of a LogNormal state's support, and then knows
+    nothing: neither a guide nor a prediction."""
+    positive, plain = ssm.Model("positive"), ssm.Model("plain")
+    for model in (positive, plain):
+        model.initial(lambda: {"n": ssm.LogNormal(2.0, sd=0.3)})
+        model.observation(lambda n: {"y": ssm.Poisson(3.0 * np.abs(n))})
+    positive.transition(lambda n: {"n": ssm.LogNormal(np.log(n) + 1.0 - n / 20.0, sd=0.3)})
+    plain.transition(lambda n: {"n": ssm.Normal(0.9 * n, sd=0.3)})
+    chosen = []
+    for model in (positive, plain):
+        program = compile_trace(trace(model), Missing(none=True))
+        assert not isinstance(program.proposals["twisted"], NotApplicable)
+        chosen.append(proposal_of(program))
+    assert chosen == ["bootstrap", "twisted"]

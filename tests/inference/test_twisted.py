@@ -11,7 +11,7 @@ import ssmppl as ssm
 from ssmppl.analysis.twisted import DEFENSIVE
 from ssmppl.codegen.kernels.particle_filter import GUIDED_SHARE
 from ssmppl.datasets import ice_varves
-from ssmppl.errors import SamplingError
+from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.chains.pmmh import run_filters
 from ssmppl.inference.particles import proposal_choice
 from ssmppl.inference.particles.filtering import FilterSettings, random_state, repeated_estimates
@@ -236,7 +236,7 @@ def pilot(monkeypatch):
     """Pretended estimates: choose(...) with given standard deviations of log Z by proposal; None
     where the filter fails. Returns what was tried, and the choice."""
 
-    def run(problem, theta, spreads):
+    def run(problem, theta, spreads, whole=True):
         tried = []
 
         def pretended(problem, theta, settings, seed, repeats):
@@ -248,7 +248,7 @@ def pilot(monkeypatch):
 
         monkeypatch.setattr(proposal_choice, "_choices", {})
         monkeypatch.setattr(proposal_choice, "repeated_estimates", pretended)
-        return tried, choose(problem, theta)
+        return tried, choose(problem, theta, whole=whole)
 
     return run
 
@@ -301,15 +301,33 @@ def test_a_last_resort_where_nothing_else_is_derived(pilot):
     assert (tried, choice.name) == (["bootstrap", "twisted"], "twisted")
 
 
+def test_a_last_resort_for_whole_records_only(pilot):
+    """Where moments at single rows are wanted, few twisted particles would tell them."""
+    problem = pose(models.varves, {"y": [20.0, 30.0, 22.0]})
+    too_much = dict.fromkeys(OTHERS, 2 * ENOUGH) | {"twisted": 0.1}
+    tried, choice = pilot(problem, np.array([0.9, 20.0]), too_much, whole=False)
+    assert tried == OTHERS
+    assert choice.name != "twisted"
+
+
+@pytest.mark.parametrize("variant", [{"order": 1}, {"order": 2}, {"correlation": 0.9}])
+def test_variants_that_know_no_guide_say_so(variant):
+    method = ssm.PMMH(particles=20, proposal="twisted", **variant)
+    with pytest.raises(ArgumentError, match="guide of the twisted proposal"):
+        ssm.sample(
+            models.varves, {"y": [20.0, 30.0, 22.0]}, method, draws=2, warmup=2, chains=1, seed=1
+        )
+
+
 @pytest.mark.slow
 def test_the_pendulum_chooses_it_and_the_varves_do_not(monkeypatch):
     y = ssm.simulate(pendulum, {}, steps=200, seed=seed_of("swing"))["y"].values[0]
-    choice = choose(pose(pendulum, {"y": y}), np.empty(0))
+    choice = choose(pose(pendulum, {"y": y}), np.empty(0), whole=True)
     assert choice.name == "twisted", choice
     assert list(choice.figures) == ["bootstrap", "twisted"]
     assert 10 * choice.figures["twisted"][0] < choice.figures["bootstrap"][0]
     assert generated(pose(pendulum, {"y": y}))
     problem = forgotten(pose(models.varves, {"y": ice_varves()}), monkeypatch)
-    choice = choose(problem, np.array([0.6, 5.0]))
+    choice = choose(problem, np.array([0.6, 5.0]), whole=True)
     assert sorted(choice.figures) == sorted(OTHERS)
     assert not generated(problem)

@@ -66,7 +66,10 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = find_mode(space, setup.root)
     theta, _ = space.parameters(pilot.z)
-    choice = choose(problem, theta, kalman=False) if method.proposal == "auto" else None
+    plain = method.order == 0 and not method.correlation  # others know no guide
+    choice = None
+    if method.proposal == "auto":
+        choice = choose(problem, theta, kalman=False, whole=plain)
     proposal = choice.name if choice else method.proposal
     problem.proposal(proposal)
     particles, tuned = method.particles, None

@@ -95,9 +95,15 @@ def _pass_cost(roots: list[Expr], known: dict[Expr, bool]) -> float:
 _choices: dict[tuple, Choice] = {}
 
 
-def choose(problem: Problem, theta: np.ndarray, kalman: bool = True) -> Choice:
+def choose(
+    problem: Problem, theta: np.ndarray, kalman: bool = True, *, whole: bool = False
+) -> Choice:
     """Kalman where the model is linear Gaussian, the user's proposal where there is one, else the
-    winner of a pilot at theta; remembered for each program and data."""
+    winner of a pilot at theta; remembered for each program and data.
+
+    whole : only the likelihood of all the data, or a trajectory given all of them, is wanted. Then
+    the twisted proposal may be chosen; few of its particles tell what was known at a single row.
+    """
     if kalman and not isinstance(linear_gaussian(problem.trace), NotApplicable):
         return Choice("kalman", {})
     if "user" in problem.program.proposals:
@@ -106,9 +112,10 @@ def choose(problem: Problem, theta: np.ndarray, kalman: bool = True) -> Choice:
         n: p for n, p in problem.program.proposals.items() if not isinstance(p, NotApplicable)
     }
     twisted = {n: candidates.pop(n) for n in ("twisted",) if n in candidates}
+    twisted = twisted if whole else {}
     if len(candidates) == 1 and not twisted:
         return Choice("bootstrap", {})
-    key = (problem.program.path, _digest(problem), theta.tobytes())
+    key = (problem.program.path, _digest(problem), theta.tobytes(), whole)
     if key not in _choices:
         _choices[key] = _pilot(problem, theta, candidates, twisted)
     return _choices[key]
