@@ -106,8 +106,8 @@ CASES = {
     "no precision": ([3.0, 0.0, 0.4, -2.0], "slice"),
     "negative precision": ([3.0, 0.3, 0.4, -2.0], "slice"),
     "no rate": ([3.0, -1.0, 3.0, -2.2], "slice"),
-    "half outside": ([8.0, -50.0, 100.0, -51.0], "conjugate"),
     "all outside": ([8.0, -50.0, 140.0, -99.0], "slice"),
+    "half outside": ([8.0, -50.0, 100.0, -51.0], "conjugate"),
 }
 
 

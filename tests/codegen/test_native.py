@@ -193,6 +193,7 @@ def passes(model, seed=1):
     return out
 
 
+@pytest.mark.slow  # a minute of Numba for the second of the two
 def test_a_filter_by_address_is_the_filter():
     """The same particles, weights, ancestors and evidence as with Numba throughout."""
     native, numba_made = passes(walk())

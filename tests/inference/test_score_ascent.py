@@ -71,6 +71,7 @@ def test_a_step_of_the_paper_between_bounds_is_one_in_atanh():
     np.testing.assert_allclose(moved, expected)
 
 
+@pytest.mark.slow
 def test_particles_find_the_top_within_the_stated_error(exact_values):
     exact = exact_values["lgss_main_text"]["mle"]
     method = ssm.ScoreAscent(particles=200, trajectories=100, proposal="bootstrap")

@@ -47,7 +47,9 @@ def vehicle_exact(y, h):
     return DenseGaussian(y, **models.vehicle_matrices(h)).log_likelihood
 
 
-@pytest.mark.parametrize(("particles", "repeats"), [(2, 1000), (10, 1000), (100, 200)])
+@pytest.mark.parametrize(("particles", "repeats"), [
+    pytest.param(2, 1000, marks=pytest.mark.slow), (10, 1000), (100, 200),
+])  # fmt: skip
 def test_position_and_velocity(particles, repeats):
     """Every scheme and threshold. The guide is exact here, so that even two particles do.
 

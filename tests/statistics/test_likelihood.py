@@ -293,6 +293,7 @@ def gaussian_table(cells, combinations, repeats, size):
     table.judge()
 
 
+@pytest.mark.slow
 def test_lgss_with_gaps(exact_values):
     cells = [c for c in lgss_cells(exact_values, gaps=True) if "theta=1.0" in c[0]]
     gaussian_table(cells, FEW, 300, len(FEW) * len(cells))

@@ -60,7 +60,7 @@ def varve_deviations(posterior, exact) -> dict[str, float]:
 VARVE_RUNS = [
     pytest.param("PGAS", ssm.PGAS(), 2_000, 200, False, id="PGAS"),
     pytest.param("PMMH", ssm.PMMH(particles=800, proposal="bootstrap"), 1_200, 500, False,
-                 id="PMMH"),
+                 id="PMMH", marks=pytest.mark.slow),
     pytest.param("PGAS", ssm.PGAS(), 20_000, 500, True, id="PGAS-long", marks=pytest.mark.slow),
     pytest.param("PMMH", ssm.PMMH(), 10_000, 1_000, True, id="PMMH-long", marks=pytest.mark.slow),
 ]  # fmt: skip
@@ -77,8 +77,8 @@ def test_varves(exact_values, name, method, draws, warmup, long):
 
 LGSS = {"main text": (lgss_main_text, 0.5), "appendix": (lgss_appendix, 1.0)}
 LGSS_METHODS = [
-    ssm.MetropolisHastings(),
     ssm.Gibbs(),
+    ssm.MetropolisHastings(),
     *(ssm.PGAS(particles=n, proposal=p) for p in ("bootstrap", "auxiliary") for n in (2, 5, 20)),
     ssm.PMMH(),
     ssm.PMMH(particles=500, proposal="bootstrap"),

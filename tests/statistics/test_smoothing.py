@@ -72,7 +72,7 @@ STEERED = [("gaps", "twisted"), ("machine", "twisted")]
 @pytest.mark.parametrize("draws", [2_000, pytest.param(20_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(
     ("label", "proposal"),
-    [*some(RUNS, 5), *some(STEERED[:1], 0), *some(STEERED[1:], 0, pytest.mark.exhaustive)],
+    [*some(RUNS, 4), *some(STEERED[:1], 0), *some(STEERED[1:], 0, pytest.mark.exhaustive)],
 )
 def test_smoother(label, proposal, draws):
     model, data, parameters, order, exact = cases()[label]
