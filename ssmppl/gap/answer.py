@@ -89,8 +89,10 @@ def answer(r: Results, seconds: float) -> GapReport:
         runs = (r.far.before, r.far.after)
         if r.far.rows:
             share = tabulate("closed", r.far.rows)
-            # Few blocks leave the share open where the test of the effect does not.
-            if not r.blocks and not np.isfinite(share["F"].iloc[0]):
+            # Few held-out rows leave the share open where the test of the effect does not; what
+            # gains nothing on them was chance.
+            open_, gained = not np.isfinite(share["F"].iloc[0]), share["nats_per_sample"].iloc[0]
+            if not r.blocks and open_ and (verdict != "effect" or gained <= 0.0):
                 verdict, missing = "no measurable gap", None
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}

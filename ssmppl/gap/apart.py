@@ -35,18 +35,17 @@ SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one
 
 
 def heads(screen: Screen, refits: Sequence[Refit]) -> list[int]:
-    """Best shape of each group: the refitted by their gain, then the others by the screen's."""
+    """Best shape of each group: the refitted by their merit, then the others by their height."""
     done = [r.index[0] for r in refits if len(r.index) == 1]
-    rest = [int(k) for k in screen.family.best if int(k) not in done]
-    groups = screen.groups
+    family, groups = screen.family, screen.groups
     known = {int(groups[k]) for k in done}
-    rest = [k for k in rest if not screen.found.status[k] and int(groups[k]) not in known]
-    return done + sorted(rest, key=lambda k: -screen.found.gain[k])
+    rest = [int(k) for k in family.best[np.argsort(-family.height, kind="stable")]]
+    return done + [k for k in rest if not screen.found.status[k] and int(groups[k]) not in known]
 
 
 def told(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
     """Classes of the candidates in `order` (of `heads`); one of its own for whatever is weak."""
-    refitted = {r.index[0]: max(r.gain, 0.0) for r in refits if len(r.index) == 1}
+    refitted = {r.index[0]: max(r.merit, 0.0) for r in refits if len(r.index) == 1}
     at = np.array(order, dtype=int)
     rho, sided = screen.found.rho[np.ix_(at, at)], screen.found.sided[at]
     gains = np.array([refitted.get(int(k), screen.found.gain[k]) for k in at])

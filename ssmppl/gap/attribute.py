@@ -12,20 +12,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ssmppl.data import Experiment
+from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.byrefit import quick_enough, refit_p, worth_testing
+from ssmppl.gap.byrefit import LAX, gain_p, quick_enough, refit_p
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.familywise import tail_p, threshold
+from ssmppl.gap.familywise import threshold
 from ssmppl.gap.fit import Fit
-from ssmppl.gap.refit import Refit, Workshop, leading, pairs, refit_all
+from ssmppl.gap.refit import Refit, Workshop, leading, mates, pairs, refit_all
 from ssmppl.gap.screen import Question, Screen, ask
 
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is asked
 FOLLOWERS = 3  # refits after a second screen
-ASKED_AGAIN = 12  # groups in a second screen, those of which the first promises most
 
 
 @dataclass
@@ -56,42 +55,54 @@ def attribute(
     refitted; None: the leading ones and their class mates. steps : effects in all. quick : without
     standard errors.
     """
-    heads = leading(screen)[:singles]
-    refits, failed = refit_all(
-        workshop,
-        out.base,
-        screen,
-        [[k] for k in heads],
-        train,
-        _seed(seed, 1),
-        kept,
-        "refitting",
-        quick=quick,
-    )
-    out.notes += [f"not refitted: {reason}" for reason in failed]
-    out.refits = refits
-    testable = not always and _testable(workshop, screen, train)
-    own = alpha / 2 if testable else alpha  # of two tests, each has half
-    significant = bool(np.min(screen.family.p, initial=1.0) <= own)
-    if not significant and testable:
-        significant = _by_refit(out, workshop, screen, _seed(seed, 4), own, kept)
-    if not refits or not (significant or always):
-        return
-    needed = needed_gain(screen, alpha)
-    chosen = refits[0]
-    if steps > 1:
-        out.doubles, failed = refit_all(
-            workshop, out.base, screen, pairs(screen, refits), train, _seed(seed, 2), kept,
-            "refitting pairs", quick=quick,
+    refits: list[Refit] = []
+    for stage in ("refitting", "refitting what is like it"):
+        if stage == "refitting":
+            heads = leading(screen)[:singles]
+        else:
+            heads = mates(screen, refits) if singles is None else []
+        more, failed = refit_all(
+            workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept, stage,
+            quick=quick,
         )  # fmt: skip
+        refits = sorted(refits + more, key=lambda r: -r.merit)
         out.notes += [f"not refitted: {reason}" for reason in failed]
-        if out.doubles and out.doubles[0].gain - chosen.gain >= needed:
-            chosen = out.doubles[0]
-    out.chosen = chosen
-    if significant and steps > 1:
-        _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
+    out.refits = refits
+    significant = False
+    if not always:
+        _rebase(out, workshop, train, _seed(seed, 6), kept, needed_gain(screen, alpha))
+        own = alpha / 2  # of two tests, each has half
+        significant = bool(np.min(screen.family.p, initial=1.0) <= own)
+        significant |= _by_refit(out, workshop, screen, train, _seed(seed, 4), own, kept)
+    if not out.refits or not (significant or always):
+        return
+    out.chosen = out.refits[0]
+    if steps > 1:
+        rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept, quick)
+        if significant:  # a step from the best one, against the best pair
+            _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, 2)
+        if rival is not None and rival.merit > out.chosen.merit:
+            out.chosen = rival
+        if significant and len(out.chosen.candidates) == 2:
+            _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
     if not quick:
         _measure(out, _seed(seed, 5), kept)
+
+
+def _best_pair(
+    out: Attribution, workshop: Workshop, screen: Screen, train: Sequence[Experiment],
+    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint, quick: bool,
+) -> Refit | None:  # fmt: skip
+    """The best of the pairs of which the screen promises most, where it is clearly better than the
+    best one."""
+    out.doubles, failed = refit_all(
+        workshop, out.base, screen, pairs(screen, out.refits), train, seed, kept,
+        "refitting pairs", quick=quick,
+    )  # fmt: skip
+    out.notes += [f"not refitted: {reason}" for reason in failed]
+    if not out.doubles or out.doubles[0].merit - out.refits[0].merit < needed_gain(screen, alpha):
+        return None
+    return out.doubles[0]
 
 
 def _measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) -> None:
@@ -107,26 +118,47 @@ def _measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) -
     out.refits = [new if r is old else r for r in out.refits]
 
 
-def _testable(workshop: Workshop, screen: Screen, train: Sequence[Experiment]) -> bool:
-    """Whether the screen was asked on the rows of the refits, and these are quick."""
-    same = [e.steps for e in train] == [e.steps for e in screen.experiments]
-    return same and quick_enough(workshop, train)
+def _rebase(
+    out: Attribution, workshop: Workshop, train: Sequence[Experiment],
+    seed: np.random.SeedSequence, kept: Checkpoint, worth: float,
+) -> None:  # fmt: skip
+    """Fit the model itself from where the best refit ended, too: a refit that found a better place
+    for the parameters gains by that, and not by its effect. Only where the gain is `worth` it."""
+    if not out.refits or out.refits[0].merit < worth:
+        return
+    fitter, best = workshop.fitter(()), out.refits[0].fit
+    values = unpack_parameters(best.problem.trace, best.theta)
+    start = {n: v for n, v in values.items() if n in workshop.trace.parameters}
+    numbers = kept.of(
+        "fitting from the best refit",
+        lambda: fitter.fit(train, seed, start, searched=True).numbers,
+    )
+    found = fitter.restored(train, numbers)
+    better = found.log_likelihood - out.base.log_likelihood
+    if better > 2.0 * np.hypot(found.error, out.base.error) + 0.1:
+        out.base = found
+        out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
 
 
 def _by_refit(
-    out: Attribution, workshop: Workshop, screen: Screen, seed: np.random.SeedSequence,
-    alpha: float, kept: Checkpoint,
+    out: Attribution, workshop: Workshop, screen: Screen, train: Sequence[Experiment],
+    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint,
 ) -> bool:  # fmt: skip
-    """Whether the best refit's own gain is more than chance."""
-    if not worth_testing(screen, out.refits, alpha):
+    """Whether the gain of a refit is more than chance: by its own law where fits are quick, else
+    by that of the scores, which is the same to first order (likelihood ratio and score tests)."""
+    found = {r.index[0]: gain_p(screen, r) for r in out.refits}
+    if not found or min(found.values()) > LAX * alpha:
         return False
-    p = refit_p(workshop, out.base, screen, out.refits, alpha, seed, kept)
-    out.p[out.refits[0].index[0]] = p
-    return p <= alpha
+    if quick_enough(workshop, train):
+        best = min(found, key=lambda k: found[k])
+        found = {best: refit_p(workshop, out.base, screen, out.refits, alpha, seed, kept)}
+    out.p |= found
+    return min(found.values()) <= alpha
 
 
 def needed_gain(screen: Screen, alpha: float) -> float:
-    """Nats that the best of all candidates gains by chance with probability alpha."""
+    """Nats, less the cost, that the best of all candidates gains by chance with probability
+    alpha."""
     return 0.5 * threshold(screen.family.maxima, alpha) ** 2
 
 
@@ -153,43 +185,33 @@ def _forward(
         except ArgumentError as error:
             out.notes.append(f"whether a further effect is missing is not known: {error.found}")
             return
-        largest = float(np.max(again.family.height, initial=0.0))
-        if tail_p(largest, screen.family.maxima) > alpha:  # few were asked, out of all
+        if float(np.min(again.family.p, initial=1.0)) > LAX * alpha:
             return
         heads = leading(again)[:FOLLOWERS]
         more, _ = refit_all(
             workshop, chosen.fit, again, [[k] for k in heads], train, _seed(seed, 10 + number),
             own, "refitting", chosen.candidates,
         )  # fmt: skip
-        if not more or more[0].gain < needed_gain(screen, alpha):
+        if not more or more[0].merit < needed_gain(again, alpha):
             return
         best = more[0]
         strengths = {c.key: k for k, c in enumerate(screen.question.candidates)}
         index = (*chosen.index, strengths[best.candidates[-1].key])
-        chosen = Refit(index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain)
+        chosen = Refit(
+            index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain,
+            chosen.cost + best.cost,
+        )  # fmt: skip
         out.chosen = chosen
 
 
 def _others(screen: Screen, chosen: Refit) -> list[Candidate]:
-    """The candidates of the groups that promise most beside what was chosen.
-
-    By the quadratic of the first screen: S~_j - V_jC V_CC^-1 S~_C and its variance.
-    """
-    groups, found = {c.group for c in chosen.candidates}, screen.found
-    at = list(chosen.index)
-    v, size = found.covariance, np.maximum(found.variance, 1e-300)
-    slopes = np.linalg.lstsq(v[np.ix_(at, at)], v[at], rcond=1e-6)[0]  # (C, K)
-    left = found.score - slopes.T @ found.score[at]
-    variance = size - np.einsum("ck,ck->k", slopes, v[at])
-    variance = np.maximum(variance, 0.02 * size)  # next to nothing: as good as the same effect
-    best: dict[str, float] = {}
-    for k, c in enumerate(screen.question.candidates):
-        if c.group in groups or found.status[k]:
-            continue
-        if found.sided[k] * left[k] >= 0.0:
-            best[c.group] = max(best.get(c.group, 0.0), float(left[k] ** 2 / variance[k]))
-    kept = sorted(best, key=lambda g: -best[g])[:ASKED_AGAIN]
-    return [c for c in screen.question.candidates if c.group in kept]
+    """The candidates of all other groups of which the screen can tell anything. What it said of
+    them is no guide: with an effect added noise shrinks, and others come to light."""
+    groups = {c.group for c in chosen.candidates}
+    return [
+        c for c, status in zip(screen.question.candidates, screen.found.status, strict=True)
+        if c.group not in groups and not status
+    ]  # fmt: skip
 
 
 def _screen_again(

@@ -16,26 +16,28 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.errors import SSMError
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
-from ssmppl.gap.efficient import efficient
 from ssmppl.gap.familywise import tail_p
 from ssmppl.gap.fit import Fit
 from ssmppl.gap.refit import Refit, Workshop, start_at
-from ssmppl.gap.screen import Screen
+from ssmppl.gap.screen import Screen, compared
 from ssmppl.inference.particles.filtering import random_state
 
-LAX = 4.0  # times alpha, where the gain is tested
+LAX = 4.0  # times alpha, up to which a closer look is worth it
 TRIED = 2  # candidates refitted in each set, the best by the score
 SETS, CHUNK = 99, 10
 MOST_WORK = 1.5e5  # rows times particles, beyond which the fits would take too long
+MOST_ROWS = 300
 
 
-def worth_testing(screen: Screen, refits: Sequence[Refit], alpha: float) -> bool:
-    """Whether a refit gains what would be worth a look in the screen, had its score been as large.
+def gain_p(screen: Screen, refit: Refit) -> float:
+    """Family-wise p of what one effect's refit gains, had its score been as large.
 
-    The screen's law says this roughly only; `refit_p` tells.
+    Twice the gain and the square of the score agree to first order where there is no effect; where
+    there is one the gain is the larger of the two, as the refit lets the noise shrink again.
     """
-    gain = best_of_tried(screen, refits)
-    return gain > 0.0 and tail_p(np.sqrt(2.0 * gain), screen.family.maxima) <= LAX * alpha
+    label = int(screen.groups[refit.index[0]])
+    height = screen.family.put(label, float(np.sqrt(2.0 * max(refit.gain, 0.0))))
+    return tail_p(height, screen.family.maxima)
 
 
 def best_of_tried(screen: Screen, refits: Sequence[Refit]) -> float:
@@ -82,7 +84,7 @@ def _gain(
         at = question.theta(fit.theta)
         passes = question.smoother.run(data, at, stream)
         seen = question.statistics(data, passes, stream)
-        found = efficient(screen.law, seen.columns, seen.nuisance)
+        found = compared(screen.law, screen.usual, seen)
         out = []
         for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
             fitter = workshop.fitter((question.candidates[j],))
@@ -108,5 +110,6 @@ def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
 
 def quick_enough(workshop: Workshop, experiments: Sequence[Experiment]) -> bool:
     """Whether the fits of the test can be afforded."""
-    work = sum(e.steps for e in experiments) * workshop.settings.particles
-    return workshop.fitter(()).exact or work <= MOST_WORK
+    rows = sum(e.steps for e in experiments)
+    quick = workshop.fitter(()).exact or rows * workshop.settings.particles <= MOST_WORK
+    return quick and rows < MOST_ROWS

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.data import Experiment, check_values, unpack_parameters
+from ssmppl.data import Experiment, check_values
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.gap.answer import Results, answer
 from ssmppl.gap.apart import separating
@@ -27,7 +27,7 @@ from ssmppl.gap.expected import Timed, in_words, timed
 from ssmppl.gap.expected import seconds as expected
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import FOLDS, Parts, long_enough, three_parts
-from ssmppl.gap.profiles import one_off
+from ssmppl.gap.profiles import passing
 from ssmppl.gap.refit import Workshop, proposal_of
 from ssmppl.gap.report import MODES, GapReport
 from ssmppl.gap.scales import Scales
@@ -148,7 +148,7 @@ class _Diagnosis:
     def _screened(self) -> Results:
         """Fit, and screen."""
         base = self.workshop.fitter(())
-        training = self.parts.screen if self.parts else self.experiments
+        training = self.parts.train if self.parts else self.experiments
         fit = self._fit("fitting", base, training, 1, {}, searched=False)
         question = Question(
             self.trace, self._scales(base, fit, training), self.workshop.missing,
@@ -173,18 +173,17 @@ class _Diagnosis:
 
     def _explained(self, r: Results) -> None:
         """Refit and choose, tell apart, and measure how far the gap closes; into `r`."""
-        train = self.parts.train if self.parts else self.experiments
-        if self.parts:
-            start = unpack_parameters(self.trace, r.fit.theta)
-            r.fit = self._fit("fitting again", r.base, train, 3, start, searched=True)
         found = Attribution(r.fit)
-        attribute(found, self.workshop, r.screen, train, self._seed(4), self.alpha, self.kept)
-        r.attribution = found
+        attribute(
+            found, self.workshop, r.screen, r.screen.experiments, self._seed(4), self.alpha,
+            self.kept,
+        )  # fmt: skip
+        r.attribution, r.fit = found, found.base
         self._separated(r)
         r.far = self._how_far(r)
 
     def _how_far(self, r: Results) -> HowFar:
-        once = r.chosen is not None and any(one_off(c) for c in r.chosen.candidates)
+        once = r.chosen is not None and any(passing(c) for c in r.chosen.candidates)
         if self.parts and not once:
             return how_far(
                 self.workshop, self.parts, self.experiments, (r.base, r.fit), r.screen, r.chosen,

@@ -3,6 +3,12 @@
 P. Westfall and S. Young, *Resampling-Based Multiple Testing* (1993), step-down maxT; the
 correlations between candidates are in the maxima. A family of shapes of one effect (break dates,
 delays, dead-zone widths) counts as one hypothesis whose statistic is its largest member.
+
+The largest of hundreds of shapes lies higher by chance than a single statistic. Left as they are,
+such families alone would make the law of the largest of all, and whatever has one shape would have
+to stand as high as they do. So hypotheses are put on one scale before they are compared, as the
+smallest p in place of the largest statistic does (section 2.5 there), but by a `Scale` of two
+numbers for each: the p values themselves would have to be counted far beyond the simulated range.
 """
 
 from __future__ import annotations
@@ -10,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import log_ndtr, ndtri_exp
 
 from ssmppl.errors import ArgumentError
 
@@ -18,13 +25,53 @@ FEWEST_IN_TAIL = 10
 HEAVIEST = 0.5  # shape of a generalised Pareto law, beyond which its variance is infinite
 
 
+MEDIAN, UPPER = 0.5, 0.95  # quantiles that set a scale
+TYPICAL, OUTER = 0.6744897501960817, 1.959963984540054  # those of one |normal|
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Of groups of statistics: what is as rare for one |normal| as a height is for the group.
+
+    number : (G,) of independent normals whose largest has the group's median. stretch : (G,) at
+    least 1, by which its upper quantile lies further out than theirs.
+    """
+
+    number: np.ndarray
+    stretch: np.ndarray
+
+    @classmethod
+    def of(cls, null: np.ndarray) -> Scale:
+        """From simulated heights (B, G)."""
+        middle = np.quantile(null, MEDIAN, axis=0)
+        number = np.log(MEDIAN) / np.minimum(log_ndtr(middle), -1e-300)
+        upper = np.quantile(_as_one(null, number), UPPER, axis=0)
+        return cls(number, np.maximum(upper / OUTER, 1.0))
+
+    def put(self, heights: np.ndarray) -> np.ndarray:
+        """(..., G) heights on the common scale, on which they keep their order."""
+        return _as_one(heights, self.number) / self.stretch
+
+
+def _as_one(heights: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """z with P(|normal| > z) = P(largest of `number` normals > height)."""
+    log_below = np.minimum(number * log_ndtr(heights), -1e-300)
+    # far out 1 - Phi^n is n (1 - Phi), whose logarithm does not vanish
+    log_above = np.where(
+        log_below > -1e-12,
+        np.log(number) + log_ndtr(-np.asarray(heights)),
+        np.log(-np.expm1(np.minimum(log_below, -1e-300))),
+    )
+    return -ndtri_exp(log_above - np.log(2.0))
+
+
 @dataclass(frozen=True)
 class FamilyWise:
     """p-values with the whole family taken into account.
 
     labels : (G,) of the groups. p : (G,) step-down adjusted. p_single : (G,) against the law of
-    the largest of all. best : (G,) column that leads its group. height : (G,) its statistic.
-    maxima : (B,) largest statistic of each simulated set.
+    the largest of all. best : (G,) column that leads its group. height : (G,) its statistic on the
+    common scale. maxima : (B,) largest on that scale of each simulated set. scale : of the groups.
     """
 
     labels: np.ndarray
@@ -33,6 +80,16 @@ class FamilyWise:
     best: np.ndarray
     height: np.ndarray
     maxima: np.ndarray
+    scale: Scale
+
+    def put(self, label: int, height: float) -> float:
+        """The height of a statistic of one group on the common scale."""
+        at = int(np.searchsorted(self.labels, label))
+        return float(Scale(self.scale.number[at], self.scale.stretch[at]).put(np.array(height)))
+
+    def cost(self, label: int) -> float:
+        """Nats that the choice among a group's shapes is worth: log of their effective number."""
+        return float(np.log(self.scale.number[np.searchsorted(self.labels, label)]))
 
     def of_columns(self, groups: np.ndarray) -> np.ndarray:
         """(K,) the p of each column's group."""
@@ -66,8 +123,9 @@ def familywise(
     high, high_null = heights(observed, sided), heights(null, sided)
     best = np.array([np.flatnonzero(member == g)[np.argmax(high[member == g])]
                      for g in range(len(labels))])  # fmt: skip
-    top = high[best]
-    top_null = np.stack([high_null[:, member == g].max(axis=1) for g in range(len(labels))], 1)
+    raw_null = np.stack([high_null[:, member == g].max(axis=1) for g in range(len(labels))], 1)
+    scale = Scale.of(raw_null)
+    top, top_null = scale.put(high[best]), scale.put(raw_null)
     order = np.argsort(-top, kind="stable")
     # Column j: the largest among the groups that stand no higher than the j-th in the data.
     rest = np.maximum.accumulate(top_null[:, order[::-1]], axis=1)[:, ::-1]
@@ -75,7 +133,7 @@ def familywise(
     p = np.empty(len(labels))
     p[order] = np.maximum.accumulate(stepped)
     single = np.array([tail_p(h, rest[:, 0]) for h in top])
-    return FamilyWise(labels, p, single, best, top, rest[:, 0])
+    return FamilyWise(labels, p, single, best, top, rest[:, 0], scale)
 
 
 def tail_p(value: float, maxima: np.ndarray) -> float:

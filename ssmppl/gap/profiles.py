@@ -15,8 +15,10 @@ import numpy as np
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.series import segments
 
-ALL_DATES = 300  # rows up to which every date is tried
-DATES = 60  # beyond
+# Rows up to which every date is tried, and how many dates beyond: a break that is dated some rows
+# off is still seen, a pulse is not.
+ALL_DATES = {"step": 300, "pulse": 1000}
+DATES = {"step": 60, "pulse": 300}
 EDGE = 0.1  # share of the rows at either end where no break can be told from a shift
 LEAST_EDGE = 2  # rows at either end without a pulse
 ONE_OFF = ("step", "pulse")  # profiles that have a date
@@ -30,8 +32,13 @@ def one_off(candidate: Candidate) -> bool:
     return candidate.effect.profile in ONE_OFF
 
 
+def passing(candidate: Candidate) -> bool:
+    """Whether it happens in one row, so that no later ones can bear it out."""
+    return candidate.effect.profile == "pulse"
+
+
 def dated(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
-    """With a candidate for every date (about `DATES` of them in long records) and for every period
+    """With a candidate for every date (`DATES` of them in long records) and for every period
     and phase where there is one.
 
     rows : of the longest experiment.
@@ -62,7 +69,8 @@ def dates(rows: int, profile: str) -> np.ndarray:
     first, last = 1 + edge, rows - edge
     if last < first:
         return np.array([max(1, rows // 2)])
-    count = last - first + 1 if rows <= ALL_DATES else min(DATES, last - first + 1)
+    every = last - first + 1
+    count = every if rows <= ALL_DATES[profile] else min(DATES[profile], every)
     return np.unique(np.linspace(first, last, count).round().astype(int))
 
 

@@ -32,20 +32,31 @@ from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import LogNormal
 from ssmppl.language.trace import Trace
 
-SINGLES, MATES, PAIRS = 5, 3, 3  # candidates refitted, further ones like them, pairs
+SINGLES, MATES, PAIRS = 5, 4, 3  # candidates refitted, further ones like the best of them, pairs
 ALIKE = 0.8  # correlation from which a candidate is refitted as a class mate
+SAME = 0.95  # beyond which two candidates are one to begin with
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
 
 @dataclass(frozen=True)
 class Refit:
-    """A model with effects, fitted. index : their places among the screen's candidates."""
+    """A model with effects, fitted.
+
+    index : their places among the screen's candidates. gain : nats over the model without them.
+    cost : of these, what the choice of their shapes is worth.
+    """
 
     index: tuple[int, ...]
     candidates: tuple[Candidate, ...]
     fitter: Fitter
     fit: Fit
     gain: float
+    cost: float = 0.0
+
+    @property
+    def merit(self) -> float:
+        """By which refits are ranked: a date chosen among hundreds gains nats by that alone."""
+        return self.gain - self.cost
 
     @property
     def strengths(self) -> list[float]:
@@ -204,23 +215,38 @@ def start_at(
 
 
 def leading(screen: Screen) -> list[int]:
-    """The best shape of each of the best groups, and those that are like the best of all."""
-    family, found = screen.family, screen.found
-    heads = [int(k) for k in family.best if found.gain[k] >= LEAST_GAIN and not found.status[k]]
-    heads.sort(key=lambda k: -found.gain[k])
-    if not heads:
+    """The best shape of each of the best groups, the highest first; of those that are almost the
+    same as one above them none."""
+    out: list[int] = []
+    for k in _by_height(screen):
+        if len(out) < SINGLES and all(abs(screen.found.rho[k, j]) < SAME for j in out):
+            out.append(k)
+    return out
+
+
+def mates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """Candidates that are like the best of the refits, to be refitted beside it."""
+    if not refits:
         return []
-    out, rest = heads[:SINGLES], heads[SINGLES:]
-    mates = [k for k in rest if abs(found.rho[out[0], k]) >= ALIKE]
-    return out + mates[:MATES]
+    best, done = refits[0].index[0], {int(screen.groups[r.index[0]]) for r in refits}
+    like = np.abs(screen.found.rho[best])
+    found = [k for k in _by_height(screen)
+             if like[k] >= ALIKE and int(screen.groups[k]) not in done]  # fmt: skip
+    return sorted(found, key=lambda k: -like[k])[:MATES]
+
+
+def _by_height(screen: Screen) -> list[int]:
+    """The best shapes of the groups that promise anything."""
+    family, found = screen.family, screen.found
+    order = family.best[np.argsort(-family.height, kind="stable")]
+    return [int(k) for k in order if found.gain[k] >= LEAST_GAIN and not found.status[k]]
 
 
 def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
     """Pairs of which the quadratic expects more than of the best single one."""
-    found = screen.found
-    heads = [int(k) for k in screen.family.best
-             if not found.status[k] and not screen.question.quadratic[k]]  # fmt: skip
-    heads = sorted(heads, key=lambda k: -found.gain[k])[:12]
+    found, family = screen.found, screen.family
+    heads = [int(k) for k in family.best[np.argsort(-family.height, kind="stable")]
+             if not found.status[k] and not screen.question.quadratic[k]][:12]  # fmt: skip
     heads = list(dict.fromkeys([*(r.index[0] for r in refits[:3]), *heads]))
     best, out = float(np.max(found.gain, initial=0.0)), []
     for i, a in enumerate(heads):
@@ -263,8 +289,9 @@ def refit_all(
         fitter = workshop.fitter(candidates)
         fit = fitter.restored(train, numbers)
         gain = fit.log_likelihood - base.log_likelihood
-        done.append(Refit(tuple(index), candidates, fitter, fit, gain))
-    done.sort(key=lambda r: -r.gain)
+        cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
+        done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))
+    done.sort(key=lambda r: -r.merit)
     return done, reasons
 
 

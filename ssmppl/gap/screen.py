@@ -25,6 +25,7 @@ from ssmppl.gap.columns import score_columns
 from ssmppl.gap.efficient import Efficient, Null, efficient
 from ssmppl.gap.familywise import FamilyWise, familywise
 from ssmppl.gap.profiles import Profiles, dated
+from ssmppl.gap.realised import excess, typical
 from ssmppl.gap.scales import Scales
 from ssmppl.gap.simulator import Simulator
 from ssmppl.gap.smoothing import Pass, Settings, Smoother, probability_transforms
@@ -41,11 +42,13 @@ FEWEST = 60  # simulated sets that must have gone through
 class Statistics:
     """Of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
 
+    squares (K,) : of the columns' rows, summed; NaN where a column is no sum of scores.
     nuisance_bins (J, P), basis_bins (J, D) : sums over J bins of time.
     """
 
     nuisance: np.ndarray
     columns: np.ndarray
+    squares: np.ndarray
     basis: np.ndarray
     detection: np.ndarray
     nuisance_bins: np.ndarray
@@ -122,6 +125,11 @@ class Question:
         return np.array([1 if c.effect.lower == 0.0 else 0 for c in self.candidates])
 
     @cached_property
+    def _sums(self) -> np.ndarray:
+        """(K,) which statistics are sums of one column's rows, all with the same weight."""
+        return np.array([not (c.process or c.effect.profile) for c in self.candidates])
+
+    @cached_property
     def quadratic(self) -> np.ndarray:
         """(K,) which statistics are quadratic forms."""
         return np.array([not c.first_order for c in self.candidates])
@@ -139,6 +147,7 @@ class Question:
         return Statistics(
             rows[:, :p].sum(axis=0),
             self._of_candidates(rows, starts),
+            np.where(self._sums, np.sum(rows**2, axis=0)[self.place], np.nan),
             rows[:, self.basis_place].sum(axis=0),
             self._detection(pits, experiments, starts).values,
             bins[:, :p],
@@ -179,7 +188,7 @@ class Screen:
     """The data's statistics beside those of B simulated sets.
 
     observed : means over passes. null : (B, ...) of the simulated ones, by name. found, family : of
-    the candidates. law : what they were compared with.
+    the candidates. law : what they were compared with. usual : (K,) sums of squares.
     """
 
     question: Question
@@ -189,6 +198,7 @@ class Screen:
     found: Efficient
     family: FamilyWise
     law: Null
+    usual: np.ndarray
     experiments: tuple[Experiment, ...]
 
     def stacked(self, name: str) -> np.ndarray:
@@ -268,16 +278,32 @@ def ask(
     each = {n: np.stack([s[n] for s in own]) for n in names}
     observed = Statistics(**{n: v.mean(axis=0) for n, v in each.items()})
     simulated = Statistics(**{n: np.stack([s[n] for s in null]) for n in names})
-    noise = each["columns"].var(axis=0, ddof=1) if len(own) > 1 else 0.0
+    usual = typical(simulated.squares)
+    noise = (each["columns"] / excess(each["squares"], usual)).var(
+        axis=0, ddof=min(1, len(own) - 1)
+    )
     law = Null.of(
-        simulated.columns, simulated.nuisance, quadratic=question.quadratic, sided=question.sided,
-        noise=noise,
+        simulated.columns / excess(simulated.squares, usual), simulated.nuisance,
+        quadratic=question.quadratic, sided=question.sided, noise=noise,
     )  # fmt: skip
-    found = efficient(law, observed.columns, observed.nuisance)
+    found = compared(law, usual, observed)
     family = familywise(
         found.statistic, found.null, sided=found.sided, groups=groups_of(question.candidates)
     )
-    return Screen(question, theta, observed, simulated, found, family, law, tuple(experiments))
+    return Screen(
+        question, theta, observed, simulated, found, family, law, usual, tuple(experiments)
+    )
+
+
+def compared(law: Null, usual: np.ndarray, seen: Statistics) -> Efficient:
+    """Efficient statistics of the candidates in one data set, each on the scale of the information
+    that these data hold."""
+    by = excess(seen.squares, usual)
+    found = efficient(law, seen.columns / by, seen.nuisance)
+    return replace(
+        found, score=found.score * by, variance=found.variance * by**2,
+        strength=found.strength / by,
+    )  # fmt: skip
 
 
 def with_parameters(trace: Trace, values: Mapping[str, float]) -> Trace:
@@ -292,4 +318,4 @@ def with_parameters(trace: Trace, values: Mapping[str, float]) -> Trace:
     return replace(trace, parameters=parameters)
 
 
-__all__ = ["Question", "Screen", "Statistics", "ask", "groups_of", "with_parameters"]
+__all__ = ["Question", "Screen", "Statistics", "ask", "compared", "groups_of", "with_parameters"]

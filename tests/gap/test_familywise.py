@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from ssmppl.errors import ArgumentError
 from ssmppl.gap.efficient import Null, efficient, regress
-from ssmppl.gap.familywise import familywise, heights, tail_p, threshold
+from ssmppl.gap.familywise import Scale, familywise, heights, tail_p, threshold
 from tests.statistics.checks import LEVEL, seed_of
 
 
@@ -22,14 +22,15 @@ def test_step_down_is_that_of_westfall_and_young():
     null = rng.standard_normal((200, 12)) @ (np.eye(12) + 0.3)
     seen = np.linspace(0.3, 3.0, 12)[rng.permutation(12)]
     found = familywise(seen, null)
+    # on the common scale, which is checked below
+    scale = Scale.of(np.abs(null))
+    seen, null = scale.put(seen), scale.put(np.abs(null))
     order, running = np.argsort(-seen), 0.0
     for j, k in enumerate(order):
-        rest = np.abs(null[:, order[j:]]).max(axis=1)
+        rest = null[:, order[j:]].max(axis=1)
         running = max(running, (1 + np.sum(rest >= seen[k])) / 201)
         assert found.p[k] == pytest.approx(running)
-        assert found.p_single[k] == pytest.approx(
-            (1 + np.sum(np.abs(null).max(axis=1) >= seen[k])) / 201
-        )
+        assert found.p_single[k] == pytest.approx((1 + np.sum(null.max(axis=1) >= seen[k])) / 201)
 
 
 def test_a_family_of_shapes_counts_once():
@@ -159,6 +160,77 @@ def test_one_skew_statistic_does_not_hide_the_others():
         scored += familywise(e.statistic, e.null, sided=e.sided).p[20] <= 0.05
         centred = s - np.where(quadratic, s[:-1].mean(axis=0), 0.0)
         size = centred[:-1].std(axis=0)
-        raw += familywise(centred[-1] / size, centred[:-1] / size, sided=e.sided).p[20] <= 0.05
+        maxima = heights(centred[:-1] / size, e.sided).max(axis=1)
+        raw += tail_p(abs(centred[-1, 20] / size[20]), maxima) <= 0.05
     assert scored >= 90
     assert raw <= 50
+
+
+@pytest.mark.parametrize(("shapes", "sided"), [(1, 1), (1, 0), (40, 0), (300, 1)])
+def test_the_common_scale_is_that_of_one_normal(shapes, sided):
+    """The largest of independent normals, put on the scale, is |normal|: its quantiles within their
+    own error and that of the scale, which has them from as many sets."""
+    rng, sets = rng_of("scale", shapes, sided), 4000
+
+    def largest():
+        z = rng.standard_normal((sets, shapes))
+        return (z if sided else np.abs(z)).max(axis=1)[:, None]
+
+    scale = Scale.of(largest())
+    put = scale.put(largest())[:, 0]
+    for level in (0.5, 0.8, 0.95, 0.99):
+        at = stats.norm.isf((1.0 - level) / 2.0)
+        error = np.sqrt(2.0 * level * (1.0 - level) / sets)
+        # powers of Phi are not quite the law of |normal|: up to 0.01 of it
+        assert abs(np.mean(put <= at) - level) < 5.0 * error + 0.01, level
+    one = (0.9, 1.1) if sided else (1.8, 2.6)  # |normal| is two of them far out
+    assert one[0] * shapes < scale.number[0] < one[1] * shapes
+    assert 1.0 <= scale.stretch[0] < 1.1
+
+
+def test_the_common_scale_far_out():
+    scale = Scale(np.array([2.4, 600.0]), np.array([1.0, 1.2]))
+    high = np.array([0.0, 1.0, 3.0, 8.0, 20.0, 40.0])
+    put = scale.put(np.stack([high, high], axis=1))
+    assert np.all(np.isfinite(put))
+    assert np.all(np.diff(put, axis=0) >= 0.0)
+    assert np.all(np.diff(put[2:], axis=0) > 0.0)
+    # 1 - Phi(z)^n is n (1 - Phi(z)) there
+    for z in (8.0, 20.0):
+        direct = -special.ndtri_exp(special.log_ndtr(-z) + np.log(600.0 / 2.0)) / 1.2
+        assert scale.put(np.array([z, z]))[1] == pytest.approx(direct, rel=1e-9)
+    assert np.all(scale.put(np.array([-30.0, -30.0])) >= 0.0)
+
+
+def test_many_shapes_of_one_effect_do_not_hide_the_others():
+    """Beside a family of 300 shapes 7 nats in one statistic are found nearly as often as without
+    it; with the largest of all taken as they are, seldom."""
+    rng, hits = rng_of("hidden"), {"common": 0, "as they are": 0, "alone": 0}
+    groups = np.concatenate([np.zeros(300, int), 1 + np.arange(20)])
+    for _ in range(100):
+        s = rng.standard_normal((201, 320))
+        s[-1, 305] = np.sqrt(2.0 * 7.0)
+        hits["common"] += familywise(s[-1], s[:-1], groups=groups).p[6] <= 0.05
+        hits["alone"] += familywise(s[-1, 300:], s[:-1, 300:]).p[5] <= 0.05
+        maxima = np.abs(s[:-1]).max(axis=1)
+        hits["as they are"] += tail_p(abs(s[-1, 305]), maxima) <= 0.05
+    print(hits)
+    assert hits["alone"] >= 90
+    assert hits["common"] >= 85
+    assert hits["as they are"] <= 60
+
+
+@pytest.mark.parametrize("times", [400, pytest.param(2000, marks=pytest.mark.slow)])
+def test_level_of_families_of_unlike_size(times):
+    """300 correlated shapes of one effect, 20 heavy-tailed statistics, 20 normal ones."""
+    rng, found = rng_of("unlike", times), []
+    groups = np.concatenate([np.zeros(300, int), 1 + np.arange(40)])
+    smooth = np.exp(-0.5 * (np.subtract.outer(np.arange(300), np.arange(300)) / 4.0) ** 2)
+    root = np.linalg.cholesky(smooth + 1e-6 * np.eye(300)).T
+    for _ in range(times):
+        s = np.concatenate([
+            rng.standard_normal((201, 300)) @ root,
+            rng.standard_t(5, (201, 20)) / np.sqrt(5 / 3), rng.standard_normal((201, 20)),
+        ], axis=1)  # fmt: skip
+        found.append(familywise(s[-1], s[:-1], groups=groups).p.min())
+    assert_level(np.array(found), 0.05, times)

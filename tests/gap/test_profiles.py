@@ -55,12 +55,12 @@ def test_every_date_of_a_short_record_is_one_family():
 
 @pytest.mark.parametrize("profile", ["step", "pulse"])
 def test_dates_lie_inside(profile):
-    for rows in (6, 40, ALL_DATES, ALL_DATES + 1, 5000):
+    for rows in (6, 40, ALL_DATES[profile], ALL_DATES[profile] + 1, 5000):
         found = dates(rows, profile)
         assert found[0] >= 1
         assert found[-1] < rows
         assert len(set(found)) == len(found)
-        assert len(found) <= (rows if rows <= ALL_DATES else DATES)
+        assert len(found) <= (rows if rows <= ALL_DATES[profile] else DATES[profile])
 
 
 def test_what_has_no_date_stays():
