@@ -76,17 +76,18 @@ class CompleteScore:
 
     def _moving(self) -> set[tuple[Expr, Expr]]:
         """(deterministic component, parameter) such that the one changes with the other."""
-        found: set[tuple[Expr, Expr]] = set()
-        size = -1
-        while size != len(found):
-            size = len(found)
+        of: dict[Expr, set[Expr]] = {}  # the parameters each component changes with
+        parameters, size = frozenset(self.parameters), -1
+        while size != sum(map(len, of.values())):
+            size = sum(map(len, of.values()))
             for values in self.value.values():
                 for s, e in values.items():
                     inside = symbols_of(e)
-                    for p in self.parameters:
-                        if p in inside or any(previous(q) in inside for q, r in found if r is p):
-                            found.add((s, p))
-        return found
+                    found = of.setdefault(s, set())
+                    found |= inside & parameters
+                    for q in [q for q in of if previous(q) in inside]:
+                        found |= of[q]
+        return {(s, p) for s, found in of.items() for p in found}
 
     def involved(self, parameter: Expr) -> list[Expr]:
         """The symbols that change with a parameter when the noisy components do not."""
@@ -111,7 +112,9 @@ class CompleteScore:
                     )
             roots = [e for a in site.distribution.parameters.values() for e in array(a).ravel()]
             changing = dependent(roots, symbols)
-            for node in topological(roots):
+            if not any(node.op in STEPWISE for node in changing):
+                continue
+            for node in topological(roots):  # the first of them
                 if node.op in STEPWISE and node in changing:
                     return NotApplicable(
                         f"the law of {site.name} changes by steps in {parameter!r}, by {node!r}",

@@ -98,8 +98,8 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
     involved = dependent(expressions, [symbol])
     tangent: dict[Expr, Expr] = {symbol: constant(1.0)}
     matrix_tangent: dict[Expr, ExprArray] = {}
-    for node in topological(expressions):
-        if node is symbol or node not in involved:
+    for node in topological(expressions, involved):
+        if node is symbol:
             continue
         if node.op in ("cholesky", "inverse"):
             matrix_tangent[node] = _matrix_tangent(node, tangent)

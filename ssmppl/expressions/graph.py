@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 from ssmppl.expressions.node import Expr, behaviour
 from ssmppl.expressions.simplify import FOLD, apply
 
 
-def topological(roots: Iterable[Expr]) -> list[Expr]:
-    """Every node under `roots`, arguments before users, each once; without recursion."""
+def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) -> list[Expr]:
+    """Every node under `roots`, arguments before users, each once; without recursion.
+
+    within : other nodes are left out, with whatever is reached only through them.
+    """
     order: list[Expr] = []
     seen: set[Expr] = set()
-    stack = [(r, False) for r in reversed(list(roots))]
+    stack = [(r, False) for r in reversed(list(roots)) if within is None or r in within]
     while stack:
         node, expanded = stack.pop()
         if expanded:
@@ -21,7 +24,10 @@ def topological(roots: Iterable[Expr]) -> list[Expr]:
         elif node not in seen:
             seen.add(node)
             stack.append((node, True))
-            stack.extend((a, False) for a in reversed(node.args) if a not in seen)
+            stack.extend(
+                (a, False) for a in reversed(node.args)
+                if a not in seen and (within is None or a in within)
+            )  # fmt: skip
     return order
 
 
@@ -56,15 +62,56 @@ def _reduced(node: Expr) -> tuple[Callable[..., Expr], tuple[Any, ...]]:
 behaviour["pickle"] = _reduced
 
 
+def symbols_in(node: Expr) -> frozenset[Expr]:
+    """The symbols that occur under one node; kept, as large models ask for them again and again."""
+    if node._symbols is not None:
+        return node._symbols
+    stack = [node]
+    while stack:
+        top = stack[-1]
+        unknown = [a for a in top.args if a._symbols is None]
+        if unknown:
+            stack += unknown
+            continue
+        stack.pop()
+        if top._symbols is None:
+            object.__setattr__(top, "_symbols", _united(top))
+    assert node._symbols is not None
+    return node._symbols
+
+
+def _united(node: Expr) -> frozenset[Expr]:
+    """Of the arguments' symbols; the largest of them itself where it holds the others, so that
+    few sets are made."""
+    if node.op == "symbol":
+        return frozenset((node,))
+    each = [a._symbols for a in node.args if a._symbols]
+    if not each:
+        return frozenset()
+    largest = max(each, key=len)
+    return largest if all(s <= largest for s in each) else frozenset().union(*each)
+
+
 def symbols_of(roots: Expr | Iterable[Expr]) -> frozenset[Expr]:
     """The symbols that occur under `roots`."""
-    nodes = topological([roots] if isinstance(roots, Expr) else roots)
-    return frozenset(n for n in nodes if n.op == "symbol")
+    if isinstance(roots, Expr):
+        return symbols_in(roots)
+    return frozenset[Expr]().union(*(symbols_in(r) for r in roots))
 
 
 def dependent(roots: Iterable[Expr], on: Iterable[Expr]) -> set[Expr]:
     """The nodes under `roots` (themselves included) that depend on some node of `on`."""
     found = set(on)
+    if all(n.op == "symbol" for n in found):  # only where they occur
+        wanted = frozenset(found)
+        stack = [r for r in roots if not wanted.isdisjoint(symbols_in(r))]
+        while stack:
+            node = stack.pop()
+            if node in found:
+                continue
+            found.add(node)
+            stack += [a for a in node.args if not wanted.isdisjoint(symbols_in(a))]
+        return found
     for node in topological(roots):
         if any(a in found for a in node.args):
             found.add(node)
@@ -73,7 +120,7 @@ def dependent(roots: Iterable[Expr], on: Iterable[Expr]) -> set[Expr]:
 
 def depends_on(expression: Expr, symbols: Iterable[Expr]) -> bool:
     """Whether the expression depends on some symbol of `symbols`."""
-    return expression in dependent([expression], symbols)
+    return not symbols_in(expression).isdisjoint(symbols)
 
 
 def substitute(roots: list[Expr], replacement: dict[Expr, Expr]) -> list[Expr]:

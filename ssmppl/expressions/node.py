@@ -82,12 +82,14 @@ class Expr:
 
     `data` holds the value of a "const", (kind, name, index) of a "symbol", the position of an
     "item", (kind, key) of a "random" draw, the function of a "call", the size of a matrix.
+    `_symbols` holds the symbols under the node once they were asked for: see `graph.symbols_in`.
     """
 
-    __slots__ = ("__weakref__", "args", "data", "op")
+    __slots__ = ("__weakref__", "_symbols", "args", "data", "op")
     op: str
     args: tuple[Expr, ...]
     data: Any
+    _symbols: frozenset[Expr] | None
 
     def __new__(cls, op: str, args: tuple[Expr, ...] = (), data: Any = None) -> Expr:
         # ids, not the nodes: == on nodes builds an expression. repr keeps 0.0, -0.0 and nan apart.
@@ -99,6 +101,7 @@ class Expr:
                 object.__setattr__(node, "op", op)
                 object.__setattr__(node, "args", args)
                 object.__setattr__(node, "data", data)
+                object.__setattr__(node, "_symbols", None)
                 _interned[key] = node
         places = _locations.get()
         if places is not None and args and node not in places:  # symbols are not written there

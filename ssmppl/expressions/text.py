@@ -18,6 +18,8 @@ def symbol_text(node: Expr) -> str:
 
 def to_text(root: Expr) -> str:
     """The expression as a person writes it."""
+    if root.op == "symbol":
+        return symbol_text(root)
     done: dict[Expr, tuple[str, int]] = {}
     for node in topological([root]):
         parts = [done[a] for a in node.args]

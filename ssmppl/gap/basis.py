@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
+import numpy as np
+
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol, symbols_of
@@ -27,9 +29,12 @@ from ssmppl.language.trace import Trace
 MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
 CURVES = bases((0.0, 1.0), MEAN + 1)[1:]  # of a standardised variable, without the constant
 # Degrees of the functions in a product of two variables; with more than `FEW` of these the first.
-DEGREES, FEW = ((1, 1), (2, 1), (1, 2)), 3
+DEGREES, FEW, FIRST = ((1, 1), (2, 1), (1, 2), (2, 2), (3, 1), (1, 3)), 4, 3
 PAST = ("past_1", "past_2", "past_3")  # low-passes in a row
 REACH = 6.0  # the time constant of each, in rows
+RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quarter turn behind
+# Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
+TURNS = tuple(6.0 * 1.4**k for k in range(7))
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,9 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
                 out += _products(part, own, scales)
                 moving = [v for v in own if v in noisy or v.role == "input"]
                 out += [_past(part, v, k, scales) for v in moving for k in range(len(PAST))]
+                driving = [v for v in moving if v is part or v.role == "input"]
+                out += [_ring(part, v, turn, k, scales)
+                        for v in driving for turn in TURNS for k in range(len(RING))]  # fmt: skip
         if not isinstance(has_scale(law), NotApplicable):
             out += [_curve(part, "scale", "noise", v, k, scales) for v in own for k in range(SCALE)]
     return out
@@ -112,7 +120,7 @@ def _curve(
 
 def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Term]:
     """Of functions of two variables each."""
-    degrees = DEGREES if len(variables) <= FEW else DEGREES[:1]
+    degrees = DEGREES if len(variables) <= FEW else DEGREES[:FIRST]
     out = []
     for a, b in combinations(variables, 2):
         for i, j in degrees:
@@ -160,6 +168,32 @@ def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
         part.role, slug(f"past {k + 1} {part.label} {label}"), shares=slug(f"past {label}"),
     )  # fmt: skip
     return Term(candidate, part.label, "mean", f"the past of {label}")
+
+
+def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Term:
+    """What a resonator with `turn` rows to a turn makes of the variable: both phases share its
+    states. It dies away by a factor e within a turn."""
+    keep, angle = np.exp(-1.0 / turn), 2.0 * np.pi / turn
+    ring = {"along": keep * np.cos(angle), "across": keep * np.sin(angle), "gain": 2 * (1 - keep)}
+
+    def term(own, z, ring_1, ring_2, strength, centre, width, along, across, gain):
+        driven = along * ring_1 - across * ring_2 + gain * (z - centre) / width
+        laws = {"ring_1": Dirac(driven), "ring_2": Dirac(across * ring_1 + along * ring_2)}
+        return Auxiliary(strength * (ring_1, ring_2)[k], laws, {n: Dirac(0.0) for n in RING})
+
+    label, scale = variable.label, scales.scale[variable.label]
+    shape = {"centre": scale.mean, "width": scale.sd, **{n: float(v) for n, v in ring.items()}}
+    name = f"ring {turn:.0f} of {label}"
+    effect = Effect(
+        name=f"{name}, phase {k + 1}", kind="state", function=term, on=part.label,
+        shapes={n: numbers(v) for n, v in shape.items()}, given={"z": "other state"},
+        states=dict.fromkeys(RING),
+    )  # fmt: skip
+    candidate = Candidate(
+        effect, part.label, tuple(shape.items()), (("z", label),), part.role,
+        slug(f"ring {k + 1} {turn:.0f} {part.label} {label}"), shares=slug(name),
+    )  # fmt: skip
+    return Term(candidate, part.label, "mean", f"the ringing of {label} at {turn:.0f} rows")
 
 
 def lifted(

@@ -208,9 +208,12 @@ class Screen:
 
     def columns_of(self, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
         """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
-        whose statistic is a sum of scores."""
-        keys = {c.key for c in chosen}
-        own = [k for k, c in enumerate(self.question.candidates) if c.key in keys and c.first_order]
+        whose statistic is a sum of scores. A shape that the screen has not (a period that was
+        sharpened) stands for the best one of its group."""
+        known = {c.key: k for k, c in enumerate(self.question.candidates)}
+        best = {self.question.candidates[k].group: int(k) for k in self.family.best}
+        found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)
+        own = sorted({k for k in found if k is not None})
         return self.stacked("columns")[:, own], self.observed.columns[own]
 
     @property

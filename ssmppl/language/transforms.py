@@ -97,6 +97,11 @@ def _bounded(z: Expr, lower: Expr, upper: Expr) -> tuple[Expr, Expr]:
 
 
 def _free(value: float, lower: float, upper: float) -> float:
+    # a search that ran towards a bound ends on it by rounding
+    if value == lower:
+        value = math.nextafter(lower, math.inf)
+    if value == upper:
+        value = math.nextafter(upper, -math.inf)
     if lower == -math.inf and upper == math.inf:
         return value
     if upper == math.inf:

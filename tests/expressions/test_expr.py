@@ -21,6 +21,7 @@ from ssmppl.expressions.expr import (
     Expr,
     constant,
     dependent,
+    depends_on,
     recording,
     substitute,
     symbol,
@@ -124,6 +125,35 @@ def test_topological_order():
     assert all(place[a] < place[n] for n in order for a in n.args)
     assert dependent([e], [Y]) >= {e, Y}
     assert X not in dependent([e], [Y])
+
+
+def test_dependence_is_what_the_graph_says():
+    """By symbols, whose sets are kept at the nodes, and by other nodes; against reaching back."""
+    w = symbol("parameter", "w", ())
+    inner = np.exp(X) * Y
+    total = inner + w * np.sin(inner) + np.cos(w)
+    order = topological([total])
+    reach: dict = {}
+    for n in order:
+        reach[n] = {n}.union(*(reach[a] for a in n.args))
+    for on in ([X], [w], [X, w], [inner], [inner, w]):
+        expected = {n for n in order if reach[n] & set(on)} | set(on)
+        assert dependent([total], on) == expected
+    for n in order:
+        assert symbols_of(n) == {m for m in reach[n] if m.op == "symbol"}
+        assert depends_on(n, [w]) == (w in reach[n])
+    assert symbols_of([inner, w]) == {X, Y, w}
+    assert dependent([total], [symbol("parameter", "elsewhere", ())]) == {
+        symbol("parameter", "elsewhere", ())
+    }
+
+
+def test_order_within():
+    """The rest keeps its order."""
+    e = make()
+    inside = dependent([e], [Y])
+    assert topological([e], inside) == [n for n in topological([e]) if n in inside]
+    assert topological([X], inside) == []
 
 
 def test_substitution_simplifies():

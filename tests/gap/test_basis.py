@@ -7,7 +7,7 @@ import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.gap import tables
 from ssmppl.gap.augment import augment
-from ssmppl.gap.basis import CURVES, REACH, basis, lifted
+from ssmppl.gap.basis import CURVES, REACH, TURNS, basis, lifted
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.reference import signal
 from ssmppl.gap.scales import Scales
@@ -79,8 +79,10 @@ def test_what_it_holds(plain):
     for t in terms:
         found[t.equation, t.moment, t.variable] += 1
     assert found == {
-        ("x", "mean", "x"): 4, ("x", "mean", "u"): 4, ("x", "mean", "x and u"): 3,
+        ("x", "mean", "x"): 4, ("x", "mean", "u"): 4, ("x", "mean", "x and u"): 6,
         ("x", "mean", "the past of x"): 3, ("x", "mean", "the past of u"): 3,
+        **{("x", "mean", f"the ringing of {v} at {turn:.0f} rows"): 2
+           for v in ("x", "u") for turn in TURNS},
         ("x", "scale", "x"): 2, ("x", "scale", "u"): 2,
         ("y", "mean", "x"): 4, ("y", "scale", "x"): 2,
     }  # fmt: skip
@@ -95,19 +97,33 @@ def test_what_is_past_shares_its_states_and_its_scale(plain):
     assert len(augment(trace, made).state_symbols) == len(trace.state_symbols) + 3
 
 
-def test_the_score_of_what_is_past_is_the_exact_one(plain):
+def low_pass(state, z):
+    first, second = state
+    return (first + (z - first) / REACH, second + (first - second) / REACH), second
+
+
+def ringing(state, z):
+    """The real part of a rotation that dies away, driven along it; before the step."""
+    keep = np.exp(-1.0 / TURNS[2])
+    turned = keep * np.exp(2j * np.pi / TURNS[2]) * complex(*state)
+    return (turned.real + 2.0 * (1.0 - keep) * z, turned.imag), state[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "filtered"), [("past 2 of u", low_pass), ("ring 12 of u, phase 1", ringing)]
+)
+def test_the_score_of_what_is_past_is_the_exact_one(plain, name, filtered):
     """In a linear model, of a function of the input: r' S^-1 (y - m), r the response of y."""
     question, e = plain.question, plain.experiments[0]
-    (k,) = [i for i, t in enumerate(question.terms) if t.candidate.effect.name == "past 2 of u"]
+    (k,) = [i for i, t in enumerate(question.terms) if t.candidate.effect.name == name]
     scale = question.scales.scale["u"]
     u, y = e.u[:, 0], e.y[:, 0]
     t = np.arange(STEPS)
-    first, second, response, mean = 0.0, 0.0, [0.0], [0.0]
+    state, response, mean = (0.0, 0.0), [0.0], [0.0]
     for row in range(STEPS - 1):
-        response.append(0.8 * response[-1] + second)
+        state, output = filtered(state, (u[row] - scale.mean) / scale.sd)
+        response.append(0.8 * response[-1] + output)
         mean.append(0.8 * mean[-1] + 0.5 * u[row])
-        z = (u[row] - scale.mean) / scale.sd
-        first, second = first + (z - first) / REACH, second + (first - second) / REACH
     var = np.array([0.8 ** (2 * s) + 0.04 * (1 - 0.8 ** (2 * s)) / (1 - 0.64) for s in t])
     cov = var[np.minimum.outer(t, t)] * 0.8 ** np.abs(np.subtract.outer(t, t)) + 0.01 * np.eye(
         STEPS
@@ -126,9 +142,32 @@ def test_what_no_curve_can_be_is_found(variable, missing):
     p, key = tables.residual_group(screen, ())
     assert p <= 0.05
     assert key[0] == "x"  # its mean or, since q is held, its scale: which, hangs on the data set
-    assert variable in {t.variable for terms, _ in signal(screen, ()) for t in terms}
+    # rings that die away within a turn can be a low-pass, too
+    found = {t.variable for terms, _ in signal(screen, ()) for t in terms}
+    assert any(v == variable or v.startswith(variable.replace("past", "ringing")) for v in found)
     curves = tables.missing_table(screen, ("x", "mean"), ())
     assert set(curves["variable"]) == {"x", "u"}
+
+
+@pytest.mark.parametrize("turn", [7.0, 14.0, 25.0])
+def test_a_resonance_is_found_at_its_own_frequency(turn):
+    """One that dies away in three turns and is between two of those that are tried: it stands out
+    of all groups, at a turn next to its own."""
+    rng = np.random.default_rng(seed_of("resonance", turn))
+    u, pole = rng.standard_normal(STEPS), np.exp((2j * np.pi - 1.0 / 3.0) / turn)
+    x, ring, out = 0.0, 0j, []
+    for t in range(STEPS):
+        out.append(x + 0.1 * rng.standard_normal())
+        x, ring = (0.8 * x + 0.5 * u[t] + 0.1 * ring.real / np.sqrt(turn / 14.0)
+                   + 0.2 * rng.standard_normal(), pole * ring + u[t])  # fmt: skip
+    screen = asked({"u": u, "y": np.array(out)})
+    groups = tables.residual_groups(screen, ())
+    best = max(groups, key=lambda key: groups[key].z)
+    print(sorted(((round(g.z, 1), k[2]) for k, g in groups.items()), reverse=True)[:4])
+    assert groups[best].p <= 0.01
+    assert best[2].startswith("the ringing of")
+    found = float(best[2].split(" at ")[1].split()[0])
+    assert turn / 1.5 <= found <= turn * 1.5
 
 
 def test_nothing_stands_out_of_a_right_model(plain):
