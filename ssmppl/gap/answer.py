@@ -204,9 +204,8 @@ def _parts(r: Results) -> dict[str, Any]:
         if r.blocks:
             return {"cross-fitting": r.blocks}
         return {"screen": _span(r.experiments[0], 0, None)}
-    first, second = r.parts.first[0], r.parts.second[0]
-    e = r.experiments[0]
-    out: dict[str, Any] = {"screen": _span(e, 0, first), "choose": _span(e, first, second)}
+    second, e = r.parts.second[0], r.experiments[0]
+    out: dict[str, Any] = {"screen": _span(e, 0, second)}
     if r.blocks:
         return {**out, "cross-fitting": r.blocks}
     return {**out, "confirm": _span(e, second, None)}

@@ -30,7 +30,7 @@ from ssmppl.gap.refit import Refit
 from ssmppl.gap.screen import Screen
 from ssmppl.inference.particles.filtering import random_state
 
-SETS = 40  # simulated under each input
+SETS = 25  # simulated under each input
 SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
 
 

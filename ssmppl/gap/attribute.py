@@ -24,7 +24,7 @@ from ssmppl.gap.screen import Question, Screen, ask
 
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is asked
-FOLLOWERS = 3  # refits after a second screen
+FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
 
 
 @dataclass
@@ -224,7 +224,8 @@ def _screen_again(
         fitter.settings, candidates=rest,
     )  # fmt: skip
     stage = f"screening for effect {number + 1}"
-    return ask(question, train, chosen.fit.theta, screen.sets, _seed(seed, number), kept, stage)
+    sets = min(screen.sets, AGAIN)
+    return ask(question, train, chosen.fit.theta, sets, _seed(seed, number), kept, stage)
 
 
 def _seed(seed: np.random.SeedSequence, stage: int) -> np.random.SeedSequence:

@@ -26,7 +26,8 @@ HEAVIEST = 0.5  # shape of a generalised Pareto law, beyond which its variance i
 
 
 MEDIAN, UPPER = 0.5, 0.95  # quantiles that set a scale
-TYPICAL, OUTER = 0.6744897501960817, 1.959963984540054  # those of one |normal|
+OUTER = 1.959963984540054  # the upper one of |normal|
+BOTH = 2.409420839653209  # normals whose largest has the median of |normal|: log 1/2 / log 3/4
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class FamilyWise:
     labels : (G,) of the groups. p : (G,) step-down adjusted. p_single : (G,) against the law of
     the largest of all. best : (G,) column that leads its group. height : (G,) its statistic on the
     common scale. maxima : (B,) largest on that scale of each simulated set. scale : of the groups.
+    sided : (G,) whether its strength has a sign.
     """
 
     labels: np.ndarray
@@ -81,6 +83,7 @@ class FamilyWise:
     height: np.ndarray
     maxima: np.ndarray
     scale: Scale
+    sided: np.ndarray
 
     def put(self, label: int, height: float) -> float:
         """The height of a statistic of one group on the common scale."""
@@ -88,8 +91,10 @@ class FamilyWise:
         return float(Scale(self.scale.number[at], self.scale.stretch[at]).put(np.array(height)))
 
     def cost(self, label: int) -> float:
-        """Nats that the choice among a group's shapes is worth: log of their effective number."""
-        return float(np.log(self.scale.number[np.searchsorted(self.labels, label)]))
+        """Nats that the choice among a group's shapes is worth: log of their effective number,
+        where the choice of a sign counts for nothing."""
+        at = int(np.searchsorted(self.labels, label))
+        return float(max(np.log(self.scale.number[at] / (1.0 if self.sided[at] else BOTH)), 0.0))
 
     def of_columns(self, groups: np.ndarray) -> np.ndarray:
         """(K,) the p of each column's group."""
@@ -133,7 +138,8 @@ def familywise(
     p = np.empty(len(labels))
     p[order] = np.maximum.accumulate(stepped)
     single = np.array([tail_p(h, rest[:, 0]) for h in top])
-    return FamilyWise(labels, p, single, best, top, rest[:, 0], scale)
+    signed = np.broadcast_to(np.asarray(sided), observed.shape)[best] != 0
+    return FamilyWise(labels, p, single, best, top, rest[:, 0], scale, signed)
 
 
 def tail_p(value: float, maxima: np.ndarray) -> float:

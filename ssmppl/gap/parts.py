@@ -1,4 +1,5 @@
-"""What each part of the data is used for: screen, choose, confirm; or blocks left out in turn.
+"""What each part of the data is used for: to find and choose an effect, to confirm it; or blocks
+left out in turn.
 
 A filter runs over all rows before the one that it predicts, so that a part needs no rows to settle
 in: with parameters fitted to earlier rows only, one-step predictions of later ones are honest
@@ -24,7 +25,9 @@ FOLDS = 10
 
 @dataclass(frozen=True)
 class Parts:
-    """Rows of each experiment: screen = [0, first), train = [0, second), confirm = [begin, T)."""
+    """Rows of each experiment: train = [0, second), on which effects are looked for and chosen;
+    confirm = [second, T). The reference of the share is fitted to [0, first) and chosen by the rest
+    of `train`, before it is fitted to all of that."""
 
     experiments: tuple[Experiment, ...]
     first: tuple[int, ...]

@@ -103,7 +103,7 @@ class GapReport:
     residual_map : standardised smoothed score by equation and window of time.
     free_run : the data, and the models run without seeing them, before and after (NaN if there is
         no after), with 95% bands.
-    parts : {"screen": (first, last), "choose": ..., "confirm": ...}, row labels, or
+    parts : {"screen": (first, last), "confirm": ...}, row labels, or
         {"cross-fitting": number of blocks}; any further entry is text.
     not_applicable : parts that do not apply to this model, the equation ("" if all), and why.
     notes : what has to be known before the figures are used.

@@ -40,7 +40,6 @@ MOMENTS = {
 
 USE = {
     "screen": "effects were looked for on",
-    "choose": "chosen among on",
     "confirm": "the gap was measured on",
 }
 
@@ -95,7 +94,10 @@ def headline(report: GapReport) -> str:
     text, measured = f"{named(report)} lacks {lacks}", share(report)
     if measured:
         return sentence(f"{text}. {adding} {measured}")
-    return sentence(f"{text} ({sure}), but {kept_back(report)} no gap could be measured")
+    return sentence(
+        f"{text} ({sure}), but {kept_back(report)} its gain is too uncertain to say how far the "
+        "gap closes"
+    )
 
 
 def _lacks(groups: list[list[str]]) -> tuple[str, str]:
@@ -224,8 +226,13 @@ def how_far(report: GapReport) -> list[str]:
         out.append(sentence(f"{kept_back(report)}, {first['effect']} {share(report)}"))
         if first["F"] < 0:
             out.append("A share below zero means that it made the predictions worse.")
-    else:
+    elif report.verdict == "no measurable gap":
         out.append(sentence(f"{kept_back(report)}, no gap could be measured"))
+    else:
+        out.append(sentence(
+            f"{kept_back(report)} the gain is too uncertain for a share of the gap: its interval "
+            "reaches zero (see the notes)"
+        ))  # fmt: skip
     if report.verdict == "no measurable gap":  # what no effect gained is no finding
         return out
     if is_number(first["nats_per_sample"]):

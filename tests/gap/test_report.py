@@ -135,7 +135,9 @@ def test_the_first_sentence_is_the_verdict_with_number_and_uncertainty(name, par
 def test_an_effect_that_gains_nothing_on_data_kept_back_is_said_so():
     report = effect_found()
     lost = report.closed.assign(F=NAN, F_low=NAN, F_high=NAN)
-    assert "no gap could be measured" in headline(dataclasses.replace(report, closed=lost))
+    assert "too uncertain to say how far the gap closes" in headline(
+        dataclasses.replace(report, closed=lost)
+    )
     stood_out = dataclasses.replace(no_gap(), causes=report.causes)
     assert "stood out at first (p < 0.001)" in headline(stood_out)
 

@@ -1,0 +1,151 @@
+"""Which candidates are refitted, how refits are ranked and tested, and which base they stand on."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ssmppl.gap import refit as refits_of
+from ssmppl.gap.attribute import Attribution, _rebase, attribute
+from ssmppl.gap.byrefit import gain_p
+from ssmppl.gap.checkpoint import Checkpoint
+from ssmppl.gap.familywise import familywise, tail_p
+from ssmppl.gap.refit import Refit, Workshop, leading, mates
+from ssmppl.gap.scales import Scales
+from ssmppl.gap.screen import Question, ask
+from ssmppl.gap.smoothing import Settings
+from ssmppl.inference.particles.filtering import seed_sequence
+from ssmppl.inference.problem import missing_of, pose
+from tests.gap.small import level, levels
+from tests.statistics.checks import seed_of
+
+
+# -- which
+def screen_of(heights, rho, shapes=None):
+    """A screen with one column for each group, but for groups with more shapes."""
+    heights, count = np.asarray(heights, float), len(heights)
+    return SimpleNamespace(
+        family=SimpleNamespace(best=np.arange(count), height=heights),
+        found=SimpleNamespace(gain=0.5 * heights**2, status=("",) * count, rho=np.asarray(rho)),
+        groups=np.arange(count),
+    )
+
+
+def test_what_is_almost_the_same_as_one_above_it_waits():
+    rho = np.eye(7)
+    rho[0, 1] = rho[1, 0] = 0.99
+    rho[2, 4] = rho[4, 2] = -0.97
+    found = leading(screen_of([9.0, 8.9, 7.0, 6.0, 5.0, 4.0, 1.2], rho))
+    assert found == [0, 2, 3, 5]  # the last promises less than a nat
+
+
+def test_what_is_like_the_best_refit_comes_next():
+    rho = np.eye(6)
+    for k, r in {1: 0.99, 2: -0.85, 3: 0.5, 4: 0.9}.items():
+        rho[0, k] = rho[k, 0] = r
+    screen = screen_of([5.0, 5.0, 4.0, 6.0, 3.0, 5.0], rho)
+    done = [SimpleNamespace(index=(0,)), SimpleNamespace(index=(4,))]
+    assert mates(screen, done) == [1, 2]
+    assert mates(screen, []) == []
+
+
+def test_a_choice_among_shapes_costs():
+    """A date among hundreds gains nats by that alone: less is enough for one that had no choice."""
+    dated = Refit((0,), (), None, None, gain=10.6, cost=np.log(300.0))
+    plain = Refit((1,), (), None, None, gain=9.0, cost=0.0)
+    assert plain.merit > dated.merit
+    assert dated.merit == pytest.approx(10.6 - np.log(300.0))
+
+
+# -- tested
+def test_the_p_of_a_gain_is_that_of_a_score_as_large():
+    rng = np.random.default_rng(seed_of("gain p"))
+    groups = np.repeat([0, 1], [1, 200])
+    null = rng.standard_normal((200, 201))
+    family = familywise(np.zeros(201), null, groups=groups)
+    screen = SimpleNamespace(family=family, groups=groups)
+
+    def p(column, gain):
+        return gain_p(screen, SimpleNamespace(index=(column,), gain=gain))
+
+    for column, label in ((0, 0), (5, 1)):
+        assert p(column, 12.0) == tail_p(family.put(label, np.sqrt(24.0)), family.maxima)
+    gains = [p(0, g) for g in (-3.0, 0.0, 2.0, 5.0, 9.0, 20.0, 300.0)]
+    assert gains == sorted(gains, reverse=True)
+    assert gains[0] == 1.0
+    assert gains[-1] < 1e-6
+    assert p(0, 8.0) < 0.1 * p(5, 8.0)
+
+
+# -- fitted
+@pytest.fixture(scope="module")
+def asked():
+    """The screen of a random walk that is right, at its fit."""
+    problem = pose(level(), levels(120, 0.0, "right"))
+    missing = missing_of(problem.experiments)
+    workshop = Workshop(problem.trace, missing, {}, Settings())
+    fitter = workshop.fitter(())
+    fit = fitter.fit(problem.experiments, seed_sequence(1), {})
+    e = problem.experiments[0]
+    states = fitter.states(e, fit.theta, np.ones(4, np.uint64))
+    scales = Scales.of(problem.trace, states, e.y, e.u, e.steps)
+    question = Question(problem.trace, scales, missing, (), Settings(),
+                        ["constant load", "outliers", "level break"])  # fmt: skip
+    screen = ask(question, problem.experiments, fit.theta, 100, seed_sequence(2),
+                 Checkpoint(None, {}))  # fmt: skip
+    return workshop, fit, screen
+
+
+def lower(workshop, fit):
+    """The same fit, stopped at another place, some nats below."""
+    fitter, theta = workshop.fitter(()), fit.theta * np.array([6.0, 0.7])
+    experiments = fit.problem.experiments
+    value = fitter.kalman.log_likelihood(experiments, theta)
+    assert value < fit.log_likelihood - 5.0
+    numbers = fit.numbers | {"theta": theta, "log_likelihood": np.asarray(value)}
+    return fitter.restored(experiments, numbers)
+
+
+def test_a_better_place_for_the_parameters_is_no_effect(asked):
+    """A base fit that stopped too early makes every effect gain; the model is fitted again from
+    where the best of them ended, and the gains shrink by what that gives."""
+    workshop, fit, screen = asked
+    bad, kept = lower(workshop, fit), Checkpoint(None, {})
+    done, _ = refits_of.refit_all(
+        workshop, bad, screen, [[k] for k in leading(screen)], screen.experiments,
+        seed_sequence(3), kept, "refitting",
+    )  # fmt: skip
+    out = Attribution(bad, list(done))
+    assert out.refits[0].gain > 5.0
+    _rebase(out, workshop, screen.experiments, seed_sequence(4), kept, worth=3.0)
+    assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
+    shift = fit.log_likelihood - bad.log_likelihood
+    for before, after in zip(done, out.refits, strict=True):
+        assert after.gain == pytest.approx(before.gain - shift, abs=0.05)
+
+
+def test_a_right_model_is_not_accused_by_a_bad_start(asked):
+    workshop, fit, screen = asked
+    out = Attribution(lower(workshop, fit))
+    attribute(out, workshop, screen, screen.experiments, seed_sequence(5), 0.05,
+              Checkpoint(None, {}))  # fmt: skip
+    assert out.chosen is None
+    assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
+
+
+def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
+    """What is projected out of the basis: a wave whose period no screen has, among others."""
+    _, _, screen = asked
+    load = next(c for c in screen.question.candidates if c.effect.name == "constant load")
+    columns, seen = screen.columns_of([load])
+    assert columns.shape == (screen.sets, 1)
+    k = screen.question.candidates.index(load)
+    np.testing.assert_array_equal(columns[:, 0], screen.stacked("columns")[:, k])
+    assert seen[0] == screen.observed.columns[k]
+    jump = next(c for c in screen.question.candidates if c.effect.name == "level break")
+    other = replace(jump, shape=(("date", 17.3),))
+    found, _ = screen.columns_of([other])
+    best = next(int(j) for j in screen.family.best
+                if screen.question.candidates[j].group == jump.group)  # fmt: skip
+    np.testing.assert_array_equal(found[:, 0], screen.stacked("columns")[:, best])
