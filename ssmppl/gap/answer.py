@@ -108,7 +108,7 @@ def answer(r: Results, seconds: float) -> GapReport:
     return GapReport(
         verdict=verdict, where=where,
         causes=tables.causes_table(
-            screen, r.refits, found, order, r.attribution.p if r.attribution else {}
+            screen, r.refits, found, order, r.attribution.p if r.attribution else None
         ),
         classes=tables.classes_table(screen, found, order, r.separating),
         closed=share, detection=_detection(screen), residual_map=tables.map_table(screen),
@@ -132,8 +132,7 @@ def labels(candidates: Sequence[Candidate]) -> list[str]:
 
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
     """The verdict but for whether a gap can be measured at all, and the missing curve."""
-    tested = r.attribution.p.values() if r.attribution else ()
-    least = min([float(np.min(r.screen.family.p, initial=1.0)), *tested])
+    least = float(np.min(r.screen.family.p, initial=1.0))
     asked = r.attribution is not None and r.mode == "full"
     if r.far is not None and _curves_beat(r.far):
         best = r.chosen or (r.refits[0] if r.refits else None)
@@ -141,7 +140,7 @@ def _verdict(r: Results, where: Any) -> tuple[str, Any]:
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= r.alpha and key is not None:
             return "none of these", _curve(r.screen, key, tried)
-    if least <= r.alpha and (r.chosen is not None or not asked):
+    if r.chosen is not None or (least <= r.alpha and not asked):
         head = where.iloc[0] if len(where) else None
         if head is not None and head["moment"] == "mean":
             return "effect", _curve(r.screen, (head["equation"], "mean"), ())

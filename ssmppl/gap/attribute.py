@@ -1,8 +1,8 @@
 """Which effect: the leading candidates refitted, pairs of them, and one step after another.
 
-Effects come together, and one at a time can look wrong: pairs are refitted beside single ones.
-After that the screen is asked again around the model with what was chosen, and an effect is added
-as long as one stands out.
+Effects come together, and one at a time can look wrong: pairs are refitted beside single ones, and
+the screen is asked again around the model with the best of these, for one more effect. From the
+better of the two pairs it goes on, as long as an effect stands out.
 """
 
 from __future__ import annotations
@@ -70,9 +70,10 @@ def attribute(
     out.refits = refits
     significant = False
     if not always:
+        before, own = out.base, alpha / 2  # of two tests, each has half
         _rebase(out, workshop, train, _seed(seed, 6), kept, needed_gain(screen, alpha))
-        own = alpha / 2  # of two tests, each has half
-        significant = bool(np.min(screen.family.p, initial=1.0) <= own)
+        if out.base is before:  # else the screen was asked at the wrong place
+            significant = bool(np.min(screen.family.p, initial=1.0) <= own)
         significant |= _by_refit(out, workshop, screen, train, _seed(seed, 4), own, kept)
     if not out.refits or not (significant or always):
         return

@@ -1,10 +1,11 @@
-"""Whether the best refit gains more than chance would: its law by parametric bootstrap.
+"""Whether the best refit gains more than chance would.
 
 Where noise has grown to swallow what is missing, the score at the fit is far smaller than what a
-refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). In
-short records, where a fit is quick, the gain itself is therefore tested: data sets simulated at
-theta-hat are fitted, screened and refitted as the data were. The test stops as soon as it cannot
-reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991).
+refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). So
+the gain itself is tested: by the law of the scores, which is the same to first order (likelihood
+ratio and score tests); in short records, where a fit is quick and first order a poor guide, by its
+own: data sets simulated at theta-hat are fitted, screened and refitted as the data were. That test
+stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ LAX = 4.0  # times alpha, up to which a closer look is worth it
 TRIED = 2  # candidates refitted in each set, the best by the score
 SETS, CHUNK = 99, 10
 MOST_WORK = 1.5e5  # rows times particles, beyond which the fits would take too long
-MOST_ROWS = 300
+MOST_ROWS = 300  # from which on the law of the scores is taken
 
 
 def gain_p(screen: Screen, refit: Refit) -> float:

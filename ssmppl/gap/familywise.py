@@ -23,8 +23,6 @@ from ssmppl.errors import ArgumentError
 TAIL = 0.1  # share of the maxima to which the tail is fitted
 FEWEST_IN_TAIL = 10
 HEAVIEST = 0.5  # shape of a generalised Pareto law, beyond which its variance is infinite
-
-
 MEDIAN, UPPER = 0.5, 0.95  # quantiles that set a scale
 OUTER = 1.959963984540054  # the upper one of |normal|
 BOTH = 2.409420839653209  # normals whose largest has the median of |normal|: log 1/2 / log 3/4

@@ -173,12 +173,14 @@ def residual_groups(
 
 def causes_table(
     screen: Screen, refits: Sequence[Refit], found: Classes, order: Sequence[int],
-    tested: Mapping[int, float],
+    tested: Mapping[int, float] | None,
 ) -> pd.DataFrame:  # fmt: skip
     """One row for each group of candidates, the refitted ones first; pairs are not listed.
 
-    tested : p of refits whose own gain was tested, by column.
+    tested : p of refits whose own gain was tested, by column; None where no refit was to be tested.
+    With two tests p is twice the smaller one (Bonferroni).
     """
+    tests, tested = (1, {}) if tested is None else (2, tested)
     by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
     significant = screen.significant
     times = screen.experiments[0].time
@@ -199,7 +201,7 @@ def causes_table(
                 strength, error = 0.0, np.nan
         shaped = own.candidates[0].shape if own is not None else c.shape
         shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in shaped)
-        p = min(float(significant[k]), tested.get(k, 1.0))
+        p = min(1.0, tests * min(float(significant[k]), tested.get(k, 1.0)))
         rows.append({
             "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
             "equation": c.equation, "z": float(s.z[k]), "p": p,

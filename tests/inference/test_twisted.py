@@ -19,7 +19,14 @@ from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import ENOUGH, choose
 from ssmppl.inference.problem import pose
 from tests.statistics import models
-from tests.statistics.checks import LEVEL, assert_moments, assert_within, deviations, seed_of
+from tests.statistics.checks import (
+    LEVEL,
+    assert_moments,
+    assert_within,
+    deviations,
+    seed_of,
+    some,
+)
 from tests.statistics.exact import DenseGaussian, GridPosterior
 from tests.statistics.test_likelihood import SCHEMES, THRESHOLDS, Table, estimates, with_gaps
 
@@ -48,7 +55,7 @@ def vehicle_exact(y, h):
 
 
 @pytest.mark.parametrize(("particles", "repeats"), [
-    pytest.param(2, 1000, marks=pytest.mark.slow), (10, 1000), (100, 200),
+    *some([(2, 1000), (10, 1000)], 0), (100, 200),
 ])  # fmt: skip
 def test_position_and_velocity(particles, repeats):
     """Every scheme and threshold. The guide is exact here, so that even two particles do.

@@ -125,7 +125,7 @@ def test_quadrature_against_reference(exact_values, series):
 @pytest.mark.parametrize(
     "method", [*some(LGSS_METHODS, 3), *some(STEERED, 0, pytest.mark.exhaustive)], ids=str
 )
-@pytest.mark.parametrize("series", LGSS)
+@pytest.mark.parametrize("series", some(LGSS, 1))
 def test_lgss(exact_values, series, method, draws):
     """theta with its vague Gamma prior; c is known. Mean, sd and the quantiles' levels."""
     load, c = LGSS[series]
