@@ -29,6 +29,7 @@ from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace
 
 CLEARLY = 2.0  # standard errors
+MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
 LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows bear it out
 
 
@@ -134,7 +135,7 @@ def _verdict(r: Results, where: Any) -> tuple[str, Any]:
     """The verdict but for whether a gap can be measured at all, and the missing curve."""
     least = float(np.min(r.screen.family.p, initial=1.0))
     asked = r.attribution is not None and r.mode == "full"
-    if r.far is not None and _curves_beat(r.far):
+    if r.far is not None and _curves_beat(r.far, r.chosen is not None):
         best = r.chosen or (r.refits[0] if r.refits else None)
         tried = list(best.candidates) if best else []
         residual, key = tables.residual_group(r.screen, tried)
@@ -153,9 +154,13 @@ def _verdict(r: Results, where: Any) -> tuple[str, Any]:
     return "no measurable gap", None
 
 
-def _curves_beat(far: HowFar) -> bool:
-    """Whether smooth curves predict the held-out rows better than the best of the catalogue."""
-    return far.beyond is not None and far.beyond.nats > CLEARLY * far.beyond.error
+def _curves_beat(far: HowFar, chosen: bool) -> bool:
+    """Whether smooth curves predict the held-out rows better than the best of the catalogue: more
+    than chance explains, and, where effects were chosen, by more than a trifle of the gap."""
+    if far.beyond is None or not far.beyond.nats > CLEARLY * far.beyond.error:
+        return False
+    share = float(far.rows[0]["F"]) if chosen and far.rows else np.nan
+    return not share > 1.0 - MATTERS
 
 
 def _curve(screen: Screen, key: tuple[str, str], others: Sequence[Candidate]) -> Any:
