@@ -10,7 +10,15 @@ from pathlib import Path
 from table import machine, versions
 
 HERE = Path(__file__).parent
-SCRIPTS = ("filters.py", "start.py", "proposals.py", "smoothing.py", "samplers.py", "kalman.py")
+SCRIPTS = (
+    "filters.py",
+    "start.py",
+    "proposals.py",
+    "smoothing.py",
+    "samplers.py",
+    "updates.py",
+    "kalman.py",
+)
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ phi truncated to (-1, 1), the pair accepted with probability sqrt(1 - phi^2).
 """
 
 import pickle
-import time
 
 import numpy as np
 import pytest
@@ -159,14 +158,3 @@ def test_pickles_and_draws_the_same(update):
     one, _ = draw(update, c, start, {}, np.random.default_rng(5))
     two, _ = draw(other, c, start, {}, np.random.default_rng(5))
     assert np.array_equal(one, two)
-
-
-def test_a_draw_takes_microseconds(update):
-    c, rng, value = totals(update, series(600)), np.random.default_rng(1), np.array([0.9, 40.0])
-    times = []
-    for _ in range(20):
-        start = time.perf_counter()
-        for _ in range(100):
-            draw(update, c, value, {}, rng)
-        times.append((time.perf_counter() - start) / 100)
-    assert min(times) < 40e-6

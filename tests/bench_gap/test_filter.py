@@ -24,6 +24,7 @@ def drawn(name, strengths=None, steps=None, seed=0):
     return system, p, e, U, Y, data
 
 
+@pytest.mark.slow
 def test_linear_systems_have_their_exact_likelihood():
     system, p, e, U, Y, data = drawn("thermal", steps=80)
     parameters = dict(zip(system.parameters, p, strict=True))

@@ -107,6 +107,7 @@ def lower(workshop, fit):
     return fitter.restored(experiments, numbers)
 
 
+@pytest.mark.slow
 def test_a_better_place_for_the_parameters_is_no_effect(asked):
     """A base fit that stopped too early makes every effect gain; the model is fitted again from
     where the best of them ended, and the gains shrink by what that gives."""

@@ -144,6 +144,7 @@ def table(rng, y, pool):
     return detection(observed, pool[0][drawn], score, pool[1][drawn] / np.array([s, s, 1.0]))
 
 
+@pytest.mark.slow
 def test_false_alarms_with_fitted_parameters(pool):
     """The level is kept by all statistics together, although the sets are not refitted."""
     rng, times = rng_of("level"), 200

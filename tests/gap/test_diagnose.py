@@ -201,6 +201,7 @@ def test_known_parameters_stay():
     assert report.estimates["before"]["r"][1] > 0.0
 
 
+@pytest.mark.slow
 def test_a_flat_start():
     """Where the level starts says nothing about a jump: the data may lie anywhere."""
     found = [run(level(ssm.Flat()), {"y": levels(80, BREAK)["y"] + shift}, ["level break"],

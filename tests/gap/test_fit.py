@@ -14,7 +14,7 @@ from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import pose
 from tests.gap import models
 from tests.gap.small import level, levels
-from tests.statistics.checks import LEVEL, seed_of
+from tests.statistics.checks import LEVEL, seed_of, some
 
 CASES = {
     "level": (level, levels, {}),
@@ -42,7 +42,7 @@ def log_posterior(fitter, fit, z):
     return kalman.log_likelihood(fit.problem.experiments, point.theta) + point.log_prior
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("name", some(CASES, 1))
 def test_particles_find_the_exact_mode(name):
     problem, exact = fitter_of(name, exact=True)
     _, particles = fitter_of(name, exact=False)

@@ -129,7 +129,7 @@ ENUMERATED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("label", "kernel", "steps", "n"), some(ENUMERATED, 4))
+@pytest.mark.parametrize(("label", "kernel", "steps", "n"), some(ENUMERATED, 3))
 def test_law_given_the_particles(label, kernel, steps, n):
     problem, theta, experiment, system = short(label, steps, n)
     law = enumerate_law(problem, theta, experiment, system)
@@ -206,7 +206,7 @@ MOMENTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("label", "proposal", "kernel", "particles"), some(MOMENTS, 2))
+@pytest.mark.parametrize(("label", "proposal", "kernel", "particles"), some(MOMENTS, 1))
 def test_moments(label, proposal, kernel, particles):
     problem, theta, exact, *_ = smoothing_case(label)
     stream = stream_of("moments", label, kernel)

@@ -79,6 +79,7 @@ def exact_top(y):
     return top, -curve / np.outer(step, step)
 
 
+@pytest.mark.slow
 def test_the_top_of_a_short_series(problem):
     y = datasets.ice_varves()[:ROWS]
     top, information = exact_top(y)

@@ -145,7 +145,7 @@ def problem_data(name):
 
 @pytest.mark.parametrize("objective", ["likelihood", "posterior"])
 @pytest.mark.parametrize(
-    "name", some(["regression", "two states", "vector", "stationary", "decay", "companion"], 3)
+    "name", some(["regression", "two states", "vector", "stationary", "decay", "companion"], 2)
 )
 def test_agrees_with_direct_optimisation(name, objective):
     """Inputs, missing values, two experiments, matrices, a Dirac state; and what does not separate.

@@ -10,13 +10,13 @@ from ssmppl import datasets
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.particles.particle_score import Run, combine, run_weights
 from tests.statistics import models
-from tests.statistics.checks import seed_of
+from tests.statistics.checks import seed_of, some
 from tests.statistics.exact import DenseGaussian
 
 VARVES = {(0.95, 50.0): "0.95,50", (0.9, 20.0): "0.9,20"}
 
 
-@pytest.mark.parametrize(("name", "c"), [("lgss_main_text", 0.5), ("lgss_appendix", 1.0)])
+@pytest.mark.parametrize(("name", "c"), some([("lgss_main_text", 0.5), ("lgss_appendix", 1.0)], 1))
 def test_the_exact_score_of_the_linear_series(name, c, exact_values):
     data = {"y": datasets.load(name)["y"]}
     found = ssm.score(models.lgss, data, {"theta": 1.0}, fixed={"c": c})
@@ -33,6 +33,7 @@ def dense(model_matrices, y, **parameters):
     return DenseGaussian(y, **model_matrices(**parameters)).log_likelihood
 
 
+@pytest.mark.slow
 def test_particles_agree_with_the_exact_score_of_a_deterministic_position():
     """A position that integrates a velocity, with the step h a parameter: Fisher's identity through
     the recursion of sensitivities, against the dense Gaussian's derivative."""
@@ -55,7 +56,7 @@ def test_particles_agree_with_the_exact_score_of_a_deterministic_position():
     assert exact.information.loc["h", "h"] == pytest.approx(curve, rel=1e-4)
 
 
-@pytest.mark.parametrize(("at", "key"), VARVES.items())
+@pytest.mark.parametrize(("at", "key"), some(VARVES.items(), 1))
 def test_the_score_of_the_varves(at, key, exact_values):
     exact = dict(zip(("phi", "tau"), exact_values["ice_varves"]["score_at"][key], strict=True))
     found = ssm.score(models.varves, {"y": datasets.ice_varves()},

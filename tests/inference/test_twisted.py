@@ -147,7 +147,7 @@ def test_quadrature():
 
 
 @pytest.mark.parametrize("combinations", [SYSTEMATIC, OTHER_SCHEMES])
-@pytest.mark.parametrize("hole", [-5.0, 0.0])
+@pytest.mark.parametrize("hole", some([-5.0, 0.0], 1))
 def test_volatility(hole, combinations):
     """A spread that depends on the state. Where the hole is at 0 the guide comes to no number, so
     that particles move by the transition."""

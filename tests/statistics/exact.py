@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from scipy import stats
 
@@ -35,11 +37,31 @@ class DenseGaussian:
         expected, spread = H @ mean.ravel() + offset, H @ S @ H.T + noise
         residual = y.ravel()[seen] - expected
         self.log_likelihood = float(stats.multivariate_normal.logpdf(residual, cov=spread))
-        gain = np.linalg.solve(spread, H @ S).T
-        self.mean = (mean.ravel() + gain @ residual).reshape(T, D)
-        self.covariance = S - gain @ H @ S
-        self.sd = np.sqrt(np.maximum(np.diag(self.covariance), 0)).reshape(T, D)
-        self.lag_one = np.diag(self.covariance, D).reshape(T - 1, D)
+        self._prior, self._residual, self._spread, self._crossed = mean, residual, spread, H @ S
+        self._states = S
+
+    # The moments cost several times the log-likelihood, for which alone many tests ask.
+
+    @cached_property
+    def _gain(self):
+        return np.linalg.solve(self._spread, self._crossed).T
+
+    @cached_property
+    def mean(self):
+        return self._prior + (self._gain @ self._residual).reshape(self._prior.shape)
+
+    @cached_property
+    def covariance(self):
+        return self._states - self._gain @ self._crossed
+
+    @cached_property
+    def sd(self):
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0)).reshape(self._prior.shape)
+
+    @cached_property
+    def lag_one(self):
+        T, D = self._prior.shape
+        return np.diag(self.covariance, D).reshape(T - 1, D)
 
 
 def varve_log_likelihood(y, phi, tau, points=600):

@@ -144,7 +144,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("method", "draws"), some(CASES, 2))
+@pytest.mark.parametrize(("method", "draws"), some(CASES, 1))
 def test_posterior_of_the_small_series(request, method, draws):
     idata = sampled(request.node.callspec.id, method, draws)
     rate = float(idata["sample_stats"]["acceptance_rate"].mean())

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
+from numpy.polynomial import Chebyshev
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
@@ -94,14 +94,15 @@ def lgss_quantiles(series):
     Carlo error of the long runs.
     """
     load, c = LGSS[series]
-    coarse, fine = np.linspace(-3, 2.5, 300), np.linspace(-3, 2.5, 100_001)
-    log_p = [
-        0.01 * z
-        - 0.01 * np.exp(z)
-        + DenseGaussian(load(), **models.lgss_matrices(np.exp(z), c)).log_likelihood
-        for z in coarse
-    ]
-    p = np.exp(CubicSpline(coarse, log_p)(fine) - np.max(log_p))
+    y = load()
+
+    def likelihood(z):
+        return [DenseGaussian(y, **models.lgss_matrices(v, c)).log_likelihood for v in np.exp(z)]
+
+    fine = np.linspace(-3, 2.5, 100_001)
+    log_p = 0.01 * (fine - np.exp(fine))
+    log_p += Chebyshev.interpolate(likelihood, 80, domain=[-3, 2.5])(fine)
+    p = np.exp(log_p - log_p.max())
     p /= p.sum()
     theta, below = np.exp(fine), np.cumsum(p) - 0.5 * p
     mean = p @ theta

@@ -72,7 +72,7 @@ STEERED = [("gaps", "twisted"), ("machine", "twisted")]
 @pytest.mark.parametrize("draws", [2_000, pytest.param(20_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(
     ("label", "proposal"),
-    [*some(RUNS, 4), *some(STEERED[:1], 0), *some(STEERED[1:], 0, pytest.mark.exhaustive)],
+    [*some(RUNS, 3), *some(STEERED[:1], 0), *some(STEERED[1:], 0, pytest.mark.exhaustive)],
 )
 def test_smoother(label, proposal, draws):
     model, data, parameters, order, exact = cases()[label]
@@ -93,7 +93,7 @@ PARAMETERS_OF_DIRAC = {
 
 
 @pytest.mark.parametrize("draws", [1_500, pytest.param(10_000, marks=pytest.mark.exhaustive)])
-@pytest.mark.parametrize("label", PARAMETERS_OF_DIRAC)
+@pytest.mark.parametrize("label", some(PARAMETERS_OF_DIRAC, 1))
 def test_parameter_inside_a_deterministic_law(label, draws):
     model, matrices, name, value, (mean, sd), (lower, upper) = PARAMETERS_OF_DIRAC[label]
     y = gaps_in(label, model, {name: value}, 25)
