@@ -19,8 +19,18 @@ from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.familywise import threshold
 from ssmppl.gap.fit import Fit
-from ssmppl.gap.refit import Refit, Workshop, leading, mates, pairs, refit_all
+from ssmppl.gap.refit import (
+    Refit,
+    Workshop,
+    best_of_groups,
+    delays,
+    leading,
+    mates,
+    pairs,
+    refit_all,
+)
 from ssmppl.gap.screen import Question, Screen, ask
+from ssmppl.gap.shaping import shaped_all
 
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is asked
@@ -32,7 +42,8 @@ class Attribution:
     """What refits say, filled in as they come to an end.
 
     base : the model's own fit. refits, doubles : with one effect, with two; best first.
-    chosen : what is kept, None for the model as it is. p : by the candidate's column, where its
+    chosen : what is kept, None for the model as it is. fewer : what it grew from, the fewest
+    effects first. p : by the candidate's column, where its
     refit was tested itself. notes : why others were not refitted.
     """
 
@@ -40,6 +51,7 @@ class Attribution:
     refits: list[Refit] = field(default_factory=list)
     doubles: list[Refit] = field(default_factory=list)
     chosen: Refit | None = None
+    fewer: list[Refit] = field(default_factory=list)
     p: dict[int, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -56,16 +68,18 @@ def attribute(
     standard errors.
     """
     refits: list[Refit] = []
-    for stage in ("refitting", "refitting what is like it"):
+    for stage in ("refitting", "refitting what is like it", "refitting other delays"):
         if stage == "refitting":
             heads = leading(screen)[:singles]
+        elif singles is not None:
+            break
         else:
-            heads = mates(screen, refits) if singles is None else []
+            heads = (mates if "like" in stage else delays)(screen, refits)
         more, failed = refit_all(
             workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept, stage,
             quick=quick,
         )  # fmt: skip
-        refits = sorted(refits + more, key=lambda r: -r.merit)
+        refits = best_of_groups(screen, refits + more)
         out.notes += [f"not refitted: {reason}" for reason in failed]
     out.refits = refits
     significant = False
@@ -77,7 +91,14 @@ def attribute(
         significant |= _by_refit(out, workshop, screen, train, _seed(seed, 4), own, kept)
     if not out.refits or not (significant or always):
         return
+    scales = screen.question.scales
+    if not quick:
+        out.refits = shaped_all(
+            workshop, out.base, scales, out.refits, train, _seed(seed, 7), kept,
+            "estimating shapes",
+        )  # fmt: skip
     out.chosen = out.refits[0]
+    single, pair = out.chosen, None
     if steps > 1:
         rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept, quick)
         if significant:  # a step from the best one, against the best pair
@@ -85,9 +106,16 @@ def attribute(
         if rival is not None and rival.merit > out.chosen.merit:
             out.chosen = rival
         if significant and len(out.chosen.candidates) == 2:
+            pair = out.chosen
             _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
+    out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen]
+    if not quick and len(out.chosen.candidates) > 1:
+        (out.chosen,) = shaped_all(
+            workshop, out.base, scales, [out.chosen], train, _seed(seed, 8), kept,
+            "estimating the shapes of all that was chosen",
+        )  # fmt: skip
     if not quick:
-        _measure(out, _seed(seed, 5), kept)
+        measure(out, _seed(seed, 5), kept)
 
 
 def _best_pair(
@@ -106,12 +134,12 @@ def _best_pair(
     return out.doubles[0]
 
 
-def _measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) -> None:
+def measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) -> None:
     """Standard errors of what was chosen, from scores simulated at its fit."""
     old = out.chosen
     assert old is not None
     numbers = kept.of(
-        "standard errors",
+        f"standard errors, {len(old.candidates)} effects",
         lambda: {"information": old.fitter.measured(old.fit, seed).information},
     )
     new = replace(old, fit=replace(old.fit, information=np.array(numbers["information"])))
@@ -197,7 +225,8 @@ def _forward(
             return
         best = more[0]
         strengths = {c.key: k for k, c in enumerate(screen.question.candidates)}
-        index = (*chosen.index, strengths[best.candidates[-1].key])
+        asked = again.question.candidates[best.index[0]]
+        index = (*chosen.index, strengths[asked.key])
         chosen = Refit(
             index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain,
             chosen.cost + best.cost,
@@ -233,4 +262,4 @@ def _seed(seed: np.random.SeedSequence, stage: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, stage))
 
 
-__all__ = ["Attribution", "attribute", "needed_gain"]
+__all__ = ["Attribution", "attribute", "measure", "needed_gain"]

@@ -123,6 +123,9 @@ def _changes(candidate: Candidate, returned: Any, part: Part) -> dict[str, Expr]
                 f"it returned {value!r}",
                 "return one number, or an expression",
             ) from None
+    if candidate.reaction and len(out) == 1:
+        (own,) = out.values()
+        out |= {label: own * factor for label, factor in candidate.reaction}
     return out
 
 

@@ -29,6 +29,8 @@ class Candidate:
     strength : name of its parameter; 0 gives the model back.
     role : what the equation is: "state", "channel", "input" or "parameter".
     held : its process is held at 1: see `increment`.
+    reaction : (label, factor) of each equation that moves with its own, by so many times as much
+        (`flows`).
     shares : candidates of the same text here have the same shapes, which then are one parameter.
     """
 
@@ -40,6 +42,7 @@ class Candidate:
     strength: str = "strength"
     held: bool = False
     shares: str = ""
+    reaction: tuple[tuple[str, Expr], ...] = ()
 
     @property
     def kind(self) -> str:
@@ -52,6 +55,8 @@ class Candidate:
         free = [a for a, role in self.effect.given.items() if role in ("other state", "any input")]
         others = [label for a, label in self.bound if a in free]
         parts = [self.effect.form, *(f"by {label}" for label in others)]
+        if self.reaction:
+            parts.append(f"with {' and '.join(label for label, _ in self.reaction)}")
         return ", ".join(filter(None, parts))
 
     @property
@@ -75,6 +80,11 @@ class Candidate:
     def change(self) -> str:
         """What it does to its equation, as a kind other than "state"."""
         return OF_ROLE[self.role] if self.kind == "state" else self.kind
+
+    def variable(self, argument: str) -> str:
+        """The label of what an argument stands for; "" is the first."""
+        own = {"": self.equation, self.effect.arguments[0]: self.equation}
+        return {**own, **dict(self.bound)}.get(argument, argument)
 
     @property
     def first_order(self) -> bool:

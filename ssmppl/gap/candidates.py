@@ -17,7 +17,9 @@ from ssmppl.gap.candidate import OF_ROLE, Candidate
 from ssmppl.gap.catalogue import effects as catalogue
 from ssmppl.gap.declared import ON
 from ssmppl.gap.effect import Effect
+from ssmppl.gap.flows import Reaction, flows
 from ssmppl.gap.laws import has_scale, has_tail, scale_of_mean
+from ssmppl.gap.profiles import ONE_OFF
 from ssmppl.gap.scales import Scale, Scales, value_of
 from ssmppl.language.rules import RESERVED
 from ssmppl.language.trace import Trace
@@ -66,10 +68,11 @@ def offers(
     ModelError : an effect's function does not fit its kind or the model; names its line.
     """
     anatomy = Anatomy(trace)
+    shared = flows(anatomy)
     out: list[Candidate] = []
     refused: list[Refused] = []
     for effect in chosen(effects):
-        found, not_for = _of_effect(effect, anatomy, scales)
+        found, not_for = _of_effect(effect, anatomy, scales, shared)
         out += found
         refused += not_for
     return _named(out, anatomy), refused
@@ -108,7 +111,7 @@ def chosen(effects: Chosen = None) -> list[Effect]:
 
 # -- one effect
 def _of_effect(
-    effect: Effect, anatomy: Anatomy, scales: Scales
+    effect: Effect, anatomy: Anatomy, scales: Scales, shared: Mapping[str, list[Reaction]]
 ) -> tuple[list[Candidate], list[Refused]]:
     out: list[Candidate] = []
     refused: list[Refused] = []
@@ -140,8 +143,14 @@ def _of_effect(
             reason = _check(made[0], anatomy)
             if reason:
                 refuse(part.label, reason)
-            else:
-                out += made
+                continue
+            out += made
+            alone = len(bind(made[0], anatomy, "transition").changes) == 1
+            if effect.on in ("rate", "state") and alone and effect.profile not in ONE_OFF:
+                for reaction in shared.get(part.label, []):
+                    moved = [replace(c, reaction=reaction) for c in made]
+                    if not _check(moved[0], anatomy):
+                        out += moved
     return out, refused
 
 
@@ -199,8 +208,12 @@ def _reason(effect: Effect, part: Part, anatomy: Anatomy, scales: Scales) -> str
         return found.reason
     if found:
         return found
-    if effect.requires == "positive" and scales.scale[part.label].quantile(0.02) <= 0.0:
-        return "it takes values below 0"
+    if effect.requires:
+        low, high = (scales.scale[part.label].quantile(level) for level in (0.02, 0.98))
+        if effect.requires == "positive" and low <= 0.0:
+            return "it takes values below 0"
+        if effect.requires == "both signs" and (low > 0.0 or high < 0.0):
+            return "it never changes its sign"
     if "second order" in effect.given.values():
         term = anatomy.second_order(part)
         return term.reason if isinstance(term, NotApplicable) else ""
@@ -257,10 +270,10 @@ def _shapes(
     effect: Effect, part: Part, bound: tuple[tuple[str, str], ...], scales: Scales
 ) -> list[tuple[tuple[str, float], ...]] | str:
     """Every combination of the shape parameters' values; a text where a scale is missing."""
-    labels = {"": part.label, effect.arguments[0]: part.label, **dict(bound)}
+    bare = Candidate(effect, part.label, bound=bound)
     axes: list[list[tuple[str, float]]] = []
     for name, grid in effect.shapes.items():
-        label = labels.get(grid.of, grid.of)
+        label = bare.variable(grid.of)
         scale = scales.scale.get(label)
         if scale is None and grid.unit not in ("number", "rows"):
             return f"there is no scale of {label} for its shape parameter {name}"

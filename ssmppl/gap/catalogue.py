@@ -24,8 +24,12 @@ class Catalogue:
     """
 
     Auxiliary = effect.Auxiliary
-    numbers, sds, means = map(staticmethod, (effect.numbers, effect.sds, effect.means))
-    quantiles, sizes, rows = map(staticmethod, (effect.quantiles, effect.sizes, effect.rows))
+    numbers = staticmethod(effect.numbers)
+    sds = staticmethod(effect.sds)
+    means = staticmethod(effect.means)
+    quantiles = staticmethod(effect.quantiles)
+    sizes = staticmethod(effect.sizes)
+    rows = staticmethod(effect.rows)
 
     def __init__(self, effects: Iterable[Effect]):
         self._effects = tuple(effects)

@@ -14,13 +14,14 @@ from ssmppl.language.distributions import Dirac, Normal
 
 # -- static nonlinearities
 @effect(on="input", kind="input", name="input saturation", lower=0,
-        shapes={"c": sizes(0.5, 0.75, 0.9)})  # fmt: skip
+        shapes={"c": sizes(0.5, 0.75, 0.9, between=(0.1, 0.99))})  # fmt: skip
 def input_saturation(u, strength, c):
     """u - l (u - clip(u, -c, c))"""
     return u - strength * (u - np.clip(u, -c, c))
 
 
-@effect(on="input", kind="input", name="dead zone", lower=0, shapes={"c": sizes(0.1, 0.25, 0.5)})
+@effect(on="input", kind="input", name="dead zone", lower=0,
+        shapes={"c": sizes(0.1, 0.25, 0.5, between=(0.01, 0.9))})  # fmt: skip
 def dead_zone(u, strength, c):
     """u - l clip(u, -c, c)"""
     return u - strength * np.clip(u, -c, c)
@@ -46,7 +47,7 @@ def input_offset(u, strength):
 
 # -- with memory
 @effect(on="input", kind="state", name="backlash", lower=0, upper=2, states=("held",),
-        shapes={"c": sds(0.25, 0.75)})  # fmt: skip
+        shapes={"c": sds(0.25, 0.75, between=(0.05, 3.0))})  # fmt: skip
 def backlash(u, held, strength, c):
     """u + l (w - u), w moved by u at the ends of a play of half width c"""
     follows = np.clip(held, u - c, u + c)
@@ -63,7 +64,7 @@ def input_delay(u, past, strength, delay):
 
 
 @effect(on="input", kind="state", name="actuator lag", lower=0, upper=2, states=("lagged",),
-        shapes={"k": numbers(2, 5, 15)})  # fmt: skip
+        shapes={"k": numbers(2, 5, 15, between=(1.0, 60.0))})  # fmt: skip
 def actuator_lag(u, lagged, strength, k):
     """u + l (w - u), w following u with the time constant of k rows"""
     follows = lagged + (u - lagged) / k

@@ -10,20 +10,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.gap.effect import Auxiliary, effect, numbers, quantiles, rows, sds
+from ssmppl.gap.effect import Auxiliary, effect, means, numbers, quantiles, rows, sds
 from ssmppl.language.distributions import Dirac, Normal
 
 POSITION, OTHER, LOAD = {"x": "position"}, {"other": "other state"}, {"u": "any input"}
 
 
 # -- friction
-@effect(on="rate", name="coulomb friction", lower=0, shapes={"v0": sds(0.05, 0.3)})
+@effect(on="rate", name="coulomb friction", lower=0, requires="both signs",
+        shapes={"v0": sds(0.05, 0.3, between=(0.01, 1.0))})  # fmt: skip
 def coulomb_friction(v, strength, v0):
     """-l tanh(v / v0)"""
     return -strength * np.tanh(v / v0)
 
 
-@effect(on="rate", name="stribeck", lower=0, shapes={"v0": sds(0.05), "vs": sds(0.2, 0.6)})
+@effect(on="rate", name="stribeck", lower=0, requires="both signs",
+        shapes={"v0": sds(0.05), "vs": sds(0.2, 0.6, between=(0.05, 2.0))})  # fmt: skip
 def stribeck(v, strength, v0, vs):
     """-l exp(-(v / vs)^2) tanh(v / v0)"""
     return -strength * np.exp(-((v / vs) ** 2)) * np.tanh(v / v0)
@@ -35,7 +37,8 @@ def asymmetric_viscous_friction(v, strength):
     return -strength * np.abs(v)
 
 
-@effect(on="rate", name="asymmetric friction", form="dry", shapes={"v0": sds(0.1)})
+@effect(on="rate", name="asymmetric friction", form="dry", requires="both signs",
+        shapes={"v0": sds(0.1)})  # fmt: skip
 def asymmetric_dry_friction(v, strength, v0):
     """-l |tanh(v / v0)|"""
     return -strength * np.abs(np.tanh(v / v0))
@@ -73,35 +76,49 @@ def state_dependent_damping(v, x, strength):
 
 
 @effect(on="rate", name="hard stop", form="upper", lower=0, given=POSITION,
-        shapes={"h": quantiles(0.8, 0.95, of="x")})  # fmt: skip
+        shapes={"h": quantiles(0.6, 0.8, 0.95, of="x", between=(0.5, 0.99))})  # fmt: skip
 def upper_stop(v, x, strength, h):
     """-l max(x - h, 0)"""
     return -strength * np.maximum(x - h, 0.0)
 
 
 @effect(on="rate", name="hard stop", form="lower", lower=0, given=POSITION,
-        shapes={"h": quantiles(0.2, 0.05, of="x")})  # fmt: skip
+        shapes={"h": quantiles(0.4, 0.2, 0.05, of="x", between=(0.01, 0.5))})  # fmt: skip
 def lower_stop(v, x, strength, h):
     """l max(h - x, 0)"""
     return strength * np.maximum(h - x, 0.0)
 
 
+@effect(
+    on="rate",
+    name="hard stop",
+    form="both ends",
+    lower=0,
+    given=POSITION,
+    shapes={"h": sds(1.0, 1.5, of="x", between=(0.3, 2.5)), "middle": means(1.0, of="x")},
+)
+def both_stops(v, x, strength, h, middle):
+    """-l (x - clip(x, m - h, m + h)), m the middle of the range"""
+    return -strength * (x - np.clip(x, middle - h, middle + h))
+
+
 @effect(on="rate", name="hard stop", form="overflow into another state", lower=0, given=OTHER,
-        shapes={"h": quantiles(0.9)})  # fmt: skip
+        shapes={"h": quantiles(0.9, between=(0.5, 0.99))})  # fmt: skip
 def overflow(x, other, strength, h):
     """-l max(x - h, 0), and as much into the other state"""
     over = strength * np.maximum(x - h, 0.0)
     return {"x": -over, "other": over}
 
 
-@effect(on="rate", name="gravity", given=POSITION)
+@effect(on="rate", name="gravity", given={"x": "integral"})
 def gravity(v, x, strength):
     """-l sin x, x an angle"""
     return -strength * np.sin(x)
 
 
 @effect(on="rate", name="bouc-wen hysteresis", kind="state", lower=0,
-        given={"x": "integral", "moved": "moved"}, shapes={"d": sds(0.2, 1.0, of="x")},
+        given={"x": "integral", "moved": "moved"},
+        shapes={"d": sds(0.2, 1.0, of="x", between=(0.2, 4.0))},
         states=("hysteresis",))  # fmt: skip
 def bouc_wen_hysteresis(v, x, moved, hysteresis, strength, d):
     """-l z, z following x over the distance d: dz = (dx - |dx| z / 2 - dx |z| / 2) / d"""
@@ -125,7 +142,8 @@ def product_coupling(x, other, strength):
 
 
 @effect(on="rate", name="extra loss", requires="positive",
-        shapes={"p": numbers(0.5, 2.0, 4.0), "ambient": quantiles(0.5)})  # fmt: skip
+        shapes={"p": numbers(0.5, 2.0, 4.0, between=(0.25, 6.0)),
+                "ambient": means(0.0, 1.0, between=(0.0, 1.5))})  # fmt: skip
 def extra_loss(x, strength, p, ambient):
     """-l (x^p - xa^p), x above 0"""
     return -strength * (np.maximum(x, 0.0) ** p - ambient**p)
@@ -146,7 +164,8 @@ def random_walk_load(v, load, strength):
 
 
 @effect(on="state", name="missing input", form="ar1", kind="state", lower=0, states=("load",),
-        constant="constant load", shapes={"memory": numbers(0.8, 0.97)}, process="ar1")  # fmt: skip
+        constant="constant load",
+        shapes={"memory": numbers(0.8, 0.97, between=(0.3, 0.995))}, process="ar1")  # fmt: skip
 def ar1_load(v, load, strength, memory):
     """l w, w an autoregression of standard deviation 1"""
     noise = np.sqrt(1.0 - memory**2)
@@ -160,8 +179,8 @@ def ar1_load(v, load, strength, memory):
     given={"wave": "profile"},
     profile="wave",
     constant="constant load",
-    shapes={"period": numbers(10.0), "phase": numbers(0.0)},
-)  # all are tried: `profiles`
+    shapes={"period": numbers(10.0), "phase": numbers(0.0)},  # all are tried: `profiles`
+)
 def periodic_forcing(v, wave, strength):
     """l cos(w t - phase)"""
     return strength * wave
@@ -185,7 +204,7 @@ def coarse_discretisation(x, second_order, strength):
 EFFECTS = (
     coulomb_friction, stribeck, asymmetric_viscous_friction, asymmetric_dry_friction,
     load_dependent_friction, quadratic_drag, cubic_stiffness, quadratic_stiffness,
-    state_dependent_damping, upper_stop, lower_stop, overflow, linear_coupling, product_coupling,
-    extra_loss, constant_load, gravity, bouc_wen_hysteresis, random_walk_load, ar1_load,
-    periodic_forcing, level_break, coarse_discretisation,
+    state_dependent_damping, upper_stop, lower_stop, both_stops, overflow, linear_coupling,
+    product_coupling, extra_loss, constant_load, gravity, bouc_wen_hysteresis, random_walk_load,
+    ar1_load, periodic_forcing, level_break, coarse_discretisation,
 )  # fmt: skip

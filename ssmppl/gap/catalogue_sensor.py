@@ -43,17 +43,24 @@ def cubic_gain(h, strength, middle):
 
 
 @effect(on="channel", kind="observation", name="sensor clipping", form="upper", lower=0,
-        shapes={"c": quantiles(0.8, 0.95)})  # fmt: skip
+        shapes={"c": quantiles(0.8, 0.95, between=(0.5, 0.99))})  # fmt: skip
 def upper_clipping(h, strength, c):
     """-l max(h - c, 0)"""
     return -strength * np.maximum(h - c, 0.0)
 
 
 @effect(on="channel", kind="observation", name="sensor clipping", form="lower", lower=0,
-        shapes={"c": quantiles(0.2, 0.05)})  # fmt: skip
+        shapes={"c": quantiles(0.2, 0.05, between=(0.01, 0.5))})  # fmt: skip
 def lower_clipping(h, strength, c):
     """l max(c - h, 0)"""
     return strength * np.maximum(c - h, 0.0)
+
+
+@effect(on="channel", kind="observation", name="sensor clipping", form="both ends", lower=0,
+        shapes={"c": sds(1.0, 1.5, between=(0.3, 2.5)), "middle": means(1.0)})  # fmt: skip
+def both_clippings(h, strength, c, middle):
+    """-l (h - clip(h, m - c, m + c)), m the middle of the range"""
+    return -strength * (h - np.clip(h, middle - c, middle + c))
 
 
 @effect(on="channel", kind="observation", name="sensor rectification")
@@ -71,7 +78,7 @@ def quantisation(h, strength, d):
 
 
 @effect(on="channel", kind="state", name="sensor lag", lower=0, upper=2, states=("sensed",),
-        shapes={"k": numbers(2, 5), "start": means(1.0)})  # fmt: skip
+        shapes={"k": numbers(2, 5, between=(1.0, 30.0)), "start": means(1.0)})  # fmt: skip
 def sensor_lag(h, sensed, strength, k, start):
     """l (s - h), s following h with the time constant of k rows"""
     return Auxiliary(strength * (sensed - h), {"sensed": Dirac(sensed + (h - sensed) / k)},
@@ -89,7 +96,8 @@ def sensor_delay(h, earlier, strength, delay, start):
 
 
 @effect(on="channel", kind="state", name="coloured noise", lower=0, states=("colour",),
-        constant="sensor bias", shapes={"memory": numbers(0.5, 0.9)}, process="ar1")  # fmt: skip
+        constant="sensor bias", process="ar1",
+        shapes={"memory": numbers(0.5, 0.9, between=(0.05, 0.99))})  # fmt: skip
 def coloured_noise(h, colour, strength, memory):
     """l w, w an autoregression of standard deviation 1"""
     noise = np.sqrt(1.0 - memory**2)
@@ -134,6 +142,6 @@ def wrong_initial_state(x, strength):
 
 EFFECTS = (
     sensor_bias, sensor_drift, quadratic_gain, cubic_gain, upper_clipping, lower_clipping,
-    sensor_rectification, sensor_lag, sensor_delay, quantisation, outliers, noise_by_size,
-    noise_by_state, noise_by_input, coloured_noise, wrong_initial_state,
+    both_clippings, sensor_rectification, sensor_lag, sensor_delay, quantisation, outliers,
+    noise_by_size, noise_by_state, noise_by_input, coloured_noise, wrong_initial_state,
 )  # fmt: skip

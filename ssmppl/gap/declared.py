@@ -18,6 +18,7 @@ KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "in
 GIVEN = ("position", "integral", "moved", "other state", "any input", "second order", "profile")
 ON = ("any", "rate", "state", "channel", "input", "parameter", "positive parameter",
       "other parameter")  # fmt: skip
+REQUIRES = ("positive", "both signs")
 PROCESSES = ("random walk", "ar1")  # of zero mean: their score in `strength` is zero
 
 # Functions of time by name: of t and of shape parameters.
@@ -73,6 +74,19 @@ def check(e: Effect) -> None:
     for name, grid in e.shapes.items():
         if not grid.values or not all(map(math.isfinite, grid.values)):
             raise refuse(f"the shape {name!r} has the values {grid.values}", "give finite numbers")
+        if grid.between is not None:
+            low, high = grid.between
+            if not low <= min(grid.values) <= max(grid.values) <= high or low == high:
+                raise refuse(
+                    f"the shape {name!r} is estimated between {low} and {high}, and its values are "
+                    f"{grid.values}",
+                    "give bounds that hold them",
+                )
+            if name in e.states.values():
+                raise refuse(
+                    f"the shape {name!r} is a number of states, which cannot be estimated",
+                    "leave out between=",
+                )
         if grid.of and grid.of not in parameters:
             raise refuse(
                 f"the shape {name!r} is relative to {grid.of!r}, which is no argument",
@@ -110,8 +124,10 @@ def _check_parts(e: Effect, refuse: Callable[[str, str], ModelError]) -> None:
             f"its process is {e.process!r}",
             f'use one of {", ".join(PROCESSES)}, with kind="state" and its auxiliary state',
         )
-    if e.requires not in ("", "positive"):
-        raise refuse(f"it requires {e.requires!r}", 'use requires="positive", or leave it out')
+    if e.requires not in ("", *REQUIRES):
+        raise refuse(
+            f"it requires {e.requires!r}", f"use one of: {listing(e.requires, REQUIRES)}, or none"
+        )
     if bool(e.profile) != ("profile" in e.given.values()):
         raise refuse(
             f"its profile is {e.profile!r} and given is {dict(e.given)}",

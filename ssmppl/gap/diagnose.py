@@ -18,10 +18,11 @@ from ssmppl.data import Experiment, check_values
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.gap.answer import Results, answer
 from ssmppl.gap.apart import separating
-from ssmppl.gap.attribute import MOST_WORK, Attribution, attribute
+from ssmppl.gap.attribute import MOST_WORK, Attribution, attribute, measure
 from ssmppl.gap.candidates import Chosen
 from ssmppl.gap.candidates import chosen as chosen_effects
 from ssmppl.gap.checkpoint import Checkpoint, Numbers, digests
+from ssmppl.gap.confirm import predict
 from ssmppl.gap.crossfit import CrossFit
 from ssmppl.gap.expected import Timed, in_words, timed
 from ssmppl.gap.expected import seconds as expected
@@ -179,8 +180,31 @@ class _Diagnosis:
             self.kept,
         )  # fmt: skip
         r.attribution, r.fit = found, found.base
+        self._borne_out(r)
         self._separated(r)
         r.far = self._how_far(r)
+
+    def _borne_out(self, r: Results) -> None:
+        """Of several effects chosen together, the last again left out while all of them predict the
+        held-out rows no better than the model itself: what they fitted was chance."""
+        found = r.attribution
+        if not self.parts or found is None or found.chosen is None or not found.fewer:
+            return
+        plain = predict(r.base, r.fit, self.experiments, self.parts.confirm, self._seed(8))
+        while found.fewer:
+            last = found.chosen
+            seen = predict(
+                last.fitter, last.fit, self.experiments, self.parts.confirm, self._seed(8)
+            )
+            gain = seen.log_density.sum(axis=1).mean() - plain.log_density.sum(axis=1).mean()
+            if gain > 0.0:
+                return
+            found.chosen = found.fewer.pop()
+            measure(found, self._seed(4), self.kept)
+            found.notes.append(
+                f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
+                f"held-out rows worse than the model itself ({gain:.1f} nats): the last is left out"
+            )
 
     def _how_far(self, r: Results) -> HowFar:
         once = r.chosen is not None and any(passing(c) for c in r.chosen.candidates)

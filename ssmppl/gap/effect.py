@@ -73,36 +73,42 @@ class Grid:
     unit : "number"; "sd" or "mean" (multiples of them), "quantile" (levels) or "size" (levels of
         absolute values) of the variable; "rows" (shares of the number of rows, rounded).
     of : the argument whose variable is meant; "" is the first.
+    between : bounds in the same unit, between which refits estimate the parameter; None: it stays
+        at a value of the grid.
     """
 
     unit: str
     values: tuple[float, ...]
     of: str = ""
+    between: tuple[float, float] | None = None
 
 
-def numbers(*values: float) -> Grid:
+Bounds = tuple[float, float] | None
+
+
+def numbers(*values: float, between: Bounds = None) -> Grid:
     """These values as they are."""
-    return Grid("number", values)
+    return Grid("number", values, between=between)
 
 
-def sds(*values: float, of: str = "") -> Grid:
+def sds(*values: float, of: str = "", between: Bounds = None) -> Grid:
     """Multiples of the variable's standard deviation."""
-    return Grid("sd", values, of)
+    return Grid("sd", values, of, between)
 
 
-def means(*values: float, of: str = "") -> Grid:
+def means(*values: float, of: str = "", between: Bounds = None) -> Grid:
     """Multiples of the variable's mean."""
-    return Grid("mean", values, of)
+    return Grid("mean", values, of, between)
 
 
-def quantiles(*levels: float, of: str = "") -> Grid:
+def quantiles(*levels: float, of: str = "", between: Bounds = None) -> Grid:
     """Quantiles of the variable."""
-    return Grid("quantile", levels, of)
+    return Grid("quantile", levels, of, between)
 
 
-def sizes(*levels: float, of: str = "") -> Grid:
+def sizes(*levels: float, of: str = "", between: Bounds = None) -> Grid:
     """Quantiles of the variable's absolute value."""
-    return Grid("size", levels, of)
+    return Grid("size", levels, of, between)
 
 
 def rows(*shares: float) -> Grid:
@@ -137,7 +143,8 @@ class Effect:
         that the score in the strength itself is zero.
     constant : what it is called with its process or profile held at 1; effects that share this
         name are then the same.
-    requires : "positive" where it makes sense for a variable above 0 only.
+    requires : "positive" where it makes sense for a variable above 0 only, "both signs" where it
+        is a constant for one that never changes its sign.
     note : the formula or what it stands for, in words.
     """
 

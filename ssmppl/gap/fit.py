@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -98,6 +99,14 @@ class Fitter:
         self.smoother = Smoother(self.columns, problem.program.missing, settings)
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
+
+    def with_fixed(self, values: Mapping[str, float]) -> Fitter:
+        """The same with other values of parameters that are fixed."""
+        if not values:
+            return self
+        out = copy(self)
+        out.fixed = self.fixed | {n: np.asarray(v, dtype=float) for n, v in values.items()}
+        return out
 
     @property
     def few(self) -> int:

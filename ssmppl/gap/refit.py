@@ -16,7 +16,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable, SSMError
-from ssmppl.expressions.expr import symbol
+from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.gap.augment import augment
 from ssmppl.gap.basis import lifted
 from ssmppl.gap.candidate import Candidate
@@ -29,12 +29,13 @@ from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import Problem
-from ssmppl.language.distributions import LogNormal
+from ssmppl.language.distributions import LogNormal, Uniform
 from ssmppl.language.trace import Trace
 
 SINGLES, MATES, PAIRS = 5, 4, 3  # candidates refitted, further ones like the best of them, pairs
 ALIKE = 0.8  # correlation from which a candidate is refitted as a class mate
 SAME = 0.95  # beyond which two candidates are one to begin with
+NEAR = 25.0  # nats behind the best, up to which other delays are tried
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
 
@@ -92,18 +93,49 @@ class Workshop:
     def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         """The fitter of the model with these effects; shapes are fixed parameters, so that the
         generated code is the same for all data."""
-        key = tuple((c.key, c.strength) for c in candidates)
-        if key not in self._made:
-            self._made[key] = self._fitter(candidates)
-        return self._made[key]
-
-    def _fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         made, shapes = lift(candidates)
-        trace = with_parameters(augment(self.trace, made), shapes) if made else self.trace
+        key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
+        if key not in self._made:
+            trace = with_parameters(augment(self.trace, made), shapes) if made else self.trace
+            self._made[key] = self._fitter(trace, shapes)
+        return self._made[key].with_fixed(shapes)
+
+    def with_free_shapes(
+        self, candidates: Sequence[Candidate], free: Mapping[str, tuple[float, float]]
+    ) -> Fitter:
+        """The fitter of the model with these effects, some of their shapes between bounds.
+
+        The last parameters are then the shapes' shares of the way between (`share_of`); the bounds
+        are fixed parameters, so that the generated code is the same for all data.
+        """
+        made, shapes = lift(candidates)
+        given = {n: v for n, v in shapes.items() if n not in free}
+        inside: dict[Expr, Expr] = {}
+        for name, (low, high) in free.items():
+            ends = (f"{name}_from", f"{name}_range")
+            given |= dict(zip(ends, (low, high - low), strict=True))
+            a, b, u = (symbol("parameter", n, ()) for n in (*ends, share_of(name)))
+            inside[symbol("parameter", name, ())] = a + b * u
+        key = (*((c.key, c.strength) for c in made), *((n, "free") for n in free))
+        if key not in self._made:
+            made = [
+                replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape)) for c in made
+            ]
+            trace = with_parameters(augment(self.trace, made), given)
+            trace = with_parameters(trace, map(share_of, free), lambda: Uniform(0, 1))
+            self._made[key] = self._fitter(trace, given)
+        return self._made[key].with_fixed(given)
+
+    def _fitter(self, trace: Trace, given: Mapping[str, float]) -> Fitter:
         program = compile_trace(trace, self.missing)
-        fixed = self.fixed | {n: np.asarray(v) for n, v in shapes.items()}
+        fixed = self.fixed | {n: np.asarray(v) for n, v in given.items()}
         settings = Settings(self.settings.particles, proposal_of(program), self.settings.lag)
         return Fitter(Problem(trace, (), program), fixed, settings)
+
+
+def share_of(shape: str) -> str:
+    """The parameter that says how far a shape is from its lower bound to its upper one."""
+    return f"{shape}_share"
 
 
 def lift(candidates: Sequence[Candidate]) -> tuple[list[Candidate], dict[str, float]]:
@@ -233,6 +265,27 @@ def mates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     found = [k for k in _by_height(screen)
              if like[k] >= ALIKE and int(screen.groups[k]) not in done]  # fmt: skip
     return sorted(found, key=lambda k: -like[k])[:MATES]
+
+
+def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """The other numbers of states, as delays are, of those near the best that have one: nothing
+    between two of them can be estimated."""
+    near = [r.index[0] for r in refits if refits[0].merit - r.merit <= NEAR]
+    out: list[int] = []
+    for best in near:
+        c = screen.question.candidates[best]
+        if any(c.effect.states.values()) and len(out) < MATES:
+            group = np.flatnonzero(screen.groups == screen.groups[best])
+            out += [int(k) for k in group if k != best and not screen.found.status[k]]
+    return out
+
+
+def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
+    """Of refits that differ in their shapes only, the best; best first."""
+    out: dict[int, Refit] = {}
+    for r in sorted(refits, key=lambda r: -r.merit):
+        out.setdefault(int(screen.groups[r.index[0]]), r)
+    return list(out.values())
 
 
 def _by_height(screen: Screen) -> list[int]:

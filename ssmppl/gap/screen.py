@@ -6,7 +6,7 @@ every statistic of the report that is not a refit takes its null law from them (
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,7 +31,7 @@ from ssmppl.gap.simulator import Simulator
 from ssmppl.gap.smoothing import Pass, Settings, Smoother, probability_transforms
 from ssmppl.gap.when import bin_edges, binned
 from ssmppl.inference.particles.filtering import random_state
-from ssmppl.language.distributions import Flat
+from ssmppl.language.distributions import Distribution, Flat
 from ssmppl.language.trace import Site, Trace, symbols
 
 OWN_RUNS = 6  # passes over the data themselves, which tell the smoother's own noise
@@ -309,12 +309,14 @@ def compared(law: Null, usual: np.ndarray, seen: Statistics) -> Efficient:
     )  # fmt: skip
 
 
-def with_parameters(trace: Trace, values: Mapping[str, float]) -> Trace:
-    """The trace with shapes as further parameters, which are given."""
+def with_parameters(
+    trace: Trace, names: Iterable[str], prior: Callable[[], Distribution] = Flat
+) -> Trace:
+    """The trace with further parameters: by default such as are given."""
     location = next(iter(trace.transition.values())).distribution.location
     parameters = dict(trace.parameters)
-    for name in values:
-        law = Flat()
+    for name in names:
+        law = prior()
         law.location = location
         own = symbols("parameter", name, ())
         parameters[name] = Site(name, "parameter", law, own, location)

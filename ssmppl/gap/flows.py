@@ -1,0 +1,85 @@
+"""Flows: expressions that several equations share, so that what one lacks the others lack with it.
+
+The acceleration of a cart turns the pole on it; who is infected leaves the susceptible. A force or
+a loss that is missing there is missing in every equation that holds the flow: an increment g of x_i
+is then one of g (d f_j / d F) / (d f_i / d F) of x_j, f the transitions' means and F the flow.
+"""
+
+from __future__ import annotations
+
+from ssmppl.expressions.calculus import NotDifferentiable, gradient
+from ssmppl.expressions.expr import Expr, substitute, symbol, symbols_of
+from ssmppl.expressions.graph import topological
+from ssmppl.gap.anatomy import Anatomy, Part
+from ssmppl.gap.laws import scale_of_mean
+
+Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
+
+FLOW = symbol("flow", "F")
+
+
+def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
+    """By the label of a state: how the others move with it, once for each set of others.
+
+    A flow is a largest shared expression of states or inputs that enters the state's own equation
+    with a constant factor, and the others' linearly. What integrates the state is not moved.
+    """
+    means = {}
+    for part in anatomy.of_role("state"):
+        mean = anatomy.mean(part)
+        if isinstance(mean, Expr) and scale_of_mean(anatomy.law(part)) == "identity":
+            means[part.label] = mean
+    out: dict[str, list[Reaction]] = {}
+    for label in means:
+        part = anatomy.parts[label]
+        if not anatomy.fixed_by_others(part):
+            found: dict[tuple[str, ...], Reaction] = {}
+            for flow in _shared(label, means):
+                reaction = _reaction(flow, part, means, anatomy)
+                found.setdefault(tuple(other for other, _ in reaction), reaction)
+            out[label] = [r for others, r in found.items() if others]
+    return out
+
+
+def _moving(e: Expr) -> bool:
+    """Whether it depends on states or inputs."""
+    return any(s.data[0] in ("state_prev", "input_prev") for s in symbols_of(e))
+
+
+def _shared(label: str, means: dict[str, Expr]) -> list[Expr]:
+    """The largest expressions in a state's equation that some other equation holds too."""
+    elsewhere = set(topological([m for other, m in means.items() if other != label]))
+    out: list[Expr] = []
+    seen: set[Expr] = set()
+    stack = [means[label]]
+    while stack:
+        node = stack.pop()
+        if node in seen or node.op in ("symbol", "const") or not _moving(node):
+            continue
+        seen.add(node)
+        if node in elsewhere and node is not means[label]:
+            out.append(node)
+        else:
+            stack += node.args
+    return out
+
+
+def _reaction(flow: Expr, part: Part, means: dict[str, Expr], anatomy: Anatomy) -> Reaction:
+    """How the other equations move with one; () where the flow does not enter as it has to."""
+    out = []
+    try:
+        (own,) = gradient(substitute([means[part.label]], {flow: FLOW})[0], [FLOW])
+        if _moving(own) or FLOW in symbols_of(own):
+            return ()
+        for label, mean in means.items():
+            if label == part.label or anatomy.integral_of.get(label) == part.label:
+                continue
+            (slope,) = gradient(substitute([mean], {flow: FLOW})[0], [FLOW])
+            if slope.op == "const" and slope.data == 0.0:
+                continue
+            if FLOW in symbols_of(slope):
+                return ()
+            out.append((label, slope / own))
+    except NotDifferentiable:
+        return ()
+    return tuple(out)
