@@ -22,6 +22,7 @@ from ssmppl.gap.bases import Smooth, bases
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import Scales, slug
 from ssmppl.gap.effect import Auxiliary, Effect, numbers
+from ssmppl.gap.flows import Reaction, carried
 from ssmppl.gap.laws import has_scale, scale_of_mean
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.trace import Trace
@@ -88,7 +89,14 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
                         for v in driving for turn in TURNS for k in range(len(RING))]  # fmt: skip
         if not isinstance(has_scale(law), NotApplicable):
             out += [_curve(part, "scale", "noise", v, k, scales) for v in own for k in range(SCALE)]
-    return out
+    moved = carried(anatomy)
+    return [_with_it(t, moved) if t.candidate.change == "transition" else t for t in out]
+
+
+def _with_it(term: Term, moved: Mapping[str, Reaction]) -> Term:
+    """With what moves within the step."""
+    along = moved.get(term.equation, ())
+    return replace(term, candidate=replace(term.candidate, carried=along)) if along else term
 
 
 def _measured(law: Distribution, states: Sequence[Part]) -> list[Part]:

@@ -38,13 +38,15 @@ class Bound:
 
 
 def bind(
-    candidate: Candidate, anatomy: Anatomy, role: str, names: Mapping[str, str] | None = None
-) -> Bound:
+    candidate: Candidate, anatomy: Anatomy, role: str, names: Mapping[str, str] | None = None,
+    *, own: bool = False,
+) -> Bound:  # fmt: skip
     """Call the effect's function as part of a law.
 
     Parameters
     ----------
     role : "initial", "transition" or "observation": whose symbols it sees.
+    own : without what moves with its equation.
     names : auxiliary state -> its name in the model; by default its own.
 
     Raises
@@ -66,6 +68,10 @@ def bind(
             out.transition, out.initial = _laws(effect, returned, names, role)
         returned = returned.change
     out.changes = _changes(candidate, returned, part)
+    also = () if own else (*candidate.reaction, *candidate.carried)
+    if also and len(out.changes) == 1:
+        (increment,) = out.changes.values()
+        out.changes |= {label: increment * factor for label, factor in also}
     return out
 
 
@@ -123,9 +129,6 @@ def _changes(candidate: Candidate, returned: Any, part: Part) -> dict[str, Expr]
                 f"it returned {value!r}",
                 "return one number, or an expression",
             ) from None
-    if candidate.reaction and len(out) == 1:
-        (own,) = out.values()
-        out |= {label: own * factor for label, factor in candidate.reaction}
     return out
 
 

@@ -30,7 +30,7 @@ class Candidate:
     role : what the equation is: "state", "channel", "input" or "parameter".
     held : its process is held at 1: see `increment`.
     reaction : (label, factor) of each equation that moves with its own, by so many times as much
-        (`flows`).
+        (`flows`). carried : likewise of what integrates its new value.
     shares : candidates of the same text here have the same shapes, which then are one parameter.
     """
 
@@ -43,6 +43,7 @@ class Candidate:
     held: bool = False
     shares: str = ""
     reaction: tuple[tuple[str, Expr], ...] = ()
+    carried: tuple[tuple[str, Expr], ...] = ()
 
     @property
     def kind(self) -> str:

@@ -17,7 +17,7 @@ from ssmppl.gap.candidate import OF_ROLE, Candidate
 from ssmppl.gap.catalogue import effects as catalogue
 from ssmppl.gap.declared import ON
 from ssmppl.gap.effect import Effect
-from ssmppl.gap.flows import Reaction, flows
+from ssmppl.gap.flows import Flows
 from ssmppl.gap.laws import has_scale, has_tail, scale_of_mean
 from ssmppl.gap.profiles import ONE_OFF
 from ssmppl.gap.scales import Scale, Scales, value_of
@@ -68,7 +68,7 @@ def offers(
     ModelError : an effect's function does not fit its kind or the model; names its line.
     """
     anatomy = Anatomy(trace)
-    shared = flows(anatomy)
+    shared = Flows.of(anatomy)
     out: list[Candidate] = []
     refused: list[Refused] = []
     for effect in chosen(effects):
@@ -111,7 +111,7 @@ def chosen(effects: Chosen = None) -> list[Effect]:
 
 # -- one effect
 def _of_effect(
-    effect: Effect, anatomy: Anatomy, scales: Scales, shared: Mapping[str, list[Reaction]]
+    effect: Effect, anatomy: Anatomy, scales: Scales, shared: Flows
 ) -> tuple[list[Candidate], list[Refused]]:
     out: list[Candidate] = []
     refused: list[Refused] = []
@@ -140,17 +140,20 @@ def _of_effect(
                 refuse(part.label, shapes)
                 continue
             made = [Candidate(effect, part.label, shape, bound, part.role) for shape in shapes]
+            moves = made[0].change == "transition" and effect.profile not in ONE_OFF
+            if moves and part.label in shared.carried:
+                made = [replace(c, carried=shared.carried[part.label]) for c in made]
             reason = _check(made[0], anatomy)
             if reason:
                 refuse(part.label, reason)
                 continue
             out += made
-            alone = len(bind(made[0], anatomy, "transition").changes) == 1
-            if effect.on in ("rate", "state") and alone and effect.profile not in ONE_OFF:
-                for reaction in shared.get(part.label, []):
-                    moved = [replace(c, reaction=reaction) for c in made]
-                    if not _check(moved[0], anatomy):
-                        out += moved
+            alone = moves and len(bind(made[0], anatomy, "transition", own=True).changes) == 1
+            if effect.on in ("rate", "state") and alone:
+                for reaction in shared.reactions.get(part.label, []):
+                    acting = [replace(c, reaction=reaction) for c in made]
+                    if not _check(acting[0], anatomy):
+                        out += acting
     return out, refused
 
 
@@ -305,7 +308,7 @@ def _check(candidate: Candidate, anatomy: Anatomy) -> str:
         if not reason and part.role == "state" and change == "transition":
             scale = scale_of_mean(anatomy.law(part))
             reason = scale.reason if isinstance(scale, NotApplicable) else ""
-        if reason:
+        if reason and label not in dict(candidate.carried):
             return f"it changes {label} too: {reason}"
     return ""
 

@@ -7,6 +7,9 @@ is then one of g (d f_j / d F) / (d f_i / d F) of x_j, f the transitions' means 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.expr import Expr, substitute, symbol, symbols_of
 from ssmppl.expressions.graph import topological
@@ -16,6 +19,19 @@ from ssmppl.gap.laws import scale_of_mean
 Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
 
 FLOW = symbol("flow", "F")
+
+
+@dataclass(frozen=True)
+class Flows:
+    """What moves with the state of a label: `flows`, and what is `carried`."""
+
+    reactions: Mapping[str, list[Reaction]]
+    carried: Mapping[str, Reaction]
+
+    @classmethod
+    def of(cls, anatomy: Anatomy) -> Flows:
+        """Of a model."""
+        return cls(flows(anatomy), carried(anatomy))
 
 
 def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
@@ -38,6 +54,24 @@ def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
                 reaction = _reaction(flow, part, means, anatomy)
                 found.setdefault(tuple(other for other, _ in reaction), reaction)
             out[label] = [r for others, r in found.items() if others]
+    return out
+
+
+def carried(anatomy: Anatomy) -> dict[str, Reaction]:
+    """By the label of a state: what integrates its new value, and so moves within the same step, as
+    in semi-implicit steps, x + h v_new."""
+    out: dict[str, Reaction] = {}
+    for x, v in anatomy.integral_of.items():
+        mean, whole = (anatomy.mean(anatomy.parts[label]) for label in (v, x))
+        if not (isinstance(mean, Expr) and isinstance(whole, Expr)):
+            continue
+        if mean in set(topological([whole])):
+            try:
+                (slope,) = gradient(substitute([whole], {mean: FLOW})[0], [FLOW])
+            except NotDifferentiable:
+                continue
+            if not _moving(slope) and FLOW not in symbols_of(slope):
+                out[v] = ((x, slope),)
     return out
 
 

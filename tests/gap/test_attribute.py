@@ -6,12 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ssmppl.gap import diagnose as diagnosis
 from ssmppl.gap import refit as refits_of
 from ssmppl.gap.attribute import Attribution, _rebase, attribute
 from ssmppl.gap.byrefit import gain_p
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.familywise import familywise, tail_p
-from ssmppl.gap.refit import Refit, Workshop, leading, mates
+from ssmppl.gap.refit import Refit, Workshop, best_of_groups, delays, leading, mates
 from ssmppl.gap.scales import Scales
 from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.smoothing import Settings
@@ -150,3 +151,56 @@ def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
     best = next(int(j) for j in screen.family.best
                 if screen.question.candidates[j].group == jump.group)  # fmt: skip
     np.testing.assert_array_equal(found[:, 0], screen.stacked("columns")[:, best])
+
+
+# -- shapes that are whole numbers, and effects that fail
+def refit_at(k, merit):
+    return Refit((k,), (), None, None, gain=merit)
+
+
+def delayed_screen():
+    """Columns 0 to 2 are the delays of one effect, 3 is an effect without, 4 and 5 another's."""
+    delayed = SimpleNamespace(effect=SimpleNamespace(states={"past": "delay"}))
+    plain = SimpleNamespace(effect=SimpleNamespace(states={"held": None}))
+    return SimpleNamespace(
+        question=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2),
+        groups=np.array([7, 7, 7, 3, 8, 8]),
+        found=SimpleNamespace(status=["", "", "too little", "", "", ""]),
+    )
+
+
+def test_other_delays_of_those_near_the_best_are_refitted():
+    screen = delayed_screen()
+    assert delays(screen, [refit_at(3, 40.0), refit_at(0, 30.0), refit_at(4, 10.0)]) == [1]
+    assert delays(screen, [refit_at(0, 30.0), refit_at(4, 10.0)]) == [1, 5]
+    assert delays(screen, []) == []
+
+
+def test_of_refits_that_differ_in_their_shape_the_best_stands():
+    screen = delayed_screen()
+    found = best_of_groups(screen, [refit_at(k, m) for k, m in ((0, 5.0), (3, 7.0), (1, 9.0))])
+    assert [(r.index[0], r.gain) for r in found] == [(1, 9.0), (3, 7.0)]
+
+
+@pytest.mark.parametrize(
+    ("gains", "left"),
+    [({1: 5.0, 2: 4.0, 3: 2.0}, 3), ({1: 5.0, 2: 4.0, 3: -2.0}, 2), ({1: 5.0, 2: -4.0, 3: -2.0}, 1),
+     ({1: -5.0, 2: -4.0, 3: -2.0}, 1)],
+)  # fmt: skip
+def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left):
+    """The number of effects left, by what each number of them gains on the held-out rows."""
+    chain = [Refit(tuple(range(n)), ("effect",) * n, n, None, 10.0 * n) for n in (1, 2, 3)]
+    out = Attribution(None, chosen=chain[2], fewer=chain[:2])
+    results = SimpleNamespace(attribution=out, base=0, fit=None)
+
+    def predict(fitter, *_):
+        return SimpleNamespace(log_density=np.full((8, 4), ({0: 0.0} | gains)[fitter] / 4.0))
+
+    monkeypatch.setattr(diagnosis, "predict", predict)
+    monkeypatch.setattr(diagnosis, "measure", lambda out, *_: None)
+    running = object.__new__(diagnosis._Diagnosis)
+    running.parts, running.experiments = SimpleNamespace(confirm=[]), ()
+    running.root, running.kept = seed_sequence(1), Checkpoint(None, {})
+    running._borne_out(results)
+    assert len(out.chosen.candidates) == left
+    assert len(out.notes) == 3 - left

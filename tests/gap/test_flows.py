@@ -9,7 +9,7 @@ from ssmppl.expressions.expr import symbols_of
 from ssmppl.gap.anatomy import Anatomy
 from ssmppl.gap.augment import augment
 from ssmppl.gap.candidates import offers
-from ssmppl.gap.flows import flows
+from ssmppl.gap.flows import carried, flows
 from ssmppl.language.trace import trace
 from tests.gap.harness import scales, traced
 
@@ -134,3 +134,39 @@ def test_an_effect_with_its_reaction_is_a_candidate_of_its_own():
     assert not any(f for name, _, f in forms if name == "level break")  # an event in one state
     assert ("hard stop", "h1", "overflow into another state, by h2, with h2") not in forms
     assert len({c.key for c in found}) == len({c.strength for c in found}) == len(found)
+
+
+# -- what integrates the new value
+def mass(extra):
+    """A mass on a spring, its step semi-implicit, with something `extra` in its new speed."""
+
+    def step(x, v, u, k, drag):
+        new = v + DT * (u - k * x) + extra(v, drag)
+        return {"x": ssm.Dirac(x + DT * new), "v": ssm.Normal(new, sd=0.1)}
+
+    start = {n: ssm.Normal(0, sd=1) for n in ("x", "v")}
+    given = {n: ssm.HalfNormal(sd=1) for n in ("k", "drag")}
+    return system(start, step, lambda x: {"y": ssm.Normal(x, sd=1)}, "u", **given)
+
+
+def test_a_force_moves_what_integrates_the_new_speed_in_the_same_step():
+    """Against the model in which the same drag stands in the new speed itself."""
+    plain, written = mass(lambda v, l: 0.0 * l), mass(lambda v, l: -l * v * np.abs(v))
+    found, _ = offers(plain, scales(plain), ["quadratic drag", "level break", "outliers"])
+    (c,) = [c for c in found if c.effect.name == "quadratic drag"]
+    assert (c.equation, c.form) == ("v", "")  # no form of its own: it is what the model's step does
+    numbers = dict.fromkeys(["drag", c.strength], 0.3)
+    draw = {}
+
+    def at(name):
+        rng = np.random.default_rng(len(draw))
+        return numbers.get(name) or draw.setdefault(name, rng.uniform(-1.2, 1.2, 20))
+
+    added, whole = means(augment(plain, [c]), at), means(written, at)
+    for state in ("x", "v"):
+        np.testing.assert_allclose(added[state], whole[state], rtol=1e-12, atol=1e-14)
+    assert not any(c.carried for c in found if c.effect.name != "quadratic drag")
+
+
+def test_an_explicit_step_carries_nothing():
+    assert carried(Anatomy(traced("gap", "oscillator"))) == {}
