@@ -15,7 +15,7 @@ parameter, or a law that changes by steps in it, excludes that parameter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from ssmppl.analysis.density import Missing, terms
@@ -48,10 +48,16 @@ class CompleteScore:
     """Derivatives of the complete-data log density in chosen parameters.
 
     parameters : the components (F of them) that are derived in, in the trace's order.
+    inert : deterministic components whose change with the parameters does not matter, as they come
+        in multiplied by what is zero.
     """
 
-    def __init__(self, trace: Trace, parameters: Sequence[Expr], missing: Missing = Missing()):
+    def __init__(
+        self, trace: Trace, parameters: Sequence[Expr], missing: Missing = Missing(),
+        inert: Collection[Expr] = (),
+    ):  # fmt: skip
         self.trace, self.parameters, self.missing = trace, list(parameters), missing
+        self.inert = frozenset(inert)
         self.value: dict[str, dict[Expr, Expr]] = {}
         for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
             self.value[role] = {
@@ -82,6 +88,8 @@ class CompleteScore:
             size = sum(map(len, of.values()))
             for values in self.value.values():
                 for s, e in values.items():
+                    if s in self.inert:
+                        continue
                     inside = symbols_of(e)
                     found = of.setdefault(s, set())
                     found |= inside & parameters
@@ -102,6 +110,8 @@ class CompleteScore:
                                          ("observation", trace.observations))
                  for s in group.values()]  # fmt: skip
         for role, site in sites:
+            if self.inert.issuperset(site.value.ravel()):
+                continue
             where: Location = site.distribution.location
             if not _is_known(site, self.value.get(role, {})):
                 support = site.distribution.support()

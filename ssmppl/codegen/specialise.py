@@ -17,6 +17,7 @@ import textwrap
 import tokenize
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from threading import Lock
 from typing import Any
 
@@ -35,13 +36,20 @@ class Specialised:
 
 def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]) -> Specialised:
     """The text of `function`, renamed, without the parameters in `bound`, which stand for text."""
-    with _ONE_AT_A_TIME:
-        return _specialised(function, name, bound)
-
-
-def _specialised(function: Callable[..., Any], name: str, bound: Mapping[str, str]) -> Specialised:
     plain = getattr(function, "py_func", inspect.unwrap(function))
-    source = _decided(inspect.getsource(plain), plain.__globals__, bound)
+    with _ONE_AT_A_TIME:
+        return _specialised(plain, name, tuple(sorted(bound.items())))
+
+
+_source = lru_cache(inspect.getsource)
+
+
+@lru_cache(maxsize=1024)  # the augmentations of one model have much in common
+def _specialised(
+    plain: Callable[..., Any], name: str, items: tuple[tuple[str, str], ...]
+) -> Specialised:
+    bound = dict(items)
+    source = _decided(_source(plain), plain.__globals__, bound)
     tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))
     start = next(i for i, t in enumerate(tokens) if t.string == "def")
     depth, end = 0, start

@@ -77,7 +77,6 @@ def attribute(
             heads = (mates if "like" in stage else delays)(screen, refits)
         more, failed = refit_all(
             workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept, stage,
-            quick=quick,
         )  # fmt: skip
         refits = best_of_groups(screen, refits + more)
         out.notes += [f"not refitted: {reason}" for reason in failed]
@@ -100,7 +99,7 @@ def attribute(
     out.chosen = out.refits[0]
     single, pair = out.chosen, None
     if steps > 1:
-        rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept, quick)
+        rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept)
         if significant:  # a step from the best one, against the best pair
             _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, 2)
         if rival is not None and rival.merit > out.chosen.merit:
@@ -120,13 +119,13 @@ def attribute(
 
 def _best_pair(
     out: Attribution, workshop: Workshop, screen: Screen, train: Sequence[Experiment],
-    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint, quick: bool,
+    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint,
 ) -> Refit | None:  # fmt: skip
     """The best of the pairs of which the screen promises most, where it is clearly better than the
     best one."""
     out.doubles, failed = refit_all(
         workshop, out.base, screen, pairs(screen, out.refits), train, seed, kept,
-        "refitting pairs", quick=quick,
+        "refitting pairs",
     )  # fmt: skip
     out.notes += [f"not refitted: {reason}" for reason in failed]
     if not out.doubles or out.doubles[0].merit - out.refits[0].merit < needed_gain(screen, alpha):

@@ -59,17 +59,19 @@ def score_columns(
     """
     wanted, refused = [], {}
     own = set(base.parameter_symbols)
-    superset = _linear_in(superset, strengths)
+    # Auxiliary states come in multiplied by a strength, which is zero.
+    inert = frozenset(superset.state_symbols) - frozenset(base.state_symbols)
+    superset = _linear_in(superset, strengths, inert)
     free = [s for s in superset.parameter_symbols if s.data[1] not in held]
     free = [s for s in free if s in own or s.data[1] in strengths]
-    derived = CompleteScore(superset, free, missing)
+    derived = CompleteScore(superset, free, missing, inert)
     for s in free:
         reason = derived.obstacle(s)
         if reason is None:
             wanted.append(s)
         else:
             refused[repr(s)] = reason
-    derived, sums = _gradient(superset, wanted, missing, refused)
+    derived, sums = _gradient(superset, wanted, missing, inert, refused)
     zero: dict[Expr, Expr] = {
         s: constant(0.0) for s in superset.parameter_symbols if s.data[1] in strengths
     }
@@ -106,9 +108,10 @@ def score_columns(
     )  # fmt: skip
 
 
-def _linear_in(superset: Trace, strengths: Collection[str]) -> Trace:
+def _linear_in(superset: Trace, strengths: Collection[str], inert: Collection[Expr]) -> Trace:
     """With the deterministic laws linear in the strengths, which is all that first derivatives at
-    zero see: products of two of them would have to be carried for nothing."""
+    zero see: products of two of them would have to be carried for nothing. In the laws of what is
+    inert the strengths are zero."""
     own = [s for s in superset.parameter_symbols if s.data[1] in strengths]
     zero: dict[Expr, Expr] = {s: constant(0.0) for s in own}
 
@@ -118,7 +121,7 @@ def _linear_in(superset: Trace, strengths: Collection[str]) -> Trace:
         if not isinstance(site.distribution, Dirac) or not inside.intersection(roots):
             return site
         values = substitute(roots, zero)
-        for s in own:
+        for s in () if site.value.ravel()[0] in inert else own:
             if dependent(roots, [s]).intersection(roots):
                 slopes = substitute(differentiate(roots, s), zero)
                 values = [v + s * d for v, d in zip(values, slopes, strict=True)]
@@ -134,21 +137,25 @@ def _linear_in(superset: Trace, strengths: Collection[str]) -> Trace:
 
 
 def _gradient(
-    superset: Trace, wanted: list[Expr], missing: Missing, refused: dict[str, NotApplicable]
+    superset: Trace,
+    wanted: list[Expr],
+    missing: Missing,
+    inert: Collection[Expr],
+    refused: dict[str, NotApplicable],
 ) -> tuple[CompleteScore, Sums]:
     """The derivatives in closed form; what has none is moved to `refused`."""
-    derived = CompleteScore(superset, wanted, missing)
+    derived = CompleteScore(superset, wanted, missing, inert)
     try:
         return derived, derived.gradient()
     except NotDifferentiable:
         kept = []
         for s in wanted:
             try:
-                CompleteScore(superset, [s], missing).gradient()
+                CompleteScore(superset, [s], missing, inert).gradient()
                 kept.append(s)
             except NotDifferentiable as error:
                 refused[repr(s)] = NotApplicable(f"no derivative in closed form: {error}")
-        derived = CompleteScore(superset, kept, missing)
+        derived = CompleteScore(superset, kept, missing, inert)
         return derived, derived.gradient()
 
 

@@ -153,7 +153,8 @@ class Fitter:
         problem = replace(self.problem, experiments=tuple(experiments))
         space = space_of(problem, self.fixed, dict(start))
         if isinstance(self.kalman, KalmanModel):
-            return self._exactly(self.kalman, space, dict(start), seed, quick)
+            climbs = 0 if searched else 1  # from another start too
+            return self._exactly(self.kalman, space, dict(start), seed, quick, climbs)
         if information is not None:
             information = self._unconstrained(space, space.theta, information, seed)
         if not searched:
@@ -167,12 +168,12 @@ class Fitter:
 
     def _exactly(
         self, kalman: KalmanModel, space: Space, start: dict[str, np.ndarray],
-        seed: np.random.SeedSequence, quick: bool,
+        seed: np.random.SeedSequence, quick: bool, climbs: int,
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Setup(problem, space, "posterior", self.fixed, start, seed)
         if len(space.where):
-            ascent = climb(setup, DirectOptimization(restarts=1))
+            ascent = climb(setup, DirectOptimization(restarts=climbs))
             theta, converged = ascent.theta, bool(ascent.report["converged"])
         else:
             theta, converged = space.theta, True
@@ -180,11 +181,8 @@ class Fitter:
         value = kalman.log_likelihood(problem.experiments, theta)
         size = len(space.where)
         information = np.full((size, size), np.nan)
-        if not quick and size:
-            information = observed_information(setup, kalman, z)
-            if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] <= 0.0:
-                information = self._simulated_information(space, theta, seed)
-        return Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged)
+        fit = Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged)
+        return fit if quick else self.measured(fit, seed)
 
     def states(
         self, e: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 16
@@ -313,10 +311,15 @@ class Fitter:
             return -np.inf
 
     def measured(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
-        """The fit with an information matrix worth its name: that of scores simulated at it, where
-        its own was built up on the way."""
-        if self.exact:
-            return fit
+        """The fit with an information matrix worth its name: minus the second derivatives where
+        they are exact, else that of scores simulated at it; its own was built up on the way."""
+        if isinstance(self.kalman, KalmanModel) and len(fit.z):
+            if np.all(np.isfinite(fit.information)):
+                return fit
+            setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
+            found = observed_information(setup, self.kalman, fit.z)
+            if np.all(np.isfinite(found)) and np.linalg.eigvalsh(found)[0] > 0.0:
+                return replace(fit, information=found)
         return replace(fit, information=self._simulated_information(fit.space, fit.theta, seed))
 
     def _unconstrained(

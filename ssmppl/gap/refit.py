@@ -28,6 +28,7 @@ from ssmppl.gap.screen import Question, Screen, with_parameters
 from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.particles.filtering import random_state
+from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import LogNormal, Uniform
 from ssmppl.language.trace import Trace
@@ -35,6 +36,7 @@ from ssmppl.language.trace import Trace
 SINGLES, MATES, PAIRS = 5, 4, 3  # candidates refitted, further ones like the best of them, pairs
 ALIKE = 0.8  # correlation from which a candidate is refitted as a class mate
 SAME = 0.95  # beyond which two candidates are one to begin with
+SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
 NEAR = 25.0  # nats behind the best, up to which other delays are tried
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
@@ -72,7 +74,9 @@ class Refit:
 
 
 def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """By the text of each component; 0 for what is fixed."""
+    """By the text of each component; 0 for what is fixed, NaN where there is no information."""
+    if not np.all(np.isfinite(fit.information)):
+        return {repr(s): np.nan for s in fit.problem.trace.parameter_symbols}
     setup = Setup(fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0))
     jacobian = setup.chart.at(fit.z).jacobian
     covariance = jacobian @ np.linalg.pinv(fit.information) @ jacobian.T
@@ -181,24 +185,42 @@ def _steerable(program: Program) -> bool:
 def refit(
     workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
     train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
-    quick: bool = False,
 ) -> Refit | NotApplicable:  # fmt: skip
     """Fit the model with the effects of `candidates`, of which the last are the screen's at
-    `index`, and the others are in `base`.
-
-    quick : as in `Fitter.fit`; there are no standard errors then.
-    """
+    `index`, and the others are in `base`. Several have no standard errors: `Fitter.measured`."""
     candidates = tuple(candidates)
     try:
         fitter = workshop.fitter(candidates)
         start = start_at(base, screen.question, screen.found, index)
+        new = [c.strength for c in candidates[-len(index) :]]
+        start = _shortened(fitter, start, new, train, seed)
         information = None if fitter.exact else _information(fitter, screen, index, train)
-        fit = fitter.fit(train, seed, start, searched=True, information=information, quick=quick)
+        fit = fitter.fit(train, seed, start, searched=True, information=information,
+                         quick=len(candidates) > 1)  # fmt: skip
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
     if not np.isfinite(fit.log_likelihood):
         return NotApplicable(f"{' and '.join(map(str, candidates))}: the likelihood is zero")
     return Refit(tuple(index), candidates, fitter, fit, fit.log_likelihood - base.log_likelihood)
+
+
+def _shortened(
+    fitter: Fitter, start: dict[str, np.ndarray], strengths: Sequence[str],
+    train: Sequence[Experiment], seed: np.random.SeedSequence,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """The start, or one with smaller strengths of the last effects where that is more likely: the
+    quadratic may promise a top beyond the data's cliff."""
+    if fitter.exact:
+        return start
+    problem, stream = fitter.problem, random_state(seed, 4)
+    best, out = -np.inf, start
+    for share in SHARES:
+        tried = start | {n: share * start[n] for n in strengths}
+        theta = space_of(problem, fitter.fixed, tried).theta
+        value = fitter.estimate(train, theta, stream.copy())
+        if value > best:
+            best, out = value, tried
+    return out
 
 
 def _information(
@@ -320,7 +342,7 @@ def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
 def refit_all(
     workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
-    given: Sequence[Candidate] = (), *, quick: bool = False,
+    given: Sequence[Candidate] = (),
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
     """The refits that came to an end, best first, and why the others did not."""
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
@@ -328,7 +350,7 @@ def refit_all(
 
     def one(k: int) -> Numbers:
         own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-        found = refit(workshop, base, screen, sets[k], train, own, added[k], quick)
+        found = refit(workshop, base, screen, sets[k], train, own, added[k])
         if isinstance(found, NotApplicable):
             return {"reason": np.array(found.reason)}
         return found.fit.numbers

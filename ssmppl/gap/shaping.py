@@ -87,7 +87,7 @@ def _shaped(
         share = (value - low) / (high - low)
         start[share_of(name)] = np.asarray(np.clip(share, INSIDE, 1.0 - INSIDE))
     try:
-        fit = fitter.fit(train, seed, start, searched=True)
+        fit = fitter.fit(train, seed, start, searched=True, quick=len(r.candidates) > 1)
     except SSMError:
         return {}
     if not np.isfinite(fit.log_likelihood):

@@ -2,9 +2,9 @@
 development and benchmarking in nonlinear system identification", European Control Conference 2013.
 
 An electronic circuit; u is the voltage that drives it, y what it answers, both in volts, 610.35 Hz.
-x is the answer without noise, v what it moves in a row (semi-implicit steps, which hold for every
-linear oscillator); `beside` is the sum of the voltages one row before and after u, as the voltage
-between two rows is smooth.
+x is the answer without the sensor's noise, `before` that of one row before: with k and c every
+linear oscillator of second order can be written so. `beside` is the sum of the voltages one row
+before and after u, as the voltage between two rows is smooth.
 """
 
 import ssmppl as ssm
@@ -27,13 +27,14 @@ def prior():
 
 @model.initial
 def initial():
-    return {"x": ssm.Normal(0.0, sd=0.1), "v": ssm.Normal(0.0, sd=0.1)}
+    return {"x": ssm.Normal(0.0, sd=0.1), "before": ssm.Normal(0.0, sd=0.1)}
 
 
 @model.transition
-def transition(x, v, u, beside, k, c, b, b_beside, offset, q):
-    moved = v - k * x - c * v + b * u + b_beside * beside + offset
-    return {"x": ssm.Dirac(x + moved), "v": ssm.Normal(moved, sd=q)}
+def transition(x, before, u, beside, k, c, b, b_beside, offset, q):
+    speed = x - before
+    force = -k * x - c * speed + b * u + b_beside * beside + offset
+    return {"x": ssm.Normal(x + speed + force, sd=q), "before": ssm.Dirac(x)}
 
 
 @model.observation
