@@ -21,7 +21,6 @@ from ssmppl.gap.familywise import threshold
 from ssmppl.gap.fit import Fit
 from ssmppl.gap.refit import (
     Refit,
-    Workshop,
     best_of_groups,
     delays,
     leading,
@@ -31,6 +30,7 @@ from ssmppl.gap.refit import (
 )
 from ssmppl.gap.screen import Question, Screen, ask
 from ssmppl.gap.shaping import shaped_all
+from ssmppl.gap.workshop import Workshop
 
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is asked

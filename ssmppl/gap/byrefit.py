@@ -19,8 +19,9 @@ from ssmppl.errors import SSMError
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.familywise import tail_p
 from ssmppl.gap.fit import Fit
-from ssmppl.gap.refit import Refit, Workshop, start_at
+from ssmppl.gap.refit import Refit, start_at
 from ssmppl.gap.screen import Screen, compared
+from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.particles.filtering import random_state
 
 LAX = 4.0  # times alpha, up to which a closer look is worth it

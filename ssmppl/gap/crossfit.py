@@ -27,9 +27,10 @@ from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import FOLDS, Fold, folds
 from ssmppl.gap.profiles import one_off
 from ssmppl.gap.reference import fit_reference
-from ssmppl.gap.refit import Refit, Workshop
+from ssmppl.gap.refit import Refit
 from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.share import HowFar, notes_of, pooled
+from ssmppl.gap.workshop import Workshop
 
 SETS = 100  # simulated data sets in each fold
 SINGLES = 5  # refits in each fold

@@ -29,12 +29,12 @@ from ssmppl.gap.expected import seconds as expected
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import FOLDS, Parts, long_enough, three_parts
 from ssmppl.gap.profiles import passing
-from ssmppl.gap.refit import Workshop, proposal_of
 from ssmppl.gap.report import MODES, GapReport
 from ssmppl.gap.scales import Scales
 from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.share import HowFar, how_far
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.workshop import Workshop, proposal_of
 from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
 from ssmppl.inference.problem import pose
 from ssmppl.language.model import Model

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-REFITS = 16  # of single effects, pairs and the reference, about
+REFITS = 24  # of single effects, their shapes, pairs and the reference, about
 FIT_PASSES = 36  # over the data in a fit, about
-SCREENS = 1.5  # as long as the first one that follow it: for further effects, under other inputs
+SCREENS = 2.0  # as long as the first one that follow it: for further effects, under other inputs
 FOLD_REFITS = 5
 
 

@@ -25,10 +25,10 @@ from ssmppl.gap.confirm import predict
 from ssmppl.gap.efficient import Null, efficient
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import Parts
-from ssmppl.gap.refit import Workshop, lift, proposal_of
 from ssmppl.gap.screen import Screen, with_parameters
 from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.tables import residual_groups
+from ssmppl.gap.workshop import Workshop, lift, proposal_of
 from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import Normal
 

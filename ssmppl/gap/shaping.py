@@ -18,8 +18,9 @@ from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.fit import Fit
 from ssmppl.gap.profiles import SHORTEST
-from ssmppl.gap.refit import Refit, Workshop, share_of
+from ssmppl.gap.refit import Refit
 from ssmppl.gap.scales import Scales, value_of
+from ssmppl.gap.workshop import Workshop, share_of
 
 SHAPED = 4  # refits at most
 WITHIN, SHARE = 15.0, 0.4  # so many nats behind the best, or with so much of what it gains

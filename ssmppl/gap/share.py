@@ -16,8 +16,9 @@ from ssmppl.gap.confirm import FreeRun, free_run, gain_of_mean, predict, rmse
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import Parts
 from ssmppl.gap.reference import fit_reference
-from ssmppl.gap.refit import Refit, Workshop
+from ssmppl.gap.refit import Refit
 from ssmppl.gap.screen import Screen
+from ssmppl.gap.workshop import Workshop
 
 SAME = 1e-6  # relative difference of two gains that are the same model's
 

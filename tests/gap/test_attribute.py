@@ -12,10 +12,11 @@ from ssmppl.gap.attribute import Attribution, _rebase, attribute
 from ssmppl.gap.byrefit import gain_p
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.familywise import familywise, tail_p
-from ssmppl.gap.refit import Refit, Workshop, best_of_groups, delays, leading, mates
+from ssmppl.gap.refit import Refit, best_of_groups, delays, leading, mates
 from ssmppl.gap.scales import Scales
 from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.problem import missing_of, pose
 from tests.gap.small import level, levels

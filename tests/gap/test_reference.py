@@ -8,8 +8,8 @@ import pytest
 from ssmppl.gap import reference
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.fit import Fitter
-from ssmppl.gap.refit import Workshop
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.particles.filtering import seed_sequence
 from tests.gap.test_basis import THETA, asked, simulated
 

@@ -7,9 +7,10 @@ import pytest
 
 from ssmppl.gap.candidates import offers
 from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.refit import Refit, Workshop, share_of
+from ssmppl.gap.refit import Refit
 from ssmppl.gap.shaping import PRICE, shape_bounds, shaped_all
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.workshop import Workshop, share_of
 from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.problem import missing_of, pose
 from tests.gap import models

@@ -14,7 +14,6 @@ from ssmppl.errors import NotApplicable
 from ssmppl.gap.columns import score_columns
 from ssmppl.gap.confirm import stretches
 from ssmppl.gap.fit import Fitter
-from ssmppl.gap.refit import proposal_of
 from ssmppl.gap.smoothing import (
     PREDICTIVE,
     Settings,
@@ -24,6 +23,7 @@ from ssmppl.gap.smoothing import (
 from ssmppl.gap.smoothing import (
     simulated as simulated_sets,
 )
+from ssmppl.gap.workshop import proposal_of
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import pose
