@@ -39,8 +39,9 @@ def heads(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     done = [r.index[0] for r in refits if len(r.index) == 1]
     family, groups = screen.family, screen.groups
     known = {int(groups[k]) for k in done}
-    rest = [int(k) for k in family.best[np.argsort(-family.height, kind="stable")]]
-    return done + [k for k in rest if not screen.found.status[k] and int(groups[k]) not in known]
+    return done + [
+        k for k in family.leaders if not screen.found.status[k] and int(groups[k]) not in known
+    ]
 
 
 def told(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:

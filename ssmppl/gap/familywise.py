@@ -83,6 +83,11 @@ class FamilyWise:
     scale: Scale
     sided: np.ndarray
 
+    @property
+    def leaders(self) -> list[int]:
+        """The column that leads each group, that of the highest group first."""
+        return [int(k) for k in self.best[np.argsort(-self.height, kind="stable")]]
+
     def put(self, label: int, height: float) -> float:
         """The height of a statistic of one group on the common scale."""
         at = int(np.searchsorted(self.labels, label))

@@ -207,15 +207,14 @@ def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
 
 def _by_height(screen: Screen) -> list[int]:
     """The best shapes of the groups that promise anything."""
-    family, found = screen.family, screen.found
-    order = family.best[np.argsort(-family.height, kind="stable")]
-    return [int(k) for k in order if found.gain[k] >= LEAST_GAIN and not found.status[k]]
+    found = screen.found
+    return [k for k in screen.family.leaders if found.gain[k] >= LEAST_GAIN and not found.status[k]]
 
 
 def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
     """Pairs of which the quadratic expects more than of the best single one."""
     found, family = screen.found, screen.family
-    heads = [int(k) for k in family.best[np.argsort(-family.height, kind="stable")]
+    heads = [k for k in family.leaders
              if not found.status[k] and not screen.question.quadratic[k]][:12]  # fmt: skip
     heads = list(dict.fromkeys([*(r.index[0] for r in refits[:3]), *heads]))
     best, out = float(np.max(found.gain, initial=0.0)), []

@@ -28,7 +28,7 @@ def screen_of(heights, rho, shapes=None):
     """A screen with one column for each group, but for groups with more shapes."""
     heights, count = np.asarray(heights, float), len(heights)
     return SimpleNamespace(
-        family=SimpleNamespace(best=np.arange(count), height=heights),
+        family=SimpleNamespace(leaders=np.argsort(-heights, kind="stable").tolist()),
         found=SimpleNamespace(gain=0.5 * heights**2, status=("",) * count, rho=np.asarray(rho)),
         groups=np.arange(count),
     )
