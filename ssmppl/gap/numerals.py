@@ -84,12 +84,20 @@ def interval(low: Any, high: Any) -> str:
     return f"95% interval {percent(low)} to {percent(high)}"
 
 
-def span(first: Any, last: Any) -> str:
-    """A stretch of time by its row labels: t = 411 to 700; dates without an empty clock."""
+def span(first: Any, last: Any, experiment: Any = "") -> str:
+    """A stretch of time by its row labels: t = 411 to 700; dates without an empty clock.
+
+    experiment : "2" or "1 to 3", where there are several.
+    """
     ends = [_label(end) for end in (first, last)]
     if not all(ends):
         return ""
-    return f"t = {ends[0]}" if ends[0] == ends[1] else f"t = {ends[0]} to {ends[1]}"
+    if not isinstance(experiment, str) or not experiment:
+        return f"t = {ends[0]}" if ends[0] == ends[1] else f"t = {ends[0]} to {ends[1]}"
+    a, _, b = experiment.partition(" to ")
+    if b:
+        return f"t = {ends[0]} of experiment {a} to t = {ends[1]} of experiment {b}"
+    return f"{span(first, last)} of experiment {a}"
 
 
 def _label(value: Any) -> str:

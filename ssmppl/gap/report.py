@@ -26,7 +26,7 @@ MODES = ("full", "fast")
 
 # The columns of each table. Times are the labels of the data's rows.
 COLUMNS: dict[str, tuple[str, ...]] = {
-    "where": ("equation", "moment", "t_from", "t_to", "region", "z", "p"),
+    "where": ("equation", "moment", "t_from", "t_to", "region", "z", "p", "experiment"),
     "causes": (
         "effect", "form", "equation", "z", "p", "gain_screen", "gain_refit", "class_id", "sign",
         "estimate", "se",
@@ -38,7 +38,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     ),
     "missing": ("equation", "variable", "value", "estimate", "low", "high"),
     "detection": ("channel", "statistic", "value", "z", "p"),
-    "residual_map": ("equation", "t_from", "t_to", "z"),
+    "residual_map": ("equation", "t_from", "t_to", "z", "experiment"),
     "free_run": (
         "experiment", "t", "channel", "observed", "before", "before_low", "before_high", "after",
         "after_low", "after_high",

@@ -62,6 +62,7 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, G
             "equation": key[0], "moment": key[1], "t_from": labels[stretch[0]],
             "t_to": labels[stretch[1] - 1], "z": max(row.z, row.z_alone), "p": p,
             "region": _region(screen, key, places[key]) if p <= alpha else "",
+            "experiment": _experiments(starts, *stretch),
         })  # fmt: skip
     rows.sort(key=lambda r: (r["p"], -r["z"]))
     return tabulate("where", rows), found
@@ -73,6 +74,14 @@ def _labels(experiments: Sequence[Experiment]) -> list[Any]:
     for e in experiments:
         out += list(e.time) if e.time is not None else list(range(1, e.steps + 1))
     return out
+
+
+def _experiments(starts: Sequence[int], first: int, last: int) -> str:
+    """Whose the rows first <= t < last are: "2", "1 to 3"; "" where there is one experiment."""
+    if len(starts) < 2:
+        return ""
+    a, b = (int(np.searchsorted(starts, row, side="right")) for row in (first, last - 1))
+    return str(a) if a == b else f"{a} to {b}"
 
 
 def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
@@ -255,6 +264,7 @@ def map_table(screen: Screen) -> pd.DataFrame:
             rows.append({
                 "equation": equation, "t_from": labels[edges[j]],
                 "t_to": labels[edges[j + 1] - 1], "z": float(z[j, strongest]),
+                "experiment": _experiments(starts, edges[j], edges[j + 1]),
             })  # fmt: skip
     return tabulate("residual_map", rows)
 

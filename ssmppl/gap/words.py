@@ -162,7 +162,7 @@ def where(report: GapReport) -> list[str]:
     out = []
     for i, r in enumerate(found[:3]):
         region = r["region"] if isinstance(r["region"], str) else ""
-        when = span(r["t_from"], r["t_to"])
+        when = span(r["t_from"], r["t_to"], r["experiment"])
         spots = [s for s in (f"at {when}" if when else "", region) if s]
         strongest = f", strongest {' and '.join(spots)}" if spots else ""
         text = f"{'also ' if i else ''}in {place(r)}{strongest} (z = {number(r['z'], 2)}, " \

@@ -167,7 +167,7 @@ def _alt(report: GapReport, name: str) -> str:
         if len(table):
             top = table.loc[table["z"].abs().idxmax()]
             text += f" Largest: {number(top['z'], 2)} for {top['equation']} at " \
-                    f"{span(top['t_from'], top['t_to'])}."  # fmt: skip
+                    f"{span(top['t_from'], top['t_to'], top['experiment'])}."  # fmt: skip
         return text
     if name == "ranked_effects":
         items = [f"{row_label(r)} {number(_gain(r), 2)}" for r in bars(report)]

@@ -52,8 +52,7 @@ def residual_map(report: GapReport, ax: Any) -> Any:
     table = report.residual_map[report.residual_map["equation"].isin(names)]
     largest = float(np.nanmax(np.abs(table["z"].to_numpy(float)), initial=0.0))
     limit = max(4.0, min(np.ceil(largest), 10.0))
-    ends = times(ax, [*table["t_from"], *table["t_to"]])
-    first, last = ends[: len(table)], ends[len(table) :]
+    first, last = _windows(table, ax)
     mesh = None
     for i, name in enumerate(names):
         mine = np.flatnonzero((table["equation"] == name).to_numpy())
@@ -70,7 +69,7 @@ def residual_map(report: GapReport, ax: Any) -> Any:
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.5, -0.5)
     ax.tick_params(axis="y", length=0)
-    ax.set_xlabel("t")
+    ax.set_xlabel("t" if not _several(table) else "experiment, its windows side by side")
     total = report.residual_map["equation"].nunique()
     if total > len(names):
         ax.set_title(f"{len(names)} of {total} equations, those with the largest |z|")
@@ -80,6 +79,29 @@ def residual_map(report: GapReport, ax: Any) -> Any:
         bar.set_label("z")
         bar.outline.set_visible(False)
     return ax
+
+
+def _several(table: Any) -> bool:
+    return int(table["experiment"].nunique()) > 1
+
+
+def _windows(table: Any, ax: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Where each window begins and ends on the x axis: by its rows' labels, or, where several
+    experiments have labels of their own, by its number, with a line between experiments."""
+    if not _several(table):
+        ends = times(ax, [*table["t_from"], *table["t_to"]])
+        return ends[: len(table)], ends[len(table) :]
+    number = table.groupby("equation", sort=False).cumcount().to_numpy(float)
+    one = table[table["equation"] == table["equation"].iloc[0]]
+    ticks, names = [], []
+    for name in dict.fromkeys(one["experiment"]):
+        inside = np.flatnonzero((one["experiment"] == name).to_numpy())
+        if inside[0]:
+            ax.axvline(inside[0], color=INK, linewidth=1.2)
+        ticks.append(0.5 * (inside[0] + inside[-1] + 1))
+        names.append(name)
+    ax.set_xticks(ticks, names)
+    return number, number + 1.0
 
 
 def _name(text: str) -> str:

@@ -4,6 +4,7 @@
 import dataclasses
 
 import numpy as np
+import pandas as pd
 
 from ssmppl.gap.report import GapReport, tabulate
 
@@ -192,12 +193,17 @@ def several():
         found,
         chosen=["coulomb friction on speed[0]", "coulomb friction on speed[1]"],
         causes=causes, classes=tabulate("classes", classes),
-        where=found.where.assign(equation=["speed[1]", "z<1>"], p=[0.001, 0.02]),
+        where=found.where.assign(equation=["speed[1]", "z<1>"], p=[0.001, 0.02],
+                                 experiment=["1", "1 to 2"]),
         closed=tabulate("closed", [
             dict(effect="coulomb friction in speed[0] and in speed[1]", F=1.08, F_low=0.4,
                  F_high=float("inf"), nats_per_sample=0.02, rmse_before=0.2, rmse_after=0.22),
         ]),
-        residual_map=residual_map(equations, 500, 25, {"speed[1]": (3, 9), "z<1>": (15, 17)}),
+        residual_map=pd.concat([
+            residual_map(equations, steps, windows, strong).assign(experiment=name)
+            for steps, windows, strong, name in ((500, 15, {"speed[1]": (3, 9)}, "1"),
+                                                 (300, 9, {"z<1>": (2, 4)}, "2"))
+        ], ignore_index=True),
         free_run=free_run(runs),
         not_applicable=tabulate("not_applicable", [
             dict(part="derivatives", equation="", reason="the model calls an @ssm.primitive: "
@@ -263,7 +269,8 @@ def residual_map(equations, steps, windows, strong, first=1):
         low, high = strong.get(name, (0, 0))
         for i in range(windows):
             z = rng.standard_normal() + (rng.uniform(3, 6) if low <= i < high else 0.0)
-            rows.append(dict(equation=name, t_from=edges[i], t_to=edges[i + 1] - 1, z=z))
+            rows.append(dict(equation=name, t_from=edges[i], t_to=edges[i + 1] - 1, z=z,
+                             experiment=""))  # fmt: skip
     return tabulate("residual_map", rows)
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.catalogue_motion import periodic_forcing, quadratic_drag, random_walk_load
-from ssmppl.gap.tables import causes_table
+from ssmppl.gap.numerals import span
+from ssmppl.gap.tables import _experiments, causes_table
 
 DRAG = Candidate(quadratic_drag, "v", strength="drag")
 LOAD = Candidate(random_walk_load, "v", strength="load")
@@ -57,3 +58,18 @@ def test_shapes_are_those_of_the_refit():
     found = refitted(WAVE.with_shape(period=9.5, phase=1.0), 0.2, 0.1)
     assert table(WAVE, 0.2, 4.0, [found])["form"] == "period = 9.5, phase = 1"
     assert table(WAVE, 0.2, 4.0)["form"] == "period = 10, phase = 0"
+
+
+@pytest.mark.parametrize(
+    ("starts", "rows", "text"),
+    [([0], (3, 9), ""), ([0, 20, 50], (0, 20), "1"), ([0, 20, 50], (20, 21), "2"),
+     ([0, 20, 50], (19, 21), "1 to 2"), ([0, 20, 50], (0, 80), "1 to 3")],
+)  # fmt: skip
+def test_a_stretch_of_rows_is_told_by_its_experiments(starts, rows, text):
+    assert _experiments(starts, *rows) == text
+
+
+def test_a_stretch_over_experiments_is_said_with_both_ends():
+    assert span(3, 9) == "t = 3 to 9"
+    assert span(3, 9, "2") == "t = 3 to 9 of experiment 2"
+    assert span(3, 9, "1 to 2") == "t = 3 of experiment 1 to t = 9 of experiment 2"
