@@ -47,7 +47,7 @@ def input_offset(u, strength):
 
 # -- with memory
 @effect(on="input", kind="state", name="backlash", lower=0, upper=2, states=("held",),
-        shapes={"c": sds(0.25, 0.75, between=(0.05, 3.0))})  # fmt: skip
+        shapes={"c": sds(0.25, 0.75, between=(0.125, 3.0))})  # fmt: skip
 def backlash(u, held, strength, c):
     """u + l (w - u), w moved by u at the ends of a play of half width c"""
     follows = np.clip(held, u - c, u + c)

@@ -18,14 +18,14 @@ POSITION, OTHER, LOAD = {"x": "position"}, {"other": "other state"}, {"u": "any 
 
 # -- friction
 @effect(on="rate", name="coulomb friction", lower=0, requires="both signs",
-        shapes={"v0": sds(0.05, 0.3, between=(0.01, 1.0))})  # fmt: skip
+        shapes={"v0": sds(0.05, 0.3, between=(0.025, 1.0))})  # fmt: skip
 def coulomb_friction(v, strength, v0):
     """-l tanh(v / v0)"""
     return -strength * np.tanh(v / v0)
 
 
 @effect(on="rate", name="stribeck", lower=0, requires="both signs",
-        shapes={"v0": sds(0.05), "vs": sds(0.2, 0.6, between=(0.05, 2.0))})  # fmt: skip
+        shapes={"v0": sds(0.05), "vs": sds(0.2, 0.6, between=(0.1, 2.0))})  # fmt: skip
 def stribeck(v, strength, v0, vs):
     """-l exp(-(v / vs)^2) tanh(v / v0)"""
     return -strength * np.exp(-((v / vs) ** 2)) * np.tanh(v / v0)

@@ -41,6 +41,9 @@ def shape_bounds(c: Candidate, scales: Scales) -> dict[str, tuple[float, float]]
             continue
         scale = scales.scale.get(c.variable(grid.of))
         low, high = (value_of(grid, v, scale, scales.rows) for v in grid.between)
+        if grid.unit in ("sd", "size"):  # a width of nothing would be another effect
+            least = min(value_of(grid, v, scale, scales.rows) for v in grid.values)
+            low = max(low, 0.5 * least)
         if low < values[name] < high:
             out[name] = (low, high)
     return out
@@ -80,7 +83,8 @@ def _shaped(
     workshop: Workshop, scales: Scales, r: Refit, train: Sequence[Experiment],
     seed: np.random.SeedSequence,
 ) -> Numbers:  # fmt: skip
-    """The values of the shapes, in order, and the fit with them; empty where there is none."""
+    """The values of the shapes, in order, and the fit with them; empty where there is none, or one
+    of them runs to its bound."""
     known = {name: (low, high, value) for _, name, low, high, value in _bounded(r, scales)}
     fitter = workshop.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
     start = {n: v for n, v in r.fit.start.items() if n not in known}
@@ -94,7 +98,12 @@ def _shaped(
     if not np.isfinite(fit.log_likelihood):
         return {}
     values = fit.values()
-    shapes = np.array([a + (b - a) * values[share_of(n)] for n, (a, b, _) in known.items()])
+    shares = np.array([values[share_of(n)] for n in known])
+    if np.any(np.minimum(shares, 1.0 - shares) < 0.5 * INSIDE):  # it wants to be another effect
+        return {}
+    shapes = np.array(
+        [a + (b - a) * s for (a, b, _), s in zip(known.values(), shares, strict=True)]
+    )
     plain = workshop.fitter(_reshaped(r.candidates, scales, shapes))
     own = {repr(s): s.data[1] for s in plain.problem.trace.parameter_symbols}
     theta = [values[text] if text in values else float(plain.fixed[name])

@@ -36,7 +36,7 @@ def test_bounds_are_what_the_effect_declares_in_the_units_of_its_variable():
     expected = [scale["x"].quantile(level) for level in (0.5, 0.99)]
     assert stop["h"] == pytest.approx(expected, rel=1e-3)
     friction = bounds(candidate("coulomb friction"))
-    assert friction["v0"] == pytest.approx([0.01 * scale["v"].sd, scale["v"].sd], rel=1e-3)
+    assert friction["v0"] == pytest.approx([0.025 * scale["v"].sd, scale["v"].sd], rel=1e-3)
 
 
 def test_what_has_no_bounds_stays():
@@ -148,3 +148,22 @@ def test_the_best_first_and_those_far_behind_as_they_were(forced):
     assert [r.index for r in new][-1] == (3,)
     assert new[-1] is far
     assert [r.merit for r in new] == sorted((r.merit for r in new), reverse=True)
+
+
+def test_an_estimate_that_runs_to_its_bound_is_none(forced):
+    """The period lies outside of the bounds: the refit stays as it was, though it could gain."""
+    workshop, experiments, base, _ = forced
+    c = candidate("periodic forcing").with_shape(period=44.0, phase=0.2)
+    assert not bounds(c)["period"][0] < 33.3
+    far = refitted(workshop, base, c, experiments, 0.1)
+    (left,) = shapes_of((workshop, experiments, base, far))
+    assert left is far
+
+
+def test_a_width_does_not_shrink_to_nothing():
+    t = traced("gap", "oscillator")
+    c = candidate("dead zone", equation="u")
+    low, high = shape_bounds(c, scales(t, ROWS))["c"]
+    least = min(dict(o.shape)["c"] for o in offers(t, scales(t, ROWS), ["dead zone"])[0])
+    assert low >= 0.5 * least
+    assert high > dict(c.shape)["c"]
