@@ -7,7 +7,7 @@ better of the two pairs it goes on, as long as an effect stands out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,8 +43,8 @@ class Attribution:
 
     base : the model's own fit. refits, doubles : with one effect, with two; best first.
     chosen : what is kept, None for the model as it is. fewer : what it grew from, the fewest
-    effects first. p : by the candidate's column, where its
-    refit was tested itself. notes : why others were not refitted.
+    effects first. p : by the candidate's column, where its refit was tested itself. notes : why
+    others were not refitted.
     """
 
     base: Fit
@@ -68,13 +68,12 @@ def attribute(
     standard errors.
     """
     refits: list[Refit] = []
-    for stage in ("refitting", "refitting what is like it", "refitting other delays"):
-        if stage == "refitting":
-            heads = leading(screen)[:singles]
-        elif singles is not None:
-            break
-        else:
-            heads = (mates if "like" in stage else delays)(screen, refits)
+    stages: dict[str, Callable[[], list[int]]] = {"refitting": lambda: leading(screen)[:singles]}
+    if singles is None:
+        stages["refitting what is like it"] = lambda: mates(screen, refits)
+        stages["refitting other delays"] = lambda: delays(screen, refits)
+    for stage, which in stages.items():
+        heads = which()
         more, failed = refit_all(
             workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept, stage,
         )  # fmt: skip
@@ -137,8 +136,9 @@ def measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) ->
     """Standard errors of what was chosen, from scores simulated at its fit."""
     old = out.chosen
     assert old is not None
+    number = len(old.candidates)
     numbers = kept.of(
-        f"standard errors, {len(old.candidates)} effects",
+        "standard errors" if number == 1 else f"standard errors of {number} effects",
         lambda: {"information": old.fitter.measured(old.fit, seed).information},
     )
     new = replace(old, fit=replace(old.fit, information=np.array(numbers["information"])))

@@ -313,8 +313,8 @@ class Fitter:
     def measured(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
         """The fit with an information matrix worth its name: minus the second derivatives where
         they are exact, else that of scores simulated at it; its own was built up on the way."""
-        if isinstance(self.kalman, KalmanModel) and len(fit.z):
-            if np.all(np.isfinite(fit.information)):
+        if isinstance(self.kalman, KalmanModel):
+            if np.all(np.isfinite(fit.information)):  # known already, or nothing is free
                 return fit
             setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
             found = observed_information(setup, self.kalman, fit.z)

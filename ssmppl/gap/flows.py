@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.expr import Expr, substitute, symbol, symbols_of
 from ssmppl.expressions.graph import topological
-from ssmppl.gap.anatomy import Anatomy, Part
+from ssmppl.gap.anatomy import Anatomy
 from ssmppl.gap.laws import scale_of_mean
 
 Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
@@ -37,8 +37,9 @@ class Flows:
 def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
     """By the label of a state: how the others move with it, once for each set of others.
 
-    A flow is a largest shared expression of states or inputs that enters the state's own equation
-    with a constant factor, and the others' linearly. What integrates the state is not moved.
+    A flow is a shared expression of states or inputs, the largest of its kind, that enters the
+    state's own equation with a constant factor, and the others' linearly. What integrates the state
+    is not moved: see `carried`.
     """
     means = {}
     for part in anatomy.of_role("state"):
@@ -50,10 +51,12 @@ def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
         part = anatomy.parts[label]
         if not anatomy.fixed_by_others(part):
             found: dict[tuple[str, ...], Reaction] = {}
-            for flow in _shared(label, means):
-                reaction = _reaction(flow, part, means, anatomy)
+            others = {k: m for k, m in means.items()
+                      if k != label and anatomy.integral_of.get(k) != label}  # fmt: skip
+            for flow in _shared(means[label], others):
+                reaction = _reaction(flow, means[label], others)
                 found.setdefault(tuple(other for other, _ in reaction), reaction)
-            out[label] = [r for others, r in found.items() if others]
+            out[label] = [r for r in found.values() if r]
     return out
 
 
@@ -80,35 +83,33 @@ def _moving(e: Expr) -> bool:
     return any(s.data[0] in ("state_prev", "input_prev") for s in symbols_of(e))
 
 
-def _shared(label: str, means: dict[str, Expr]) -> list[Expr]:
-    """The largest expressions in a state's equation that some other equation holds too."""
-    elsewhere = set(topological([m for other, m in means.items() if other != label]))
+def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
+    """What a state's equation and some other one hold, larger expressions first. A function of one
+    quantity alone, h v or cos x, is geometry and no flow."""
+    elsewhere = set(topological(others.values()))
     out: list[Expr] = []
     seen: set[Expr] = set()
-    stack = [means[label]]
+    stack = [mean]
     while stack:
         node = stack.pop()
         if node in seen or node.op in ("symbol", "const") or not _moving(node):
             continue
         seen.add(node)
-        if node in elsewhere and node is not means[label]:
+        if node in elsewhere and node is not mean and len(symbols_of(node)) > 1:
             out.append(node)
-        else:
-            stack += node.args
+        stack += node.args
     return out
 
 
-def _reaction(flow: Expr, part: Part, means: dict[str, Expr], anatomy: Anatomy) -> Reaction:
+def _reaction(flow: Expr, mean: Expr, others: Mapping[str, Expr]) -> Reaction:
     """How the other equations move with one; () where the flow does not enter as it has to."""
     out = []
     try:
-        (own,) = gradient(substitute([means[part.label]], {flow: FLOW})[0], [FLOW])
+        (own,) = gradient(substitute([mean], {flow: FLOW})[0], [FLOW])
         if _moving(own) or FLOW in symbols_of(own):
             return ()
-        for label, mean in means.items():
-            if label == part.label or anatomy.integral_of.get(label) == part.label:
-                continue
-            (slope,) = gradient(substitute([mean], {flow: FLOW})[0], [FLOW])
+        for label, other in others.items():
+            (slope,) = gradient(substitute([other], {flow: FLOW})[0], [FLOW])
             if slope.op == "const" and slope.data == 0.0:
                 continue
             if FLOW in symbols_of(slope):

@@ -85,7 +85,7 @@ def _shaped(
 ) -> Numbers:  # fmt: skip
     """The values of the shapes, in order, and the fit with them; empty where there is none, or one
     of them runs to its bound."""
-    known = {name: (low, high, value) for _, name, low, high, value in _bounded(r, scales)}
+    known = _bounded(r, scales)
     fitter = workshop.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
     start = {n: v for n, v in r.fit.start.items() if n not in known}
     for name, (low, high, value) in known.items():
@@ -115,13 +115,13 @@ def _shaped(
     }  # fmt: skip
 
 
-def _bounded(r: Refit, scales: Scales) -> list[tuple[int, str, float, float, float]]:
-    """(candidate, name of the parameter, bounds, value) of each shape that can be estimated."""
-    return [
-        (i, f"{c.shares or c.strength}_{name}", low, high, dict(c.shape)[name])
-        for i, c in enumerate(r.candidates)
+def _bounded(r: Refit, scales: Scales) -> dict[str, tuple[float, float, float]]:
+    """Bounds and value of each shape that can be estimated, by the name of its parameter."""
+    return {
+        f"{c.shares or c.strength}_{name}": (low, high, dict(c.shape)[name])
+        for c in r.candidates
         for name, (low, high) in shape_bounds(c, scales).items()
-    ]
+    }
 
 
 def _reshaped(

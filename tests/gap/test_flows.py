@@ -170,3 +170,39 @@ def test_a_force_moves_what_integrates_the_new_speed_in_the_same_step():
 
 def test_an_explicit_step_carries_nothing():
     assert carried(Anatomy(traced("gap", "oscillator"))) == {}
+
+
+def test_the_pole_on_a_cart_in_semi_implicit_steps():
+    """The new speed is held by the position too: that is no flow, and hides none."""
+
+    def step(x, v, th, w, u, b, c, d):
+        acceleration = b * u - c * v - x
+        new = v + DT * acceleration
+        return {
+            "x": ssm.Dirac(x + DT * new),
+            "v": ssm.Normal(new, sd=0.1),
+            "th": ssm.Dirac(th + DT * w),
+            "w": ssm.Normal(w + DT * (-np.sin(th) - d * w - acceleration * np.cos(th)), sd=0.1),
+        }
+
+    start = {n: ssm.Normal(0, sd=1) for n in ("x", "v", "th", "w")}
+    given = {n: ssm.HalfNormal(sd=1) for n in ("b", "c", "d")}
+    t = system(start, step, lambda x: {"y": ssm.Normal(x, sd=1)}, "u", **given)
+    anatomy = Anatomy(t)
+    assert [[label for label, _ in r] for r in flows(anatomy)["v"]] == [["w"]]
+    assert [label for label, _ in carried(anatomy)["v"]] == ["x"]
+
+
+def test_a_flow_within_a_flow():
+    """What two equations hold lies inside of what one of them holds."""
+
+    def step(a, b, c, k):
+        inner = k * a
+        outer = np.sin(b) + inner
+        return {"a": ssm.Normal(a - outer, sd=1), "b": ssm.Normal(b + outer, sd=1),
+                "c": ssm.Normal(c + 2.0 * inner, sd=1)}  # fmt: skip
+
+    start = {n: ssm.Normal(0, sd=1) for n in "abc"}
+    t = system(start, step, lambda a: {"y": ssm.Normal(a, sd=1)}, k=ssm.HalfNormal(sd=1))
+    found = [{label: evaluate(f, {}) for label, f in r} for r in flows(Anatomy(t))["a"]]
+    assert found == [{"b": -1.0}, {"b": -1.0, "c": -2.0}]
