@@ -84,8 +84,8 @@ def _moving(e: Expr) -> bool:
 
 
 def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
-    """What a state's equation and some other one hold, larger expressions first. A function of one
-    quantity alone, h v or cos x, is geometry and no flow."""
+    """What a state's equation and some other one hold, larger expressions first. Without a parameter,
+    as h v, cos x or x_1 - x_2, it is geometry and no flow."""
     elsewhere = set(topological(others.values()))
     out: list[Expr] = []
     seen: set[Expr] = set()
@@ -95,7 +95,8 @@ def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
         if node in seen or node.op in ("symbol", "const") or not _moving(node):
             continue
         seen.add(node)
-        if node in elsewhere and node is not mean and len(symbols_of(node)) > 1:
+        law = any(s.data[0] == "parameter" for s in symbols_of(node))
+        if law and node in elsewhere and node is not mean:
             out.append(node)
         stack += node.args
     return out

@@ -111,6 +111,11 @@ def semi_implicit(a, b, k):
     return {"a": ssm.Normal(a + 0.1 * speed, sd=1), "b": ssm.Normal(speed, sd=1)}
 
 
+def geometry(a, b, k):
+    apart = a - b
+    return {"a": ssm.Normal(a - 0.1 * apart, sd=1), "b": ssm.Normal(b + 0.1 * apart - k, sd=1)}
+
+
 def of_parameters(a, b, k):
     rate = np.exp(-k)
     return {"a": ssm.Normal(rate * a, sd=1), "b": ssm.Normal(rate * b, sd=1)}
@@ -119,7 +124,7 @@ def of_parameters(a, b, k):
 @pytest.mark.parametrize(
     ("step", "of_a"),
     [(linear, {"b": -0.5}), (squared, None), (scaled_by_a_state, None), (semi_implicit, None),
-     (of_parameters, None)],
+     (geometry, None), (of_parameters, None)],
 )  # fmt: skip
 def test_a_flow_enters_its_own_equation_with_a_constant_factor_the_others_linearly(step, of_a):
     found = flows(Anatomy(two_states(step))).get("a", [])
