@@ -84,7 +84,7 @@ def _moving(e: Expr) -> bool:
 
 
 def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
-    """What a state's equation and some other one hold, larger expressions first. Without a parameter,
+    """What a state's equation and some other one hold, the larger first. Without a parameter,
     as h v, cos x or x_1 - x_2, it is geometry and no flow."""
     elsewhere = set(topological(others.values()))
     out: list[Expr] = []
