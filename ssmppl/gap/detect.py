@@ -92,6 +92,8 @@ def statistics(
             fix="give (T, C) and (T, U) with as many names",
         )
     parts = list(segments(len(z), starts))
+    ready = [(name, _standard(u), _standard(u**2))
+             for name, u in zip(input_names, given.T, strict=True)]  # fmt: skip
     found: dict[tuple[str, str], float] = {}
     for c, channel in enumerate(channels):
         e = z[:, c]
@@ -102,13 +104,13 @@ def statistics(
         for k, value in enumerate(at_lags[:lags], start=1):
             found[channel, f"autocorrelation at lag {k}"] = value
         found[channel, f"autocorrelation, {LONG} lags"] = float(np.sum(np.square(at_lags)))
-        for name, u in zip(input_names, given.T, strict=True):
+        for name, u, square in ready:
             for k in range(delays + 1):
                 when = name if k == 0 else f"{name}, {k} step{'s' * (k > 1)} before"
-                found[channel, f"mean with {when}"] = _sum(_lagged(e, _standard(u), k, parts))
-                scale = _lagged((e**2 - 1.0) / np.sqrt(2.0), _standard(u**2), k, parts)
+                found[channel, f"mean with {when}"] = _sum(_lagged(e, u, k, parts))
+                scale = _lagged((e**2 - 1.0) / np.sqrt(2.0), square, k, parts)
                 found[channel, f"variance with {when} squared"] = _sum(scale)
-            before = [_sum(_lagged(e, _standard(u), k, parts)) for k in range(LONG + 1)]
+            before = [_sum(_lagged(e, u, k, parts)) for k in range(LONG + 1)]
             found[channel, f"mean with {name}, {LONG} lags"] = float(np.sum(np.square(before)))
     quadratic = np.array([name.endswith(f"{LONG} lags") for _, name in found], bool)
     return Statistics(tuple(found), np.array(list(found.values())), quadratic)
