@@ -1,10 +1,8 @@
 """Fits of a model and of its augmentations: the mode of the posterior, by scoring.
 
-Linear Gaussian models are climbed with their exact score. Others by Newton-like steps on the
-unconstrained scale, z <- z + H^-1 g, with g the particle smoother's score and H an estimate of the
-information, kept up by damped BFGS updates (Nocedal and Wright 2006, procedure 18.2); near the top
-the steps shrink as 1 / k, which averages the smoother's noise out (Robbins and Monro 1951). How far
-the top still is is told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
+Linear Gaussian models are climbed with their exact score, others with the particle smoother's: see
+`noisy_climb`. How far the top still is is told in nats: g' H^-1 g / 2 is what a quadratic would
+still gain.
 """
 
 from __future__ import annotations
@@ -20,6 +18,7 @@ import numpy as np
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import SamplingError
 from ssmppl.gap.columns import Columns, score_columns
+from ssmppl.gap.noisy_climb import NEAR, noisy_climb
 from ssmppl.gap.simulator import Simulator
 from ssmppl.gap.smoothing import Settings, Smoother
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
@@ -32,11 +31,6 @@ from ssmppl.inference.particles.pilot import Space, at, climb_to_mode, space_of
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import run_tasks
 
-MOST_STEPS = 20  # of the first phase
-NEAR = 1.0  # nats from the top where the first phase ends
-AVERAGED = 6  # steps of the second phase
-CLIFF = 30.0  # nats that a step of it may lose: Monte Carlo noise seldom explains more
-FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
 LARGEST = 1e100  # of a score: what is beyond is an overflow
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
 PILOT_PARTICLES = 300
@@ -225,7 +219,7 @@ class Fitter:
         z = space.z[space.where]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
-        h, found = information, self.gradient(space, z, stream)
+        found = self.gradient(space, z, stream)
         if found is None:
             raise SamplingError(
                 f"the model {space.problem.trace.name!r} cannot have produced the data where its "
@@ -233,31 +227,9 @@ class Fitter:
                 fix="check the data for outliers, or give the parameters priors round plausible "
                 "values",
             )
-        value, g = found
-        size = 1.0
-        for _ in range(MOST_STEPS):
-            step = _step(h, g)
-            if 0.5 * g @ step < NEAR:
-                break
-            step *= size * min(1.0, FARTHEST / np.max(np.abs(step)))
-            new = self.gradient(space, z + step, stream)
-            if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
-                size *= 0.4
-                if size < 0.01:
-                    break
-                continue
-            h = _update(h, step, g - new[1])
-            z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
-        distance, size = np.inf, 1.0
-        for k in range(AVERAGED):
-            step = _step(h, g)
-            distance = 0.5 * float(g @ step)
-            step *= size * min(1.0, FARTHEST / np.max(np.abs(step))) / (k + 1.0)
-            new = self.gradient(space, z + step, stream)
-            if new is None or new[0] < value - CLIFF:
-                size *= 0.4
-                continue
-            z, (value, g) = z + step, new
+        z, h, distance = noisy_climb(
+            lambda z: self.gradient(space, z, stream), z, found, information
+        )
         theta = space.parameters(z)[0].copy()
         value, error = self.log_likelihood(space.problem.experiments, theta, seed)
         return Fit(at(space, theta), theta, z, value, error, h, distance, distance < 3.0 * NEAR)
@@ -369,21 +341,3 @@ class Fitter:
             )
         square = np.mean([np.outer(s, s) for s in scores], axis=0)
         return self._unconstrained(space, theta, square, seed)
-
-
-def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """H^-1 g, with the small eigenvalues of the scaled H lifted."""
-    scale = np.sqrt(np.maximum(np.diagonal(h), 1e-12))
-    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
-    values = np.maximum(values, 1e-3)
-    return (vectors @ ((vectors.T @ (g / scale)) / values)) / scale
-
-
-def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Damped BFGS: H such that H s is about y, positive definite still (procedure 18.2)."""
-    hs = h @ s
-    curvature, along = float(s @ hs), float(s @ y)
-    if along < 0.2 * curvature:
-        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
-        along = float(s @ y)
-    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along

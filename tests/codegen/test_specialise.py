@@ -78,6 +78,7 @@ def test_threads_do_not_parse_at_the_same_time(monkeypatch):
 
     monkeypatch.setattr(module, "_decided", watched)
     with ThreadPoolExecutor(4) as pool:
-        texts = list(pool.map(lambda _: text("NONE", "(0, 7)"), range(8)))
-    assert len(set(texts)) == 1
+        texts = list(pool.map(lambda k: text("NONE", f"(0, {100 + k})"), range(8)))
+    assert len(set(texts)) == 8
+    assert len(most) == 8  # none of them was known
     assert max(most) == 1

@@ -128,6 +128,7 @@ def test_a_better_place_for_the_parameters_is_no_effect(asked):
         assert after.gain == pytest.approx(before.gain - shift, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_right_model_is_not_accused_by_a_bad_start(asked):
     workshop, fit, screen = asked
     out = Attribution(lower(workshop, fit))
@@ -205,3 +206,18 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
     running._borne_out(results)
     assert len(out.chosen.candidates) == left
     assert len(out.notes) == 3 - left
+
+
+@pytest.mark.parametrize(("top", "share"), [(1.1, 1.0), (0.6, 0.5), (0.1, 0.25)])
+def test_a_fit_starts_where_the_data_are_likelier(monkeypatch, top, share):
+    """The quadratic promises a strength of 1; the likelihood is highest at `top`."""
+    monkeypatch.setattr(refits_of, "space_of", lambda _, fixed, start: SimpleNamespace(theta=start))
+    fitter = SimpleNamespace(
+        exact=False, problem=None, fixed={},
+        estimate=lambda _, theta, stream: -((theta["new"] - top) ** 2) + theta["old"],
+    )  # fmt: skip
+    start = {"old": 3.0, "new": 1.0}
+    found = refits_of._shortened(fitter, start, ["new"], (), seed_sequence(1))
+    assert found == {"old": 3.0, "new": share}
+    fitter.exact = True
+    assert refits_of._shortened(fitter, start, ["new"], (), seed_sequence(1)) == start
