@@ -44,7 +44,8 @@ def asymmetric_dry_friction(v, strength, v0):
     return -strength * np.abs(np.tanh(v / v0))
 
 
-@effect(on="rate", name="load-dependent friction", lower=0, given=LOAD, shapes={"v0": sds(0.1)})
+@effect(on="rate", name="load-dependent friction", lower=0, requires="both signs", given=LOAD,
+        shapes={"v0": sds(0.1)})  # fmt: skip
 def load_dependent_friction(v, u, strength, v0):
     """-l |u| tanh(v / v0)"""
     return -strength * np.abs(u) * np.tanh(v / v0)
