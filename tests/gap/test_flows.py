@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.analysis.density import Missing
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.gap.anatomy import Anatomy
 from ssmppl.gap.augment import augment
 from ssmppl.gap.candidates import offers
+from ssmppl.gap.columns import score_columns
 from ssmppl.gap.flows import carried, flows
 from ssmppl.language.trace import trace
 from tests.gap.harness import scales, traced
@@ -211,3 +213,16 @@ def test_a_flow_within_a_flow():
     t = system(start, step, lambda a: {"y": ssm.Normal(a, sd=1)}, k=ssm.HalfNormal(sd=1))
     found = [{label: evaluate(f, {}) for label, f in r} for r in flows(Anatomy(t))["a"]]
     assert found == [{"b": -1.0}, {"b": -1.0, "c": -2.0}]
+
+
+def test_what_follows_the_new_position_keeps_no_effect_from_the_screen():
+    """Hysteresis and backlash hold clips, and move with what a force moves within the step: as they
+    come in multiplied by a strength of zero, no first derivative needs to know how."""
+    t = mass(lambda v, l: 0.0 * l)
+    found, _ = offers(t, scales(t))
+    found = [c.increment for c in found]
+    assert any(c.carried and c.effect.states for c in found)
+    columns = score_columns(t, augment(t, found, prior=True), {c.strength for c in found}, (),
+                            Missing(none=True))  # fmt: skip
+    assert set(columns.names) == {c.strength for c in found}
+    assert columns.refused == {}

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ssmppl.gap import shaping
 from ssmppl.gap.candidates import offers
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.refit import Refit
@@ -134,10 +135,14 @@ def test_the_period_ends_where_the_likelihood_is_highest(forced):
     assert np.all(np.linalg.eigvalsh(measured.information) > 0.0)
 
 
-def test_a_shape_that_gains_less_than_its_price_stays_as_it_was(forced):
-    (at_top,) = shapes_of(forced)
-    (again,) = shapes_of(forced, [at_top])
-    assert again is at_top
+@pytest.mark.parametrize(("short", "moves"), [(1.5, False), (2.5, True)])
+def test_two_shapes_have_to_gain_two_nats(forced, short, moves):
+    """A refit that is said to lie so many nats below its top."""
+    found = forced[-1]
+    (top,) = shapes_of(forced)
+    low = replace(found, gain=top.gain - short)
+    (new,) = shapes_of(forced, [low])
+    assert (new is not low) == moves
 
 
 def test_the_best_first_and_those_far_behind_as_they_were(forced):
@@ -150,14 +155,16 @@ def test_the_best_first_and_those_far_behind_as_they_were(forced):
     assert [r.merit for r in new] == sorted((r.merit for r in new), reverse=True)
 
 
-def test_an_estimate_that_runs_to_its_bound_is_none(forced):
-    """The period lies outside of the bounds: the refit stays as it was, though it could gain."""
-    workshop, experiments, base, _ = forced
-    c = candidate("periodic forcing").with_shape(period=44.0, phase=0.2)
-    assert not bounds(c)["period"][0] < 33.3
-    far = refitted(workshop, base, c, experiments, 0.1)
-    (left,) = shapes_of((workshop, experiments, base, far))
-    assert left is far
+def test_an_estimate_that_runs_to_its_bound_is_none(forced, monkeypatch):
+    """The period that is true lies beyond the bound: nothing is kept of the way towards it."""
+    found = forced[-1]
+    (c,) = found.candidates
+    own = bounds(c)
+    for low, kept in ((34.5, True), (31.0, False)):
+        limits = own | {"period": (low, 37.5)}
+        monkeypatch.setattr(shaping, "shape_bounds", lambda *_, limits=limits: limits)
+        (new,) = shapes_of(forced)
+        assert (new is found) == kept
 
 
 def test_a_width_does_not_shrink_to_nothing():
