@@ -30,7 +30,7 @@ from ssmppl.codegen.kernels.backward_pairs import (
 from ssmppl.codegen.kernels.conditional_smc import conditional_smc, filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
-from ssmppl.codegen.kernels.simulation import simulate
+from ssmppl.codegen.kernels.simulation import simulate, simulate_on
 from ssmppl.codegen.kits import (
     backward_kit,
     conditional_passes,
@@ -89,8 +89,8 @@ class Program:
         """
         if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
             return self.twisted.entry(name.removesuffix("_twisted"))
-        if name == "simulate":  # many a model is simulated a few times only
-            return self.loaded.simulate
+        if name.startswith("simulate"):  # many a model is simulated a few times only
+            return getattr(self.loaded, name)
         if not hasattr(self.module, name):
             for proposal, found in self.proposals.items():
                 if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
@@ -141,6 +141,7 @@ def _write(
     simulation = simulation_kit(trace, layout, plain)
     out.add("simulation", simulation)
     out.algorithm(simulate, "simulate", simulation, "entry")
+    out.algorithm(simulate_on, "simulate_on", simulation, "entry")
     for name, proposal in proposals.items():
         if isinstance(proposal, NotApplicable) or not trace.observations or name == "twisted":
             continue

@@ -63,10 +63,11 @@ def both_clippings(h, strength, c, middle):
     return -strength * (h - np.clip(h, middle - c, middle + c))
 
 
-@effect(on="channel", kind="observation", name="sensor rectification")
+@effect(on="channel", kind="observation", name="sensor rectification", lower=0, upper=1,
+        afresh=0.9)  # fmt: skip
 def sensor_rectification(h, strength):
-    """l |h|"""
-    return strength * np.abs(h)
+    """l (|h| - h): 1/2 cuts what is below 0 off, 1 folds it up"""
+    return strength * (np.abs(h) - h)
 
 
 @effect(on="channel", kind="observation", name="quantisation", lower=0,

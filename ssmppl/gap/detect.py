@@ -42,7 +42,7 @@ class Statistics:
     quadratic: np.ndarray
 
     def with_values(self, channel: str, values: Mapping[str, float]) -> Statistics:
-        """With more statistics of a channel, for instance its CRPS at a horizon."""
+        """With more statistics of a channel, its CRPS at each horizon (`ahead`)."""
         names = tuple((channel, name) for name in values)
         return Statistics(
             self.names + names, np.append(self.values, list(values.values())),
@@ -141,37 +141,6 @@ def detection(
     table["p"] = family.of_columns(np.arange(len(observed.names)))
     order = np.lexsort((-np.abs(table["z"]), table["p"]))
     return table.iloc[order].reset_index(drop=True)
-
-
-def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """(T,) continuous ranked probability score of predictive samples (T, M), smaller is better.
-
-    mean |x_i - y| - sum_{i<j} |x_i - x_j| / (M (M - 1)): fair, i.e. unbiased for the score of the
-    law that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018, equation 6).
-    NaN where nothing was observed.
-    """
-    x, y = np.sort(np.asarray(samples, float), axis=-1), np.asarray(observed, float)
-    m = x.shape[-1]
-    if m < 2 or x.shape[:-1] != y.shape:
-        raise ArgumentError(
-            f"predictive samples of shape {x.shape} for observations of shape {y.shape}",
-            fix="give (T, M) samples, M at least 2, and (T,) observations",
-        )
-    apart = x @ (2.0 * np.arange(1, m + 1) - m - 1.0)  # sum over pairs, by the order statistics
-    return np.mean(np.abs(x - y[..., None]), axis=-1) - apart / (m * (m - 1.0))
-
-
-def crps_by_horizon(samples: Mapping[int, np.ndarray], observed: np.ndarray) -> dict[str, float]:
-    """Mean CRPS over the observed rows, by horizon: samples[h] (T, M) predict row t from t - h.
-
-    Rows that no prediction reaches (the first h) hold NaN.
-    """
-    found = {}
-    for horizon, x in samples.items():
-        values = crps(x, observed)
-        known = np.isfinite(values)
-        found[f"CRPS {horizon} ahead"] = float(values[known].mean()) if known.any() else 0.0
-    return found
 
 
 def _sum(values: np.ndarray) -> float:

@@ -145,6 +145,8 @@ class Effect:
         name are then the same.
     requires : "positive" where it makes sense for a variable above 0 only, "both signs" where it
         is a constant for one that never changes its sign.
+    afresh : the strength with which the model is fitted anew from its own start where the variable
+        keeps one sign, None for no such fit: its fit may lie where the effect is nothing.
     note : the formula or what it stands for, in words.
     """
 
@@ -162,6 +164,7 @@ class Effect:
     process: str = ""
     constant: str = ""
     requires: str = ""
+    afresh: float | None = None
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -224,6 +227,7 @@ def effect(
     process: str = "",
     constant: str = "",
     requires: str = "",
+    afresh: float | None = None,
     note: str = "",
 ) -> Any:
     """Declare an unmodelled effect that `diagnose` shall look for.
@@ -234,7 +238,8 @@ def effect(
     name : what the report calls it; by default the function's name with spaces.
     kind : what the function changes; see the tables of this module.
     lower, upper : bounds of the strength. `lower` alone must be 0.
-    shapes, given, states, profile, process, constant, requires, note : see `Effect`.
+    shapes, given, states, profile, process, constant, requires, afresh, note : see
+        `Effect`.
 
     Raises
     ------
@@ -274,6 +279,7 @@ def effect(
             process=process,
             constant=constant,
             requires=requires,
+            afresh=afresh,
             note=note or doc,
         )
 

@@ -30,6 +30,7 @@ ALIKE = 0.8  # correlation from which a candidate is refitted as a class mate
 SAME = 0.95  # beyond which two candidates are one to begin with
 SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
 NEAR = 25.0  # nats behind the best, up to which other delays are tried
+ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
 
@@ -80,18 +81,26 @@ def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, floa
 def refit(
     workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
     train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
+    afresh: bool = False,
 ) -> Refit | NotApplicable:  # fmt: skip
     """Fit the model with the effects of `candidates`, of which the last are the screen's at
-    `index`, and the others are in `base`. Several have no standard errors: `Fitter.measured`."""
+    `index`, and the others are in `base`. Several have no standard errors: `Fitter.measured`.
+
+    afresh : from the model's own start, with the strengths that the effects declare for that.
+    """
     candidates = tuple(candidates)
     try:
         fitter = workshop.fitter(candidates)
-        start = start_at(base, screen.question, screen.found, index)
-        new = [c.strength for c in candidates[-len(index) :]]
-        start = _shortened(fitter, start, new, train, seed)
-        information = None if fitter.exact else _information(fitter, screen, index, train)
-        fit = fitter.fit(train, seed, start, searched=True, information=information,
-                         quick=len(candidates) > 1)  # fmt: skip
+        if afresh:
+            strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
+            fit = fitter.fit(train, seed, strengths)
+        else:
+            start = start_at(base, screen.question, screen.found, index)
+            new = [c.strength for c in candidates[-len(index) :]]
+            start = _shortened(fitter, start, new, train, seed)
+            information = None if fitter.exact else _information(fitter, screen, index, train)
+            fit = fitter.fit(train, seed, start, searched=True, information=information,
+                             quick=len(candidates) > 1)  # fmt: skip
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
     if not np.isfinite(fit.log_likelihood):
@@ -197,6 +206,20 @@ def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     return out
 
 
+def asleep(screen: Screen) -> list[int]:
+    """Candidates that the fitted model cannot show, as their variable keeps one sign in the data:
+    a model of the speed whose sensor gives |speed| fits best where speeds never change theirs."""
+    out = []
+    for k in screen.family.leaders:
+        c = screen.question.candidates[k]
+        if c.effect.afresh is None:
+            continue
+        scale = screen.question.scales.scale[c.equation]
+        if scale.quantile(ONE_SIGN) >= -BELOW * scale.quantile(1.0 - ONE_SIGN):
+            out.append(k)
+    return out[:MATES]
+
+
 def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
     """Of refits that differ in their shapes only, the best; best first."""
     out: dict[int, Refit] = {}
@@ -216,7 +239,8 @@ def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
     found, family = screen.found, screen.family
     heads = [k for k in family.leaders
              if not found.status[k] and not screen.question.quadratic[k]][:12]  # fmt: skip
-    heads = list(dict.fromkeys([*(r.index[0] for r in refits[:3]), *heads]))
+    refitted = [r.index[0] for r in refits[:3] if not found.status[r.index[0]]]
+    heads = list(dict.fromkeys([*refitted, *heads]))
     best, out = float(np.max(found.gain, initial=0.0)), []
     for i, a in enumerate(heads):
         for b in heads[i + 1 :]:
@@ -236,15 +260,15 @@ def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
 def refit_all(
     workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
-    given: Sequence[Candidate] = (),
+    given: Sequence[Candidate] = (), *, afresh: bool = False,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
-    """The refits that came to an end, best first, and why the others did not."""
+    """The refits that came to an end, best first, and why the others did not. afresh : `refit`."""
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
     def one(k: int) -> Numbers:
         own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-        found = refit(workshop, base, screen, sets[k], train, own, added[k])
+        found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh)
         if isinstance(found, NotApplicable):
             return {"reason": np.array(found.reason)}
         return found.fit.numbers

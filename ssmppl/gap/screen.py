@@ -16,6 +16,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.gap import detect, series
+from ssmppl.gap.ahead import mean_scores
 from ssmppl.gap.augment import augment
 from ssmppl.gap.basis import Term, basis, lifted
 from ssmppl.gap.candidate import Candidate
@@ -149,7 +150,9 @@ class Question:
             self._of_candidates(rows, starts),
             np.where(self._sums, np.sum(rows**2, axis=0)[self.place], np.nan),
             rows[:, self.basis_place].sum(axis=0),
-            self._detection(pits, experiments, starts).values,
+            self._detection(
+                pits, experiments, starts, [p.ahead for p in passes if p.ahead is not None]
+            ).values,
             bins[:, :p],
             bins[:, self.basis_place],
         )
@@ -168,19 +171,23 @@ class Question:
         return out
 
     def _detection(
-        self, pits: np.ndarray, experiments: Sequence[Experiment], starts: list[int]
-    ) -> detect.Statistics:
+        self, pits: np.ndarray, experiments: Sequence[Experiment], starts: list[int],
+        ahead: Sequence[np.ndarray],
+    ) -> detect.Statistics:  # fmt: skip
         channels = [repr(s) for s in self.trace.observation_symbols]
         inputs = np.concatenate([e.u for e in experiments])
         names = [repr(s) for s in self.trace.input_symbols]
-        return detect.statistics(pits, channels, inputs, names, starts=starts)
+        found = detect.statistics(pits, channels, inputs, names, starts=starts)
+        for channel, values in mean_scores(ahead, channels).items():
+            found = found.with_values(channel, values)
+        return found
 
     def detection_names(self, experiments: Sequence[Experiment]) -> detect.Statistics:
         """The detection statistics' names, with values of nothing."""
         rows = sum(e.steps for e in experiments)
         starts = np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()
         nothing = np.full((rows, len(self.trace.observation_symbols)), 0.5)
-        return self._detection(nothing, experiments, starts)
+        return self._detection(nothing, experiments, starts, ())
 
 
 @dataclass(frozen=True)
@@ -260,7 +267,7 @@ def ask(
         try:
             if number >= OWN_RUNS:
                 data = question.simulator.sets(experiments, given, stream)
-            passes = smoother.run(data, whole, stream)
+            passes = smoother.run(data, whole, stream, ahead=True)
         except SamplingError:
             if number < OWN_RUNS:
                 raise

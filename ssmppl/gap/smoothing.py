@@ -22,11 +22,13 @@ from ssmppl.codegen.row_scores import compile_row_scores
 from ssmppl.codegen.twisted import TwistedFilter
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
+from ssmppl.gap.ahead import crps_ahead
 from ssmppl.gap.columns import Columns
-from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
 from ssmppl.inference.particles.backward import ParticleSystem, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.simulation import feeds_back
 
 LAG = 40
 DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
@@ -48,11 +50,13 @@ class Pass:
 
     log_increments : (T,) log p(y_t | y_{1:t-1}). rows : (T, F) smoothed scores, row by row.
     prediction : (T, 4, K) mean, variance, P(Y <= y), P(Y < y) given y_{1:t-1}.
+    ahead : (O, H, K) CRPS of predictions further ahead (`crps_ahead`), where it was asked for.
     """
 
     log_increments: np.ndarray
     rows: np.ndarray
     prediction: np.ndarray
+    ahead: np.ndarray | None = None
 
 
 class Smoother:
@@ -84,26 +88,32 @@ class Smoother:
 
     def run(
         self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray,
-        *, predicted: bool = True,
+        *, predicted: bool = True, ahead: bool = False,
     ) -> list[Pass]:  # fmt: skip
         """A pass over each experiment at theta, the values of `columns.given`'s parameters.
 
         The stream is advanced in place. predicted : whether the predictions are wanted, which are
-        NaN where they are not and cost something.
+        NaN where they are not and cost something; ahead : likewise those of more than one row.
 
         Raises
         ------
         SamplingError : all weights vanish, or are NaN; names the step and the parameters.
         """
-        return [self._one(e, theta, stream, predicted) for e in experiments]
+        return [self._one(e, theta, stream, predicted or ahead, ahead) for e in experiments]
 
-    def _one(self, e: Experiment, theta: np.ndarray, stream: np.ndarray, predicted: bool) -> Pass:
+    def _one(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, predicted: bool, ahead: bool
+    ) -> Pass:
         given, data = theta, (e.y, e.seen, e.u)
         own = given[: len(self.columns.base.parameter_symbols)]
         rows = np.empty((e.steps, len(self.columns.later)))
         prediction = np.full((e.steps, 4, e.y.shape[1]), np.nan)
+        known: tuple[np.ndarray, np.ndarray] | None = None
         if isinstance(self.kalman, KalmanModel):
-            increments = self._exact(self.kalman, e, own, prediction)
+            moments = self.kalman.filter(e, own)
+            increments = _exact(moments, e, prediction)
+            if ahead:
+                known = _drawn(moments.mean, moments.covariance, stream)
             # Antithetic: scores that are linear in the states come out exact.
             paths = self.kalman.draw(e, own, stream, DRAWS // 2)
             paths = np.concatenate([paths, 2.0 * self.kalman.smooth(e, own).mean - paths])
@@ -114,14 +124,18 @@ class Smoother:
             system, weights = self.system(e, own, stream)
             found, ancestors, increments = system.particles, system.ancestors, system.log_increments
             if predicted:
-                before = self._before_prediction(system, weights, e, own, stream)
-                self.module.row_predictions(given, *data, *before, stream, prediction)
+                known = self._before_prediction(system, weights, e, own, stream)
+                self.module.row_predictions(given, *data, *known, stream, prediction)
         particles = np.zeros((e.steps, len(self.columns.carried.state_symbols), found.shape[2]))
         particles[:, : found.shape[1]] = found
         if self.columns.follows:
             self.module.complete_rows(given, *data, particles, ancestors)
         self.module.row_scores(given, *data, particles, weights, ancestors, self.settings.lag, rows)
-        return Pass(increments, rows, prediction)
+        scores = None
+        if ahead and known is not None:
+            feedback = feeds_back(self.columns.base)
+            scores = crps_ahead(self.program, e, own, *known, stream, feedback)
+        return Pass(increments, rows, prediction, scores)
 
     def system(
         self, e: Experiment, theta: np.ndarray, stream: np.ndarray
@@ -153,14 +167,7 @@ class Smoother:
         moments = self._twisted.filtered(theta, e.y, e.seen, e.u)
         if moments is None:
             return system.particles, system.weights
-        mean, covariance = moments
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        normals = np.empty(mean.size * (PREDICTIVE // 2))
-        fill_normal(stream, normals)
-        away = root @ normals.reshape(*mean.shape, -1)
-        drawn = mean[:, :, None] + np.concatenate([away, -away], axis=2)
-        return drawn, np.full((e.steps, PREDICTIVE), 1.0 / PREDICTIVE)
+        return _drawn(*moments, stream)
 
     @property
     def _twisted(self) -> TwistedFilter:
@@ -168,17 +175,30 @@ class Smoother:
         assert isinstance(found, TwistedFilter)
         return found
 
-    def _exact(
-        self, kalman: KalmanModel, e: Experiment, theta: np.ndarray, prediction: np.ndarray
-    ) -> np.ndarray:
-        """Fill the predictions of a linear Gaussian model; returns the increments (T,)."""
-        found = kalman.filter(e, theta)
-        variance = np.diagonal(found.observation_covariance, axis1=1, axis2=2)
-        prediction[:, 0], prediction[:, 1] = found.observation_mean, variance
-        with np.errstate(all="ignore"):
-            below = ndtr((e.y - found.observation_mean) / np.sqrt(variance))
-        prediction[:, 2] = prediction[:, 3] = below
-        return found.log_increments
+
+def _drawn(
+    mean: np.ndarray, covariance: np.ndarray, stream: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Particles (T, D, N), in pairs mirrored at the mean, and weights (T, N) of normal laws with
+    these moments (T, D), (T, D, D)."""
+    # Rows before a flat start is known have none: what is drawn there is NaN, as their mean is.
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    normals = np.empty(mean.size * (PREDICTIVE // 2))
+    fill_normal(stream, normals)
+    away = root @ normals.reshape(*mean.shape, -1)
+    drawn = mean[:, :, None] + np.concatenate([away, -away], axis=2)
+    return drawn, np.full((len(mean), PREDICTIVE), 1.0 / PREDICTIVE)
+
+
+def _exact(found: KalmanMoments, e: Experiment, prediction: np.ndarray) -> np.ndarray:
+    """Fill the predictions of a linear Gaussian model; returns the increments (T,)."""
+    variance = np.diagonal(found.observation_covariance, axis1=1, axis2=2)
+    prediction[:, 0], prediction[:, 1] = found.observation_mean, variance
+    with np.errstate(all="ignore"):
+        below = ndtr((e.y - found.observation_mean) / np.sqrt(variance))
+    prediction[:, 2] = prediction[:, 3] = below
+    return found.log_increments
 
 
 def probability_transforms(

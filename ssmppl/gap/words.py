@@ -287,9 +287,13 @@ def untold(report: GapReport) -> list[str]:
     for row in leaders(report):
         if rivals(report, row):
             out.append(sentence(f"which it is: {listed(alternatives(report, row), 'or')}"))
+    parts: dict[tuple[str, str], list[str]] = {}
     for r in rows(report.not_applicable):
-        about = f" for {r['equation']}" if isinstance(r["equation"], str) and r["equation"] else ""
-        out.append(sentence(f"{r['part']}{about}: {r['reason']}"))
+        equation = r["equation"] if isinstance(r["equation"], str) else ""
+        parts.setdefault((equation, r["reason"]), []).append(r["part"])
+    for (equation, reason), own in parts.items():
+        about = f" for {equation}" if equation else ""
+        out.append(sentence(f"{listed(list(dict.fromkeys(own)))}{about}: {reason}"))
     return out
 
 

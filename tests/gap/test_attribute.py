@@ -6,14 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ssmppl.gap import catalogue_sensor as ssm_effects
 from ssmppl.gap import diagnose as diagnosis
 from ssmppl.gap import refit as refits_of
 from ssmppl.gap.attribute import Attribution, _rebase, attribute
 from ssmppl.gap.byrefit import gain_p
+from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.familywise import familywise, tail_p
-from ssmppl.gap.refit import Refit, best_of_groups, delays, leading, mates
-from ssmppl.gap.scales import Scales
+from ssmppl.gap.refit import Refit, asleep, best_of_groups, delays, leading, mates
+from ssmppl.gap.scales import Scale, Scales
 from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.workshop import Workshop
@@ -58,6 +60,21 @@ def test_a_choice_among_shapes_costs():
     plain = Refit((1,), (), None, None, gain=9.0, cost=0.0)
     assert plain.merit > dated.merit
     assert dated.merit == pytest.approx(10.6 - np.log(300.0))
+
+
+def test_what_the_fit_cannot_show_is_fitted_anew():
+    """A fold of a channel that is never below 0; not of one that is, and of no other effect."""
+    fold = ssm_effects.sensor_rectification
+    bound = [Candidate(fold, "y", role="channel"), Candidate(fold, "z", role="channel"),
+             Candidate(fold, "noisy", role="channel"),
+             Candidate(ssm_effects.sensor_bias, "y", role="channel")]  # fmt: skip
+    values = np.linspace(0.1, 3.0, 50)
+    scale = {"y": Scale.of(values), "z": Scale.of(values - 1.0), "noisy": Scale.of(values - 0.3)}
+    screen = SimpleNamespace(
+        family=SimpleNamespace(leaders=[3, 1, 2, 0]),
+        question=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
+    )
+    assert asleep(screen) == [2, 0]
 
 
 # -- tested

@@ -1,4 +1,4 @@
-"""Detection on a model that can be fitted by hand, and the CRPS against its integrals."""
+"""Detection on a model that can be fitted by hand."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from ssmppl.errors import ArgumentError
 from ssmppl.gap.detect import (
     LONG,
     Statistics,
-    crps,
-    crps_by_horizon,
     detection,
     normal_scores,
     statistics,
@@ -191,39 +189,3 @@ def test_more_statistics_can_be_added():
     assert more.names == (("y", "mean"), ("y", "CRPS 10 ahead"))
     np.testing.assert_array_equal(more.values, [1.0, 0.4])
     np.testing.assert_array_equal(more.quadratic, [False, False])
-
-
-# --- CRPS ----------------------------------------------------------------------------------------
-
-
-def test_crps_is_its_double_sum():
-    rng = rng_of("double sum")
-    x, y = rng.standard_normal((6, 9)), rng.standard_normal(6)
-    pairs = np.abs(x[:, :, None] - x[:, None, :]).sum(axis=(1, 2)) / (2 * 9 * 8)
-    np.testing.assert_allclose(crps(x, y), np.abs(x - y[:, None]).mean(axis=1) - pairs)
-
-
-@pytest.mark.parametrize("samples", [2, 20])
-def test_crps_is_unbiased_for_the_law(samples):
-    """Of N(0, 1): y (2 Phi(y) - 1) + 2 phi(y) - 1 / sqrt(pi), however few samples there are."""
-    rng, times = rng_of("fair", samples), 40_000
-    for y in (0.0, 1.3):
-        exact = y * (2 * stats.norm.cdf(y) - 1) + 2 * stats.norm.pdf(y) - 1 / np.sqrt(np.pi)
-        found = crps(rng.standard_normal((times, samples)), np.full(times, y))
-        assert abs(found.mean() - exact) < 4 * found.std() / np.sqrt(times)
-
-
-def test_crps_by_horizon():
-    rng = rng_of("horizons")
-    y = rng.standard_normal(50)
-    y[7] = np.nan
-    samples = rng.standard_normal((50, 30))
-    late = samples.copy()
-    late[:10] = np.nan
-    found = crps_by_horizon({1: samples, 10: late, 100: np.full((50, 30), np.nan)}, y)
-    each = crps(samples, y)
-    assert found["CRPS 1 ahead"] == pytest.approx(np.nanmean(each))
-    assert found["CRPS 10 ahead"] == pytest.approx(each[10:].mean())
-    assert found["CRPS 100 ahead"] == 0.0
-    with pytest.raises(ArgumentError, match="M at least 2"):
-        crps(samples[:, :1], y)

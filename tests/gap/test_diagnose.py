@@ -280,6 +280,46 @@ def test_what_is_wrong_with_the_data_is_said():
 
 
 @pytest.mark.slow
+def test_a_sensor_that_gives_the_size_only():
+    """Driven to and fro, and |speed| measured: the fitted model never changes the sign of its
+    speed, so that no score tells of the fold. Fitted anew with it, the model is right: as good as
+    the true one at the true parameters, and with the true gain."""
+    values, rng = {"a": 0.9, "b": 0.3, "q": 0.05, "r": 0.1}, np.random.default_rng(3)
+
+    def declared(fold):
+        model = ssm.Model("speed", inputs=("u",))
+        model.prior(lambda: {
+            "a": ssm.Uniform(0, 1), "b": ssm.LogNormal(-1, sd=1), "q": ssm.LogNormal(-2, sd=1),
+            "r": ssm.LogNormal(-2, sd=1),
+        })  # fmt: skip
+        model.initial(lambda: {"v": ssm.Normal(0, sd=0.1)})
+        model.transition(lambda v, u, a, b, q: {"v": ssm.Normal(a * v + b * u, sd=q)})
+        if fold:
+            model.observation(lambda v, r: {"y": ssm.Normal(np.abs(v), sd=r)})
+        else:
+            model.observation(lambda v, r: {"y": ssm.Normal(v, sd=r)})
+        return model
+
+    u = np.repeat(rng.choice([-1.0, 1.0], 40) * rng.uniform(0.5, 1.0, 40), 10)
+    drawn = ssm.simulate(declared(True), values, inputs={"u": u}, seed=4)
+    data = {"y": drawn["y"].values[0], "u": u}
+    report = run(
+        declared(False), data, ["sensor rectification", "constant load", "cubic stiffness"]
+    )
+    assert report.verdict == "effect"
+    assert report.chosen[0] == "sensor rectification"
+    head = report.causes.iloc[0]
+    assert head["effect"] == "sensor rectification"
+    assert head["p"] < 0.01
+    after = {n: v for n, (v, _) in report.estimates["after"].items()}
+    assert after["sensor_rectification_y"] > 0.9
+    assert after["b"] / (1.0 - after["a"]) == pytest.approx(3.0, rel=0.05)
+    whole = [ssm.log_likelihood(m, data, v, particles=1000, seed=1)
+             for m, v in ((report.model, after), (declared(True), values))]  # fmt: skip
+    assert whole[0] > whole[1] - 3.0  # fitted to the first 70% only
+
+
+@pytest.mark.slow
 def test_the_dam_at_aswan(monkeypatch):
     """A level that jumps in the step from 1898 to 1899 and is constant otherwise (Cobb 1978)."""
     monkeypatch.setattr(diagnose, "SETS", {"fast": 100, "full": 120})

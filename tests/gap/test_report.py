@@ -221,6 +221,18 @@ def test_what_does_not_apply_is_told_with_its_reason():
     assert any("@ssm.primitive" in line for line in told)
 
 
+def test_what_does_not_apply_for_one_reason_is_told_once():
+    cells = [("drag", "x"), ("stop", "x"), ("stop", "x"), ("drag", "w"), ("outliers", "")]
+    why = "it is only the integral of v"
+    found = [{"part": p, "equation": e, "reason": why} for p, e in cells]
+    report = dataclasses.replace(several(), not_applicable=tabulate("not_applicable", found))
+    assert untold(report)[-3:] == [
+        "Drag and stop for x: it is only the integral of v.",
+        "Drag for w: it is only the integral of v.",
+        "Outliers: it is only the integral of v.",
+    ]
+
+
 # -- the object
 def test_a_table_takes_its_columns_and_no_others():
     table = tabulate("where", [{"equation": "v", "z": 2.0}])

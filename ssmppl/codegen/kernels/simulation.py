@@ -36,3 +36,42 @@ def simulate(
         if feedback:
             for k in range(y.shape[1]):
                 y[t, k] = observations[t, k, 0]
+
+
+@exact
+def simulate_on(
+    prepare, step, draw, observe, sizes,
+    theta, y, seen, u, first, x, rng, states, observations, feedback,
+):  # fmt: skip
+    """Fill states (H, D, n) and observations (H, K, n) of rows first, ..., first + H - 1 from x
+    (D, n), the states of the row before.
+
+    feedback : as in `simulate`; the draws are then made one after the other, and rows of y from
+        `first` on are overwritten.
+    """
+    n_steps, d, n = states.shape
+    width = 1 if feedback else n
+    c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    normals, uniforms = np.empty(sizes[3] * width), np.empty(sizes[4] * width)
+    before, after = np.empty((d, width)), np.empty((d, width))
+    seen_at = np.empty((y.shape[1], width))
+    prepare(theta, c)
+    for a in range(0, n, width):
+        for j in range(d):
+            for i in range(width):
+                before[j, i] = x[j, a + i]
+        for h in range(n_steps):
+            step(theta, c, y, seen, u, first + h, s)
+            fill_normal(rng, normals)
+            fill_uniform(rng, uniforms)
+            draw(theta, c, s, before, after, normals, uniforms, rng)
+            fill_normal(rng, normals)
+            fill_uniform(rng, uniforms)
+            observe(theta, c, s, after, seen_at, normals, uniforms, rng)
+            for i in range(width):
+                for j in range(d):
+                    before[j, i] = states[h, j, a + i] = after[j, i]
+                for k in range(y.shape[1]):
+                    observations[h, k, a + i] = seen_at[k, i]
+                    if feedback:
+                        y[first + h, k] = seen_at[k, i]
