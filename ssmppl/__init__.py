@@ -13,6 +13,7 @@ from ssmppl.gap.report import GapReport
 from ssmppl.inference.evidence import Evidence, evidence
 from ssmppl.inference.explain import compile, explain
 from ssmppl.inference.filters import kalman_filter, particle_filter
+from ssmppl.inference.forecast import forecast
 from ssmppl.inference.likelihood import log_likelihood
 from ssmppl.inference.maximize import maximize
 from ssmppl.inference.methods import (
@@ -29,6 +30,7 @@ from ssmppl.inference.methods import (
     ParticleEM,
     ScoreAscent,
 )
+from ssmppl.inference.predict import predict
 from ssmppl.inference.sample import sample
 from ssmppl.inference.score import score
 from ssmppl.inference.simulation import simulate
@@ -118,11 +120,13 @@ __all__ = [
     "effects",
     "evidence",
     "explain",
+    "forecast",
     "kalman_filter",
     "log_likelihood",
     "maximize",
     "particle_filter",
     "plots",
+    "predict",
     "primitive",
     "sample",
     "score",

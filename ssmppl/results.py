@@ -37,6 +37,9 @@ __all__ = [
 
 SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
+# Groups of draws all of whose variables have a time axis.
+BY_ROW = ("log_likelihood", "prior_predictive", "posterior_predictive")
+
 # What a netCDF attribute may hold in the 64 KB that HDF5 leaves for one; longer text is cut.
 LONGEST_ATTRIBUTE = 60_000
 
@@ -49,6 +52,7 @@ def to_inference_data(
     constant_data: Mapping[str, np.ndarray] | None = None,
     log_likelihood: Mapping[str, np.ndarray] | None = None,
     prior: Mapping[str, np.ndarray] | None = None,
+    prior_predictive: Mapping[str, np.ndarray] | None = None,
     posterior_predictive: Mapping[str, np.ndarray] | None = None,
     over_time: Collection[str] = (),
     time: Any = None,
@@ -64,7 +68,7 @@ def to_inference_data(
     ----------
     posterior, sample_stats, prior
         Arrays of shape (chain, draw, ...); (chain, draw, T, ...) for the names in `over_time`.
-    log_likelihood, posterior_predictive
+    log_likelihood, prior_predictive, posterior_predictive
         Arrays of shape (chain, draw, T, ...).
     observed_data, constant_data
         Arrays of shape (T, ...).
@@ -87,6 +91,7 @@ def to_inference_data(
         "log_likelihood": log_likelihood,
         "posterior_predictive": posterior_predictive,
         "prior": prior,
+        "prior_predictive": prior_predictive,
     }
     fixed = {"observed_data": observed_data, "constant_data": constant_data}
     written = _provenance() | netcdf_attributes(attrs or {})
@@ -94,7 +99,7 @@ def to_inference_data(
     for group, variables in {**sampled, **fixed}.items():
         if not variables:
             continue
-        by_row = group in fixed or group in ("log_likelihood", "posterior_predictive")
+        by_row = group in fixed or group in BY_ROW
         groups[group] = _dataset(
             variables,
             sample_dims=() if group in fixed else ("chain", "draw"),

@@ -30,7 +30,7 @@ from ssmppl.codegen.kernels.backward_pairs import (
 from ssmppl.codegen.kernels.conditional_smc import conditional_smc, filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
-from ssmppl.codegen.kernels.simulation import simulate, simulate_on
+from ssmppl.codegen.kernels.simulation import observe_states, simulate, simulate_on
 from ssmppl.codegen.kits import (
     backward_kit,
     conditional_passes,
@@ -47,6 +47,8 @@ from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import TwistedFilter, compile_twisted
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.trace import Trace
+
+SELDOM = ("simulate", "simulate_on", "observe_states")
 
 
 @dataclass
@@ -89,7 +91,7 @@ class Program:
         """
         if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
             return self.twisted.entry(name.removesuffix("_twisted"))
-        if name.startswith("simulate"):  # many a model is simulated a few times only
+        if name in SELDOM:  # many a model is simulated a few times only
             return getattr(self.loaded, name)
         if not hasattr(self.module, name):
             for proposal, found in self.proposals.items():
@@ -142,6 +144,7 @@ def _write(
     out.add("simulation", simulation)
     out.algorithm(simulate, "simulate", simulation, "entry")
     out.algorithm(simulate_on, "simulate_on", simulation, "entry")
+    out.algorithm(observe_states, "observe_states", simulation, "entry")
     for name, proposal in proposals.items():
         if isinstance(proposal, NotApplicable) or not trace.observations or name == "twisted":
             continue

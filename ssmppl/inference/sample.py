@@ -15,6 +15,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.labels import Labels
 from ssmppl.inference.method_choice import choose_sampler
 from ssmppl.inference.methods import PGAS, PMMH, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
@@ -137,38 +138,20 @@ def _to_arviz(
     drawn, stats = stack(result)
     trace = problem.trace
     posterior = {n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held}
-    several = len(problem.experiments) > 1
-    dims: dict[str, list[str]] = {}
-    coords: dict[str, Any] = {}
+    labels = Labels(problem.experiments)
     over_time: list[str] = []
     observed: dict[str, np.ndarray] = {}
     inputs: dict[str, np.ndarray] = {}
     log_likelihood: dict[str, np.ndarray] = {}
     for i, e in enumerate(problem.experiments):
-        mark = f"_{i + 1}" if several else ""
-        axis = [f"time{mark}"]
-        if several:
-            coords[axis[0]] = np.arange(1, e.steps + 1) if e.time is None else e.time
-
-        def own(
-            values: Mapping[str, np.ndarray], mark: str = mark, axis: list[str] = axis,
-            leading: int = 1,
-        ) -> dict[str, np.ndarray]:  # fmt: skip
-            named = {f"{n}{mark}": v for n, v in values.items()}
-            if mark:
-                for n, v in named.items():
-                    rest = [f"{n}_dim_{k}" for k in range(v.ndim - leading)]
-                    dims.setdefault(n, [*axis, *rest])  # the log likelihood has none but time
-            return named
-
         if states:
-            paths = own(unpack_states(trace, drawn[f"path_{i}"]), leading=3)
+            paths = labels.named(i, unpack_states(trace, drawn[f"path_{i}"]), leading=3)
             posterior |= paths
-            over_time += list(paths) if not several else []
-        observed |= own(e.observed)
-        inputs |= own(e.inputs)
+            over_time += list(paths) if not labels.several else []
+        observed |= labels.named(i, e.observed)
+        inputs |= labels.named(i, e.inputs)
         if f"increment_{i}" in drawn:
-            log_likelihood |= own({"y": drawn[f"increment_{i}"]}, leading=3)
+            log_likelihood |= labels.named(i, {"y": drawn[f"increment_{i}"]}, leading=3)
     return to_inference_data(
         posterior=posterior,
         sample_stats=stats,
@@ -176,8 +159,8 @@ def _to_arviz(
         constant_data=inputs or None,
         log_likelihood=log_likelihood or None,
         over_time=over_time,
-        time=None if several else problem.experiments[0].time,
-        dims=dims,
-        coords=coords,
+        time=labels.time,
+        dims=labels.dims,
+        coords=labels.coords,
         attrs=attrs,
     )

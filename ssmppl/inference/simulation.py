@@ -62,12 +62,7 @@ def simulate(
     ModelError, DataError, ArgumentError : what is wrong with model, inputs or call, and the fix.
     """
     traced = trace(model)
-    for site in flat_start(traced):
-        raise ModelError(
-            f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
-            fix="give it a proper law in @initial to simulate",
-            where=site.distribution.location,
-        )
+    check_drawable(traced)
     u, steps, time = bind_inputs(traced, inputs, steps)
     check_count("draws", draws, 1)
     root = seed_sequence(seed)
@@ -90,7 +85,7 @@ def simulate(
         program.entry("simulate")(row, y, seen, u, rng, x, out, feedback)
         states[first : first + side_by_side] = np.moveaxis(x, 2, 0)
         observations[first : first + side_by_side] = np.moveaxis(out, 2, 0)
-    _check_finite(traced, states, observations)
+    check_finite(traced, states, observations)
     variables = {**unpack_states(traced, states), **unpack_observations(traced, observations)}
     over_time = set(variables)
     if parameters is None and traced.parameters:
@@ -103,7 +98,22 @@ def simulate(
     )
 
 
-def _check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) -> None:
+def check_drawable(traced: Trace) -> None:
+    """Refuse a model whose x_1 has no proper law.
+
+    Raises
+    ------
+    ModelError : naming the state and its line.
+    """
+    for site in flat_start(traced):
+        raise ModelError(
+            f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
+            fix="give it a proper law in @initial to simulate",
+            where=site.distribution.location,
+        )
+
+
+def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) -> None:
     """Refuse draws that are nan: some law left its domain.
 
     Raises

@@ -75,3 +75,17 @@ def simulate_on(
                     observations[h, k, a + i] = seen_at[k, i]
                     if feedback:
                         y[first + h, k] = seen_at[k, i]
+
+
+@exact
+def observe_states(prepare, step, observe, sizes, theta, y, seen, u, rng, states, observations):
+    """Fill observations (T, K, n) by their laws given states (T, D, n)."""
+    n_steps, n = states.shape[0], states.shape[2]
+    c, s = np.empty(sizes[0]), np.empty(sizes[1])
+    normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
+    prepare(theta, c)
+    for t in range(n_steps):
+        step(theta, c, y, seen, u, t, s)
+        fill_normal(rng, normals)
+        fill_uniform(rng, uniforms)
+        observe(theta, c, s, states[t], observations[t], normals, uniforms, rng)

@@ -1,0 +1,171 @@
+"""The verb `forecast`: what comes after the data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
+from ssmppl.data.parameters import pack
+from ssmppl.errors import ArgumentError
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
+from ssmppl.inference.posterior_draws import group, parameters_of, posterior_of, states_of
+from ssmppl.inference.simulation import check_finite, feeds_back
+from ssmppl.language.model import Model
+from ssmppl.language.trace import Trace, trace
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def forecast(
+    model: Model,
+    idata: Any,
+    steps: int | None = None,
+    inputs: Any = None,
+    *,
+    experiment: int | None = None,
+    seed: int | None = None,
+) -> xr.Dataset:
+    """Draws of the states and observations after the last row of the data.
+
+    Each posterior draw of the parameters and of x_T is continued by the model's laws: one draw of
+    p(x_{T+1:T+H}, y_{T+1:T+H} | y_{1:T}) each.
+
+    Parameters
+    ----------
+    model : the model that was sampled. idata : what `sample` returned, with its states.
+    steps : number H of rows; may be left out where `inputs` tell it.
+    inputs : the inputs of the rows T+1, ..., T+H: mapping of arrays, DataFrame or Dataset. The step
+        into the first of them is driven by the data's last input.
+    experiment : which one is continued, from 1, where several were sampled.
+    seed : the same seed gives the same draws.
+
+    Returns
+    -------
+    Dataset with states and observations (draw, time, ...) and parameters (draw, ...); all chains
+    one after the other. Its time goes on from the data's where that is evenly spaced.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    """
+    traced, posterior = trace(model), posterior_of(idata)
+    future, steps, labels = bind_inputs(traced, inputs, steps)
+    mark, axis = _which(traced, posterior, experiment)
+    theta = parameters_of(traced, posterior)
+    paths = states_of(traced, posterior, mark, axis)
+    if paths is None:
+        raise ArgumentError(
+            "the posterior holds no trajectories: a forecast starts from the last state",
+            fix="sample with states=True",
+        )
+    theta, paths = theta.reshape(-1, theta.shape[-1]), paths.reshape(-1, *paths.shape[2:])
+    rows = paths.shape[1]
+    given = _past(idata, "constant_data", traced.inputs, mark, rows)
+    columns = [given[n].reshape(rows, -1) for n in traced.inputs]
+    u = np.concatenate([np.concatenate([np.zeros((rows, 0)), *columns], axis=1), future])
+    y = np.zeros((rows + steps, len(traced.observation_symbols)))
+    feedback = feeds_back(traced)
+    if feedback:
+        seen = _past(idata, "observed_data", traced.observations, mark, rows)
+        y[:rows] = pack(traced.observations.values(), seen)
+    program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
+    states, observed = _continued(program, theta, paths, y, u, feedback, root)
+    check_finite(traced, states, observed)
+    over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
+    return to_dataset(
+        over_time | unpack_parameters(traced, theta),
+        over_time=set(over_time),
+        time=labels if labels is not None else after(posterior[axis].values, steps),
+        attrs={"model": traced.name, "seed": str(root.entropy), "after": int(rows)},
+    )
+
+
+def after(time: np.ndarray, steps: int) -> np.ndarray:
+    """Labels of the rows that follow `time`: numbers and dates go on where they are evenly spaced
+    (dates also by months and the like), else there are row numbers."""
+    count = np.arange(1, steps + 1)
+    if np.issubdtype(time.dtype, np.datetime64):
+        import pandas as pd
+
+        spacing = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
+        if spacing is not None:
+            return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=spacing)[1:])
+    elif np.issubdtype(time.dtype, np.number) and len(time):
+        gaps = np.diff(time) if len(time) > 1 else np.ones(1, time.dtype)
+        if np.allclose(gaps, gaps[0], rtol=1e-6):
+            return np.asarray(time[-1] + gaps[0] * count)
+    return len(time) + count
+
+
+def _continued(
+    program: Program, theta: np.ndarray, paths: np.ndarray, y: np.ndarray, u: np.ndarray,
+    feedback: bool, root: np.random.SeedSequence,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """States (n, H, D) and observations (n, H, K) of the rows of u that follow those of paths."""
+    n, rows, d = paths.shape
+    steps, k = len(u) - rows, y.shape[1]
+    states, observed = np.empty((n, steps, d)), np.empty((n, steps, k))
+    simulate, observe = program.entry("simulate_on"), program.entry("observe_states")
+    seen = np.ones_like(y)
+    unknown = feedback and bool(np.isnan(y[rows - 1]).any())
+    for r in range(n):
+        stream, own = random_state(root, r), y
+        if feedback:  # what is drawn is written there, for the transition to read
+            own = np.nan_to_num(y)
+        if unknown:
+            drawn = np.empty((rows, k, 1))
+            x = np.ascontiguousarray(paths[r][:, :, None])
+            observe(theta[r], own[:rows], seen[:rows], u[:rows], stream, x, drawn)
+            own[rows - 1] = np.where(np.isnan(y[rows - 1]), drawn[-1, :, 0], y[rows - 1])
+        x, out = np.empty((steps, d, 1)), np.empty((steps, k, 1))
+        last = np.ascontiguousarray(paths[r, -1][:, None])
+        simulate(theta[r], own, seen, u, rows, last, stream, x, out, feedback)
+        states[r], observed[r] = x[:, :, 0], out[:, :, 0]
+    return states, observed
+
+
+def _which(trace: Trace, posterior: Any, experiment: int | None) -> tuple[str, str]:
+    """What follows the variables' names, and the dim over time, of the experiment asked for.
+
+    Raises
+    ------
+    ArgumentError : there are several, and none or an unknown one was asked for.
+    """
+    numbers = [d.removeprefix("time_") for d in map(str, posterior.dims) if d.startswith("time_")]
+    known = sorted(int(d) for d in numbers if d.isdigit())
+    if not known and experiment in (None, 1):
+        return "", "time"
+    if experiment in known:
+        return f"_{experiment}", f"time_{experiment}"
+    raise ArgumentError(
+        f"experiment={experiment!r}, and the posterior is of "
+        + (f"the experiments {', '.join(map(str, known))}" if known else "a single experiment"),
+        fix=f"give experiment={known[0]}, or another of them" if known else "leave experiment out",
+    )
+
+
+def _past(
+    idata: Any, name: str, names: Iterable[str], mark: str, rows: int
+) -> dict[str, np.ndarray]:
+    """Values (T, ...) by name, of a group of the data that were sampled.
+
+    Raises
+    ------
+    ArgumentError : they are not there.
+    """
+    found, out = group(idata, name), {}
+    for n in names:
+        if found is None or f"{n}{mark}" not in found:
+            raise ArgumentError(
+                f"the group {name!r} has no {n!r}, which the last step of the data needs",
+                fix="give what ssm.sample returned, with all its groups",
+            )
+        out[n] = np.asarray(found[f"{n}{mark}"].values, dtype=np.float64)
+    return out

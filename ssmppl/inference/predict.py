@@ -1,0 +1,192 @@
+"""The verb `predict`: observations that the model expects, from the prior or from the posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.data import (
+    Experiment,
+    bind,
+    unpack_observations,
+    unpack_parameters,
+    unpack_states,
+)
+from ssmppl.errors import ArgumentError, ModelError
+from ssmppl.inference.labels import Labels
+from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
+from ssmppl.inference.posterior_draws import parameters_of, posterior_of, states_of
+from ssmppl.inference.prior import draw_prior
+from ssmppl.inference.simulation import check_drawable, check_finite, feeds_back
+from ssmppl.language.model import Model
+from ssmppl.language.trace import Trace, trace
+from ssmppl.results import to_inference_data
+
+# Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
+Drawn = tuple[np.ndarray, np.ndarray]
+
+
+def predict(
+    model: Model,
+    idata: Any = None,
+    data: Any = None,
+    *,
+    steps: int | None = None,
+    draws: int = 1000,
+    conditional: bool | None = None,
+    seed: int | None = None,
+) -> Any:
+    """Draws of the observations at the rows of `data`, from the prior or from the posterior.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    idata : what `sample` returned; None draws parameters, states and observations from the prior.
+    data : the data set (or the list of them) whose rows and inputs are meant; observations may be
+        left out of it for the prior, and are compared with by ArviZ where they are there.
+    steps : number of rows where there are no data.
+    draws : from the prior; of the posterior all its draws are taken.
+    conditional : of the posterior, whether the states are those of its trajectories, so that a
+        draw is of p(y'_t | x_t, theta) at x_t | y_{1:T}, or are simulated anew from x_1 on, a free
+        run. None: as the trajectories are there or not.
+    seed : the same seed gives the same draws.
+
+    Returns
+    -------
+    InferenceData (ArviZ 0.x) or DataTree (ArviZ 1.x)
+        Groups prior (parameters and states) and prior_predictive, or posterior_predictive; with
+        them observed_data and constant_data, so that `az.plot_ppc` draws them. Every row has a
+        draw, missing ones too.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    """
+    traced = trace(model)
+    if not traced.observations:
+        raise ModelError(
+            f"model {traced.name!r} has no @observation function: there is nothing to predict",
+            fix="declare the law of y_t with @model.observation",
+            where=model.location,
+        )
+    experiments = bind(traced, data, need_observations=idata is not None, steps=steps)
+    program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
+    labels = Labels(experiments)
+    attrs: dict[str, Any] = {"model": traced.name, "seed": str(root.entropy)}
+    if idata is None:
+        return _from_prior(traced, program, experiments, labels, draws, root, attrs)
+    posterior = posterior_of(idata)
+    theta = parameters_of(traced, posterior)
+    lead = theta.shape[:2]
+    predicted: dict[str, np.ndarray] = {}
+    for i, e in enumerate(experiments):
+        paths = None
+        if conditional is not False:
+            paths = states_of(traced, posterior, labels.mark(i), labels.axis(i))
+            _check_paths(paths, e, conditional)
+        flat = theta.reshape(-1, theta.shape[-1])
+        if paths is not None:
+            drawn = _observed(program, e, flat, paths.reshape(-1, *paths.shape[2:]), root, i)
+        else:
+            check_drawable(traced)
+            drawn = _simulated(program, e, flat, root, i)
+        check_finite(traced, *drawn)
+        y = drawn[1].reshape(*lead, *drawn[1].shape[1:])
+        predicted |= labels.named(i, unpack_observations(traced, y), leading=3)
+        attrs["conditional"] = paths is not None
+    return _container(experiments, labels, attrs, posterior_predictive=predicted)
+
+
+def _check_paths(paths: np.ndarray | None, e: Experiment, conditional: bool | None) -> None:
+    if paths is None and conditional:
+        raise ArgumentError(
+            "conditional=True, and the posterior holds no trajectories of this data set",
+            fix="sample with states=True, give the data sets that were sampled, or leave "
+            "conditional out",
+        )
+    if paths is not None and paths.shape[2] != e.steps:
+        raise ArgumentError(
+            f"the trajectories of the posterior have {paths.shape[2]} rows, the data {e.steps}",
+            fix="give the data that were sampled, conditional=False for other data, or "
+            "ssm.forecast for the rows after them",
+        )
+
+
+def _from_prior(
+    traced: Trace, program: Program, experiments: list[Experiment], labels: Labels, draws: int,
+    root: np.random.SeedSequence, attrs: dict[str, Any],
+) -> Any:  # fmt: skip
+    check_count("draws", draws, 1)
+    check_drawable(traced)
+    theta = draw_prior(traced, np.random.default_rng(root), draws)
+    prior = {n: v[None] for n, v in unpack_parameters(traced, theta).items()}
+    over_time: list[str] = []
+    predicted: dict[str, np.ndarray] = {}
+    for i, e in enumerate(experiments):
+        x, y = _simulated(program, e, theta, root, i)
+        check_finite(traced, x, y)
+        paths = labels.named(i, unpack_states(traced, x[None]), leading=3)
+        prior |= paths
+        over_time += [] if labels.several else list(paths)
+        predicted |= labels.named(i, unpack_observations(traced, y[None]), leading=3)
+    return _container(
+        experiments, labels, attrs, prior=prior, prior_predictive=predicted, over_time=over_time
+    )
+
+
+def _simulated(
+    program: Program, e: Experiment, theta: np.ndarray, root: np.random.SeedSequence, i: int
+) -> Drawn:
+    """x_1 on, with the experiment's inputs."""
+    simulate, feedback = program.entry("simulate"), feeds_back(program.trace)
+
+    def one(r: int, x: np.ndarray, y: np.ndarray) -> None:
+        own = np.zeros_like(e.y)
+        simulate(theta[r], own, np.ones_like(e.y), e.u, random_state(root, i, r), x, y, feedback)
+
+    return _each(program, e, len(theta), one)
+
+
+def _observed(
+    program: Program, e: Experiment, theta: np.ndarray, paths: np.ndarray,
+    root: np.random.SeedSequence, i: int,
+) -> Drawn:  # fmt: skip
+    """Observations given trajectories (n, T, D)."""
+    observe = program.entry("observe_states")
+
+    def one(r: int, x: np.ndarray, y: np.ndarray) -> None:
+        x[:, :, 0] = paths[r]
+        observe(theta[r], e.y, np.ones_like(e.y), e.u, random_state(root, i, r), x, y)
+
+    return _each(program, e, len(theta), one)
+
+
+def _each(
+    program: Program, e: Experiment, n: int, one: Callable[[int, np.ndarray, np.ndarray], None]
+) -> Drawn:
+    d, k = len(program.trace.state_symbols), len(program.trace.observation_symbols)
+    states, observations = np.empty((n, e.steps, d)), np.empty((n, e.steps, k))
+    for r in range(n):
+        x, y = np.empty((e.steps, d, 1)), np.empty((e.steps, k, 1))
+        one(r, x, y)
+        states[r], observations[r] = x[:, :, 0], y[:, :, 0]
+    return states, observations
+
+
+def _container(
+    experiments: list[Experiment], labels: Labels, attrs: dict[str, Any], **groups: Any
+) -> Any:
+    observed: dict[str, np.ndarray] = {}
+    inputs: dict[str, np.ndarray] = {}
+    for i, e in enumerate(experiments):
+        if e.seen.any():
+            observed |= labels.named(i, e.observed)
+        inputs |= labels.named(i, e.inputs)
+    return to_inference_data(
+        observed_data=observed, constant_data=inputs, time=labels.time, dims=labels.dims,
+        coords=labels.coords, attrs=attrs, **groups,
+    )  # fmt: skip
