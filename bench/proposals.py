@@ -52,7 +52,7 @@ def report(case: Case) -> tuple[list[list[str]], list[list[str]]]:
             rng = new_state(np.random.SeedSequence(0))
             log_likelihood_estimate(problem, theta, FilterSettings(10, k), rng)
     start = time.perf_counter()
-    choice = choose(problem, theta, kalman=False)
+    choice = choose(problem, theta, exact=False)
     pilot = time.perf_counter() - start
     rows, chosen = [], []
     for n in PARTICLES:

@@ -24,7 +24,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains.bridge import Bridge, bridge, importance
-from ssmppl.inference.exact.kalman import kalman_log_likelihood, kalman_model
+from ssmppl.inference.exact.models import exact_log_likelihood, exact_model, filter_of
 from ssmppl.inference.methods import PMMH, MetropolisHastings
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -168,9 +168,9 @@ def _log_prior_of_fixed(problem: Problem, held: Mapping[str, np.ndarray]) -> flo
 def _chosen(
     problem: Problem, method: PMMH | MetropolisHastings | None
 ) -> PMMH | MetropolisHastings:
-    linear = not isinstance(kalman_model(problem.trace), NotApplicable)
+    exact = not isinstance(exact_model(problem.trace), NotApplicable)
     if method is None:
-        return MetropolisHastings() if linear else PMMH()
+        return MetropolisHastings() if exact else PMMH()
     if not isinstance(method, (PMMH, MetropolisHastings)):
         raise ArgumentError(
             f"method={method!r} gives no estimates of the likelihood to bridge with",
@@ -191,7 +191,7 @@ def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedS
     if proposal == "auto" or particles is None:
         theta, _ = space.parameters(find_mode(space, root).z)
         if proposal == "auto":
-            proposal = choose(problem, theta, kalman=False, whole=True).name
+            proposal = choose(problem, theta, exact=False, whole=True).name
         problem.proposal(proposal)
         if particles is None:
             particles = tune_particles(problem, theta, proposal, TARGET_SD, root).particles
@@ -202,8 +202,10 @@ def _without_parameters(
     problem: Problem, space: Space, method: PMMH | MetropolisHastings, root: np.random.SeedSequence
 ) -> Evidence:
     if isinstance(method, MetropolisHastings):
-        exact = kalman_log_likelihood(problem.trace, problem.experiments, space.theta)
-        return Evidence(exact, 0.0, {"method": "kalman"})
+        model = exact_model(problem.trace)
+        assert not isinstance(model, NotApplicable)
+        exact = model.log_likelihood(problem.experiments, space.theta)
+        return Evidence(exact, 0.0, {"method": filter_of(model)})
     assert method.particles is not None
     settings = FilterSettings(method.particles, method.proposal)
     found = importance(repeated_estimates(problem, space.theta, settings, root, range(REPEATS)))
@@ -248,7 +250,7 @@ def _log_densities(
             stream = random_state(root, 2, int(number))
             out[i] = log_likelihood_estimate(problem, theta, settings, stream) + log_prior
         else:
-            out[i] = kalman_log_likelihood(problem.trace, problem.experiments, theta) + log_prior
+            out[i] = exact_log_likelihood(problem.trace, problem.experiments, theta) + log_prior
     return out
 
 

@@ -9,11 +9,13 @@ from typing import Any
 
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
+from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.method_choice import (
     choose_maximiser,
     choose_sampler,
@@ -30,7 +32,8 @@ PAGE = 100  # columns
 class Plan:
     """Everything that was derived from a model; `print` it, or show it in a notebook.
 
-    structure : the model as a linear Gaussian one, or why it is not.
+    structure : the model as a linear Gaussian one, or why it is not. finite : the values that its
+    states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
     memory : see `structure.deterministic_memory`.
@@ -38,6 +41,7 @@ class Plan:
 
     trace: Trace
     structure: LinearGaussian | NotApplicable
+    finite: FiniteStates | NotApplicable
     proposals: dict[str, Proposal | NotApplicable]
     updates: tuple[Update, ...]
     memory: int | None
@@ -66,6 +70,10 @@ class Plan:
         return [(title, rows) for title, rows in out if rows]
 
     def _structure(self) -> list[tuple[str, str]]:
+        if isinstance(self.finite, FiniteStates):
+            return [("finite states", f"{len(self.finite.values)} combinations of values: the "
+                     "likelihood is exact, by the forward algorithm; particles are used only where "
+                     "they are asked for")]  # fmt: skip
         if isinstance(self.structure, NotApplicable):
             return [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
@@ -77,12 +85,12 @@ class Plan:
         return name, proposal.explanation
 
     def _choices(self) -> list[tuple[str, str]]:
-        choices: dict[str, tuple[Any, str]] = {
-            "sample": choose_sampler(self.structure, self.updates)
-        }
+        exact = exact_model(self.trace)
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        choices: dict[str, tuple[Any, str]] = {"sample": choose_sampler(kind, self.updates)}
         if self.trace.parameters:
-            choices["maximize"] = choose_maximiser(self.structure, self.trace)
-        choices["smooth"] = choose_smoother(self.structure)
+            choices["maximize"] = choose_maximiser(kind, self.trace)
+        choices["smooth"] = choose_smoother(kind)
         return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
 
     def _trajectories(self) -> str:
@@ -178,6 +186,7 @@ def explain(model: Model, data: Any = None) -> Plan:
     return Plan(
         traced,
         linear_gaussian(traced),
+        finite_states(traced),
         program.proposals,
         tuple(derive_updates(traced, (), missing)),
         deterministic_memory(traced),

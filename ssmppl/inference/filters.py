@@ -13,6 +13,7 @@ from scipy.special import ndtr, ndtri
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact import kalman
+from ssmppl.inference.exact.models import EXACT
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterRun,
@@ -77,11 +78,13 @@ def particle_filter(
     theta = check_parameters(problem.trace, parameters)
     check_count("repeats", repeats, 1)
     if proposal == "auto":
-        proposal = choose(problem, theta, kalman=False).name
+        proposal = choose(problem, theta, exact=False).name
     settings = settle(problem, theta, particles, proposal, resampling, ess_threshold)
-    if settings.proposal == "kalman":
+    if settings.proposal in EXACT:
+        instead = "kalman_filter" if settings.proposal == "kalman" else "smooth"
         raise ArgumentError(
-            'particle_filter with proposal="kalman"', fix="call ssm.kalman_filter instead"
+            f'particle_filter with proposal="{settings.proposal}"',
+            fix=f"call ssm.{instead} instead",
         )
     levels = quantile_levels(quantiles)
     root = seed_sequence(seed)

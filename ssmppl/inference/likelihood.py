@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.exact.kalman import kalman_log_likelihood
+from ssmppl.inference.exact.hidden_markov import hidden_markov
+from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.exact.models import EXACT, exact_log_likelihood, exact_model, filter_of
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     check_count,
@@ -48,10 +49,11 @@ def log_likelihood(
     parameters : value of each parameter of the model, {} where it has none.
     particles : number N of particles.
     repeats : number of independent estimates.
-    proposal : "auto", "kalman", "bootstrap", "guided", "auxiliary", "twisted", or "user" where the
-        model has a @proposal. "auto" is exact on linear Gaussian models, else the proposal with
-        the least variance for its cost in a pilot; "twisted", which looks ahead to the end of the
-        data, is tried where the others tell log Z to no better than 3 at 100 particles.
+    proposal : "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted", or "user"
+        where the model has a @proposal. "auto" is exact on linear Gaussian models and on those of
+        finitely many states (the forward algorithm), else the proposal with the least variance for
+        its cost in a pilot; "twisted", which looks ahead to the end of the data, is tried where the
+        others tell log Z to no better than 3 at 100 particles.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.
@@ -71,8 +73,8 @@ def log_likelihood(
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
     settings = settle(problem, theta, particles, proposal, resampling, ess_threshold, whole=True)
-    if settings.proposal == "kalman":
-        exact = kalman_log_likelihood(problem.trace, problem.experiments, theta)
+    if settings.proposal in EXACT:
+        exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
     task = estimates_task(problem, theta, settings, seed_sequence(seed))
     pieces = [r for r in np.array_split(np.arange(repeats), min(TASKS, repeats)) if len(r)]
@@ -98,11 +100,13 @@ def settle(
     if proposal == "auto":
         chosen = choose(problem, theta, whole=whole).name
         return filter_settings(particles, chosen, resampling, ess_threshold)
-    if proposal == "kalman":
-        found = linear_gaussian(problem.trace)
-        if isinstance(found, NotApplicable):
+    if proposal in EXACT:
+        found = exact_model(problem.trace)
+        if isinstance(found, NotApplicable) or filter_of(found) != proposal:
+            own = kalman_model if proposal == "kalman" else hidden_markov
+            kind = "linear Gaussian model" if proposal == "kalman" else "model of finite states"
             raise ArgumentError(
-                f'proposal="kalman" needs a linear Gaussian model: {found}',
+                f'proposal="{proposal}" needs a {kind}: {own(problem.trace)}',
                 fix='use proposal="auto"',
             )
     else:

@@ -14,7 +14,7 @@ from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.exact.exact_score import exact_score
-from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import kind_of
 from ssmppl.inference.maximum import direct_optimization, em, particle_em, psaem, score_ascent
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.method_choice import choose_maximiser
@@ -136,9 +136,9 @@ def maximize(
 
 def choose_method(setup: Setup) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
-    exact = setup.kalman
-    structure = exact if isinstance(exact, NotApplicable) else exact.form
-    chosen, reason = choose_maximiser(structure, setup.problem.trace)
+    exact = setup.exact
+    kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+    chosen, reason = choose_maximiser(kind, setup.problem.trace)
     return chosen, f"automatically: {reason}"
 
 
@@ -147,8 +147,8 @@ def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> floa
     if ascent.log_likelihood is not None:
         return ascent.log_likelihood
     problem, theta = setup.problem, ascent.theta
-    if isinstance(setup.kalman, KalmanModel):
-        return setup.kalman.log_likelihood(problem.experiments, theta)
+    if not isinstance(setup.exact, NotApplicable):
+        return setup.exact.log_likelihood(problem.experiments, theta)
     try:
         settings = FilterSettings(PARTICLES, choose(problem, theta).name)
         task = estimates_task(problem, theta, settings, setup.seed(1))
@@ -187,14 +187,14 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
 
 
 def _information(setup: Setup, theta: np.ndarray) -> np.ndarray | None:
-    if isinstance(setup.kalman, KalmanModel):
+    if not isinstance(setup.exact, NotApplicable):
         free = free_components(setup.problem.trace, setup.held)
         return exact_score(
-            setup.kalman, setup.problem.experiments, free, setup.space.theta
+            setup.exact, setup.problem.experiments, free, setup.space.theta
         ).information(theta)
     try:
         scores = complete_scores(setup.problem, setup.held)
-        settings = FilterSettings(PARTICLES, choose(setup.problem, theta, kalman=False).name)
+        settings = FilterSettings(PARTICLES, choose(setup.problem, theta, exact=False).name)
         smoothing = Smoothing(settings, TRAJECTORIES)
         runs = several_runs(
             scores, theta, smoothing, True, setup.seed(2), range(REPEATS), setup.executor

@@ -246,6 +246,12 @@ class KalmanSmoother:
 
 
 @dataclass(frozen=True)
+class ForwardBackward:
+    """Exact smoothing where the states take finitely many values (Rabiner 1989): moments, or
+    independent draws by backward sampling (Chib 1996)."""
+
+
+@dataclass(frozen=True)
 class FFBSi:
     """Forward filtering, backward simulation: independent draws, given the filter's particles, from
     the joint smoothing distribution (Godsill, Doucet and West 2004; Schön et al. 2015, section 5).
@@ -285,4 +291,4 @@ class FixedLag:
     ess_threshold: float = 1.0
 
 
-SmoothingMethod = KalmanSmoother | FFBSi | FixedLag | PGAS
+SmoothingMethod = KalmanSmoother | ForwardBackward | FFBSi | FixedLag | PGAS

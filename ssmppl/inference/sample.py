@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.labels import Labels
 from ssmppl.inference.method_choice import choose_sampler
 from ssmppl.inference.methods import PGAS, PMMH, Gibbs, Method, MetropolisHastings
@@ -55,11 +55,11 @@ def sample(
     ----------
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
-    method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models,
-        `ssm.PMMH(...)` or `ssm.PGAS(...)` for all. None: for linear Gaussian models Gibbs if every
-        parameter has a closed-form conditional, else a random walk on the exact likelihood while
-        the parameters are few; for the others PGAS. `explain` and the attributes say which, and
-        why.
+    method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
+        of finitely many states, `ssm.PMMH(...)` or `ssm.PGAS(...)` for all. None: for the former
+        Gibbs if every parameter has a closed-form conditional, else a random walk on the exact
+        likelihood while the parameters are few; for the others PGAS. `explain` and the attributes
+        say which, and why.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
@@ -126,9 +126,10 @@ def sample(
 
 
 def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
-    structure = linear_gaussian(problem.trace)
-    linear = not isinstance(structure, NotApplicable)
-    return choose_sampler(structure, plan_updates(problem, held) if linear else ())
+    exact = exact_model(problem.trace)
+    if isinstance(exact, NotApplicable):
+        return choose_sampler(exact, ())
+    return choose_sampler(kind_of(exact), plan_updates(problem, held))
 
 
 def _to_arviz(

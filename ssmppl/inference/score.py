@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.data import check_parameters, check_values
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.estimate import by_name, free_components, table
 from ssmppl.inference.exact.exact_score import ExactScore, exact_score
-from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.models import EXACT, exact_model
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
@@ -88,7 +88,8 @@ def score(
 ) -> Score:
     """Gradient of log p(y | parameters), and the observed information.
 
-    Exact on linear Gaussian models, by the sensitivities of the Kalman filter; else by Fisher's and
+    Exact on linear Gaussian models, by the sensitivities of the Kalman filter, and on those of
+    finitely many states; else by Fisher's and
     Louis' identities over backward trajectories of a particle filter.
 
     Parameters
@@ -118,13 +119,14 @@ def score(
     settings = settle(problem, theta, particles, proposal)
     root = seed_sequence(seed)
     attrs: dict[str, Any] = {"model": problem.trace.name, "fixed": dict(fixed or {})}
-    kalman = kalman_model(problem.trace)
-    if settings.proposal == "kalman" and isinstance(kalman, KalmanModel):
-        exact = exact_score(
-            kalman, problem.experiments, free_components(problem.trace, held), theta
-        )
+    form = exact_model(problem.trace)
+    if settings.proposal in EXACT and not isinstance(form, NotApplicable):
+        exact = exact_score(form, problem.experiments, free_components(problem.trace, held), theta)
         found = _exact(exact, theta)
-        attrs["method"] = "exact, by the sensitivities of the Kalman filter"
+        by = "the sensitivities of the Kalman filter"
+        if settings.proposal == "forward":
+            by = "Fisher's identity over the forward and backward algorithm"
+        attrs["method"] = f"exact, by {by}"
         if exact.differences:
             attrs["method"] = "differences of the exact likelihood"
             attrs["central_differences"] = exact.differences

@@ -14,11 +14,20 @@ from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_
 from ssmppl.errors import ArgumentError, NotApplicable, listing
 from ssmppl.inference.chains import pgas
 from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.models import EXACT, exact_model, kind_of
 from ssmppl.inference.filters import LEVELS, quantile_levels
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.method_choice import choose_smoother
-from ssmppl.inference.methods import PGAS, FFBSi, FixedLag, KalmanSmoother, SmoothingMethod
+from ssmppl.inference.methods import (
+    PGAS,
+    FFBSi,
+    FixedLag,
+    ForwardBackward,
+    KalmanSmoother,
+    SmoothingMethod,
+)
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -43,6 +52,7 @@ PGAS_WARMUP = 100  # sweeps that are dropped
 # what a method may be called by
 NAMES: dict[str, SmoothingMethod] = {
     "kalman": KalmanSmoother(),
+    "forward_backward": ForwardBackward(),
     "ffbsi": FFBSi(),
     "exact": FFBSi(kernel="exact"),
     "rejection": FFBSi(kernel="rejection"),
@@ -70,15 +80,17 @@ def smooth(
     ----------
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
-    method : `ssm.KalmanSmoother()`, exact, for linear Gaussian models; `ssm.FFBSi(...)`, particles
+    method : `ssm.KalmanSmoother()`, exact, for linear Gaussian models; `ssm.ForwardBackward()`,
+        exact, where the states take finitely many values; `ssm.FFBSi(...)`, particles
         with backward simulation; `ssm.PGAS(...)`, a Markov chain of conditional particle filters;
         `ssm.FixedLag(...)`, marginal moments from the genealogy. Or one of the names "kalman",
-        "ffbsi", "exact", "rejection", "mcmc", "genealogy", "pgas", "fixed_lag". None: Kalman where
-        the model is linear and Gaussian, else FFBSi; the attribute `method_chosen` says why.
+        "forward_backward", "ffbsi", "exact", "rejection", "mcmc", "genealogy", "pgas",
+        "fixed_lag". None: the exact one where there is one, else FFBSi; the attribute
+        `method_chosen` says why.
     particles : number N; None: 1000, and for PGAS its own. An exact smoother, where `method` is
         left to the model, does without. Moments have a bias of order 1 / N, but
         those of PGAS, whose chain has the right law for every N >= 2.
-    trajectories : number M of draws; None: exact moments from the Kalman smoother, and 1000 draws
+    trajectories : number M of draws; None: exact moments from an exact smoother, and 1000 draws
         from FFBSi and PGAS.
     quantiles : levels of the quantiles that go with moments.
     seed : the same seed gives the same numbers; None: a random one.
@@ -110,8 +122,8 @@ def smooth(
         if value is not None:
             check_count(name, value, least)
     call = _Call(problem, theta, particles, trajectories, levels, root)
-    if isinstance(chosen, KalmanSmoother):
-        found = _kalman(call, method)
+    if isinstance(chosen, KalmanSmoother | ForwardBackward):
+        found = _exact(call, chosen, method)
     elif isinstance(chosen, FFBSi):
         found = _ffbsi(call, chosen)
     elif isinstance(chosen, FixedLag):
@@ -156,9 +168,10 @@ class _Found:
 
 
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
-    exact = kalman_model(problem.trace)
+    exact = exact_model(problem.trace)
     if method is None:
-        chosen, why = choose_smoother(exact.form if isinstance(exact, KalmanModel) else exact)
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        chosen, why = choose_smoother(kind)
         return chosen, f"automatically: {why}"
     if isinstance(method, str):
         if method not in NAMES:
@@ -167,28 +180,37 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
             )
         method = NAMES[method]
     if not isinstance(method, SmoothingMethod):
-        names = ", ".join(f"ssm.{t.__name__}(...)" for t in (KalmanSmoother, FFBSi, FixedLag, PGAS))
+        kinds = (KalmanSmoother, ForwardBackward, FFBSi, FixedLag, PGAS)
+        names = ", ".join(f"ssm.{t.__name__}(...)" for t in kinds)
         raise ArgumentError(
             f"method={method!r} is no method of smoothing", fix=f"use {names}, a name, or None"
         )
-    if isinstance(method, KalmanSmoother) and isinstance(exact, NotApplicable):
+    needed: tuple[str, KalmanModel | HiddenMarkov | NotApplicable] | None = None
+    if isinstance(method, KalmanSmoother):
+        needed = "a linear Gaussian model", kalman_model(problem.trace)
+    elif isinstance(method, ForwardBackward):
+        needed = "states of finitely many values", hidden_markov(problem.trace)
+    if needed is not None and isinstance(needed[1], NotApplicable):
         raise ArgumentError(
-            f"KalmanSmoother needs a linear Gaussian model: {exact.reason}",
+            f"{type(method).__name__} needs {needed[0]}: {needed[1].reason}",
             fix="use ssm.FFBSi(...) or ssm.PGAS(...), or None, which picks by structure",
-            where=exact.where,
+            where=needed[1].where,
         )
     return method, "by the user"
 
 
-def _kalman(call: _Call, method: SmoothingMethod | str | None) -> list[_Found]:
+def _exact(
+    call: _Call, chosen: SmoothingMethod, method: SmoothingMethod | str | None
+) -> list[_Found]:
     """Exact moments, or exact draws."""
     if call.particles is not None and method is not None:
         raise ArgumentError(
-            f"particles={call.particles}: KalmanSmoother is exact and has none",
+            f"particles={call.particles}: {type(chosen).__name__} is exact and has none",
             fix="leave particles= out, or use method=ssm.FFBSi()",
         )
-    model = kalman_model(call.problem.trace)
-    assert isinstance(model, KalmanModel)
+    trace = call.problem.trace
+    model = kalman_model(trace) if isinstance(chosen, KalmanSmoother) else hidden_markov(trace)
+    assert not isinstance(model, NotApplicable)
     out = []
     for i, e in enumerate(call.problem.experiments):
         if call.trajectories is not None:
@@ -198,8 +220,11 @@ def _kalman(call: _Call, method: SmoothingMethod | str | None) -> list[_Found]:
             out.append(_Found({"log_likelihood": exact}, paths=paths))
             continue
         m = model.smooth(e, call.theta)
-        sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
-        spread = m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :]
+        if isinstance(model, HiddenMarkov):
+            spread = model.quantiles(model.probabilities(e, call.theta), call.levels)
+        else:
+            sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
+            spread = m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :]
         moments = m.mean, m.covariance, m.cross, spread
         out.append(_Found({"log_likelihood": m.log_likelihood}, moments=moments))
     return out
@@ -208,13 +233,14 @@ def _kalman(call: _Call, method: SmoothingMethod | str | None) -> list[_Found]:
 def _filter(call: _Call, method: FFBSi | FixedLag) -> FilterSettings:
     """The filter's settings, "auto" resolved among the particle proposals."""
     proposal = method.proposal
-    if proposal == "kalman":
+    if proposal in EXACT:
+        exact = "KalmanSmoother" if proposal == "kalman" else "ForwardBackward"
         raise ArgumentError(
-            f'{type(method).__name__}(proposal="kalman") has no particles',
-            fix="use ssm.KalmanSmoother(), or another proposal",
+            f'{type(method).__name__}(proposal="{proposal}") has no particles',
+            fix=f"use ssm.{exact}(), or another proposal",
         )
     if proposal == "auto":
-        proposal = choose(call.problem, call.theta, kalman=False).name
+        proposal = choose(call.problem, call.theta, exact=False).name
     n = PARTICLES if call.particles is None else call.particles
     return settle(call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold)
 

@@ -119,7 +119,7 @@ def lgss_estimates():
 def test_direct_optimisation_finds_the_exact_maximum(name, c, lgss_estimates, exact_values):
     estimate, exact = lgss_estimates[name], exact_values[name]
     assert estimate.attrs["method"] == "DirectOptimization"
-    assert "linear and Gaussian" in estimate.attrs["method_chosen"]
+    assert "linear Gaussian" in estimate.attrs["method_chosen"]
     assert estimate.attrs["converged"]
     assert estimate.parameters["theta"] == pytest.approx(exact["mle"], abs=1e-6)
     assert estimate.log_likelihood == pytest.approx(exact["max_log_likelihood"], abs=1e-9)

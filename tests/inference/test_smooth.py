@@ -44,7 +44,7 @@ def test_exact_moments(label):
     assert np.isnan(found["covariance_previous"].values[0, 0]).all()
     assert found.attrs["log_likelihood"] == pytest.approx(exact.log_likelihood, abs=1e-8)
     assert found.attrs["method"] == "KalmanSmoother"
-    assert "linear and Gaussian" in found.attrs["method_chosen"]
+    assert "linear Gaussian" in found.attrs["method_chosen"]
     name = states(label)[0]
     level = found[f"{name}_quantile"].sel(quantile=0.95)
     expected = found[name] + stats.norm.ppf(0.95) * found[f"{name}_sd"]

@@ -1,7 +1,8 @@
-"""Gibbs sampling of linear Gaussian models.
+"""Gibbs sampling where the states can be drawn exactly.
 
 Schön et al. (2015), section 4.2: the states given the parameters by the Kalman filter and backward
-sampling (Frühwirth-Schnatter 1994; Carter and Kohn 1994), the parameters given the states by their
+sampling (Frühwirth-Schnatter 1994; Carter and Kohn 1994) or, where they take few values, by the
+forward algorithm and backward sampling (Chib 1996); the parameters given the states by their
 derived updates.
 """
 
@@ -13,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.inference.chains.metropolis import exact_model
+from ssmppl.inference.chains.metropolis import needed_model
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
@@ -21,7 +22,7 @@ from ssmppl.inference.chains.parameter_steps import (
     plan_updates,
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import ExactModel, filter_of
 from ssmppl.inference.methods import Gibbs
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.runner import Block
@@ -41,17 +42,17 @@ def prepare(setup: Setup, method: Gibbs) -> Sampler:
 
     Raises
     ------
-    ArgumentError : the model is not linear and Gaussian; gives the reason and the line.
+    ArgumentError : the states cannot be drawn exactly; gives the reason and the line.
     """
     problem, space = setup.problem, setup.space
-    exact_model(problem, "Gibbs")
+    kind = filter_of(needed_model(problem, "Gibbs"))
     steps = ParameterSteps(problem, plan_updates(problem, setup.held))
     if space.where.size:
-        pilot = find_mode(space, setup.root, "kalman")
+        pilot = find_mode(space, setup.root, kind)
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     states = []
-    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "kalman")):
+    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, kind)):
         generator, stream = setup.streams(chain)
         theta = space.parameters(z)[0] if len(z) else space.theta
         states.append(GibbsState(theta.copy(), generator, stream))
@@ -67,7 +68,7 @@ def gibbs_block(
     steps: ParameterSteps, thin: int, state: GibbsState, n: int
 ) -> tuple[GibbsState, Block]:
     """n draws of one chain, each after `thin` sweeps."""
-    model = exact_model(steps.problem, "Gibbs")
+    model = needed_model(steps.problem, "Gibbs")
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta = state.theta.copy()
     draws: dict[str, list[np.ndarray]] = {"theta": []}
@@ -91,7 +92,7 @@ def gibbs_block(
 
 
 def draw_paths(
-    steps: ParameterSteps, model: KalmanModel, theta: np.ndarray, stream: np.ndarray
+    steps: ParameterSteps, model: ExactModel, theta: np.ndarray, stream: np.ndarray
 ) -> list[np.ndarray]:
     """Independent trajectories (T, D), one per experiment, from p(x_{1:T} | y_{1:T}, theta)."""
     paths = [

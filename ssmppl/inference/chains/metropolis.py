@@ -1,7 +1,8 @@
-"""Metropolis-Hastings with the exact likelihood of a linear Gaussian model.
+"""Metropolis-Hastings with an exact likelihood.
 
-Schön et al. (2015), algorithm 1 and section 3.2: the Kalman filter gives the likelihood; the states
-follow given each kept draw by backward sampling.
+Schön et al. (2015), algorithm 1 and section 3.2: the Kalman filter (or, where the states
+take few values, the forward algorithm) gives the likelihood; the states follow given each kept draw
+by backward sampling.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ from ssmppl.inference.chains.walk import (
     metropolis_block,
     start_chain,
 )
-from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.models import ExactModel, exact_model, filter_name, filter_of
 from ssmppl.inference.methods import MetropolisHastings
 from ssmppl.inference.particles.pilot import dispersed, find_mode
 from ssmppl.inference.problem import Problem
 
 
-def exact_model(problem: Problem, method: str) -> KalmanModel:
-    """The linear Gaussian form of the problem's model, for a method that needs one.
+def needed_model(problem: Problem, method: str) -> ExactModel:
+    """The exact form of the problem's model, for a method that needs one.
 
     Raises
     ------
-    ArgumentError : the model is not linear and Gaussian; gives the reason and the line.
+    ArgumentError : there is none; gives the reason and the line.
     """
-    model = kalman_model(problem.trace)
+    model = exact_model(problem.trace)
     if isinstance(model, NotApplicable):
         raise ArgumentError(
-            f"{method} needs a linear Gaussian model: {model.reason}",
+            f"{method} needs a linear Gaussian model, or one of finitely many states: "
+            f"{model.reason}",
             fix="use ssm.PGAS(...) or ssm.PMMH(...), or None, which picks by structure",
             where=model.where,
         )
@@ -48,18 +50,18 @@ def exact_model(problem: Problem, method: str) -> KalmanModel:
 
 @dataclass(frozen=True)
 class ExactLikelihood:
-    """The Kalman filter's likelihood; states, if they are wanted, by backward sampling."""
+    """The exact filter's likelihood; states, if they are wanted, by backward sampling."""
 
     problem: Problem
     states: bool
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
-        model = exact_model(self.problem, "MetropolisHastings")
+        model = needed_model(self.problem, "MetropolisHastings")
         value = model.log_likelihood(self.problem.experiments, theta)
         return Run(value) if value > -np.inf else None
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
-        model = exact_model(self.problem, "MetropolisHastings")
+        model = needed_model(self.problem, "MetropolisHastings")
         return {
             f"path_{i}": model.draw(e, point.theta, stream, 1)[0]
             for i, e in enumerate(self.problem.experiments)
@@ -70,10 +72,11 @@ class ExactLikelihood:
 def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
     """Find the mode and the information there, and start the chains."""
     problem, space = setup.problem, setup.space
-    exact_model(problem, "MetropolisHastings")
+    exact = needed_model(problem, "MetropolisHastings")
+    kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
-    pilot = find_mode(space, setup.root, "kalman")
-    factor = walk_factor(setup, method, where, pilot, "kalman")
+    pilot = find_mode(space, setup.root, kind)
+    factor = walk_factor(setup, method, where, pilot, kind)
     d = len(where)
     target = method.target_acceptance or (0.44 if d <= 1 else 0.35 if d == 2 else 0.234)
     kernel = Metropolis(
@@ -81,12 +84,12 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
         setup.warmup if adapts(method) else 0, target, setup.thin,
     )  # fmt: skip
     states = []
-    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "kalman")):
+    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, kind)):
         generator, stream = setup.streams(chain)
         states.append(start_chain(kernel, where.at(z), factor, generator, stream))
     report = {
         "settings": settings_of(method),
-        "likelihood": "exact, by the Kalman filter",
+        "likelihood": f"exact, by {filter_name(exact)}",
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
         "walk_covariance": (factor @ factor.T).tolist(),
     }

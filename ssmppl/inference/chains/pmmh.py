@@ -69,7 +69,7 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     plain = method.order == 0 and not method.correlation  # others know no guide
     choice = None
     if method.proposal == "auto":
-        choice = choose(problem, theta, kalman=False, whole=plain)
+        choice = choose(problem, theta, exact=False, whole=plain)
     proposal = choice.name if choice else method.proposal
     problem.proposal(proposal)
     particles, tuned = method.particles, None

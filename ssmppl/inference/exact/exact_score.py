@@ -1,4 +1,4 @@
-"""Score and information of a linear Gaussian model, by differences where there is no closed form.
+"""Score and information of exact likelihoods, by differences where there is no closed form.
 
 The sensitivities of the Kalman filter need derivatives of the model's matrices. Where a matrix goes
 through an opaque primitive, the exact likelihood itself is differenced, which is smooth.
@@ -14,7 +14,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.differences import jacobian, observed_information
-from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import ExactModel
 
 STEP = 1e-2  # the largest of the differences, relative to the parameter
 LEAST = 0.1  # parameters nearer to zero count as this large
@@ -27,7 +27,7 @@ class ExactScore:
     free : (P,) bool. differences : why the likelihood is differenced; empty where it is not.
     """
 
-    kalman: KalmanModel
+    model: ExactModel
     experiments: Sequence[Experiment]
     free: np.ndarray
     differences: str = ""
@@ -35,8 +35,8 @@ class ExactScore:
     def score(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """(log p(y | theta), gradient (P,), zero in what is not free); -inf and NaN where none."""
         if not self.differences:
-            return self.kalman.score(self.experiments, theta, self.free)
-        value = self.kalman.log_likelihood(self.experiments, theta)
+            return self.model.score(self.experiments, theta, self.free)
+        value = self.model.log_likelihood(self.experiments, theta)
         if value == -np.inf:
             return value, np.where(self.free, np.nan, 0.0)
         index = np.flatnonzero(self.free)
@@ -44,7 +44,7 @@ class ExactScore:
         def likelihood(part: np.ndarray) -> np.ndarray:
             moved = theta.copy()
             moved[index] = part
-            return np.array([self.kalman.log_likelihood(self.experiments, moved)])
+            return np.array([self.model.log_likelihood(self.experiments, moved)])
 
         gradient = np.zeros(len(theta))
         with np.errstate(invalid="ignore"):
@@ -59,11 +59,11 @@ class ExactScore:
 
 
 def exact_score(
-    kalman: KalmanModel, experiments: Sequence[Experiment], free: np.ndarray, theta: np.ndarray
+    model: ExactModel, experiments: Sequence[Experiment], free: np.ndarray, theta: np.ndarray
 ) -> ExactScore:
     """By sensitivities if these exist at theta (P,), else by differences, with the reason."""
     try:
-        kalman.score(experiments, theta, free)
+        model.score(experiments, theta, free)
     except ArgumentError as reason:
-        return ExactScore(kalman, experiments, free, reason.found)
-    return ExactScore(kalman, experiments, free)
+        return ExactScore(model, experiments, free, reason.found)
+    return ExactScore(model, experiments, free)

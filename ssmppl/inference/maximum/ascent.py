@@ -16,6 +16,7 @@ import numpy as np
 
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.models import ExactModel, exact_model
 from ssmppl.inference.maximum.chart import Chart
 from ssmppl.inference.particles.pilot import Pilot, Space, at, find_mode, finite_point
 from ssmppl.inference.problem import Problem
@@ -63,8 +64,13 @@ class Setup:
         return Chart(self.space)
 
     @cached_property
-    def kalman(self) -> KalmanModel | NotApplicable:
+    def exact(self) -> ExactModel | NotApplicable:
         """The exact filter, or why there is none."""
+        return exact_model(self.problem.trace)
+
+    @cached_property
+    def kalman(self) -> KalmanModel | NotApplicable:
+        """The exact filter of a linear Gaussian model, or why it is none."""
         return kalman_model(self.problem.trace)
 
     @property
@@ -80,14 +86,14 @@ class Setup:
     def start(self) -> np.ndarray:
         """(F,) where to begin, on the unconstrained scale.
 
-        The user's own point where `start` gives every free parameter; on linear Gaussian models
-        moderate values at which the likelihood is finite; else the pilot's mode.
+        The user's own point where `start` gives every free parameter; where the likelihood is exact
+        moderate values at which it is finite; else the pilot's mode.
         """
         z = self.space.z[self.space.where]
         free = set(self.problem.trace.parameters) - set(self.held)
         if free <= set(self.near) or not len(z):
             return z
-        if isinstance(self.kalman, NotApplicable):
+        if isinstance(self.exact, NotApplicable):
             return self.pilot.z
         return finite_point(z, self._exact, np.random.default_rng(self.root))
 
@@ -110,9 +116,9 @@ class Setup:
 
     def _exact(self, z: np.ndarray) -> float:
         theta, log_prior = self.space.parameters(z)
-        if log_prior == -np.inf or isinstance(self.kalman, NotApplicable):
+        if log_prior == -np.inf or isinstance(self.exact, NotApplicable):
             return -np.inf
-        return self.kalman.log_likelihood(self.problem.experiments, theta)
+        return self.exact.log_likelihood(self.problem.experiments, theta)
 
     def seed(self, *path: int) -> np.random.SeedSequence:
         """A seed for one part of a climb."""

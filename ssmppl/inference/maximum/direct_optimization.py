@@ -1,7 +1,7 @@
 """Direct optimisation: quasi-Newton ascent of the log-likelihood on the unconstrained scale.
 
-Schön et al. (2015), section on direct optimisation. On linear Gaussian models the likelihood and
-its score come from the Kalman filter and its sensitivities, and Newton steps with the observed
+Schön et al. (2015), section on direct optimisation. On linear Gaussian models and on those of
+finitely many states the likelihood and its score are exact, and Newton steps with the observed
 information polish the result; for one scalar state see `smooth_likelihood.py`.
 """
 
@@ -16,7 +16,7 @@ from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.exact_score import exact_score
-from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import ExactModel, filter_name
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
@@ -38,27 +38,27 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
     check_count("particles", method.particles, 2)
     check_count("averages", method.averages, 2)
     check_count("steps", method.steps, 1)
-    if isinstance(setup.kalman, NotApplicable):
+    if isinstance(setup.exact, NotApplicable):
         reason = smooth_filter_applies(setup.problem.trace)
         if reason is not None:
             raise ArgumentError(
                 f"DirectOptimization needs a linear Gaussian model, or one scalar state: "
-                f"{setup.kalman.reason}; {reason.reason}",
+                f"{setup.exact.reason}; {reason.reason}",
                 fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
-                where=reason.where or setup.kalman.where,
+                where=reason.where or setup.exact.where,
             )
         return smooth_likelihood.climb(setup, method)
-    return ExactClimb(setup, setup.kalman, method).run()
+    return ExactClimb(setup, setup.exact, method).run()
 
 
 class ExactClimb:
     """Ascent of an exact log-likelihood with its exact score."""
 
-    def __init__(self, setup: Setup, kalman: KalmanModel, method: DirectOptimization):
-        self.setup, self.kalman, self.method = setup, kalman, method
+    def __init__(self, setup: Setup, model: ExactModel, method: DirectOptimization):
+        self.setup, self.model, self.method = setup, model, method
         self.experiments = setup.problem.experiments
         free = free_components(setup.problem.trace, setup.held)
-        self.exact = exact_score(kalman, self.experiments, free, setup.space.theta)
+        self.exact = exact_score(model, self.experiments, free, setup.space.theta)
         self.best, self.best_value = np.empty(0), -np.inf
         self.iterates: list[np.ndarray] = []
         self.evaluations = 0
@@ -91,12 +91,12 @@ class ExactClimb:
         point = self.setup.chart.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
-            "likelihood": "exact, by the Kalman filter", "restarts": restarts,
+            "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
         }  # fmt: skip
         if self.exact.differences:
             report["central_differences"] = self.exact.differences
         return Ascent(
-            point.theta, self.kalman.log_likelihood(self.experiments, point.theta),
+            point.theta, self.model.log_likelihood(self.experiments, point.theta),
             np.array(self.iterates), report, interrupted=interrupted,
         )  # fmt: skip
 
@@ -160,11 +160,11 @@ class ExactClimb:
         return _curvature(self.setup, self.exact, z)
 
 
-def observed_information(setup: Setup, kalman: KalmanModel, z: np.ndarray) -> np.ndarray:
+def observed_information(setup: Setup, model: ExactModel, z: np.ndarray) -> np.ndarray:
     """Minus the second derivatives of the objective in z (F,), (F, F), by the exact score."""
     free = free_components(setup.problem.trace, setup.held)
     theta = setup.chart.at(z).theta
-    return _curvature(setup, exact_score(kalman, setup.problem.experiments, free, theta), z)
+    return _curvature(setup, exact_score(model, setup.problem.experiments, free, theta), z)
 
 
 def _curvature(setup: Setup, exact: Any, z: np.ndarray) -> np.ndarray:

@@ -55,7 +55,7 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
     theta = setup.space.parameters(setup.start)[0]
     proposal = method.proposal
     if proposal == "auto":
-        proposal = choose(problem, theta, kalman=False).name
+        proposal = choose(problem, theta, exact=False).name
     problem.proposal(proposal)
     settings = FilterSettings(int(method.particles), proposal)
     each = -(-method.trajectories // method.runs)

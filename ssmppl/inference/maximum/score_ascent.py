@@ -103,7 +103,7 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     theta, _ = setup.space.parameters(start)
     proposal = method.proposal
     if proposal == "auto":
-        proposal = choose(setup.problem, theta, kalman=False).name
+        proposal = choose(setup.problem, theta, exact=False).name
     settings = settle(setup.problem, theta, counts["particles"], proposal)
     smoothing = Smoothing(settings, counts["trajectories"], method.kernel)
 

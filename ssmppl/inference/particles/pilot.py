@@ -19,7 +19,7 @@ from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.exact.kalman import kalman_log_likelihood
+from ssmppl.inference.exact.models import EXACT, exact_log_likelihood
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     log_likelihood_estimate,
@@ -179,12 +179,13 @@ def climb_to_mode(
 def pilot_likelihood(
     problem: Problem, proposal: str
 ) -> Callable[[np.ndarray, np.random.SeedSequence], float]:
-    """(theta, seed) -> log p(y | theta): exact for "kalman", else a particle filter's estimate.
+    """(theta, seed) -> log p(y | theta): exact for those of `EXACT`, else a particle filter's
+    estimate.
 
     -inf where it is zero, or where it does not exist.
     """
-    if proposal == "kalman":
-        return lambda theta, _: kalman_log_likelihood(problem.trace, problem.experiments, theta)
+    if proposal in EXACT:
+        return lambda theta, _: exact_log_likelihood(problem.trace, problem.experiments, theta)
     settings = FilterSettings(PILOT_PARTICLES, proposal)
 
     def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
@@ -200,9 +201,9 @@ def averaged_density(
     space: Region, seed: np.random.SeedSequence, proposal: str, repeats: int
 ) -> Callable[[np.ndarray], float]:
     """The log posterior as a function of the coordinates, from the mean of several estimates of the
-    likelihood with common random numbers (exact for "kalman")."""
+    likelihood with common random numbers (exact for `EXACT`)."""
     problem = space.problem
-    exact = pilot_likelihood(problem, proposal) if proposal == "kalman" else None
+    exact = pilot_likelihood(problem, proposal) if proposal in EXACT else None
     settings = FilterSettings(PILOT_PARTICLES, proposal)
 
     def averaged(v: np.ndarray) -> float:

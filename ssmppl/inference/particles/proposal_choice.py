@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.analysis.proposals import Proposal
-from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.codegen.module import PARTICLE, level_of
 from ssmppl.codegen.render import depends, is_small_power, topological_until
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.expr import Expr
+from ssmppl.inference.exact.models import exact_model, filter_of
 from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
 from ssmppl.inference.problem import Problem
 
@@ -96,16 +96,17 @@ _choices: dict[tuple, Choice] = {}
 
 
 def choose(
-    problem: Problem, theta: np.ndarray, kalman: bool = True, *, whole: bool = False
+    problem: Problem, theta: np.ndarray, exact: bool = True, *, whole: bool = False
 ) -> Choice:
-    """Kalman where the model is linear Gaussian, the user's proposal where there is one, else the
+    """The exact filter where there is one, the user's proposal where there is one, else the
     winner of a pilot at theta; remembered for each program and data.
 
     whole : only the likelihood of all the data, or a trajectory given all of them, is wanted. Then
     the twisted proposal may be chosen; few of its particles tell what was known at a single row.
     """
-    if kalman and not isinstance(linear_gaussian(problem.trace), NotApplicable):
-        return Choice("kalman", {})
+    found = exact_model(problem.trace)
+    if exact and not isinstance(found, NotApplicable):
+        return Choice(filter_of(found), {})
     if "user" in problem.program.proposals:
         return Choice("user", {})
     candidates = {

@@ -1,0 +1,114 @@
+"""Models of finitely many values, and their answers by enumerating every path."""
+
+import itertools
+
+import numpy as np
+from scipy import stats
+
+import ssmppl as ssm
+from ssmppl.analysis.density import Missing, terms
+from ssmppl.analysis.finite import finite_states
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.inference.exact.kalman_matrices import values_of
+from ssmppl.language.trace import previous, seen
+
+
+def weather():
+    """Two values, Gaussian readings, three parameters."""
+    model = ssm.Model("weather")
+    model.prior(lambda: {"stay": ssm.Beta(2, 1), "leave": ssm.Beta(1, 2), "m": ssm.Normal(1, sd=1)})
+    model.initial(lambda leave: {"z": ssm.Bernoulli(leave)})
+    model.transition(lambda z, stay, leave: {"z": ssm.Bernoulli(np.where(z, stay, leave))})
+    model.observation(lambda z, m: {"y": ssm.Normal(m * z, sd=0.8)})
+    return model
+
+
+def patches():
+    """Three values whose moves depend on an input and on time; counts and a vector that may be
+    missing in part."""
+    model = ssm.Model("patches", inputs=("u",))
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1), "rate": ssm.Gamma(2, rate=1)})
+    model.initial(lambda: {"k": ssm.Categorical(np.array([0.2, 0.5, 0.3]))})
+
+    def transition(k, u, t, a):
+        odds = np.exp(np.stack([a * u, 0.3 * k, 0.1 * t]))
+        return {"k": ssm.Categorical(odds / np.sum(odds))}
+
+    model.transition(transition)
+    model.observation(lambda k, rate: {
+        "n": ssm.Poisson(rate * (k + 0.5)),
+        "y": ssm.MvNormal(np.stack([k, -k]), covariance=np.array([[1.0, 0.6], [0.6, 2.0]])),
+    })  # fmt: skip
+    return model
+
+
+def second_order():
+    """A chain that remembers two steps, by a lagged copy; and one that hears its observation."""
+    model = ssm.Model("second order")
+    model.prior(lambda: {"p": ssm.Beta(1, 1), "e": ssm.Beta(1, 4)})
+    model.initial(lambda: {"now": ssm.Bernoulli(0.5), "before": ssm.Dirac(0.0)})
+    model.transition(lambda now, before, y, p, e: {
+        "now": ssm.Bernoulli(np.where(now + before + y >= 2, p, 1.0 - p)), "before": ssm.Dirac(now),
+    })  # fmt: skip
+    model.observation(lambda now, e: {"y": ssm.Bernoulli(np.where(now, 1.0 - e, e))})
+    return model
+
+
+MODELS = {
+    "weather": (weather, [0.9, 0.2, 1.4]),
+    "patches": (patches, [0.7, 1.3]),
+    "second order": (second_order, [0.8, 0.15]),
+}
+
+
+def data_of(name, steps=5):
+    rng = np.random.default_rng(len(name))
+    if name == "weather":
+        y = rng.normal(0.5, 1.0, steps)
+        y[2] = np.nan
+        return {"y": y}
+    if name == "patches":
+        y, n = rng.normal(0.0, 1.5, (steps, 2)), rng.poisson(2.0, steps).astype(float)
+        y[1, 0] = y[3] = n[0] = np.nan
+        return {"n": n, "y": y, "u": rng.standard_normal(steps)}
+    return {"y": rng.integers(0, 2, steps).astype(float)}
+
+
+def enumerated(traced, e, theta):
+    """(paths (M, T, D), log p(path, y) (M,)): every path there is, density by density."""
+    form = finite_states(traced)
+    assert not isinstance(form, NotApplicable)
+    values, missing = form.values, Missing(partial=e.partial)
+    given = values_of(traced, e, theta)
+    paths, total = [], []
+    for index in itertools.product(range(len(values)), repeat=e.steps):
+        path, log_p = values[list(index)], 0.0
+        for t in range(e.steps):
+            env = {s: (v[t] if np.ndim(v) else v) for s, v in given.items()}
+            env |= dict(zip(traced.observation_symbols, e.y[t], strict=True))
+            env |= {seen(s): m for s, m in zip(traced.observation_symbols, e.seen[t], strict=True)}
+            env |= dict(zip(traced.state_symbols, path[t], strict=True))
+            if t:
+                before = [previous(s) for s in traced.state_symbols]
+                env |= dict(zip(before, path[t - 1], strict=True))
+            for role in ("transition" if t else "initial", "observation"):
+                for term in terms(traced, role, missing):
+                    log_p += float(evaluate(term.guarded(), env))
+        paths.append(path)
+        total.append(log_p)
+    return np.array(paths), np.array(total)
+
+
+def independent(theta, y):
+    """log p(y) of `weather` by matrices written by hand."""
+    stay, leave, m = theta
+    law = np.array([1.0 - leave, leave])
+    move, total = np.array([[1.0 - leave, leave], [1.0 - stay, stay]]), 0.0
+    for t, value in enumerate(y):
+        law = law @ move if t else law
+        if np.isfinite(value):
+            law = law * stats.norm.pdf(value, [0.0, m], 0.8)
+        total += np.log(law.sum())
+        law = law / law.sum()
+    return total

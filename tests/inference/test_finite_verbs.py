@@ -1,0 +1,144 @@
+"""The verbs on models of finitely many states: exact wherever they can be."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.optimize import minimize
+
+import ssmppl as ssm
+from ssmppl.data import bind
+from ssmppl.errors import ArgumentError
+from ssmppl.inference.exact.hidden_markov import hidden_markov
+from ssmppl.language.trace import trace
+from tests.inference.finite_models import MODELS, independent, second_order, weather
+from tests.statistics.checks import LEVEL, seed_of
+
+NAMES = ("stay", "leave", "m")
+VALUES = dict(zip(NAMES, MODELS["weather"][1], strict=True))
+
+
+@pytest.fixture(scope="module")
+def data():
+    y = ssm.simulate(weather(), VALUES, steps=80, seed=seed_of("weather"))["y"].values[0]
+    y[[5, 6, 30]] = np.nan
+    return {"y": y}
+
+
+def test_likelihoods_are_exact(data):
+    exact = independent(list(VALUES.values()), data["y"])
+    found = ssm.log_likelihood(weather(), data, VALUES, repeats=2)
+    np.testing.assert_allclose(found, exact, rtol=1e-12)
+    particles = ssm.log_likelihood(
+        weather(), data, VALUES, proposal="bootstrap", particles=500, repeats=400,
+        seed=seed_of("finite"),
+    )  # fmt: skip
+    share = np.exp(particles - exact)
+    limit = stats.norm.isf(LEVEL / 2)
+    assert abs(share.mean() - 1.0) < limit * share.std() / np.sqrt(len(share))
+    with pytest.raises(ArgumentError, match="needs a linear Gaussian model"):
+        ssm.log_likelihood(weather(), data, VALUES, proposal="kalman")
+    level = ssm.Model("level")
+    level.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    level.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    level.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    with pytest.raises(ArgumentError, match=r"model of finite states: .*continuum"):
+        ssm.log_likelihood(level, data, {}, proposal="forward")
+    with pytest.raises(ArgumentError, match="ForwardBackward needs states of finitely many"):
+        ssm.smooth(level, data, {}, ssm.ForwardBackward())
+    with pytest.raises(ArgumentError, match=r"call ssm\.smooth"):
+        ssm.particle_filter(weather(), data, VALUES, proposal="forward")
+
+
+def test_smoothing_is_exact(data):
+    (e,) = bind(trace(weather()), data)
+    law = hidden_markov(trace(weather())).probabilities(e, np.array(list(VALUES.values())))
+    found = ssm.smooth(weather(), data, VALUES, quantiles=(0.25, 0.5))
+    assert found.attrs["method"] == "ForwardBackward"
+    np.testing.assert_allclose(found["z"].values[0], law[:, 1])
+    np.testing.assert_allclose(found["z_sd"].values[0] ** 2, law[:, 1] * law[:, 0], atol=1e-12)
+    for k, level in enumerate((0.25, 0.5)):
+        wanted = (law[:, 0] < level).astype(float)
+        np.testing.assert_array_equal(found["z_quantile"].values[0, :, k], wanted)
+    drawn = ssm.smooth(weather(), data, VALUES, trajectories=4000, seed=1)["z"]
+    assert drawn.dims == ("trajectory", "time")
+    error = np.sqrt(law[:, 1] * law[:, 0] / 4000)
+    off = np.abs(drawn.mean("trajectory").values - law[:, 1])
+    assert np.all(off <= stats.norm.isf(LEVEL / 160) * error + 1e-3)
+    with pytest.raises(ArgumentError, match="ForwardBackward is exact and has none"):
+        ssm.smooth(weather(), data, VALUES, "forward_backward", particles=10)
+
+
+def test_the_score_and_the_maximum(data):
+    found = ssm.score(weather(), data, VALUES)
+    assert "forward and backward" in found.attrs["method"]
+    h = 1e-5
+    for i, name in enumerate(NAMES):
+        ends = [independent(np.array(list(VALUES.values())) + s * h * np.eye(3)[i], data["y"])
+                for s in (1, -1)]  # fmt: skip
+        assert found.gradient[name] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-5)
+    best = ssm.maximize(weather(), data, start=VALUES, seed=1)
+    assert best.attrs["method"] == "DirectOptimization"
+    assert "forward algorithm" in best.attrs["likelihood"]
+    top = minimize(
+        lambda v: -independent(v, data["y"]), list(VALUES.values()), method="L-BFGS-B",
+        bounds=[(1e-3, 1 - 1e-3)] * 2 + [(None, None)], options={"ftol": 1e-14},
+    )  # fmt: skip
+    assert best.log_likelihood == pytest.approx(-top.fun, abs=1e-6)
+
+
+def posterior_by_grid(y):
+    """Means and standard deviations of (stay, leave, m), by the midpoint rule."""
+    unit = (np.arange(40) + 0.5) / 40
+    m = np.linspace(-0.5, 3.0, 60)
+    grid = np.array(np.meshgrid(unit, unit, m, indexing="ij")).reshape(3, -1)
+    law = np.stack([1.0 - grid[1], grid[1]], axis=1)
+    density = stats.norm.pdf(y[None, :, None], np.stack([0 * m, m]).T[:, None, :], 0.8)
+    density = np.where(np.isnan(density), 1.0, density)  # (60, T, 2)
+    which = np.tile(np.arange(60), 1600)
+    total = np.log(grid[0]) + np.log(1 - grid[1]) - 0.5 * (grid[2] - 1.0) ** 2
+    for t in range(len(y)):
+        if t:
+            up = law[:, 0] * grid[1] + law[:, 1] * grid[0]
+            law = np.stack([1.0 - up, up], axis=1)
+        law = law * density[which, t]
+        norm = law.sum(axis=1)
+        total, law = total + np.log(norm), law / norm[:, None]
+    w = np.exp(total - total.max())
+    w /= w.sum()
+    mean = grid @ w
+    return mean, np.sqrt((grid - mean[:, None]) ** 2 @ w)
+
+
+def test_gibbs_is_chosen_and_has_the_right_posterior(data):
+    """Every parameter has a closed-form conditional: Beta rows of the transition, Normal mean."""
+    idata = ssm.sample(weather(), data, draws=3000, warmup=200, seed=5, progress=False)
+    attrs = idata["posterior"].attrs
+    assert attrs["method"] == "Gibbs"
+    assert "finitely many states" in attrs["method_reason"]
+    table = ssm.summary(idata)
+    mean, sd = posterior_by_grid(data["y"])
+    assert np.all(np.abs(table["mean"] - mean) < 4 * table["mcse_mean"] + 1e-3)
+    assert np.all(np.abs(table["sd"] - sd) < 4 * table["mcse_sd"] + 1e-3)
+    assert set(np.unique(idata["posterior"]["z"].values)) == {0.0, 1.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [ssm.MetropolisHastings(), ssm.PGAS(10)])
+def test_other_samplers_agree(data, method):
+    idata = ssm.sample(weather(), data, method, draws=4000, warmup=500, seed=6, progress=False)
+    table = ssm.summary(idata)
+    mean, sd = posterior_by_grid(data["y"])
+    assert np.all(np.abs(table["mean"] - mean) < 4 * table["mcse_mean"] + 1e-3)
+    assert np.all(np.abs(table["sd"] - sd) < 4 * table["mcse_sd"] + 1e-3)
+
+
+def test_evidence_without_parameters_is_exact(data):
+    found = ssm.evidence(weather(), data, fixed=VALUES)
+    assert found.log_evidence == pytest.approx(independent(list(VALUES.values()), data["y"]))
+    assert found.standard_error == 0.0
+
+
+def test_explain_says_so():
+    text = str(ssm.explain(second_order()))
+    assert "4 combinations of values: the likelihood is exact, by the forward algorithm" in text
+    assert "ForwardBackward: the model is of finitely many states" in " ".join(text.split())

@@ -1,0 +1,147 @@
+"""Exact passes over finite states against the enumeration of all paths."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+
+import ssmppl as ssm
+from ssmppl.analysis.finite import MOST, finite_states
+from ssmppl.data import bind
+from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.inference.exact.hidden_markov import hidden_markov
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
+from ssmppl.language.trace import trace
+from tests.inference.finite_models import MODELS, data_of, enumerated, independent, weather
+from tests.statistics.checks import LEVEL, seed_of
+
+
+@pytest.fixture(scope="module", params=sorted(MODELS))
+def case(request):
+    build, theta = MODELS[request.param]
+    traced = trace(build())
+    (e,) = bind(traced, data_of(request.param))
+    theta = np.array(theta)
+    return request.param, traced, e, theta, *enumerated(traced, e, theta)
+
+
+def test_the_likelihood_is_the_sum_over_all_paths(case):
+    _, traced, e, theta, _, log_p = case
+    model = hidden_markov(traced)
+    assert model.log_likelihood([e, e], theta) == pytest.approx(2.0 * logsumexp(log_p), rel=1e-12)
+
+
+def test_by_matrices_written_by_hand():
+    theta, data = np.array([0.9, 0.2, 1.4]), data_of("weather", 200)
+    traced = trace(weather())
+    found = hidden_markov(traced).log_likelihood(bind(traced, data), theta)
+    assert found == pytest.approx(independent(theta, data["y"]), rel=1e-12)
+
+
+def test_moments_are_those_of_all_paths(case):
+    _, traced, e, theta, paths, log_p = case
+    w = np.exp(log_p - logsumexp(log_p))
+    found = hidden_markov(traced).smooth(e, theta)
+    mean = np.einsum("m,mtd->td", w, paths)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-12)
+    away = paths - mean
+    np.testing.assert_allclose(
+        found.covariance, np.einsum("m,mti,mtj->tij", w, away, away), atol=1e-12
+    )
+    cross = np.einsum("m,mti,mtj->tij", w, away[:, 1:], away[:, :-1])
+    np.testing.assert_allclose(found.cross[1:], cross, atol=1e-12)
+    assert found.log_likelihood == pytest.approx(logsumexp(log_p), rel=1e-12)
+
+
+def test_the_filter_knows_no_later_rows(case):
+    """Its laws at row t are the smoothed ones of the data up to t."""
+    name, traced, e, theta, *_ = case
+    model = hidden_markov(traced)
+    found = model.filter(e, theta)
+    full = data_of(name)
+    for t in (1, 3, e.steps):
+        (short,) = bind(traced, {n: v[:t] for n, v in full.items()})
+        np.testing.assert_allclose(found.filtered[t - 1], model.probabilities(short, theta)[-1],
+                                   atol=1e-12)  # fmt: skip
+        value = model.log_likelihood([short], theta)
+        assert found.log_increments[:t].sum() == pytest.approx(value, rel=1e-12)
+
+
+def test_draws_are_paths_with_their_probabilities(case):
+    """Chi-square over all paths that can be, the rare ones together."""
+    name, traced, e, theta, paths, log_p = case
+    draws, stream = 20_000, random_state(seed_sequence(seed_of("draws", name)))
+    drawn = hidden_markov(traced).draw(e, theta, stream, draws)
+    number = {p.tobytes(): i for i, p in enumerate(paths)}
+    count = np.bincount([number[p.tobytes()] for p in drawn], minlength=len(paths))
+    expected = draws * np.exp(log_p - logsumexp(log_p))
+    assert np.all(count[expected == 0.0] == 0)
+    common = expected >= 10.0
+    seen = np.append(count[common], count[~common].sum())
+    wanted = np.append(expected[common], expected[~common].sum())
+    kept = wanted > 0.0
+    statistic = np.sum((seen[kept] - wanted[kept]) ** 2 / wanted[kept])
+    assert stats.chi2.sf(statistic, kept.sum() - 1) > LEVEL
+
+
+def test_the_score_is_the_likelihoods_derivative(case):
+    _, traced, e, theta, *_ = case
+    model, h = hidden_markov(traced), 1e-5
+    value, gradient = model.score([e], theta)
+    assert value == pytest.approx(model.log_likelihood([e], theta), rel=1e-13)
+    for i in range(len(theta)):
+        step = h * np.eye(len(theta))[i]
+        ends = [model.log_likelihood([e], theta + s * step) for s in (2, 1, -1, -2)]
+        slope = (-ends[0] + 8 * ends[1] - 8 * ends[2] + ends[3]) / (12 * h)
+        assert gradient[i] == pytest.approx(slope, rel=1e-7, abs=1e-8)
+    free = np.zeros(len(theta), bool)
+    free[0] = True
+    assert model.score([e], theta, free)[1].tolist() == [gradient[0], *[0.0] * (len(theta) - 1)]
+    second = model.information([e], theta)
+    ends = [model.score([e], theta + s * h * np.eye(len(theta))[0])[1] for s in (1, -1)]
+    np.testing.assert_allclose(second[0], -(ends[0] - ends[1]) / (2 * h), rtol=1e-5, atol=1e-6)
+
+
+def test_what_cannot_be_is_said():
+    """A reading that no value allows."""
+    model = ssm.Model("strict")
+    model.initial(lambda: {"z": ssm.Bernoulli(0.5)})
+    model.transition(lambda z: {"z": ssm.Bernoulli(0.5)})
+    model.observation(lambda z: {"y": ssm.Uniform(z, z + 1.0)})
+    traced = trace(model)
+    (e,) = bind(traced, {"y": [0.5, 1.5, 2.5, 0.5]})
+    found = hidden_markov(traced)
+    assert found.log_likelihood([e], np.empty(0)) == -np.inf
+    with pytest.raises(SamplingError, match=r"no value of the states is possible at t=3"):
+        found.smooth(e, np.empty(0))
+
+
+def of(transition, initial=None):
+    model = ssm.Model("made")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda: initial or {"z": ssm.Bernoulli(0.5)})
+    model.transition(transition)
+    model.observation(lambda z: {"y": ssm.Normal(z, sd=1)})
+    return finite_states(trace(model))
+
+
+def test_which_states_are_finite():
+    two = of(lambda z: {"z": ssm.Truncated(ssm.Poisson(2.0 + z), lower=1, upper=3)})
+    assert two.values.ravel().tolist() == [0.0, 1.0, 2.0, 3.0]
+    counter = of(
+        lambda z, d: {
+            "z": ssm.Bernoulli(0.3), "d": ssm.Dirac(np.where(z, 0.0, np.minimum(d + 1, 4))),
+        },
+        {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(0.0)},
+    )  # fmt: skip
+    assert np.unique(counter.values[:, 1]).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    reasons = {
+        "continuum": of(lambda z: {"z": ssm.Normal(z, sd=1)}),
+        "infinitely many": of(lambda z: {"z": ssm.Poisson(z + 1)}),
+        "depend on a": of(lambda z, a: {"z": ssm.Dirac(z + a)}),
+        "go on and on": of(lambda z: {"z": ssm.Dirac(z + 1)}),
+        f"more than {MOST}": of(lambda z: {"z": ssm.Binomial(100, 0.5)}),
+    }
+    for words, found in reasons.items():
+        assert isinstance(found, NotApplicable)
+        assert words in found.reason
