@@ -86,6 +86,50 @@ def test_the_score_and_the_maximum(data):
     assert best.log_likelihood == pytest.approx(-top.fun, abs=1e-6)
 
 
+def tied():
+    """leave = 1 - stay^2, which no family holds."""
+    model = ssm.Model("tied")
+    model.prior(lambda: {"stay": ssm.Beta(2, 2), "m": ssm.Normal(1, sd=1)})
+    model.initial(lambda: {"z": ssm.Bernoulli(0.5)})
+    model.transition(lambda z, stay: {"z": ssm.Bernoulli(np.where(z, stay, 1.0 - stay**2))})
+    model.observation(lambda z, m: {"y": ssm.Normal(m * np.exp(z), sd=0.8)})
+    return model
+
+
+def logistic():
+    """Odds that change with time: the density does not separate."""
+    model = ssm.Model("logistic")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=2), "b": ssm.Normal(0, sd=2)})
+    model.initial(lambda: {"z": ssm.Bernoulli(0.5)})
+    model.transition(lambda z, t, a, b: {
+        "z": ssm.Bernoulli(1.0 / (1.0 + np.exp(-a * (2.0 * z - 1.0) - b * t / 40.0)))
+    })  # fmt: skip
+    model.observation(lambda z: {"y": ssm.Normal(z, sd=0.4)})
+    return model
+
+
+EM_CASES = {"closed form": weather, "Newton": tied, "BFGS": logistic}
+
+
+@pytest.mark.parametrize("step", EM_CASES)
+@pytest.mark.parametrize("objective", ["likelihood", "posterior"])
+def test_em_reaches_the_same_top(data, step, objective):
+    """Baum and Welch's steps, of which none falls."""
+    model = EM_CASES[step]()
+    plain = ssm.EM(accelerate=False, iterations=30)
+    slow = ssm.maximize(model, data, plain, objective=objective, seed=1)
+    assert step in slow.attrs["m_step"]
+    if objective == "likelihood":
+        at = [{n: float(slow.iterates[n][k]) for n in slow.parameters} for k in range(0, 30, 3)]
+        path = [float(ssm.log_likelihood(model, data, v)[0]) for v in at]
+        assert np.all(np.diff(path) > -1e-9)
+    found = ssm.maximize(model, data, ssm.EM(), objective=objective, seed=1)
+    best = ssm.maximize(model, data, objective=objective, seed=1)
+    assert found.attrs["converged"]
+    for name, value in best.parameters.items():
+        assert found.parameters[name] == pytest.approx(value, abs=1e-4)
+
+
 def posterior_by_grid(y):
     """Means and standard deviations of (stay, leave, m), by the midpoint rule."""
     unit = (np.arange(40) + 0.5) / 40

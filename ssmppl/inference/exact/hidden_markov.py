@@ -8,7 +8,7 @@ the interpreter, over all values and rows at once, and handed to the compiled pa
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -89,6 +89,15 @@ class HiddenMarkov:
         """(T, K) of each combination of values given all data."""
         return self._smoothed(self.filter(experiment, theta), pairs=False)[0]
 
+    def laws(self, experiment: Experiment, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(T, K) of x_t, and (T, K, K) of (x_{t-1}, x_t), row 0 zero, given all data.
+
+        Raises
+        ------
+        SamplingError : as of `filter`.
+        """
+        return self._smoothed(self.filter(experiment, theta), pairs=True)
+
     def smooth(self, experiment: Experiment, theta: np.ndarray) -> SmoothedMoments:
         """Moments of the states given all data.
 
@@ -156,13 +165,10 @@ class HiddenMarkov:
                 return -np.inf, np.where(wanted, np.nan, 0.0)
             law, pairs = self._smoothed(found, pairs=True)
             total += float(found.log_increments.sum())
-            slopes = [
-                self._expected(e, theta, "initial", s, law[:1])
-                + self._expected(e, theta, "transition", s, pairs)
-                + self._expected(e, theta, "observation", s, law)
-                for s in symbols
-            ]
-            gradient[wanted] += np.array(slopes)
+            for role in ("initial", "transition", "observation"):
+                own = pairs if role == "transition" else law
+                slopes = [self.density(role, e, s) for s in symbols]
+                gradient[wanted] += self.expected(e, theta, role, slopes, own)
         return total, gradient
 
     def information(
@@ -189,9 +195,9 @@ class HiddenMarkov:
     def _forward(self, e: Experiment, theta: np.ndarray) -> Filtered | int:
         """The forward pass, or the row at which it came to an end."""
         size = len(self.values)
-        start = np.exp(self._over_values(self._density("initial", e), e, theta, "initial")[0])
-        move = np.exp(self._over_values(self._density("transition", e), e, theta, "transition"))
-        log_g = self._over_values(self._density("observation", e), e, theta, "observation")
+        start = np.exp(self._over_values(self.density("initial", e), e, theta, "initial")[0])
+        move = np.exp(self._over_values(self.density("transition", e), e, theta, "transition"))
+        log_g = self._over_values(self.density("observation", e), e, theta, "observation")
         log_g = np.ascontiguousarray(np.broadcast_to(log_g, (e.steps, size)))
         out = Filtered(
             np.empty(e.steps), np.empty((e.steps, size)), np.empty((e.steps, size)), move
@@ -207,7 +213,7 @@ class HiddenMarkov:
         kernel.backward(found.move, found.predicted, found.filtered, law, both)
         return law, both
 
-    def _density(self, role: str, e: Experiment, by: Expr | None = None) -> Expr:
+    def density(self, role: str, e: Experiment, by: Expr | None = None) -> Expr:
         """The log density of a role, or its derivative by a parameter."""
         missing = Missing(partial=e.partial)
         key = f"{role} {sorted(e.partial)}"
@@ -223,12 +229,18 @@ class HiddenMarkov:
             self._densities[slope] = differentiate([self._densities[key]], by)[0]
         return self._densities[slope]
 
-    def _expected(
-        self, e: Experiment, theta: np.ndarray, role: str, by: Expr, law: np.ndarray
-    ) -> float:
-        """Sum over rows and values of d log density / d by, weighed; 0 where the weight is."""
-        slope = self._over_values(self._density(role, e, by), e, theta, role)
-        return float(np.sum(law * np.where(law > 0.0, slope, 0.0)))
+    def expected(
+        self, e: Experiment, theta: np.ndarray, role: str, expressions: Sequence[Expr],
+        law: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
+        """Sums over rows and values of each expression, weighed by a law of `laws`: of pairs for
+        "transition". What has no weight does not count, be it infinite."""
+        law = law[:1] if role == "initial" else law
+        out = np.empty(len(expressions))
+        for k, expression in enumerate(expressions):
+            values = self._over_values(expression, e, theta, role)
+            out[k] = np.sum(law * np.where(law > 0.0, values, 0.0))
+        return out
 
     def _over_values(
         self, expression: Expr, e: Experiment, theta: np.ndarray, role: str

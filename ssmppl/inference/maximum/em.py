@@ -1,9 +1,9 @@
-"""Expectation maximisation of linear Gaussian models, every step of it exact.
+"""Expectation maximisation where the smoother is exact, and so every step.
 
 Dempster, Laird and Rubin (1977); Shumway and Stoffer (1982); Schön et al. (2015), section on EM.
-The E-step takes the smoother's moments (`analysis/expectation.py`), the M-step is derived
-(`analysis/mstep.py`). Where the densities do not separate, Q is climbed as it stands, by BFGS with
-its symbolic gradient, evaluated over all rows at once.
+The E-step takes the smoother's moments (`analysis/expectation.py`; for finite states see
+`baum_welch.py`), the M-step is derived (`analysis/mstep.py`). Where the densities do not separate,
+Q is climbed as it stands, by BFGS with its symbolic gradient, evaluated over all rows at once.
 
 EM nears its limit by a constant factor at each step, close to one where the states tell much more
 of the parameters than the data do. So its steps are extrapolated by SQUAREM (Varadhan and Roland
@@ -17,7 +17,6 @@ when to stop.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ssmppl.analysis.climber import Unconstrained
 from ssmppl.analysis.expectation import (
@@ -32,8 +31,12 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import ExactModel, filter_name
 from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.baum_welch import FiniteSteps
+from ssmppl.inference.maximum.expected_climb import climbed
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods import EM
 from ssmppl.inference.particles.filtering import check_count
@@ -49,18 +52,19 @@ def climb(setup: Setup, method: EM) -> Ascent:
 
     Raises
     ------
-    ArgumentError : the model is not linear and Gaussian, or its states cannot be the missing data.
+    ArgumentError : the model has no exact smoother, or its states cannot be the missing data.
     """
     check_count("iterations", method.iterations, 1)
     if not method.tolerance > 0.0:
         raise ArgumentError(f"tolerance={method.tolerance!r}", fix="give a positive number")
-    if isinstance(setup.kalman, NotApplicable):
+    if isinstance(setup.exact, NotApplicable):
         raise ArgumentError(
-            f"EM needs a linear Gaussian model: {setup.kalman.reason}",
+            "EM needs a linear Gaussian model, or one of finitely many states: "
+            f"{setup.exact.reason}",
             fix="use ssm.ParticleEM() or ssm.PSAEM()",
-            where=setup.kalman.where,
+            where=setup.exact.where,
         )
-    return _Climb(setup, setup.kalman, method).run()
+    return _Climb(setup, setup.exact, method).run()
 
 
 class ExactSteps:
@@ -117,7 +121,7 @@ class ExactSteps:
     def _climbed(self, theta: np.ndarray) -> np.ndarray:
         """The M-step on Q as it stands."""
         assert self.density is not None
-        chart, symbols = self.setup.chart, self.setup.problem.trace.parameter_symbols
+        symbols = self.setup.problem.trace.parameter_symbols
         density, slopes = self.density, self.density.slopes
         series = [
             (self._values(e, rows, theta), e.steps)
@@ -125,12 +129,8 @@ class ExactSteps:
         ]
         place = [i for i, s in enumerate(symbols) if s.data[1] not in self.setup.held]
 
-        def at(z: np.ndarray) -> tuple[float, np.ndarray]:
-            """-Q and its derivatives in z."""
-            point = chart.at(z)
-            if not np.all(np.isfinite(point.theta)):
-                return np.inf, np.zeros(len(z))
-            here = dict(zip(symbols, point.theta, strict=True))
+        def expected(at: np.ndarray) -> tuple[float, np.ndarray]:
+            here = dict(zip(symbols, at, strict=True))
             total, gradient = 0.0, np.zeros(len(symbols))
             for k, (values, steps) in enumerate(series):
                 for role, e in density.summands.items():
@@ -140,19 +140,9 @@ class ExactSteps:
                     found = summed(both, {**values, **here}, role, steps)
                     total += found[0]
                     gradient[place] += found[1:] if len(found) > 1 else 0.0
-            if not np.isfinite(total) or not np.all(np.isfinite(gradient)):
-                return np.inf, np.zeros(len(z))
-            return -total, -point.pull(gradient)
+            return total, gradient
 
-        z = self.setup.space_at(theta)
-        before = at(z)[0]
-        with_slope = isinstance(slopes, dict)
-        found = minimize(
-            at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
-            method="BFGS" if with_slope else "Nelder-Mead",
-            options={"gtol": 1e-7} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},
-        )  # fmt: skip
-        return chart.at(found.x).theta if found.fun <= before else theta
+        return climbed(self.setup, theta, expected, isinstance(slopes, dict))
 
 
 def row_values(trace: Trace, experiment: Experiment) -> dict[Expr, np.ndarray]:
@@ -189,9 +179,13 @@ def summed(
 class _Climb:
     """The iteration; `best` never has a smaller objective than what came before it."""
 
-    def __init__(self, setup: Setup, kalman: KalmanModel, method: EM):
-        self.setup, self.kalman, self.method = setup, kalman, method
-        self.map = ExactSteps(setup, kalman)
+    def __init__(self, setup: Setup, model: ExactModel, method: EM):
+        self.setup, self.model, self.method = setup, model, method
+        self.map = (
+            FiniteSteps(setup, model)
+            if isinstance(model, HiddenMarkov)
+            else ExactSteps(setup, model)
+        )
         free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held]
         self.to_z = Unconstrained(setup.problem.trace, free)
         self.theta = setup.space.parameters(setup.start)[0].copy()
@@ -201,7 +195,7 @@ class _Climb:
 
     def objective(self, theta: np.ndarray) -> float:
         """log p(y | theta), with the log prior density for a posterior mode; -inf where none."""
-        value = self.kalman.log_likelihood(self.setup.problem.experiments, theta)
+        value = self.model.log_likelihood(self.setup.problem.experiments, theta)
         if self.setup.with_prior:
             value += float(self.setup.problem.program.entry("log_prior")(theta))
         return value if np.isfinite(value) else -np.inf
@@ -229,9 +223,9 @@ class _Climb:
             "m_step": str(self.map.step)
             if isinstance(self.map.step, MStep)
             else f"BFGS on the expected log density: {self.map.step.reason}",
-            "likelihood": "exact, by the Kalman filter",
+            "likelihood": f"exact, by {filter_name(self.model)}",
         }
-        likelihood = self.kalman.log_likelihood(self.setup.problem.experiments, self.theta)
+        likelihood = self.model.log_likelihood(self.setup.problem.experiments, self.theta)
         return Ascent(
             self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted
         )
