@@ -59,7 +59,7 @@ def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Row
     """The same of the true model, refitted to the first 70% of a set's rows."""
     keys = tuple(e["key"] for e in answer["effects"])
     strengths = {e["key"]: e["strength"] for e in answer["effects"]}
-    p = np.array(list(answer["parameters"].values()))
+    p = parameters(system, answer)
     found = fit(system, U, Y, keys, p, system.strengths(strengths), int(CONFIRM * len(Y)))
 
     def rows(data: pd.DataFrame, repeats: int) -> np.ndarray:
@@ -68,6 +68,11 @@ def reference(system: System, answer: dict, U: np.ndarray, Y: np.ndarray) -> Row
         return np.repeat(ll[None], repeats, axis=0)
 
     return rows
+
+
+def parameters(system: System, answer: dict) -> np.ndarray:
+    """(P,) true values in the system's order; an answer has its keys sorted."""
+    return np.array([answer["parameters"][name] for name in system.parameters])
 
 
 def arrays(system: System, data: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +87,7 @@ def share(
     cut = int(CONFIRM * len(data))
     parts = [rows(data, REPEATS)[:, cut:] for rows in (base, effect, true)]
     found = closed(*parts)
-    p = np.array(list(answer["parameters"].values()))
+    p = parameters(system, answer)
     e = system.strengths({x["key"]: x["strength"] for x in answer["effects"]})
     U, _ = arrays(system, data)
     total = np.zeros(2)

@@ -200,6 +200,22 @@ def measures(method: str, scored: Sequence[Scored], fresh: Shares | None = None)
 SPLIT_INSIDE = ("one-20", "one-50", "two-50")
 
 
+def by_system(scored: Sequence[Scored]) -> str:
+    """Sets with one effect, both levels together, system by system: a table of hits."""
+    tests: dict[str, Callable[[Scored], bool]] = {
+        "first": lambda s: s.right_first, "class first": lambda s: s.right_class,
+        "equation": lambda s: s.right_equation, "none of these, falsely": says_none,
+        "not detected": lambda s: not detected(s),
+    }  # fmt: skip
+    ones = [s for s in scored if s.cell in ("one-20", "one-50")]
+    lines = ["| system | sets | " + " | ".join(tests) + " |", "|---" * (len(tests) + 2) + "|"]
+    for name in dict.fromkeys(s.answer["system"] for s in ones):
+        own = [s for s in ones if s.answer["system"] == name]
+        hits = " | ".join(str(sum(map(test, own))) for test in tests.values())
+        lines.append(f"| {name} | {len(own)} | {hits} |")
+    return "\n".join(lines)
+
+
 def detected(s: Scored) -> bool:
     return s.record.verdict != "no measurable gap"
 
@@ -278,6 +294,7 @@ def main() -> None:
     parser.add_argument("--half", choices=list(SPLIT["halves"]))
     parser.add_argument("--subset", choices=["ci"])
     parser.add_argument("--methods", nargs="+", default=["diagnose"])
+    parser.add_argument("--systems", action="store_true", help="hits system by system, too")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument(
         "--require", nargs="*", default=[], help="measures whose missed target is an error"
@@ -291,13 +308,17 @@ def main() -> None:
     path = CACHE / "fresh.json"
     fresh = json.loads(path.read_text()) if path.exists() else {}
     rows: list[Row] = []
+    systems: list[str] = []
     for method in options.methods:
         kept = {id: r for id, r in records(method).items() if id in ids}
         answers = opened(kept)
         print(f"{method}: {len(kept)} of {len(ids)} sets run")
         scored = [Scored(record, answers[id]) for id, record in kept.items()]
         rows += measures(method, scored, fresh.get(method, {}))
+        systems.append(f"\n{method}\n\n{by_system(scored)}")
     print(table(rows, options.methods))
+    if options.systems:
+        print("\n".join(systems))
     if options.output:
         frame = pd.DataFrame([{**vars(r), "missed": r.missed} for r in rows])
         frame.to_csv(options.output, index=False)

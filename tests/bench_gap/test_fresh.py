@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from bench.gap.fit import fit
-from bench.gap.fresh import arrays, reference, share, through
+from bench.gap.fresh import arrays, parameters, reference, share, through
 from bench.gap.run import MODELS
 from bench.gap.truth import SYSTEMS
 from ssmppl.modelfile import load_model
@@ -22,13 +22,29 @@ def case():
     _, Y = SYSTEM.simulate(p, SYSTEM.strengths({"delay": 2.0}), U, rng)
     data = pd.DataFrame(np.hstack([U, Y]), columns=[*SYSTEM.inputs, *SYSTEM.channels])
     answer = {
-        "parameters": dict(zip(SYSTEM.parameters, p.tolist(), strict=True)),
+        "parameters": dict(sorted(zip(SYSTEM.parameters, p.tolist(), strict=True))),  # as sealed
         "effects": [{"key": "delay", "strength": 2.0}],
         "seed": 7,
     }
     base = reference(SYSTEM, {**answer, "effects": []}, U, Y)
     true = reference(SYSTEM, answer, U, Y)
     return data, answer, base, true
+
+
+def test_fresh_runs_are_of_the_sets_own_system():
+    """What an answer holds, keys sorted, simulates the set again."""
+    system = SYSTEMS["pendulum"]
+    rng = np.random.default_rng(3)
+    p = system.drawn_parameters(rng)
+    U = system.excite(rng, system.steps)
+    answer = {"parameters": dict(sorted(zip(system.parameters, p.tolist(), strict=True)))}
+    np.testing.assert_array_equal(parameters(system, answer), p)
+    none = system.strengths({})
+    one, other = (
+        system.simulate(v, none, U, np.random.default_rng(4))[1]
+        for v in (p, parameters(system, answer))
+    )
+    np.testing.assert_array_equal(one, other)
 
 
 def test_the_true_model_closes_all_and_the_base_nothing(case):
@@ -57,10 +73,10 @@ def test_a_models_increments_are_those_of_the_exact_filter(case):
     data, answer, base, _ = case
     U, Y = arrays(SYSTEM, data)
     model = load_model(str(MODELS / "thermal.py"))
-    p = np.array(list(answer["parameters"].values()))
+    p = parameters(SYSTEM, answer)
     found = fit(SYSTEM, U, Y, (), p, SYSTEM.strengths({}), int(0.7 * len(Y)))
-    parameters = dict(zip(SYSTEM.parameters, found.p, strict=True))
-    estimates = through(model, parameters)(data, 8)
+    fitted = dict(zip(SYSTEM.parameters, found.p, strict=True))
+    estimates = through(model, fitted)(data, 8)
     exact = base(data, 1)[0]
     error = estimates.std(axis=0, ddof=1) / np.sqrt(8)
     off = np.abs(estimates.mean(axis=0) - exact)
