@@ -31,6 +31,7 @@ SAME = 0.95  # beyond which two candidates are one to begin with
 SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
 NEAR = 25.0  # nats behind the best, up to which other delays are tried
 ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
+LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
 
@@ -282,6 +283,10 @@ def refit_all(
         fitter = workshop.fitter(candidates)
         fit = fitter.restored(train, numbers)
         gain = fit.log_likelihood - base.log_likelihood
+        if gain < -LOST - 3.0 * np.hypot(fit.error, base.error):
+            reasons.append(f"{' and '.join(map(str, candidates))}: its fit lost its way, and ended "
+                           f"{-gain:.0f} nats below the model's own")  # fmt: skip
+            continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
         done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))
     done.sort(key=lambda r: -r.merit)

@@ -126,6 +126,26 @@ def lower(workshop, fit):
     return fitter.restored(experiments, numbers)
 
 
+def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
+    """A model with an effect holds the model without it: what ends far below is not ranked."""
+    workshop, fit, screen = asked
+    made = refits_of.refit
+
+    def lost(*args):
+        found = made(*args)
+        value = found.fit.log_likelihood - 40.0
+        return replace(found, fit=replace(found.fit, log_likelihood=value))
+
+    own = [[leading(screen)[0]]]
+    given = (workshop, fit, screen, own, screen.experiments, seed_sequence(3))
+    done, reasons = refits_of.refit_all(*given, Checkpoint(None, {}), "refitting")
+    assert [len(done), reasons] == [1, []]
+    monkeypatch.setattr(refits_of, "refit", lost)
+    done, reasons = refits_of.refit_all(*given, Checkpoint(None, {}), "refitting")
+    assert done == []
+    assert "nats below the model's own" in reasons[0]
+
+
 @pytest.mark.slow
 def test_a_better_place_for_the_parameters_is_no_effect(asked):
     """A base fit that stopped too early makes every effect gain; the model is fitted again from
