@@ -126,6 +126,7 @@ def lower(workshop, fit):
     return fitter.restored(experiments, numbers)
 
 
+@pytest.mark.slow
 def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
     """A model with an effect holds the model without it: what ends far below is not ranked."""
     workshop, fit, screen = asked
@@ -175,6 +176,7 @@ def test_a_right_model_is_not_accused_by_a_bad_start(asked):
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
     """What is projected out of the basis: a wave whose period no screen has, among others."""
     _, _, screen = asked
