@@ -47,7 +47,7 @@ def predict(
     model : the model, as declared.
     idata : what `sample` returned; None draws parameters, states and observations from the prior.
     data : the data set (or the list of them) whose rows and inputs are meant; observations may be
-        left out of it for the prior, and are compared with by ArviZ where they are there.
+        left out of it, and are compared with by ArviZ where they are there.
     steps : number of rows where there are no data.
     draws : from the prior; of the posterior all its draws are taken.
     conditional : of the posterior, whether the states are those of its trajectories, so that a
@@ -73,7 +73,7 @@ def predict(
             fix="declare the law of y_t with @model.observation",
             where=model.location,
         )
-    experiments = bind(traced, data, need_observations=idata is not None, steps=steps)
+    experiments = bind(traced, data, need_observations=False, steps=steps)
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     labels = Labels(experiments)
     attrs: dict[str, Any] = {"model": traced.name, "seed": str(root.entropy)}

@@ -77,6 +77,10 @@ def test_given_the_trajectories_or_simulated_anew():
     assert group(without, "posterior_predictive").attrs["conditional"] == 0
     observed = group(free, "observed_data")["y"].values
     np.testing.assert_array_equal(observed, y)
+    bare = ssm.predict(model(), idata, {"u": U}, conditional=False, seed=1)
+    drawn = group(bare, "posterior_predictive")["y"].values
+    np.testing.assert_array_equal(drawn, group(free, "posterior_predictive")["y"].values)
+    assert group(bare, "observed_data") is None
 
 
 def test_several_experiments(tmp_path):
