@@ -169,7 +169,7 @@ def test_gibbs_is_chosen_and_has_the_right_posterior(data):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [ssm.MetropolisHastings(), ssm.PGAS(10)])
 def test_other_samplers_agree(data, method):
-    idata = ssm.sample(weather(), data, method, draws=4000, warmup=500, seed=6, progress=False)
+    idata = ssm.sample(weather(), data, method, draws=2000, warmup=500, seed=6, progress=False)
     table = ssm.summary(idata)
     mean, sd = posterior_by_grid(data["y"])
     assert np.all(np.abs(table["mean"] - mean) < 4 * table["mcse_mean"] + 1e-3)
