@@ -42,6 +42,11 @@ def check(e: Effect) -> None:
         return ModelError(f"the effect {e.name!r}: {found}", fix=fix, where=e.where)
 
     parameters = inspect.signature(e.function).parameters
+    if e.afresh is not None and not (e.lower < e.afresh < e.upper and e.afresh != 0.0):
+        raise refuse(
+            f"afresh={e.afresh!r} is no strength between {e.lower:g} and {e.upper:g} other than 0",
+            "give the strength at which the model shall be fitted anew, or leave it out",
+        )
     if e.kind not in KINDS:
         raise refuse(f"its kind is {e.kind!r}", f"use one of: {listing(str(e.kind), KINDS)}")
     if any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values()):

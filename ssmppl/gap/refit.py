@@ -215,8 +215,8 @@ def asleep(screen: Screen) -> list[int]:
         c = screen.question.candidates[k]
         if c.effect.afresh is None:
             continue
-        scale = screen.question.scales.scale[c.equation]
-        if scale.quantile(ONE_SIGN) >= -BELOW * scale.quantile(1.0 - ONE_SIGN):
+        scale = screen.question.scales.scale.get(c.equation)  # a parameter has none
+        if scale is None or scale.quantile(ONE_SIGN) >= -BELOW * scale.quantile(1.0 - ONE_SIGN):
             out.append(k)
     return out[:MATES]
 

@@ -67,14 +67,15 @@ def test_what_the_fit_cannot_show_is_fitted_anew():
     fold = ssm_effects.sensor_rectification
     bound = [Candidate(fold, "y", role="channel"), Candidate(fold, "z", role="channel"),
              Candidate(fold, "noisy", role="channel"),
-             Candidate(ssm_effects.sensor_bias, "y", role="channel")]  # fmt: skip
+             Candidate(ssm_effects.sensor_bias, "y", role="channel"),
+             Candidate(replace(fold), "gain", role="parameter")]  # fmt: skip
     values = np.linspace(0.1, 3.0, 50)
     scale = {"y": Scale.of(values), "z": Scale.of(values - 1.0), "noisy": Scale.of(values - 0.3)}
     screen = SimpleNamespace(
-        family=SimpleNamespace(leaders=[3, 1, 2, 0]),
+        family=SimpleNamespace(leaders=[3, 1, 4, 2, 0]),
         question=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
     )
-    assert asleep(screen) == [2, 0]
+    assert asleep(screen) == [4, 2, 0]
 
 
 # -- tested

@@ -106,6 +106,7 @@ def plain(v, strength):
     [
         ({"kind": "transiton"}, plain, "kind is 'transiton'.*\n.*transition"),
         ({}, lambda v: v, "no argument `strength`"),
+        ({"lower": 0, "upper": 1, "afresh": 2.0}, lambda v, strength: v, "between 0 and 1"),
         ({}, lambda strength, v: v, "first argument is `strength`"),
         ({}, lambda v, strength, *args: v, r"takes \*arguments"),
         ({"lower": 1}, plain, "between 1 and inf"),
