@@ -63,9 +63,9 @@ def bootstrap(trace: Trace, missing: Missing) -> Proposal:
     observed = tuple(terms(trace, "observation", missing))
     return Proposal(
         "bootstrap",
-        _draws(trace, list(trace.initial.values())),
+        _resolved(_draws(trace, list(trace.initial.values()))),
         observed,
-        _draws(trace, list(trace.transition.values())),
+        _resolved(_draws(trace, list(trace.transition.values()))),
         observed,
         explanation="particles move by the transition and are weighed by the observation",
     )
@@ -80,6 +80,16 @@ def _draws(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
             sample = array(law.sample(Draws(site.name)) if law.proper else law.mean())
         out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
     return out
+
+
+def _resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:
+    """Components that follow from others of the same step, in terms of what these are."""
+    if not any(depends_on(e, list(values)) for e in values.values()):
+        return values
+    known: dict[Expr, Expr] = {}
+    for s, e in values.items():  # what follows stands behind what it follows from
+        (known[s],) = substitute([e], known)
+    return known
 
 
 def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:
@@ -120,24 +130,35 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
 
 @dataclass(frozen=True)
 class _Split:
-    """The states of one law: Gaussian ones, and the others with their draws."""
+    """The states of one law: Gaussian ones, and the others with their draws.
+
+    following : those of the others that are functions of the Gaussian ones of the same step.
+    """
 
     gaussian: GaussianBlock
     others: dict[Expr, Expr]
     random: bool  # whether some other state is random
+    following: dict[Expr, Expr]
 
     def insert(self, expressions: dict[Expr, Expr]) -> dict[Expr, Expr]:
         """`expressions` with the other states replaced by their draws."""
         values = substitute(list(expressions.values()), self.others)
         return dict(zip(expressions, values, strict=True))
 
+    def complete(self, draw: dict[Expr, Expr]) -> dict[Expr, Expr]:
+        """The draws of all states, given those of the Gaussian ones."""
+        draw = self.insert(draw)
+        after = substitute(list(self.following.values()), draw)
+        return {**self.others, **draw, **dict(zip(self.following, after, strict=True))}
+
 
 def _split(trace: Trace, sites: list[Site]) -> _Split:
     block = gaussian_block(sites)
     own = set(block.symbols)
     others = {s: e for s, e in _draws(trace, sites).items() if s not in own}
+    following = {s: e for s, e in others.items() if depends_on(e, block.symbols)}
     random = any(n.op == "random" for n in topological(others.values()))
-    return _Split(block, others, random)
+    return _Split(block, others, random, following)
 
 
 # -- tier 2: locally optimal
@@ -151,7 +172,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     if not len(move.gaussian):
         where = next(iter(trace.transition.values())).distribution.location
         return NotApplicable("no state has a Gaussian transition", where)
-    observation = affine_observation(sites, move.gaussian.symbols)
+    observation = affine_observation(sites, move.gaussian.symbols, move.following)
     if isinstance(observation, NotApplicable):
         return observation
     if all(e.op == "const" and e.data == 0.0 for e in observation.matrix.ravel()):
@@ -171,12 +192,12 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
             h, residual = array(masks[:, None] * h), masks * residual
             r = mask_covariance(r, masks)
         draw, predictive = _condition(block, h, r, residual, masks)
-        return {**split.others, **split.insert(draw)}, predictive
+        return split.complete(draw), predictive
 
     draw, predictive = law(move)
     start = _split(trace, list(trace.initial.values()))
     same = set(start.gaussian.symbols) == set(move.gaussian.symbols)
-    if same:
+    if same and not move.following:
         place = {s: i for i, s in enumerate(start.gaussian.symbols)}  # no .index: == is symbolic
         order = [place[s] for s in move.gaussian.symbols]
         start = replace(start, gaussian=_reorder(start.gaussian, order))
@@ -184,7 +205,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         site = sites[0]
         initial_weight: tuple[Term, ...] = (Term(site, initial_predictive, None),)
     else:
-        initial_draw = _draws(trace, list(trace.initial.values()))
+        initial_draw = _resolved(_draws(trace, list(trace.initial.values())))
         initial_weight = tuple(terms(trace, "observation", missing))
     weight = Term(sites[0], predictive, None)
     look_ahead = None if move.random else move.insert({predictive: predictive})[predictive]
@@ -253,6 +274,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     for t in smooth:
         total = total + t.guarded()
     move = _split(trace, list(trace.transition.values()))
+    (total,) = substitute([total], move.following)
     where = sites[0].distribution.location
     if not len(move.gaussian):
         law = next(iter(trace.transition.values())).distribution
@@ -270,7 +292,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     correction = Term(observed[0].site, -log_ratio, None)
     return Proposal(
         "guided",
-        _draws(trace, list(trace.initial.values())),
+        _resolved(_draws(trace, list(trace.initial.values()))),
         tuple(observed),
         draw,
         (*observed, correction),
@@ -319,7 +341,7 @@ def _newton(
     fit = (*x, *(factor[i, j] for i in range(n) for j in range(i + 1)))
     if depends_on(look_ahead, list(move.others)):  # the fit is no function of x_{t-1} alone
         fit = ()
-    return {**move.others, **move.insert(chosen)}, fit, log_ratio, ahead
+    return move.complete(chosen), fit, log_ratio, ahead
 
 
 # -- the user's own

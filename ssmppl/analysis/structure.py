@@ -4,7 +4,7 @@ and which observations are affine and Gaussian in them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from ssmppl.errors import ModelError, NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
-from ssmppl.expressions.expr import Expr, constant, depends_on, symbols_of
+from ssmppl.expressions.expr import Expr, constant, depends_on, substitute, symbols_of
 from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace, previous
 
@@ -73,30 +73,40 @@ class AffineObservation:
 
 
 def affine_observation(
-    sites: Sequence[Site], states: Sequence[Expr]
+    sites: Sequence[Site], states: Sequence[Expr], following: Mapping[Expr, Expr] | None = None
 ) -> AffineObservation | NotApplicable:
-    """All observations as one affine Gaussian law in `states`; the reason where one is not."""
+    """All observations as one affine Gaussian law in `states`; the reason where one is not.
+
+    following : further components that are functions of the states, and are put in first.
+    """
+    known = dict(following or {})
     for site in sites:
         if not isinstance(site.distribution, (Normal, MvNormal)):
             kind = type(site.distribution).__name__
             return NotApplicable(f"{site.name} is {kind}", site.distribution.location)
-        reason = _not_affine(site, "observation", states)
+        reason = _not_affine(site, "observation", states, known)
         if reason is not None:
             return reason
     block = gaussian_block(sites)
-    form = affine(block.mean, states)
+    form = affine(substitute(list(block.mean), known), states)
     if isinstance(form, NotApplicable):
         return form
-    return AffineObservation(block.symbols, form[0], form[1], block.covariance)
+    covariance = array(substitute(list(block.covariance.ravel()), known))
+    return AffineObservation(
+        block.symbols, form[0], form[1], array(covariance.reshape(block.covariance.shape))
+    )
 
 
-def _not_affine(site: Site, role: str, states: Sequence[Expr]) -> NotApplicable | None:
+def _not_affine(
+    site: Site, role: str, states: Sequence[Expr], known: dict[Expr, Expr] | None = None
+) -> NotApplicable | None:
     """Why a Gaussian or deterministic law is not affine in `states` with a spread free of them."""
     d = site.distribution
-    form = affine(array(d.mean()).ravel(), states)
+    form = affine(substitute(list(array(d.mean()).ravel()), known or {}), states)
     if isinstance(form, NotApplicable):
         return NotApplicable(f"the mean of the {role} of {site.name}: {form.reason}", d.location)
-    if any(depends_on(e, states) for e in gaussian_block([site]).covariance.ravel()):
+    spread = substitute(list(gaussian_block([site]).covariance.ravel()), known or {})
+    if any(depends_on(e, states) for e in spread):
         reason = f"the spread of the {role} of {site.name} depends on the state"
         return NotApplicable(reason, d.location)
     return None

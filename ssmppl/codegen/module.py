@@ -17,7 +17,7 @@ from ssmppl.language.trace import Trace
 CONSTANT, THETA, STEP, PARTICLE = 0, 1, 2, 3
 LEVELS = {
     "parameter": THETA, "time": STEP, "time_prev": STEP, "input": STEP, "input_prev": STEP,
-    "observation": STEP, "observation_prev": STEP, "seen": STEP,
+    "observation": STEP, "observation_prev": STEP, "seen": STEP, "seen_prev": STEP,
     "guide": STEP, "state": PARTICLE, "state_prev": PARTICLE, "noise": PARTICLE,
 }  # fmt: skip
 

@@ -41,11 +41,14 @@ from ssmppl.codegen.kits import (
     simulation_kit,
 )
 from ssmppl.codegen.loading import Loaded, load
+from ssmppl.codegen.marginal import NAMES as MARGINAL
+from ssmppl.codegen.marginal import MarginalFilter, compile_marginal
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import TwistedFilter, compile_twisted
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.expr import Expr
 from ssmppl.language.trace import Trace
 
 SELDOM = ("simulate", "simulate_on", "observe_states")
@@ -73,6 +76,24 @@ class Program:
         """The twisted filter, in a module of its own; generated when it is first asked for."""
         return compile_twisted(self.trace, self.missing)
 
+    @cached_property
+    def marginal(self) -> MarginalFilter | NotApplicable:
+        """The Rao-Blackwellised filters, likewise."""
+        return compile_marginal(self.trace, self.missing)
+
+    def proposal(self, name: str) -> Proposal | NotApplicable | None:
+        """What was derived under this name, or why nothing was; None where no proposal has it."""
+        if name in MARGINAL:
+            found = self.marginal
+            return found if isinstance(found, NotApplicable) else found.proposals[name]
+        return self.proposals.get(name)
+
+    def carried(self, proposal: str) -> list[Expr]:
+        """The components that a particle has under this proposal."""
+        if proposal in MARGINAL and isinstance(self.marginal, MarginalFilter):
+            return self.marginal.found.trace.state_symbols
+        return self.trace.state_symbols
+
     def source(self) -> str:
         """The generated Python module, commented with the user's lines."""
         return self.text
@@ -91,6 +112,9 @@ class Program:
         """
         if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
             return self.twisted.entry(name.removesuffix("_twisted"))
+        if name.endswith(tuple(f"_{own}" for own in MARGINAL)):
+            if isinstance(self.marginal, MarginalFilter):
+                return self.marginal.entry(name)
         if name in SELDOM:  # many a model is simulated a few times only
             return getattr(self.loaded, name)
         if not hasattr(self.module, name):

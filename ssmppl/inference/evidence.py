@@ -191,8 +191,10 @@ def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedS
     if proposal == "auto" or particles is None:
         theta, _ = space.parameters(find_mode(space, root).z)
         if proposal == "auto":
-            proposal = choose(problem, theta, exact=False, whole=True).name
-        problem.proposal(proposal)
+            plain = method.order == 0  # filters with scores know all states, and no guide
+            choice = choose(problem, theta, exact=False, whole=plain, integrate=plain)
+            proposal = choice.name
+        problem.proposal(proposal, integrate=method.order == 0)
         if particles is None:
             particles = tune_particles(problem, theta, proposal, TARGET_SD, root).particles
     return replace(method, proposal=proposal, particles=particles)

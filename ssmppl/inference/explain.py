@@ -7,6 +7,7 @@ import textwrap
 from dataclasses import dataclass
 from typing import Any
 
+from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linear
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.finite import FiniteStates, finite_states
@@ -32,7 +33,8 @@ PAGE = 100  # columns
 class Plan:
     """Everything that was derived from a model; `print` it, or show it in a notebook.
 
-    structure : the model as a linear Gaussian one, or why it is not. finite : the values that its
+    structure : the model as a linear Gaussian one, or why it is not. conditional : the states that
+    are linear and Gaussian given the others, or why there are none. finite : the values that its
     states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
@@ -41,6 +43,7 @@ class Plan:
 
     trace: Trace
     structure: LinearGaussian | NotApplicable
+    conditional: ConditionallyLinear | NotApplicable
     finite: FiniteStates | NotApplicable
     proposals: dict[str, Proposal | NotApplicable]
     updates: tuple[Update, ...]
@@ -75,7 +78,10 @@ class Plan:
                      "likelihood is exact, by the forward algorithm; particles are used only where "
                      "they are asked for")]  # fmt: skip
         if isinstance(self.structure, NotApplicable):
-            return [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
+            found = [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
+            if isinstance(self.conditional, ConditionallyLinear):
+                found.append(("given the others", _integrated(self.conditional)))
+            return found
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
                  "used only where they are asked for")]  # fmt: skip
 
@@ -140,6 +146,16 @@ def _reason(found: NotApplicable) -> str:
     return found.reason + (f"\n{found.where.short}" if found.where else "")
 
 
+def _integrated(split: ConditionallyLinear) -> str:
+    names = ", ".join(map(repr, split.linear))
+    verb = "is" if len(split.linear) == 1 else "are"
+    return (
+        f"{names} {verb} linear and Gaussian: a Kalman filter for each particle integrates "
+        f"{'it' if verb == 'is' else 'them'} out, and only the other states are sampled "
+        '(Rao-Blackwellised; proposals "marginal", "marginal_guided", "marginal_auxiliary")'
+    )
+
+
 def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
     return [(s.name, f"~ {s.distribution!r}") for s in sites.values()]
 
@@ -186,6 +202,7 @@ def explain(model: Model, data: Any = None) -> Plan:
     return Plan(
         traced,
         linear_gaussian(traced),
+        conditionally_linear(traced),
         finite_states(traced),
         program.proposals,
         tuple(derive_updates(traced, (), missing)),

@@ -23,6 +23,7 @@ from ssmppl.inference.particles.filtering import (
     random_state,
     seed_sequence,
 )
+from ssmppl.inference.particles.marginal import is_marginal, marginal_run
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import run_tasks
@@ -53,7 +54,8 @@ def particle_filter(
 
     With proposal="twisted" the particles know what comes later: their sum of log-likelihood
     increments is worth most, while few of them tell the moments at single rows. "auto" leaves it
-    out here.
+    out here. With a Rao-Blackwellised one ("marginal", ...) means and covariances of the states
+    that are integrated out are exact given the particles of the others.
 
     Returns
     -------
@@ -78,8 +80,10 @@ def particle_filter(
     theta = check_parameters(problem.trace, parameters)
     check_count("repeats", repeats, 1)
     if proposal == "auto":
-        proposal = choose(problem, theta, exact=False).name
-    settings = settle(problem, theta, particles, proposal, resampling, ess_threshold)
+        proposal = choose(problem, theta, exact=False, integrate=True).name
+    settings = settle(
+        problem, theta, particles, proposal, resampling, ess_threshold, integrate=True
+    )
     if settings.proposal in EXACT:
         instead = "kalman_filter" if settings.proposal == "kalman" else "smooth"
         raise ArgumentError(
@@ -107,8 +111,9 @@ def _one_run(
     root: np.random.SeedSequence, repeat: int,
 ) -> list[FilterRun]:  # fmt: skip
     """One run over every experiment; a function that another process can be sent."""
+    run = marginal_run if is_marginal(settings.proposal) else full_run
     return [
-        full_run(problem, e, theta, settings, random_state(root, repeat, i), levels)
+        run(problem, e, theta, settings, random_state(root, repeat, i), levels)
         for i, e in enumerate(problem.experiments)
     ]
 

@@ -53,7 +53,10 @@ def log_likelihood(
         where the model has a @proposal. "auto" is exact on linear Gaussian models and on those of
         finitely many states (the forward algorithm), else the proposal with the least variance for
         its cost in a pilot; "twisted", which looks ahead to the end of the data, is tried where the
-        others tell log Z to no better than 3 at 100 particles.
+        others tell log Z to no better than 3 at 100 particles. "marginal", "marginal_guided" and
+        "marginal_auxiliary" are Rao-Blackwellised: states that are linear and Gaussian given the
+        others are integrated out by a Kalman filter per particle (Schön, Gustafsson and Nordlund
+        2005), and the others move by the transition or the two better proposals; "auto" tries them.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.
@@ -72,7 +75,9 @@ def log_likelihood(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
-    settings = settle(problem, theta, particles, proposal, resampling, ess_threshold, whole=True)
+    settings = settle(
+        problem, theta, particles, proposal, resampling, ess_threshold, whole=True, integrate=True
+    )
     if settings.proposal in EXACT:
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
@@ -91,14 +96,15 @@ def settle(
     ess_threshold: float = 1.0,
     *,
     whole: bool = False,
+    integrate: bool = False,
 ) -> FilterSettings:
     """The settings of a call with "auto" resolved, checked against what could be derived.
 
-    whole : as in `choose`.
+    whole, integrate : as in `choose`.
     """
     settings = filter_settings(particles, proposal, resampling, ess_threshold)
     if proposal == "auto":
-        chosen = choose(problem, theta, whole=whole).name
+        chosen = choose(problem, theta, whole=whole, integrate=integrate).name
         return filter_settings(particles, chosen, resampling, ess_threshold)
     if proposal in EXACT:
         found = exact_model(problem.trace)
@@ -110,5 +116,5 @@ def settle(
                 fix='use proposal="auto"',
             )
     else:
-        problem.proposal(proposal)
+        problem.proposal(proposal, integrate)
     return settings

@@ -11,6 +11,7 @@ import numpy as np
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import flat_start
+from ssmppl.codegen.marginal import NAMES as MARGINAL
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
@@ -26,14 +27,16 @@ class Problem:
     experiments: tuple[Experiment, ...]
     program: Program
 
-    def proposal(self, name: str) -> Proposal:
+    def proposal(self, name: str, integrate: bool = False) -> Proposal:
         """A derived proposal.
+
+        integrate : whether it may integrate states out, so that particles are of the others only.
 
         Raises
         ------
         ArgumentError : no proposal has this name, or it could not be derived; gives the reason.
         """
-        found = self.program.proposals.get(name)
+        found = self.program.proposal(name)
         if found is None:
             raise ArgumentError(
                 f"proposal={name!r} is not known for this model",
@@ -44,6 +47,13 @@ class Problem:
             if flat_start(self.trace):
                 fix = "use an exact method, or give the state a proper law in @initial"
             raise ArgumentError(f"proposal={name!r} does not apply: {found}", fix=fix)
+        if name in MARGINAL and not integrate:
+            raise ArgumentError(
+                f"proposal={name!r} integrates states out, and this method needs particles of all "
+                "of them",
+                fix='use proposal="auto", "bootstrap" or "guided"; log_likelihood, '
+                "particle_filter, PMMH and FFBSi know what to do with the others",
+            )
         return found
 
 

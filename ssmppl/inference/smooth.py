@@ -36,6 +36,8 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.particles.fixed_lag import LAG, lag_moments
+from ssmppl.inference.particles.marginal import is_marginal
+from ssmppl.inference.particles.marginal_backward import marginal_paths, may_integrate
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
@@ -230,7 +232,7 @@ def _exact(
     return out
 
 
-def _filter(call: _Call, method: FFBSi | FixedLag) -> FilterSettings:
+def _filter(call: _Call, method: FFBSi | FixedLag, integrate: bool = False) -> FilterSettings:
     """The filter's settings, "auto" resolved among the particle proposals."""
     proposal = method.proposal
     if proposal in EXACT:
@@ -240,21 +242,28 @@ def _filter(call: _Call, method: FFBSi | FixedLag) -> FilterSettings:
             fix=f"use ssm.{exact}(), or another proposal",
         )
     if proposal == "auto":
-        proposal = choose(call.problem, call.theta, exact=False).name
+        proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name
     n = PARTICLES if call.particles is None else call.particles
-    return settle(call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold)
+    return settle(
+        call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
+        integrate=integrate,
+    )  # fmt: skip
 
 
 def _ffbsi(call: _Call, method: FFBSi) -> list[_Found]:
-    settings = _filter(call, method)
+    settings = _filter(call, method, integrate=may_integrate(call.problem, method))
     check_count("moves", method.moves, 0)
     draws = TRAJECTORIES if call.trajectories is None else call.trajectories
-    kernel, why = choose_kernel(call.problem, settings, draws, method.kernel)
+    marginal = is_marginal(settings.proposal)
+    kernel, why = "exact", "states that are linear given the others are integrated out"
+    if not marginal:
+        kernel, why = choose_kernel(call.problem, settings, draws, method.kernel)
     out = []
     for i, e in enumerate(call.problem.experiments):
         stream = random_state(call.root, i)
         system = particle_system(call.problem, call.theta, settings, e, stream)
-        paths = draw_paths(call.problem, call.theta, e, system, draws, stream, kernel, method.moves)
+        own = call.problem, call.theta, e, system, draws, stream
+        paths = marginal_paths(*own) if marginal else draw_paths(*own, kernel, method.moves)
         report = {
             "particles": settings.particles, "proposal": settings.proposal, "kernel": kernel,
             "kernel_chosen": why, "log_likelihood": system.log_Z,

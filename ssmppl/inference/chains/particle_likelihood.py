@@ -18,6 +18,7 @@ from ssmppl.codegen.metropolis import (
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.walk import Point, Run
 from ssmppl.inference.particles.filtering import FilterSettings, failure
+from ssmppl.inference.particles.marginal import draw_given
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
 
@@ -31,9 +32,10 @@ class ParticleLikelihood:
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
         entry = self.problem.program.entry(f"filtered_path_{self.settings.proposal}")
+        carried = len(self.problem.program.carried(self.settings.proposal))
         total, paths, increments = 0.0, [], []
         for e in self.problem.experiments:
-            path = np.empty((e.steps, len(self.problem.trace.state_symbols)))
+            path = np.empty((e.steps, carried))
             increment = np.empty(e.steps)
             status, t, log_z = entry(
                 theta, e.y, e.seen, e.u, self.settings.particles, stream, path, increment
@@ -49,6 +51,18 @@ class ParticleLikelihood:
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
         return paths_of(point)
+
+
+@dataclass(frozen=True)
+class MarginalLikelihood(ParticleLikelihood):
+    """A Rao-Blackwellised filter; what it integrates out is drawn for the kept draws."""
+
+    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+        found = paths_of(point)
+        for i, e in enumerate(self.problem.experiments):
+            path = point.run.paths[i][None]
+            found[f"path_{i}"] = draw_given(self.problem, e, point.theta, path, stream)[0]
+        return found
 
 
 class _WithFilter:

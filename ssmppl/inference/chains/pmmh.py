@@ -19,6 +19,7 @@ from ssmppl.inference.chains.curvature import fitted_covariance
 from ssmppl.inference.chains.langevin import Langevin
 from ssmppl.inference.chains.particle_likelihood import (
     CorrelatedLikelihood,
+    MarginalLikelihood,
     ParticleLikelihood,
     ScoredLikelihood,
     run_filters,
@@ -34,6 +35,7 @@ from ssmppl.inference.chains.walk import (
 )
 from ssmppl.inference.methods import PMMH, MetropolisHastings
 from ssmppl.inference.particles.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.pilot import (
     SCALE_REPEATS,
     TUNING_REPEATS,
@@ -69,9 +71,9 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     plain = method.order == 0 and not method.correlation  # others know no guide
     choice = None
     if method.proposal == "auto":
-        choice = choose(problem, theta, exact=False, whole=plain)
+        choice = choose(problem, theta, exact=False, whole=plain, integrate=plain)
     proposal = choice.name if choice else method.proposal
-    problem.proposal(proposal)
+    problem.proposal(proposal, integrate=plain)
     particles, tuned = method.particles, None
     if particles is None:
         tuned = _tuned(setup, method, theta, proposal)
@@ -144,6 +146,8 @@ def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelih
         scored = ScoredLikelihood(problem, settings, method.lag, wanted, method.order == 2)
         _ = scored.filter
         return scored
+    if is_marginal(settings.proposal):
+        return MarginalLikelihood(problem, settings)
     return ParticleLikelihood(problem, settings)
 
 

@@ -79,7 +79,7 @@ def particle_system(
     """
     steps, n = experiment.steps, settings.particles
     out = ParticleSystem(
-        np.empty((steps, len(problem.trace.state_symbols), n)), np.empty((steps, n)),
+        np.empty((steps, len(problem.program.carried(settings.proposal)), n)), np.empty((steps, n)),
         np.zeros((steps, n), dtype=np.int32), np.empty(steps), np.empty(steps),
     )  # fmt: skip
     scheme = None if settings.scheme == SYSTEMATIC else settings.scheme

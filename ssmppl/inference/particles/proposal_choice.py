@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.analysis.proposals import Proposal
+from ssmppl.codegen.marginal import MarginalFilter
 from ssmppl.codegen.module import PARTICLE, level_of
 from ssmppl.codegen.render import depends, is_small_power, topological_until
 from ssmppl.errors import NotApplicable, SamplingError
@@ -96,13 +97,16 @@ _choices: dict[tuple, Choice] = {}
 
 
 def choose(
-    problem: Problem, theta: np.ndarray, exact: bool = True, *, whole: bool = False
-) -> Choice:
+    problem: Problem, theta: np.ndarray, exact: bool = True, *, whole: bool = False,
+    integrate: bool = False,
+) -> Choice:  # fmt: skip
     """The exact filter where there is one, the user's proposal where there is one, else the
     winner of a pilot at theta; remembered for each program and data.
 
     whole : only the likelihood of all the data, or a trajectory given all of them, is wanted. Then
     the twisted proposal may be chosen; few of its particles tell what was known at a single row.
+    integrate : whether states that are linear given the others may be integrated out; the
+    particles are then of the others.
     """
     found = exact_model(problem.trace)
     if exact and not isinstance(found, NotApplicable):
@@ -114,9 +118,14 @@ def choose(
     }
     twisted = {n: candidates.pop(n) for n in ("twisted",) if n in candidates}
     twisted = twisted if whole else {}
+    found_marginal = problem.program.marginal if integrate else None
+    if isinstance(found_marginal, MarginalFilter):
+        candidates |= {
+            n: p for n, p in found_marginal.proposals.items() if not isinstance(p, NotApplicable)
+        }
     if len(candidates) == 1 and not twisted:
         return Choice("bootstrap", {})
-    key = (problem.program.path, _digest(problem), theta.tobytes(), whole)
+    key = (problem.program.path, _digest(problem), theta.tobytes(), whole, integrate)
     if key not in _choices:
         _choices[key] = _pilot(problem, theta, candidates, twisted)
     return _choices[key]
