@@ -48,6 +48,62 @@ def counts_observation(x):
     return {"y": ssm.Poisson(np.exp(x))}
 
 
+# Two states that are nonlinear and four that are linear given them, after the example of section
+# 6 of T. Schön, F. Gustafsson and P.-J. Nordlund, IEEE Trans. Signal Processing 53 (2005).
+mixed = ssm.Model("2 + 4 states")
+ROTATIONS = np.array([
+    [0.9 * np.cos(0.3), -0.9 * np.sin(0.3), 0.0, 0.0], [0.9 * np.sin(0.3), 0.9 * np.cos(0.3), 0, 0],
+    [0.0, 0.0, 0.8 * np.cos(0.9), -0.8 * np.sin(0.9)], [0, 0, 0.8 * np.sin(0.9), 0.8 * np.cos(0.9)],
+])  # fmt: skip
+
+
+@mixed.initial
+def mixed_initial():
+    return {"x": ssm.Normal(np.zeros(2), sd=1.0), "z": ssm.Normal(np.zeros(4), sd=1.0)}
+
+
+@mixed.transition
+def mixed_transition(x, z):
+    return {
+        "x": ssm.Normal(
+            np.stack([np.arctan(x[0]) + z[0], 0.8 * x[1] + np.sin(x[0]) + z[2]]), sd=0.3
+        ),
+        "z": ssm.Normal(ROTATIONS @ z, sd=0.3),
+    }
+
+
+@mixed.observation
+def mixed_observation(x, z):
+    return {
+        "y": ssm.Normal(
+            np.stack([0.1 * x[0] * np.abs(x[0]), x[1], z[0] - z[1] + z[2] - z[3]]), sd=0.3
+        )
+    }
+
+
+regimes = ssm.Model("two regimes")
+
+
+@regimes.initial
+def regimes_initial():
+    return {"k": ssm.Bernoulli(0.5), "z": ssm.Normal(np.zeros(2), sd=1.0)}
+
+
+@regimes.transition
+def regimes_transition(k, z):
+    return {
+        "k": ssm.Bernoulli(np.where(k == 1, 0.95, 0.1)),
+        "z": ssm.Normal(
+            np.where(k == 1, np.stack([0.95 * z[0] + z[1], 0.8 * z[1]]), 0.5 * z), sd=0.3
+        ),
+    }
+
+
+@regimes.observation
+def regimes_observation(z):
+    return {"y": ssm.Normal(z[0], sd=0.3)}
+
+
 @dataclass(frozen=True)
 class Case:
     """A model with data and parameters at which its likelihood is estimated."""
@@ -64,9 +120,12 @@ def simulated(model: ssm.Model, steps: int) -> dict[str, np.ndarray]:
 
 
 def cases() -> list[Case]:
-    """The varves; an LGSS with observation variance 0.001; Poisson counts around 500."""
+    """The varves; an LGSS with observation variance 0.001; Poisson counts around 500; and two
+    models that are linear given some of their states."""
     return [
         Case("varves", varves, {"y": ice_varves()}, {"phi": 0.95, "tau": 50.0}),
         Case("LGSS, variance 0.001", precise, simulated(precise, 300), {}),
         Case("Poisson, mean 500", counts, simulated(counts, 300), {}),
+        Case("2 + 4 states", mixed, simulated(mixed, 300), {}),
+        Case("two regimes", regimes, simulated(regimes, 300), {}),
     ]

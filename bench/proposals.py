@@ -6,17 +6,19 @@ grows as N, so that the product is what a filter costs whatever the variance wan
 choice of `proposal="auto"` without the Kalman filter, the time that its pilot takes, and the costs
 that it reckons with beside the measured ones.
 
-    python bench/proposals.py
+    python bench/proposals.py [words of the cases ...]
 """
 
 from __future__ import annotations
 
+import sys
 import time
 
 import numpy as np
 from models import Case, cases
 from table import show
 
+from ssmppl.analysis.proposals import Proposal
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.errors import NotApplicable
@@ -28,9 +30,17 @@ PARTICLES = (100, 1000)
 REPEATS = 200
 
 
+def derived(problem: Problem) -> dict[str, Proposal]:
+    """All proposals that there are, those of Rao-Blackwellised filters too."""
+    marginal = problem.program.marginal
+    found = dict(problem.program.proposals)
+    found |= {} if isinstance(marginal, NotApplicable) else marginal.proposals
+    return {k: p for k, p in found.items() if not isinstance(p, NotApplicable)}
+
+
 def measure(problem: Problem, theta: np.ndarray, n: int) -> dict[str, tuple[float, float]]:
     """Proposal -> (variance of log Z, seconds per run), the runs of all in turn."""
-    names = [k for k, p in problem.program.proposals.items() if not isinstance(p, NotApplicable)]
+    names = list(derived(problem))
     streams = {k: new_state(np.random.SeedSequence(i)) for i, k in enumerate(names)}
     log_z: dict[str, list[float]] = {k: [] for k in names}
     seconds: dict[str, list[float]] = {k: [] for k in names}
@@ -47,12 +57,11 @@ def report(case: Case) -> tuple[list[list[str]], list[list[str]]]:
     """Rows of the table of proposals, and those of the table of choices."""
     problem = pose(case.model, case.data)
     theta = check_parameters(problem.trace, case.parameters)
-    for k, p in problem.program.proposals.items():
-        if not isinstance(p, NotApplicable):  # compile
-            rng = new_state(np.random.SeedSequence(0))
-            log_likelihood_estimate(problem, theta, FilterSettings(10, k), rng)
+    for k in derived(problem):  # compile
+        rng = new_state(np.random.SeedSequence(0))
+        log_likelihood_estimate(problem, theta, FilterSettings(10, k), rng)
     start = time.perf_counter()
-    choice = choose(problem, theta, exact=False)
+    choice = choose(problem, theta, exact=False, whole=True, integrate=True)
     pilot = time.perf_counter() - start
     rows, chosen = [], []
     for n in PARTICLES:
@@ -63,7 +72,7 @@ def report(case: Case) -> tuple[list[list[str]], list[list[str]]]:
         for k, (variance, seconds) in found.items():
             rows.append([
                 case.label, f"{n:,}", k, f"{variance:.4g}", f"{variance / base_variance:.3g}",
-                f"{seconds * per_step:.1f}", f"{cost(problem.program.proposals[k]):.1f}",
+                f"{seconds * per_step:.1f}", f"{cost(derived(problem)[k]):.1f}",
                 f"{work[k] / work['bootstrap']:.3g}",
             ])  # fmt: skip
         best = min(work, key=lambda k: work[k])
@@ -77,6 +86,8 @@ def report(case: Case) -> tuple[list[list[str]], list[list[str]]]:
 def main() -> None:
     tables: tuple[list, list] = ([], [])
     for case in cases():
+        if sys.argv[1:] and not any(word in case.label for word in sys.argv[1:]):
+            continue
         for table, rows in zip(tables, report(case), strict=True):
             table += rows
     print(f"Variance of log Z over {REPEATS} runs.\n")
