@@ -14,6 +14,7 @@ from ssmppl.inference.evidence import Evidence, evidence
 from ssmppl.inference.explain import compile, explain
 from ssmppl.inference.filters import kalman_filter, particle_filter
 from ssmppl.inference.forecast import forecast
+from ssmppl.inference.leave_future_out import leave_future_out
 from ssmppl.inference.likelihood import log_likelihood
 from ssmppl.inference.maximize import maximize
 from ssmppl.inference.methods import (
@@ -124,6 +125,7 @@ __all__ = [
     "explain",
     "forecast",
     "kalman_filter",
+    "leave_future_out",
     "log_likelihood",
     "maximize",
     "particle_filter",

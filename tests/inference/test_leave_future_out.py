@@ -1,0 +1,102 @@
+"""Leave-future-out scores against the exact predictive densities of a grid over the parameters."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+import ssmppl as ssm
+from ssmppl.errors import ArgumentError
+from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.problem import pose
+from tests.statistics.checks import MCSE, seed_of
+
+STEPS, MISSING = 30, 19
+
+
+def autoregression(observed):
+    model = ssm.Model("autoregression")
+    model.prior(lambda: {"a": ssm.Uniform(-1, 1), "tau": ssm.Gamma(2, rate=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, a, tau: {"x": ssm.Normal(a * x, precision=tau)})
+    model.observation(observed)
+    return model
+
+
+def plain():
+    return autoregression(lambda x: {"y": ssm.Normal(x, sd=0.5)})
+
+
+@pytest.fixture(scope="module")
+def y():
+    made = ssm.simulate(plain(), {"a": 0.7, "tau": 1.0}, steps=STEPS, seed=seed_of("lfo"))
+    y = made["y"].values[0]
+    y[MISSING] = np.nan
+    return y
+
+
+@pytest.fixture(scope="module")
+def exact(y):
+    """log p(y_t | y_{1:t-1}) for every t, by a grid over a and tau."""
+    a, tau = np.meshgrid(np.linspace(-0.995, 0.995, 100), np.linspace(0.02, 9, 150))
+    problem = pose(plain(), {"y": y})
+    model = kalman_model(problem.trace)
+    rows = np.array([
+        model.filter(problem.experiments[0], np.array(theta)).log_increments
+        for theta in zip(a.ravel(), tau.ravel(), strict=True)
+    ])  # fmt: skip
+    given = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(rows, axis=1)], axis=1)
+    given += (np.log(tau) - tau).ravel()[:, None]
+    return logsumexp(given[:, 1:], axis=0) - logsumexp(given[:, :-1], axis=0)
+
+
+@pytest.mark.parametrize("threshold", [0.7, -2.0])
+def test_scores_are_those_of_the_grid(threshold, y, exact):
+    """With weighted draws all along, and with new ones for many a row."""
+    found = ssm.leave_future_out(
+        plain(), {"y": y}, first=12 if threshold > 0 else 26, draws=400, warmup=300, chains=2,
+        threshold=threshold, seed=seed_of("lfo", threshold), progress=False,
+    )  # fmt: skip
+    rows = found["time"].values - 1
+    there = rows != MISSING
+    z = (found["elpd"].values - exact[rows])[there] / found["mc_error"].values[there]
+    assert np.abs(z).max() < MCSE
+    assert np.all(found["mc_error"].values[there] < 0.1)
+    assert np.isnan(found["elpd"].values[~there]).all()
+    assert found.attrs["elpd"] == pytest.approx(found["elpd"].values[there].sum())
+    assert found.attrs["refits"] == found["sampled_anew"].values.sum()
+    if threshold > 0:
+        assert found.attrs["refits"] < 3
+    else:
+        assert found.attrs["refits"] == len(rows)
+
+
+@pytest.mark.slow
+def test_scores_by_particle_filters(y, exact):
+    """The same model of exp(y), which no longer is linear and Gaussian."""
+    model = autoregression(lambda x: {"y": ssm.LogNormal(x, sd=0.5)})
+    found = ssm.leave_future_out(
+        model, {"y": np.exp(y)}, first=15, draws=1000, warmup=500, particles=500,
+        seed=seed_of("lfo particles"), progress=False,
+    )  # fmt: skip
+    rows = found["time"].values - 1
+    there = rows != MISSING
+    z = (found["elpd"].values - exact[rows] + y[rows])[there] / found["mc_error"].values[there]
+    assert np.abs(z).max() < MCSE
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"first": 1}, "first=1"),
+        ({"first": 31}, "the data have 30 rows"),
+        ({"particles": 0}, "particles=0"),
+    ],
+)
+def test_what_is_out_of_range_is_refused(change, message, y):
+    with pytest.raises(ArgumentError, match=message):
+        ssm.leave_future_out(plain(), {"y": y}, **change)
+
+
+def test_several_data_sets_are_refused(y):
+    with pytest.raises(ArgumentError, match="2 data sets"):
+        ssm.leave_future_out(plain(), [{"y": y}, {"y": y}])
