@@ -41,6 +41,7 @@ from ssmppl.language.distributions import Dirac, Draws, LogNormal, MvNormal, Nor
 from ssmppl.language.trace import Site, Trace
 
 DEFENSIVE = 0.02  # share of the transition in the proposal's mixture
+MOST_NOISES = 16  # two minutes of compilation; at forty it takes more than 20 GB
 WRITTEN_OUT = 6  # noises up to which the factorisation is written out, and so vectorises
 
 
@@ -141,6 +142,13 @@ def guided(trace: Trace, missing: Missing) -> Guided | NotApplicable:
     where = next(iter(trace.transition.values())).distribution.location
     if not transition.noise:
         return NotApplicable("no state has noise", where)
+    noises = max(len(initial.noise), len(transition.noise))
+    if noises > MOST_NOISES:
+        return NotApplicable(
+            f"there are {noises} noises, more than the {MOST_NOISES} up to which their matrices "
+            "compile in reasonable time",
+            where,
+        )
     total = constant(0.0)
     for t in terms(trace, "observation", missing, guard=False):
         total = total + t.guarded()

@@ -340,3 +340,12 @@ def test_the_pendulum_chooses_it_and_the_varves_do_not(monkeypatch):
     choice = choose(problem, np.array([0.6, 5.0]), whole=True)
     assert sorted(choice.figures) == sorted(OTHERS)
     assert not generated(problem)
+
+
+def test_too_many_noises_are_refused_before_they_are_compiled():
+    model = ssm.Model("wide")
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(17), sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
+    with pytest.raises(ArgumentError, match="17 noises, more than the 16"):
+        ssm.log_likelihood(model, {"y": np.zeros(3)}, {}, proposal="twisted")
