@@ -85,6 +85,8 @@ def _conjugate(search: Search, found: Found) -> Update:
         left = ", ".join(to_text(form.functions[j]) for j in found.correction)
         where = sources[0].where
         reason = f"the {laws} leaves {left} outside the {family.name} family"
+    if form.left:
+        where, reason = form.left[0][1].where or where, form.left[0][1].reason
     update = Update(
         block=tuple(dict.fromkeys(c.data[1] for c in found.components)),
         components=found.components,
@@ -98,6 +100,7 @@ def _conjugate(search: Search, found: Found) -> Update:
         where=where,
         kind=kind_of(site),
         conditional=family,
+        left=tuple(factor for factor, _ in form.left),
     )
     title = joined(found.components)
     if len(update.block) > 1:
@@ -123,7 +126,15 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
-    if update.correction:
+    if update.left:
+        laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
+        notes.append(
+            f"corrected for the {laws} by a Metropolis step on the log joint density and a slice "
+            f"sweep: {update.reason}"
+        )
+        if update.where is not None:
+            notes.append(update.where.short)
+    elif update.correction:
         text = describe.correction_text(form, update.correction)
         if _may_be_bounded(update):
             notes.append(f"accepted with probability proportional to {text}: {update.reason}")

@@ -12,8 +12,8 @@ from ssmppl.analysis.families import (
     Family,
     Gamma,
     NormalGamma,
-    Wishart,
 )
+from ssmppl.analysis.families_matrix import MatrixNormalWishart, Wishart
 from ssmppl.analysis.sufficient import BlockForm
 from ssmppl.expressions.algebra import Separation, separate, split_constant
 from ssmppl.expressions.expr import (
@@ -252,6 +252,8 @@ def conditional(family: Family, form: BlockForm) -> str:
             f"{block} | {v} ~ Normal(H^-1 h, precision = {scale}*H), h and H from the linear and "
             "quadratic statistics"
         )
+    if isinstance(family, MatrixNormalWishart):
+        return _matrix_normal(family, form)
     if len(names) == 1:
         h = c(family.linear[0])
         return (
@@ -260,6 +262,18 @@ def conditional(family: Family, form: BlockForm) -> str:
     return (
         f"({', '.join(names)}) ~ Normal(H^-1 h, precision = H), h and H from the linear and "
         "quadratic statistics"
+    )
+
+
+def _matrix_normal(family: MatrixNormalWishart, form: BlockForm) -> str:
+    wishart, name = family.wishart, form.components[-1].data[1]
+    sign, plus = (-2.0, -1.0) if wishart.inverse else (2.0, 1.0)
+    df = _linear(form, wishart.log, sign, plus * (wishart.size + 1.0) - len(family.rows[0]))
+    law, scale = ("inverse Wishart", "scale S") if wishart.inverse else ("Wishart", "scale S^-1")
+    rows = name if wishart.inverse else f"{name}^-1"
+    return (
+        f"{name} ~ {law}(df = {df}, {scale}), S = S_yy - S_yz K^-1 S_yz'; A | {name} ~ Normal("
+        f"mean = S_yz K^-1, covariance = {rows} (x) K^-1)"
     )
 
 

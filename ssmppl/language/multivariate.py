@@ -17,7 +17,7 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.expr import constant
-from ssmppl.expressions.linear import cholesky, inverse, log_determinant
+from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Draws, Support, one_of
 from ssmppl.language.positive import log_gamma_draw, needs_log_gamma
@@ -91,7 +91,8 @@ class MvNormal(_Joint):
             return m
         if self.spread == "precision":
             return inverse(m)
-        return array(m @ m.T)
+        whole = squared(m)
+        return array(m @ m.T) if whole is None else whole
 
     def variance(self):
         return array(np.diagonal(self.covariance_matrix().view(np.ndarray)))
@@ -99,7 +100,10 @@ class MvNormal(_Joint):
     def log_densities(self, value):
         m, d = self.parameters[self.spread], array(value) - self.mean_
         constant_term = -0.5 * len(d) * LOG_2PI
-        if self.spread == "cholesky":
+        whole = squared(m) if self.spread == "cholesky" else None
+        if whole is not None:  # the density of a covariance, by whichever name it came
+            m = whole
+        elif self.spread == "cholesky":
             z = lower_inverse(m) @ d
             log_root = np.sum(array([ew("log", e) for e in np.diagonal(m.view(np.ndarray))]))
             return array(constant_term - log_root - 0.5 * np.sum(z**2))

@@ -6,7 +6,7 @@ from scipy import stats
 from ssmppl.analysis import check
 from ssmppl.analysis.conjugacy import draw
 from ssmppl.analysis.density import terms
-from ssmppl.analysis.families import lower_half
+from ssmppl.analysis.families_matrix import lower_half
 from ssmppl.analysis.pythontext import DOMAIN, python_function
 from ssmppl.analysis.sampler import sampler_of
 from ssmppl.expressions.evaluate import evaluate
