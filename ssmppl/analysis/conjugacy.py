@@ -17,6 +17,7 @@ from ssmppl.analysis import describe
 from ssmppl.analysis.check import verify
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.describe import Explanation, joined
+from ssmppl.analysis.describe_matrices import matrix_statistics, named, shown_as_matrices
 from ssmppl.analysis.families import Normal, NormalGamma
 from ssmppl.analysis.sampler import draw, natural_bounds, sampler_of
 from ssmppl.analysis.search import Found, Search, kind_of
@@ -102,13 +103,17 @@ def _conjugate(search: Search, found: Found) -> Update:
         conditional=family,
         left=tuple(factor for factor, _ in form.left),
     )
-    title = joined(found.components)
+    title = name = joined(found.components)
+    lines = None
+    if shown_as_matrices(family):
+        title = name = named(found.components, search.data.trace)
+        lines = matrix_statistics(family, form, search.data.trace)
     if len(update.block) > 1:
         title += " jointly"
     explanation = Explanation(
         title,
-        describe.conditional(family, form),
-        describe.statistics(form),
+        describe.conditional(family, form, name),
+        describe.statistics(form) if lines is None else lines,
         tuple(_notes(update, form)),
     )
     return replace(update, explanation=explanation)

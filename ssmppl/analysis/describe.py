@@ -200,7 +200,7 @@ def shorten(text: str, length: int = MAX_LENGTH) -> str:
 
 
 # -- the law
-def conditional(family: Family, form: BlockForm) -> str:
+def conditional(family: Family, form: BlockForm, name: str) -> str:
     """The law of the block given all else, its parameters in terms of the statistics."""
     names = [to_text(c) for c in form.components]
 
@@ -224,9 +224,7 @@ def conditional(family: Family, form: BlockForm) -> str:
         sign, plus = (-2.0, -p - 1.0) if family.inverse else (2.0, p + 1.0)
         matrix = "scale S" if family.inverse else "inverse scale S"
         law = "inverse Wishart" if family.inverse else "Wishart"
-        name = names[0].split("[")[0]
-        s = f"tr(S {name}^-1) / 2" if family.inverse else f"tr(S {name}) / 2"
-        return f"{name} ~ {law}(df = {stat(family.log, sign, plus)}, {matrix}: -{s} collects C)"
+        return f"{name} ~ {law}(df = {stat(family.log, sign, plus)}, {matrix})"
     if isinstance(family, NormalGamma):
         *thetas, v = names
         n = len(thetas)
@@ -259,10 +257,7 @@ def conditional(family: Family, form: BlockForm) -> str:
         return (
             f"{names[0]} ~ Normal({h} / H, precision = H), H = {stat(family.quadratic[0][0], -2.0)}"
         )
-    return (
-        f"({', '.join(names)}) ~ Normal(H^-1 h, precision = H), h and H from the linear and "
-        "quadratic statistics"
-    )
+    return f"{name} ~ Normal(H^-1 h, precision = H), {len(names)} numbers"
 
 
 def _matrix_normal(family: MatrixNormalWishart, form: BlockForm) -> str:
