@@ -76,9 +76,18 @@ def _compare_normal(conditional, draws):
     h = np.array([[f(e[i]) + f(e[j]) - f(e[i] + e[j]) for j in range(d)] for i in range(d)])
     g = np.array([0.5 * (f(e[i]) - f(-e[i])) for i in range(d)])
     z = (draws - np.linalg.solve(h, g)) @ np.linalg.cholesky(h)
+    assert_standard_normal(z)
+
+
+def assert_standard_normal(z):
+    """Each column, the sum of their squares, and the second moments of pairs."""
+    n, d = z.shape
     for column in z.T:
         assert stats.kstest(column, "norm").pvalue > LEVEL
     assert stats.kstest((z**2).sum(1), stats.chi2(d).cdf).pvalue > LEVEL
+    moments = z.T @ z / n - np.eye(d)
+    errors = np.sqrt((1.0 + np.eye(d)) / n)
+    assert np.all(np.abs(moments) < stats.norm.isf(LEVEL / (d * (d + 1))) * errors), moments
 
 
 def _compare_matrix_normal(conditional, draws):
@@ -103,9 +112,7 @@ def _compare_matrix_normal(conditional, draws):
     mean = np.linalg.solve(h, g[..., None])[..., 0]
     roots = np.linalg.cholesky(h)
     z = np.einsum("nji,nj->ni", roots, theta.T - mean)
-    for column in z.T:
-        assert stats.kstest(column, "norm").pvalue > LEVEL
-    assert stats.kstest((z**2).sum(1), stats.chi2(d).cdf).pvalue > LEVEL
+    assert_standard_normal(z)
 
     c = [*conditional.totals.tolist(), 0.0]
     df, scale, _, _ = family.solve(c)
