@@ -51,7 +51,8 @@ def compare(conditional, n=1500, thin=None, seed=1):
         return infos
     if isinstance(update.conditional, MatrixNormalWishart):
         assert inside
-        _compare_matrix_normal(conditional, draws)
+        more, _ = conditional.draws(10_000, rng)
+        _compare_matrix_normal(conditional, np.concatenate([draws, more]))
         return infos
     values, weights = conditional.grid(draws)
     tested = [(x, v) for x, v in zip(draws.T, values, strict=True)]
