@@ -17,8 +17,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ssmppl.analysis.families import lower_half
-from ssmppl.analysis.sufficient import ROLES, CompleteData
+from ssmppl.analysis.families_matrix import lower_half
+from ssmppl.analysis.sufficient import ROLES, CompleteData, Factor
 from ssmppl.analysis.update import Update
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import Separation, separate
@@ -83,18 +83,23 @@ def joint(data: CompleteData, update: Update, series: list[Point]) -> np.ndarray
     """Summands of the log joint that hold the block, (terms, points), as they were written."""
     rows = [
         np.broadcast_to(evaluate(factor.density, values), POINTS)
-        for factor in data.holding(update.components)
+        for factor in _checked(data, update)
         for t, values in enumerate(series)
         if _counts(factor.role, t)
     ]
     return np.array(rows).reshape(-1, POINTS)
 
 
+def _checked(data: CompleteData, update: Update) -> list[Factor]:
+    """The factors that hold the block, but for those that the update leaves to the log joint."""
+    return [f for f in data.holding(update.components) if not any(f is g for g in update.left)]
+
+
 def _culprit(
     data: CompleteData, update: Update, series: list[Point], changed: Point
 ) -> Location | None:
     """Where the first factor stands that differs from its own separated form."""
-    for factor in data.holding(update.components):
+    for factor in _checked(data, update):
         form = separate(factor.density, update.components)
         if not isinstance(form, Separation):
             return factor.where

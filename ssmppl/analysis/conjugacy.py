@@ -17,6 +17,7 @@ from ssmppl.analysis import describe
 from ssmppl.analysis.check import verify
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.describe import Explanation, joined
+from ssmppl.analysis.describe_matrices import matrix_statistics, named, shown_as_matrices
 from ssmppl.analysis.families import Normal, NormalGamma
 from ssmppl.analysis.sampler import draw, natural_bounds, sampler_of
 from ssmppl.analysis.search import Found, Search, kind_of
@@ -85,6 +86,8 @@ def _conjugate(search: Search, found: Found) -> Update:
         left = ", ".join(to_text(form.functions[j]) for j in found.correction)
         where = sources[0].where
         reason = f"the {laws} leaves {left} outside the {family.name} family"
+    if form.left:
+        where, reason = form.left[0][1].where or where, form.left[0][1].reason
     update = Update(
         block=tuple(dict.fromkeys(c.data[1] for c in found.components)),
         components=found.components,
@@ -98,14 +101,19 @@ def _conjugate(search: Search, found: Found) -> Update:
         where=where,
         kind=kind_of(site),
         conditional=family,
+        left=tuple(factor for factor, _ in form.left),
     )
-    title = joined(found.components)
+    title = name = joined(found.components)
+    lines = None
+    if shown_as_matrices(family):
+        title = name = named(found.components, search.data.trace)
+        lines = matrix_statistics(family, form, search.data.trace)
     if len(update.block) > 1:
         title += " jointly"
     explanation = Explanation(
         title,
-        describe.conditional(family, form),
-        describe.statistics(form),
+        describe.conditional(family, form, name),
+        describe.statistics(form) if lines is None else lines,
         tuple(_notes(update, form)),
     )
     return replace(update, explanation=explanation)
@@ -123,7 +131,15 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
-    if update.correction:
+    if update.left:
+        laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
+        notes.append(
+            f"corrected for the {laws} by a Metropolis step on the log joint density and a slice "
+            f"sweep: {update.reason}"
+        )
+        if update.where is not None:
+            notes.append(update.where.short)
+    elif update.correction:
         text = describe.correction_text(form, update.correction)
         if _may_be_bounded(update):
             notes.append(f"accepted with probability proportional to {text}: {update.reason}")

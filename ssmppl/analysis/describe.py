@@ -12,8 +12,8 @@ from ssmppl.analysis.families import (
     Family,
     Gamma,
     NormalGamma,
-    Wishart,
 )
+from ssmppl.analysis.families_matrix import MatrixNormalWishart, Wishart
 from ssmppl.analysis.sufficient import BlockForm
 from ssmppl.expressions.algebra import Separation, separate, split_constant
 from ssmppl.expressions.expr import (
@@ -200,7 +200,7 @@ def shorten(text: str, length: int = MAX_LENGTH) -> str:
 
 
 # -- the law
-def conditional(family: Family, form: BlockForm) -> str:
+def conditional(family: Family, form: BlockForm, name: str) -> str:
     """The law of the block given all else, its parameters in terms of the statistics."""
     names = [to_text(c) for c in form.components]
 
@@ -224,9 +224,7 @@ def conditional(family: Family, form: BlockForm) -> str:
         sign, plus = (-2.0, -p - 1.0) if family.inverse else (2.0, p + 1.0)
         matrix = "scale S" if family.inverse else "inverse scale S"
         law = "inverse Wishart" if family.inverse else "Wishart"
-        name = names[0].split("[")[0]
-        s = f"tr(S {name}^-1) / 2" if family.inverse else f"tr(S {name}) / 2"
-        return f"{name} ~ {law}(df = {stat(family.log, sign, plus)}, {matrix}: -{s} collects C)"
+        return f"{name} ~ {law}(df = {stat(family.log, sign, plus)}, {matrix})"
     if isinstance(family, NormalGamma):
         *thetas, v = names
         n = len(thetas)
@@ -252,14 +250,25 @@ def conditional(family: Family, form: BlockForm) -> str:
             f"{block} | {v} ~ Normal(H^-1 h, precision = {scale}*H), h and H from the linear and "
             "quadratic statistics"
         )
+    if isinstance(family, MatrixNormalWishart):
+        return _matrix_normal(family, form)
     if len(names) == 1:
         h = c(family.linear[0])
         return (
             f"{names[0]} ~ Normal({h} / H, precision = H), H = {stat(family.quadratic[0][0], -2.0)}"
         )
+    return f"{name} ~ Normal(H^-1 h, precision = H), {len(names)} numbers"
+
+
+def _matrix_normal(family: MatrixNormalWishart, form: BlockForm) -> str:
+    wishart, name = family.wishart, form.components[-1].data[1]
+    sign, plus = (-2.0, -1.0) if wishart.inverse else (2.0, 1.0)
+    df = _linear(form, wishart.log, sign, plus * (wishart.size + 1.0) - len(family.rows[0]))
+    law, scale = ("inverse Wishart", "scale S") if wishart.inverse else ("Wishart", "scale S^-1")
+    rows = name if wishart.inverse else f"{name}^-1"
     return (
-        f"({', '.join(names)}) ~ Normal(H^-1 h, precision = H), h and H from the linear and "
-        "quadratic statistics"
+        f"{name} ~ {law}(df = {df}, {scale}), S = S_yy - S_yz K^-1 S_yz'; A | {name} ~ Normal("
+        f"mean = S_yz K^-1, covariance = {rows} (x) K^-1)"
     )
 
 

@@ -13,9 +13,12 @@ log p, log(1 - p)                                  Beta
 log p_1, ..., log p_K                              Dirichlet
 log det P, P_ij                                    Wishart
 log det C, (C^-1)_ij                               inverse Wishart
+log det W, W_ij, W_ij theta_jk, W_ij theta_ik      matrix Normal-Wishart (W = P) or
+theta_jl                                           matrix Normal-inverse-Wishart (W = C^-1)
 =================================================  =============================================
 
-(Bernardo and Smith (1994), "Bayesian theory", appendix A.) Each class below holds the positions of
+(Bernardo and Smith (1994), "Bayesian theory", appendix A; those of matrices in
+`families_matrix.py`.) Each class holds the positions of
 its functions among those of the block, from which `parameters` computes the law's parameters out
 of the statistics C. C is a list with a 0 at its end, so that position -1 stands for a function that
 is absent. `draw` returns None where the law with these statistics is improper.
@@ -24,13 +27,11 @@ is absent. `draw` returns None where the law with these statistics is improper.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-Statistics = Sequence[float]
-Values = tuple[float, ...]
+from ssmppl.analysis.families_matrix import MatrixNormalWishart, Statistics, Values, Wishart
 
 
 @dataclass(frozen=True)
@@ -247,77 +248,4 @@ class Dirichlet:
         return float((self.parameters(c) - 1.0) @ np.log(v))
 
 
-@dataclass(frozen=True)
-class Wishart:
-    """P ~ Wishart(df, scale=V), log det P ** ((df - p - 1) / 2), exp(-tr(V^-1 P) / 2).
-
-    entries : positions of the functions P_ij (or (C^-1)_ij), row by row; of the symmetric matrix
-    P only those of the lower half. inverse : the block is C = P^-1, an inverse Wishart, whose
-    log determinant enters as -(df + p + 1) / 2.
-    """
-
-    size: int
-    log: int
-    entries: tuple[int, ...]
-    inverse: bool
-
-    @property
-    def name(self) -> str:
-        return "inverse Wishart" if self.inverse else "Wishart"
-
-    @property
-    def used(self) -> frozenset[int]:
-        return frozenset({self.log, *self.entries}) - {-1}
-
-    def parameters(self, c: Statistics) -> tuple[float, np.ndarray]:
-        """(df, S): S the inverse scale of a Wishart, the scale of an inverse Wishart."""
-        p = self.size
-        total = np.asarray(c)[np.array(self.entries)].reshape(p, p)
-        matrix = -(total + total.T)
-        sign = -1.0 if self.inverse else 1.0
-        return sign * 2.0 * c[self.log] + (-p - 1.0 if self.inverse else p + 1.0), matrix
-
-    def draw(self, c: Statistics, rng: np.random.Generator) -> Values | None:
-        df, matrix = self.parameters(c)
-        p = self.size
-        if not df > p - 1.0:
-            return None
-        try:
-            root = np.linalg.cholesky(matrix)
-        except np.linalg.LinAlgError:
-            return None
-        bartlett = np.tril(rng.standard_normal((p, p)), -1)
-        bartlett += np.diag(np.sqrt(2.0 * rng.standard_gamma(0.5 * (df - np.arange(p)))))
-        if self.inverse:  # S = K K', C = K (A A')^-1 K'
-            half = root @ np.linalg.inv(bartlett).T
-        else:  # V = (K K')^-1 = K^-T K^-1
-            half = np.linalg.solve(root.T, bartlett)
-        value = half @ half.T
-        return tuple(value[i, j] for i, j in lower_half(p))
-
-    def log_q(self, c: Statistics, v: np.ndarray) -> float:
-        df, matrix = self.parameters(c)
-        p = self.size
-        value = symmetric(v, p)
-        log_det = float(np.linalg.slogdet(value)[1])
-        if self.inverse:
-            return -0.5 * (df + p + 1.0) * log_det - 0.5 * float(
-                np.trace(np.linalg.solve(value, matrix))
-            )
-        return 0.5 * (df - p - 1.0) * log_det - 0.5 * float(np.sum(matrix * value))
-
-
-Family = Gamma | Normal | NormalGamma | Beta | Dirichlet | Wishart
-
-
-def lower_half(p: int) -> list[tuple[int, int]]:
-    """(i, j) of a symmetric matrix's components, in the order of `Site.components`."""
-    return list(dict.fromkeys((max(i, j), min(i, j)) for i in range(p) for j in range(p)))
-
-
-def symmetric(v: Sequence[float] | np.ndarray, p: int) -> np.ndarray:
-    """The symmetric matrix with these components."""
-    out = np.empty((p, p))
-    for (i, j), x in zip(lower_half(p), v, strict=True):
-        out[i, j] = out[j, i] = x
-    return out
+Family = Gamma | Normal | NormalGamma | Beta | Dirichlet | Wishart | MatrixNormalWishart

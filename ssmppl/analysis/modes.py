@@ -6,8 +6,9 @@ logarithm). Bounds are respected: a maximum beyond one lies just inside of it, a
 open, by the share `MARGIN` of their width (of the bound's size where the other is infinite).
 
 Normal-Gamma: v > 0 only scales the quadratic form in theta, so theta is found first, whatever the
-bounds are. A quadratic form under bounds is a least-squares problem with bounds, solved exactly by
-the active sets of Stark and Parker (1995), "Bounded-variable least-squares".
+bounds are; so it is with a Normal matrix and the covariance of its columns, without bounds. A
+quadratic form under bounds is a least-squares problem with bounds, solved exactly by the active
+sets of Stark and Parker (1995), "Bounded-variable least-squares".
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ from ssmppl.analysis.families import (
     Gamma,
     Normal,
     NormalGamma,
-    Wishart,
-    lower_half,
+)
+from ssmppl.analysis.families_matrix import (
+    MatrixNormalWishart,
+    Values,
+    lower_values,
 )
 
 MARGIN = 1e-9
@@ -63,7 +67,10 @@ def mode(
         return _beta(c[family.first], c[family.second], limits[0])
     if isinstance(family, Dirichlet):
         return _dirichlet(np.asarray(c)[np.array(family.logs)])
-    return _wishart(family, c)
+    if isinstance(family, MatrixNormalWishart):
+        return _matrix_normal(family, c, limits)
+    value = _wishart(family.parameters(c)[1], c[family.log], family.inverse)
+    return None if value is None else np.array(value)
 
 
 def inside(value: float, low: float, high: float) -> float:
@@ -141,15 +148,25 @@ def _dirichlet(c: np.ndarray) -> np.ndarray | None:
     return p / p.sum()
 
 
-def _wishart(family: Wishart, c: Sequence[float]) -> np.ndarray | None:
-    """P = 2 C[log] S^-1 of C[log] log det P - tr(S P) / 2; the inverse's C = S / (-2 C[log])."""
-    _, matrix = family.parameters(c)
-    log = c[family.log]
+def _wishart(matrix: np.ndarray, log: float, inverse: bool) -> Values | None:
+    """P = 2 c S^-1 of c log det P - tr(S P) / 2; the inverse's C = S / (-2 c)."""
     values = np.linalg.eigvalsh(matrix)
     if not values[0] > FLAT * values[-1]:
         return None
-    if family.inverse:
-        value = matrix / (-2.0 * log) if log < 0.0 else None
-    else:
-        value = 2.0 * log * np.linalg.inv(matrix) if log > 0.0 else None
-    return None if value is None else np.array([value[i, j] for i, j in lower_half(family.size)])
+    if inverse:
+        return lower_values(matrix / (-2.0 * log)) if log < 0.0 else None
+    return lower_values(2.0 * log * np.linalg.inv(matrix)) if log > 0.0 else None
+
+
+def _matrix_normal(
+    family: MatrixNormalWishart, c: Sequence[float], limits: Limits
+) -> np.ndarray | None:
+    """A = S_yz K^-1 whatever the matrix is, and that from what A leaves of S_yy."""
+    solved = family.solve(c)
+    if solved is None:
+        return None
+    _, matrix, mean, _ = solved
+    value = _wishart(matrix, c[family.wishart.log], family.wishart.inverse)
+    a = family.entries(mean)
+    inside = all(low < x < high for x, (low, high) in zip(a, limits, strict=False))
+    return np.array([*a, *value]) if value is not None and inside else None

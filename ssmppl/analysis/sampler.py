@@ -6,7 +6,8 @@ The draw leaves the exact conditional invariant, whatever path it takes:
   independent draw from the conditional itself;
 - after `MAX_TRIES` refusals a sweep of slice steps instead. How many refusals there were does not
   depend on the current value, so this mixes two kernels that both leave the conditional invariant;
-- a correction without a known upper bound: a Metropolis-Hastings step that proposes from the
+- a correction without a known upper bound, or one that does not separate and is taken from the
+  log joint density: a Metropolis-Hastings step that proposes from the
   conjugate part, then always a sweep of slice steps, so that no value is held for long;
 - statistics under which the conjugate part is improper: slice steps. A Normal-Gamma block is then
   updated separately, v by its Gamma given theta and theta by slices.
@@ -23,8 +24,9 @@ import numpy as np
 
 from ssmppl.analysis.bounds import WHOLE, interval
 from ssmppl.analysis.families import Beta, Gamma, Normal, NormalGamma, Values
+from ssmppl.analysis.families_matrix import MatrixNormalWishart
 from ssmppl.analysis.pythontext import DOMAIN, python_function, python_sum
-from ssmppl.analysis.slices import sweep_matrix, sweep_real, sweep_simplex
+from ssmppl.analysis.slices import Density, sweep_matrix, sweep_real, sweep_simplex
 from ssmppl.analysis.truncated_draws import truncated_draw
 from ssmppl.analysis.update import Update
 from ssmppl.errors import SamplingError
@@ -120,8 +122,8 @@ class Sampler:
         c.append(0.0)
         weights = [c[j] for j in self.corrections]
         ceiling = self.ceiling(c) if weights else 0.0
-        if not ceiling < math.inf:
-            return self.metropolis(totals, c, weights, current, limits, rng)
+        if update.left or not ceiling < math.inf:
+            return self.metropolis(totals, c, weights, current, limits, rng, log_joint)
         truncated = self.truncated
         for tries in range(1, MAX_TRIES + 1):
             v = self.conjugate(c, limits, rng)
@@ -146,7 +148,16 @@ class Sampler:
         current: np.ndarray,
         limits: list[tuple[float, float]],
         rng: np.random.Generator,
+        log_joint: LogJoint | None = None,
     ) -> tuple[np.ndarray, DrawInfo]:
+        def excess(v: Sequence[float]) -> float:
+            """Log of the conditional over the conjugate part's density."""
+            correction = self.correct(v, weights) if weights else 0.0
+            if not self.update.left:
+                return correction
+            whole = self.exactly(log_joint)(v)
+            return whole - self.log_density(v, c) + correction
+
         accepted, tries = False, 0
         while tries < MAX_TRIES:
             tries += 1
@@ -155,13 +166,23 @@ class Sampler:
                 break
             if self.truncated and not _inside(v, limits):
                 continue
-            change = self.correct(v, weights) - self.correct(current.tolist(), weights)
+            change = excess(v) - excess(current.tolist())
             accepted = change >= 0.0 or rng.standard_exponential() > -change
             if accepted:
                 current = np.array(v)
             break
-        value, _ = self.slices(totals, current, limits, rng, None, tries)
+        value, _ = self.slices(totals, current, limits, rng, log_joint, tries)
         return value, DrawInfo("metropolis", tries, accepted)
+
+    def exactly(self, log_joint: LogJoint | None) -> Density:
+        """The log joint density as a function of the block's values."""
+        if log_joint is None:
+            raise SamplingError(
+                f"the update of {', '.join(self.update.block)} needs the log joint density",
+                fix="pass log_joint=, a function of the block's values",
+                where=self.update.where,
+            )
+        return lambda v: float(log_joint(np.array(v)))
 
     def slices(
         self,
@@ -175,16 +196,8 @@ class Sampler:
         """A sweep of slice steps over the exact conditional."""
         update = self.update
         c = totals.tolist() if totals is not None else []
-        if update.needs_log_joint:
-            if log_joint is None:
-                raise SamplingError(
-                    f"the update of {', '.join(update.block)} needs the log joint density",
-                    fix="pass log_joint=, a function of the block's values",
-                    where=update.where,
-                )
-
-            def at(v: Sequence[float]) -> float:
-                return float(log_joint(np.array(v)))
+        if update.needs_log_joint or update.left:
+            at = self.exactly(log_joint)
         else:
 
             def at(v: Sequence[float]) -> float:
@@ -204,6 +217,8 @@ class Sampler:
             new = sweep_simplex(at, values, rng)
         elif update.kind == "matrix":
             new = sweep_matrix(at, values, _size(len(values)), rng)
+        elif isinstance(update.conditional, MatrixNormalWishart):
+            new = self._sweep_in_turn(at, values, limits, rng)
         else:
             natural = [
                 (max(a, n[0]), min(b, n[1])) for (a, b), n in zip(limits, self.natural, strict=True)
@@ -212,6 +227,22 @@ class Sampler:
                 values[-1] = self._gamma_given(c, values, limits[-1], rng)
             new = sweep_real(at, values, natural, rng)
         return np.array(new), DrawInfo("slice", tries, True)
+
+    def _sweep_in_turn(
+        self,
+        at: Density,
+        values: list[float],
+        limits: list[tuple[float, float]],
+        rng: np.random.Generator,
+    ) -> list[float]:
+        """Slice steps on the numbers of a block given its matrix, then on the matrix."""
+        family = self.update.conditional
+        assert isinstance(family, MatrixNormalWishart)
+        n = family.thetas
+        matrix = values[n:]
+        thetas = sweep_real(lambda v: at([*v, *matrix]), values[:n], limits[:n], rng)
+        size = family.wishart.size
+        return thetas + sweep_matrix(lambda v: at([*thetas, *v]), matrix, size, rng)
 
     def _gamma_given(
         self,
@@ -256,7 +287,7 @@ def draw(
     current : values of the components.
     rest : values of the other parameters, read where bounds depend on them.
     log_joint : log joint density as a function of the components' values; needed (and used) only
-        where update.needs_log_joint.
+        where update.needs_log_joint or update.left.
     """
     return sampler_of(update).draw(totals, current, rest, rng, log_joint)
 

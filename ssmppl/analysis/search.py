@@ -13,14 +13,22 @@ import numpy as np
 
 from ssmppl.analysis.describe import joined, shorten
 from ssmppl.analysis.families import Family, Gamma, Normal
+from ssmppl.analysis.families_matrix import Wishart
 from ssmppl.analysis.recognise import (
     match_dirichlet,
+    match_matrix_normal,
     match_normal,
     match_normal_gamma,
     match_scalar,
     match_wishart,
 )
-from ssmppl.analysis.sufficient import BlockForm, CompleteData, separate_block
+from ssmppl.analysis.sufficient import (
+    BOUNDED_ROLES,
+    BlockForm,
+    CompleteData,
+    Factor,
+    separate_block,
+)
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
 from ssmppl.language.trace import Site
@@ -60,7 +68,7 @@ class Search:
 
     # -- one unit by itself
     def _alone(self, unit: tuple[Expr, ...]) -> Found | NotApplicable:
-        form = separate_block(self.data, unit)
+        form = separate_block(self.data, unit, leave=True)
         if not isinstance(form, BlockForm):
             return form
         site = self.site(unit[0])
@@ -89,11 +97,13 @@ class Search:
     ) -> Found | NotApplicable:
         """The family with its correction, where that does not grow with the series."""
         left = tuple(i for i in range(len(form.functions)) if i not in family.used)
-        growing = [i for i in left if form.roles(form.monomials[i]) & {"transition", "observation"}]
+        growing = [i for i in left if _grows(form, i)]
         if growing:
             return self._outside(form, family.used)
         if not family.used:
             return self._outside(form, frozenset())
+        if form.left and not any(_grows(form, i) for i in family.used):
+            return form.left[0][1]  # nothing but what was left tells of the block
         return Found(components, form, family, left)
 
     def _outside(self, form: BlockForm, used: frozenset[int]) -> NotApplicable:
@@ -101,10 +111,11 @@ class Search:
         names = joined(form.components)
         growing: list[int] = []
         others: list[int] = []
-        for i, m in enumerate(form.monomials):
+        for i in range(len(form.monomials)):
             if i not in used:
-                grows = form.roles(m) & {"transition", "observation"}
-                (growing if grows else others).append(i)
+                (growing if _grows(form, i) else others).append(i)
+        if form.left and not growing:
+            return form.left[0][1]
         positions = growing or others or list(range(len(form.functions)))
         if not positions:
             where = self.site(form.components[0]).distribution.location
@@ -127,7 +138,11 @@ class Search:
         out: list[tuple[tuple[Expr, ...], Found | NotApplicable]] = []
         taken: set[Expr] = set()
         for block in self._normal_blocks():
-            found = self._normal_gamma(block, taken) or self._joint_normal(block)
+            found = (
+                self._normal_gamma(block, taken)
+                or self._matrix_normal(block, taken)
+                or self._joint_normal(block)
+            )
             if found is not None:
                 out.append((found.components, found))
                 taken.update(found.components)
@@ -176,7 +191,7 @@ class Search:
         """The form of a block that is jointly Normal but for its components' own corrections."""
         if not self._independent(block):
             return None
-        form = separate_block(self.data, block)
+        form = separate_block(self.data, block, leave=True)
         if not isinstance(form, BlockForm):
             return None
         found = self._joint(block, form)
@@ -192,7 +207,15 @@ class Search:
             monomial = found.form.monomials[j]
             if not any(self._refused_alone(c, monomial) for c in found.components):
                 return False
-        return True
+        return all(
+            any(factor is other for c in found.components for other in self._left_alone(c))
+            for factor, _ in found.form.left
+        )
+
+    def _left_alone(self, component: Expr) -> list[Factor]:
+        unit = next(u for u in self.single if component in u)
+        single = self.single[unit]
+        return [factor for factor, _ in single.form.left] if isinstance(single, Found) else []
 
     def _refused_alone(self, component: Expr, monomial: frozenset) -> bool:
         mine = frozenset((a, e) for a, e in monomial if component in symbols_of(a))
@@ -213,7 +236,7 @@ class Search:
             v = unit[0]
             if v in taken or v in set(block) or not self._independent((*block, v)):
                 continue
-            form = separate_block(self.data, (*block, v))
+            form = separate_block(self.data, (*block, v), leave=True)
             if not isinstance(form, BlockForm):
                 continue
             family = match_normal_gamma(block, v, form.monomials)
@@ -223,6 +246,29 @@ class Search:
             if isinstance(joint, Found) and self._own(joint):
                 return joint
         return None
+
+    def _matrix_normal(self, block: tuple[Expr, ...], taken: set[Expr]) -> Found | None:
+        """The block as a matrix, together with the first matrix that scales its precision."""
+        for unit, found in self.single.items():
+            if not isinstance(found, Found) or not isinstance(found.family, Wishart):
+                continue
+            if not taken.isdisjoint(unit) or not self._independent((*block, *unit)):
+                continue
+            form = separate_block(self.data, (*block, *unit), leave=True)
+            if not isinstance(form, BlockForm):
+                continue
+            family = match_matrix_normal(block, unit, found.family.size, form)
+            if family is None:
+                continue
+            joint = self._judged((*block, *unit), form, family)
+            if isinstance(joint, Found) and self._own(joint):
+                return joint
+        return None
+
+
+def _grows(form: BlockForm, i: int) -> bool:
+    """Whether a function's statistic has a term for each time step."""
+    return bool(form.roles(form.monomials[i]) - set(BOUNDED_ROLES))
 
 
 def _connected(components: Iterable[Expr], form: BlockForm) -> list[tuple[Expr, ...]]:

@@ -35,6 +35,7 @@ from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Site, Trace
 
 ROLES = ("prior", "initial", "transition", "observation")
+BOUNDED_ROLES = ("prior", "initial")  # as many terms, however long the series
 _BOUNDED = ("interval", "integers")
 
 
@@ -90,6 +91,8 @@ class BlockForm:
     functions : the s_i; `monomials` holds them as products of powers.
     coefficients : role -> the summands of C_i, aligned with `functions`.
     origins : monomial -> the factors it comes from.
+    left : factors of the prior and the initial law that do not separate, and why; they are missing
+        in the sum. Empty unless it was asked for.
     """
 
     components: tuple[Expr, ...]
@@ -97,6 +100,7 @@ class BlockForm:
     functions: tuple[Expr, ...]
     coefficients: dict[str, tuple[Expr, ...]]
     origins: dict[Monomial, tuple[Factor, ...]] = field(repr=False)
+    left: tuple[tuple[Factor, NotApplicable], ...] = ()
 
     def roles(self, monomial: Monomial) -> frozenset[str]:
         """The roles of the factors that a function comes from."""
@@ -153,8 +157,12 @@ def _restrictions(role: str, site: Site) -> list[Restriction]:
     return out
 
 
-def separate_block(trace: Trace | CompleteData, block: Iterable[Expr]) -> BlockForm | NotApplicable:
+def separate_block(
+    trace: Trace | CompleteData, block: Iterable[Expr], leave: bool = False
+) -> BlockForm | NotApplicable:
     """The separated log density of a block of parameter components, given all else.
+
+    leave : go on where a factor that does not grow with the series does not separate, without it.
 
     NotApplicable where a factor does not separate, where a Dirac's value depends on the block
     (its density is degenerate), or where the support of another quantity does.
@@ -164,16 +172,18 @@ def separate_block(trace: Trace | CompleteData, block: Iterable[Expr]) -> BlockF
     wanted = frozenset(components)
     sums_by_role: dict[str, dict[Monomial, Expr]] = {role: {} for role in ROLES}
     origins: dict[Monomial, list[Factor]] = {}
+    left: list[tuple[Factor, NotApplicable]] = []
     for refusal in (degenerate(data, components), restricted(data, components)):
         if refusal is not None:
             return refusal
     for factor in data.holding(components):
         form = separate(factor.density, wanted)
         if not isinstance(form, Separation):
-            return NotApplicable(
-                f"{_law(factor)}: {_shorten(form.reason)}",
-                factor.where,
-            )
+            why = NotApplicable(f"{_law(factor)}: {_shorten(form.reason)}", factor.where)
+            if not leave or factor.role not in BOUNDED_ROLES:
+                return why
+            left.append((factor, why))
+            continue
         for monomial, coefficient in form.terms.items():
             if monomial == ONE:
                 continue
@@ -189,6 +199,7 @@ def separate_block(trace: Trace | CompleteData, block: Iterable[Expr]) -> BlockF
         tuple(texts[m] for m in monomials),
         {role: tuple(sums_by_role[role].get(m, zero) for m in monomials) for role in ROLES},
         {m: tuple(o) for m, o in origins.items()},
+        tuple(left),
     )
 
 

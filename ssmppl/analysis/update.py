@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from ssmppl.analysis.describe import Explanation
 from ssmppl.analysis.families import Family
+from ssmppl.analysis.sufficient import Factor
 from ssmppl.errors import Location
 from ssmppl.expressions.expr import Expr
 
@@ -23,6 +24,8 @@ class Update:
     bounds : (lower, upper) of each component, expressions of other parameters.
     needs_log_joint : not separable, so each evaluation takes the whole log joint density; where a
         deterministic state depends on the block, that of the noisy states and the observations.
+    left : factors of the prior or the initial law that the statistics do not hold; the log joint
+        density corrects for them.
     reason, where : why nothing better applies, and the user's line.
     """
 
@@ -37,5 +40,6 @@ class Update:
     reason: str = ""
     where: Location | None = None
     needs_log_joint: bool = False
+    left: tuple[Factor, ...] = ()
     kind: str = "real"  # or "simplex", "matrix"
     conditional: Family | None = field(default=None, repr=False)

@@ -123,6 +123,8 @@ def _matrix(op: str, n: int, entries: list[Any]) -> np.ndarray:
     if op == "logdet":
         return np.linalg.slogdet(matrices)[1]
     function = np.linalg.inv if op == "inverse" else np.linalg.cholesky
+    with contextlib.suppress(np.linalg.LinAlgError):
+        return function(matrices)
     result = np.full(matrices.shape, np.nan)  # nan where there is no such factor
     for index in np.ndindex(matrices.shape[:-2]):
         with contextlib.suppress(np.linalg.LinAlgError):

@@ -60,6 +60,20 @@ def cholesky(a: Any) -> ExprArray:
     return _matrix("cholesky", a)
 
 
+def squared(root: Any) -> ExprArray | None:
+    """The matrix whose Cholesky factor, made by `cholesky`, this is; None if it is no such."""
+    a = plain(root)
+    first = as_expr(a.flat[0]) if a.size else constant(0.0)
+    if first.op != "item" or first.args[0].op != "cholesky":
+        return None
+    node, n, zero = first.args[0], len(a), constant(0.0)
+    if node.data != n or any(
+        as_expr(a[i, j]) is not (item(node, i, j) if j <= i else zero) for i, j in np.ndindex(n, n)
+    ):
+        return None
+    return array(np.array(node.args, dtype=object).reshape(n, n))
+
+
 def inverse(a: Any) -> ExprArray:
     """Inverse of a square matrix."""
     a = square_matrix(a, "linalg inverse")

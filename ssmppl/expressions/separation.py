@@ -20,13 +20,13 @@ from ssmppl.expressions.expr import (
     apply,
     constant,
     dependent,
-    item,
     matrix_op,
     substitute,
     symbols_of,
     to_text,
     topological,
 )
+from ssmppl.expressions.separation_matrices import MatrixRules, NotSeparable
 from ssmppl.expressions.terms import (
     ONE,
     Monomial,
@@ -62,22 +62,17 @@ class Separation:
         return total
 
 
-class _NotSeparable(Exception):
-    def __init__(self, node: Expr, reason: str):
-        self.node, self.reason = node, reason
-
-
 def separate(expression: Expr, block: Iterable[Expr]) -> Separation | NotApplicable:
     """Separate an expression in the symbols of `block`; the reason where it is not separable."""
     try:
         separator = _Separator([expression], block)
         terms = separator.terms_of(expression)
-    except _NotSeparable as failure:
+    except NotSeparable as failure:
         return NotApplicable(failure.reason)
     return Separation(gathered(terms))
 
 
-class _Separator:
+class _Separator(MatrixRules):
     """One pass over a graph, bottom up; remembers which atoms are sums."""
 
     def __init__(self, roots: list[Expr], block: Iterable[Expr]):
@@ -87,7 +82,7 @@ class _Separator:
         self.done: dict[Expr, Terms] = {}
 
     def terms_of(self, root: Expr) -> Terms:
-        failures: dict[Expr, _NotSeparable] = {}
+        failures: dict[Expr, NotSeparable] = {}
         for node in topological([root]):
             if node in self.done or node in failures:
                 continue
@@ -99,7 +94,7 @@ class _Separator:
                 if bad is not None:
                     raise bad
                 self.done[node] = self._expand_by_cases(node)
-            except _NotSeparable as failure:
+            except NotSeparable as failure:
                 if symbols_of(node) <= self.block:  # a function of the block alone
                     self.done[node] = {frozenset({(node, 1.0)}): [constant(1.0)]}
                 else:
@@ -111,21 +106,23 @@ class _Separator:
     def _expand_by_cases(self, node: Expr) -> Terms:
         """`_expand`; where that fails, the two cases of a condition under the node apart.
 
-        log(where(c, a, b)) = where(c, log a, log b), and so for every function.
+        log(where(c, a, b)) = where(c, log a, log b), and so for every function. Where the
+        condition is an equation, it holds in its case: a sum over the values that a state may
+        have becomes the one term of the value that it has.
         """
         try:
             return self._expand(node)
-        except _NotSeparable:
+        except NotSeparable:
             under = [
                 n
                 for n in topological([node])
-                if n.op == "where" and n in self.involved and n.args[0] not in self.involved
+                if n.op == "where" and n.args[0] not in self.involved and n is not node
             ]
-            if not under or under[-1] is node:
+            if not under:
                 raise
-            condition = under[-1].args[0]
-            same = [n for n in under if n.args[0] is condition]
-            cases = [substitute([node], {n: n.args[k] for n in same})[0] for k in (1, 2)]
+            condition = next((n for n in under[::-1] if n in self.involved), under[-1]).args[0]
+            known = {condition: constant(1.0)} | _equated(condition)
+            cases = [substitute([node], case)[0] for case in (known, {condition: constant(0.0)})]
             self.involved |= dependent(cases, self.block)
             return self._where(condition, *(self.terms_of(case) for case in cases))
 
@@ -174,10 +171,6 @@ class _Separator:
             return self._where(args[0], parts[1], parts[2])
         raise self._mixed(node)
 
-    def _mixed(self, node: Expr) -> _NotSeparable:
-        names = sorted({s.data[1] for s in symbols_of(node) & self.block})
-        return _NotSeparable(node, f"{to_text(node)} does not separate in {', '.join(names)}")
-
     def _multiply(self, a: Terms, b: Terms) -> Terms:
         out: Terms = {}
         for ma, ca in a.items():
@@ -186,7 +179,7 @@ class _Separator:
                 for m, parts in self._combine(ma, mb).items():
                     out.setdefault(m, []).extend(coefficient * p for p in parts)
         if len(out) > MAX_TERMS:
-            raise _NotSeparable(constant(0.0), f"more than {MAX_TERMS} terms when multiplied out")
+            raise NotSeparable(constant(0.0), f"more than {MAX_TERMS} terms when multiplied out")
         return out
 
     def _combine(self, a: Monomial, b: Monomial) -> Terms:
@@ -305,76 +298,11 @@ class _Separator:
             for m in {**a, **b}
         }
 
-    def _scaled_matrix(self, node: Expr) -> tuple[Expr, tuple[Expr, ...]]:
-        """The matrix under `node` as one factor free of the block times block-only entries."""
-        entries, core = [], None
-        for a in node.args:
-            terms = gathered(self.done[a]) if a in self.done else None
-            if terms is None or len(terms) != 1:
-                raise self._mixed(node)
-            ((m, c),) = terms.items()
-            core = c if core is None else core
-            if c is not core:
-                raise self._mixed(node)
-            entries.append(monomial_expr(m))
-        assert core is not None
-        return core, tuple(entries)
 
-    def _common_factor(self, node: Expr) -> tuple[Monomial, list[Expr]] | None:
-        """The matrix under `node` as one function of the block times entries free of it."""
-        common, entries = None, []
-        for a in node.args:
-            terms = gathered(self.done[a]) if a in self.done else {}
-            if not terms and a in self.done:  # an entry that is zero
-                entries.append(constant(0.0))
-                continue
-            if len(terms) != 1:
-                return None
-            ((m, c),) = terms.items()
-            common = m if common is None else common
-            if m != common:
-                return None
-            entries.append(c)
-        return None if common is None else (common, entries)
-
-    def _logdet(self, node: Expr) -> Terms:
-        if (found := self._common_factor(node)) is not None:
-            common, free = found
-            logs = self._log({common: [constant(1.0)]}, node)
-            logs = scaled(logs, constant(float(node.data)))
-            return added(logs, {ONE: [matrix_op("logdet", free, node.data)]})
-        original = _inverse_of(node)
-        if original is not None:  # log det A^-1 = -log det A
-            logdet = matrix_op("logdet", original.args, node.data)
-            self.involved |= dependent([logdet], self.block)
-            return scaled(self.terms_of(logdet), _MINUS)
-        scale, entries = self._scaled_matrix(node)
-        atom = matrix_op("logdet", entries, node.data)
-        n = constant(float(node.data))
-        unit = {frozenset({(atom, 1.0)}): [constant(1.0)]}
-        return added({ONE: [n * apply("log", scale)]}, unit)
-
-    def _matrix_item(self, node: Expr) -> Terms:
-        matrix = node.args[0]
-        power = -1.0 if matrix.op == "inverse" else 0.5
-        if (found := self._common_factor(matrix)) is not None:
-            common, free = found
-            factor = frozenset((a, round(e * power, 12)) for a, e in common)
-            return {factor: [item(matrix_op(matrix.op, free, matrix.data), *node.data)]}
-        original = _inverse_of(matrix) if matrix.op == "inverse" else None
-        if original is not None:  # (A^-1)^-1 = A
-            row, column = node.data
-            return self.done[original.args[row * matrix.data + column]]
-        scale, entries = self._scaled_matrix(matrix)
-        atom = item(matrix_op(matrix.op, entries, matrix.data), *node.data)
-        return {frozenset({(atom, 1.0)}): [scale**power]}
-
-
-def _inverse_of(node: Expr) -> Expr | None:
-    """The "inverse" node whose entries, in order, are the arguments of a matrix node."""
-    first = node.args[0]
-    if first.op != "item" or first.args[0].op != "inverse" or first.args[0].data != node.data:
-        return None
-    n, source = node.data, first.args[0]
-    whole = [item(source, i, j) for i in range(n) for j in range(n)]
-    return source if all(a is b for a, b in zip(node.args, whole, strict=True)) else None
+def _equated(condition: Expr) -> dict[Expr, Expr]:
+    """What an equation with a number says: {x: 2} of x == 2."""
+    if condition.op == "eq":
+        for x, value in (condition.args, condition.args[::-1]):
+            if value.op == "const" and x.op != "const":
+                return {x: value}
+    return {}

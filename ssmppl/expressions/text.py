@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ssmppl.expressions.graph import topological
-from ssmppl.expressions.node import Expr, behaviour
+from ssmppl.expressions.node import MATRIX_OPS, Expr, behaviour
 
 _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "pow": ("**", 4)}
 _INFIX |= {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "mod": ("%", 2)}
@@ -14,6 +14,28 @@ def symbol_text(node: Expr) -> str:
     kind, name, index = node.data
     suffix = "_prev" if kind.endswith("_prev") else ""
     return name + suffix + (f"[{', '.join(map(str, index))}]" if index else "")
+
+
+def _matrix_name(node: Expr) -> str | None:
+    """The name of the parameter, or the text of the inverse, that a matrix node is made of."""
+    n, first = node.data, node.args[0]
+    cells = [(i, j) for i in range(n) for j in range(n)]
+    if first.op == "symbol":
+        kind, name, _ = first.data
+        for whole in (cells, [(max(c), min(c)) for c in cells]):  # any matrix; a symmetric one
+            if all(
+                a.op == "symbol" and a.data == (kind, name, c)
+                for a, c in zip(node.args, whole, strict=True)
+            ):
+                return symbol_text(first).partition("[")[0]
+    if first.op == "item" and first.args[0].data == n:
+        source = first.args[0]
+        if all(
+            a.op == "item" and a.args[0] is source and a.data == c
+            for a, c in zip(node.args, cells, strict=True)
+        ):
+            return to_text(source)
+    return None
 
 
 def to_text(root: Expr) -> str:
@@ -37,6 +59,10 @@ def to_text(root: Expr) -> str:
         elif node.op == "neg":
             a, level = parts[0]
             done[node] = (f"-({a})" if level < 2 else f"-{a}", 1)
+        elif node.op in MATRIX_OPS:
+            name = _matrix_name(node)
+            inside = ", ".join(p[0] for p in parts) if name is None else name
+            done[node] = (f"{node.op}({inside})", 9)
         elif node.op == "item":
             done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
         else:

@@ -16,8 +16,8 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
-from ssmppl.expressions.expr import constant
-from ssmppl.expressions.linear import cholesky, inverse, log_determinant
+from ssmppl.expressions.expr import as_expr, constant
+from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Draws, Support, one_of
 from ssmppl.language.positive import log_gamma_draw, needs_log_gamma
@@ -91,7 +91,8 @@ class MvNormal(_Joint):
             return m
         if self.spread == "precision":
             return inverse(m)
-        return array(m @ m.T)
+        whole = squared(m)
+        return array(m @ m.T) if whole is None else whole
 
     def variance(self):
         return array(np.diagonal(self.covariance_matrix().view(np.ndarray)))
@@ -99,13 +100,23 @@ class MvNormal(_Joint):
     def log_densities(self, value):
         m, d = self.parameters[self.spread], array(value) - self.mean_
         constant_term = -0.5 * len(d) * LOG_2PI
-        if self.spread == "cholesky":
+        whole = squared(m) if self.spread == "cholesky" else None
+        if whole is not None:  # the density of a covariance, by whichever name it came
+            m = whole
+        elif self.spread == "cholesky":
             z = lower_inverse(m) @ d
             log_root = np.sum(array([ew("log", e) for e in np.diagonal(m.view(np.ndarray))]))
             return array(constant_term - log_root - 0.5 * np.sum(z**2))
         if self.spread == "precision":
             return array(constant_term + 0.5 * log_determinant(m) - 0.5 * (d @ m @ d))
         return array(constant_term - 0.5 * log_determinant(m) - 0.5 * (d @ inverse(m) @ d))
+
+    def guarded_log_densities(self, value):
+        density, m = self.log_densities(value), self.parameters[self.spread]
+        if self.spread == "cholesky" or _surely_positive(m):
+            return density
+        last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
+        return array(ew("where", ew("lt", 0.0, last), density[()], -math.inf))
 
     def factor(self) -> ExprArray:
         """A matrix L, (d, d), with L L' = covariance."""
@@ -126,6 +137,23 @@ class MvNormal(_Joint):
     def sample(self, draws):
         z = array([draws.normal() for _ in range(len(self.mean_))])
         return array(self.mean_ + self.factor() @ z)
+
+
+def _surely_positive(m: ExprArray) -> bool:
+    """Whether a matrix is one of numbers (checked before), a parameter with that support, or the
+    inverse of one: what its own law keeps positive definite. Of a diagonal one the logs see to it.
+    """
+    entries = [as_expr(e) for e in m.ravel()]
+    off = [as_expr(m[i, j]) for i, j in np.ndindex(m.shape) if i != j]
+    if all(e.op == "const" for e in entries) or all(e.op == "const" and e.data == 0 for e in off):
+        return True
+    if all(e.op == "item" and e.args[0].op == "inverse" for e in entries):
+        entries = list(entries[0].args[0].args)
+    n = len(m)
+    return all(
+        e.op == "symbol" and e.data[2] == (max(i, j), min(i, j))
+        for e, (i, j) in zip(entries, np.ndindex(n, n), strict=True)
+    )
 
 
 class Dirichlet(_Joint):

@@ -650,3 +650,375 @@ def student(m):
         return {"y": StudentT(4, x, scale=scale)}
 
     laws(m, prior, transition, None, observation)
+
+
+# -- vector autoregressions: a covariance or precision matrix, all coefficients jointly
+MNIW = "matrix Normal-inverse-Wishart"
+
+
+def two_states():
+    return {"x": MvNormal(np.zeros(2), covariance=np.eye(2))}
+
+
+@expects((("A", "B", "c"), "joint Normal"), (("Q",), "inverse Wishart"))
+@with_inputs(u=2)
+def vector_regression(m):
+    def prior():
+        return {
+            "A": Normal(np.zeros((2, 2)), sd=1),
+            "B": Normal(np.zeros((2, 2)), sd=2),
+            "c": MvNormal(np.zeros(2), covariance=np.eye(2) + 0.3),
+            "Q": InverseWishart(5, scale=np.eye(2)),
+        }
+
+    def transition(x, u, A, B, c, Q):
+        return {"x": MvNormal(A @ x + B @ u + c, covariance=Q)}
+
+    laws(m, prior, transition, two_states)
+
+
+@expects((("a", "c"), "joint Normal"), (("Q",), "inverse Wishart"))
+def vector_by_rows(m):
+    """A as one vector with a joint prior, the noise by its Cholesky factor."""
+
+    def prior():
+        return {
+            "a": MvNormal(np.zeros(4), covariance=np.eye(4) + 0.2),
+            "c": Normal(np.zeros(2), sd=1),
+            "Q": InverseWishart(5, scale=np.eye(2)),
+        }
+
+    def transition(x, a, c, Q):
+        mean = [a[2 * i] * x[0] + a[2 * i + 1] * x[1] + c[i] for i in range(2)]
+        return {"x": MvNormal(np.stack(mean), cholesky=np.linalg.cholesky(Q))}
+
+    laws(m, prior, transition, two_states)
+
+
+@expects((("Q",), "inverse Wishart"))
+def noise_through_a_matrix(m):
+    """The covariance L Q L' with known L, and blocks of Q by a Kronecker product."""
+
+    def prior():
+        return {"Q": InverseWishart(5, scale=np.eye(2))}
+
+    def initial(Q):
+        return {"x": MvNormal(np.zeros(4), covariance=np.kron(np.array([[2.0, 0.5], [0.5, 1]]), Q))}
+
+    def transition(x, Q):
+        root = np.array([[1.0, 0.0], [0.5, 2.0]])
+        both = np.kron(np.eye(2), root)
+        return {"x": MvNormal(0.5 * x, covariance=both @ np.kron(np.eye(2), 3 * Q) @ both.T)}
+
+    laws(m, prior, transition, initial)
+
+
+@expects((("a0", "a1", "Q"), MNIW))
+def conjugate_columns(m):
+    """The columns of A have Q, times a number, as their prior covariance."""
+
+    def first():
+        return {"Q": InverseWishart(5, scale=np.array([[1.0, 0.3], [0.3, 2.0]]))}
+
+    def prior(Q):
+        return {
+            "a0": MvNormal([0.5, 0.0], covariance=2 * Q),
+            "a1": MvNormal([0.0, 0.5], precision=np.linalg.inv(Q)),
+        }
+
+    def transition(x, a0, a1, Q):
+        return {"x": MvNormal(a0 * x[0] + a1 * x[1], covariance=Q)}
+
+    m.prior(first)
+    laws(m, prior, transition, two_states)
+
+
+@expects((("a", "Q"), MNIW))
+def conjugate_rows(m):
+    """The same kind of prior on A's entries in a row: cov(A_ik, A_jl) = Q_ij V_kl."""
+
+    def first():
+        return {"Q": InverseWishart(5, scale=np.eye(2))}
+
+    def prior(Q):
+        spread = np.kron(Q, np.array([[1.0, 0.3], [0.3, 2.0]]))
+        return {"a": MvNormal([0.5, 0, 0, 0.5], covariance=spread)}
+
+    def initial(Q):
+        return {"x": MvNormal(np.zeros(2), covariance=4 * Q)}
+
+    def transition(x, a, Q):
+        return {"x": MvNormal(np.reshape(a, (2, 2)) @ x, cholesky=np.linalg.cholesky(Q))}
+
+    m.prior(first)
+    laws(m, prior, transition, initial)
+
+
+@expects((("A", "Q"), MNIW))
+@with_inputs(dt=None)
+def flat_coefficients(m):
+    """A flat prior on A; the noise grows with the step."""
+
+    def prior():
+        return {"A": Flat((2, 2)), "Q": InverseWishart(5, scale=np.eye(2))}
+
+    def transition(x, A, Q, dt):
+        return {"x": MvNormal(A @ x, covariance=Q * dt)}
+
+    laws(m, prior, transition, two_states)
+
+
+@expects((("d", "P"), "matrix Normal-Wishart"))
+@with_inputs(u=None)
+def conjugate_precision(m):
+    """In the observation, by precisions: some of its rows are missing."""
+
+    def first():
+        return {"P": Wishart(4, scale=np.eye(2) * 0.5)}
+
+    def prior(P):
+        return {"d": MvNormal([1.0, 2.0], precision=P / 3)}
+
+    def transition(x):
+        return {"x": Normal(0.5 * x, sd=1)}
+
+    def observation(x, u, d, P):
+        return {"y": MvNormal(x + d * u, precision=P)}
+
+    m.prior(first)
+    laws(m, prior, transition, None, observation)
+
+
+@expects((("C", "d"), "joint Normal"), (("R",), "inverse Wishart"))
+@with_inputs(u=None)
+def observation_matrix(m):
+    def prior():
+        return {
+            "C": Normal(np.zeros((2, 2)), sd=1),
+            "d": Normal(np.zeros(2), sd=1),
+            "R": InverseWishart(4, scale=np.eye(2)),
+        }
+
+    def transition(x):
+        return {"x": Normal(0.5 * x, sd=1)}
+
+    def observation(x, u, C, d, R):
+        return {"y": MvNormal(C @ x + d * u, covariance=R)}
+
+    laws(m, prior, transition, two_states, observation)
+
+
+# -- equations that share parameters
+def level_and_slope():
+    return {"x": Normal(0, sd=1), "z": Normal(0, sd=1)}
+
+
+@expects((("a", "b"), "joint Normal"), (("q",), "inverse Gamma"), (("r",), "inverse Gamma"))
+def shared_coefficient(m):
+    """a in the laws of two states and of the observation, each with a variance of its own."""
+
+    def prior():
+        return {
+            "a": Normal(0, sd=1),
+            "b": Normal(0, sd=1),
+            "q": InverseGamma(3, scale=1),
+            "r": InverseGamma(3, scale=1),
+        }
+
+    def transition(x, z, a, b, q, r):
+        return {"x": Normal(a * x + b * z, variance=q), "z": Normal(z - a * z / 2, variance=r)}
+
+    def observation(x, z, a, r):
+        return {"y": Normal(x + a * z, variance=2 * r)}
+
+    laws(m, prior, transition, level_and_slope, observation)
+
+
+@expects((("a", "q"), "Normal-inverse-Gamma"))
+def shared_variance(m):
+    def prior():
+        return {"a": Flat(), "q": InverseGamma(3, scale=1)}
+
+    def transition(x, z, a, q):
+        return {"x": Normal(a * x, variance=q), "z": Normal(a + z, sd=np.sqrt(2 * q))}
+
+    laws(m, prior, transition, level_and_slope)
+
+
+@expects((("tau",), "Gamma"))
+def random_walk(m):
+    """The precision of a random walk, shared by its vague initial law."""
+
+    def prior():
+        return {"tau": Gamma(2, rate=1)}
+
+    def initial(tau):
+        return {"x": Normal(0, sd=10 / np.sqrt(tau))}
+
+    def transition(x, tau):
+        return {"x": Normal(x, precision=tau)}
+
+    laws(m, prior, transition, initial)
+
+
+# -- rows of a transition matrix, chosen in many ways
+def three_values():
+    return {"x": Categorical(np.ones(3) / 3)}
+
+
+def rows_prior():
+    return {f"row{i}": Dirichlet(1.0 + np.eye(3)[i]) for i in range(3)}
+
+
+ROWS = tuple(((f"row{i}",), "Dirichlet") for i in range(3))
+
+
+@expects(*ROWS)
+def rows_by_where(m):
+    def transition(x, row0, row1, row2):
+        return {"x": Categorical(np.where(x == 0, row0, np.where(x == 1, row1, row2)))}
+
+    laws(m, rows_prior, transition, three_values)
+
+
+@expects(*ROWS)
+def rows_by_index(m):
+    def transition(x, row0, row1, row2):
+        return {"x": Categorical(np.stack([row0, row1, row2])[x, :])}
+
+    laws(m, rows_prior, transition, three_values)
+
+
+@expects(*ROWS)
+def rows_by_indicators(m):
+    """A sum over the values that the state may have, of which one counts."""
+
+    def transition(x, row0, row1, row2):
+        chosen = np.stack([np.where(x == k, 1.0, 0.0) for k in range(3)])
+        return {"x": Categorical(chosen @ np.stack([row0, row1, row2]))}
+
+    laws(m, rows_prior, transition, three_values)
+
+
+@expects((("stay",), "Beta"), (("kind0",), "Dirichlet"), (("kind1",), "Dirichlet"))
+def stay_or_leave(m):
+    """One probability of staying, the rest shared out; a Dirichlet law for what each shows."""
+
+    def prior():
+        return {
+            "stay": Beta(3, 2),
+            "kind0": Dirichlet([1.0, 2.0, 1.0]),
+            "kind1": Dirichlet([2.0, 1.0, 1.0]),
+        }
+
+    def transition(x, stay):
+        return {"x": Bernoulli(np.where(x == 1, stay, 1 - stay))}
+
+    def observation(x, kind0, kind1):
+        return {"y": Categorical((x == 0) * kind0 + (x == 1) * kind1)}
+
+    def initial():
+        return {"x": Bernoulli(0.5)}
+
+    laws(m, prior, transition, initial, observation)
+
+
+@expects((("mu",), "joint Normal"), (("v",), "inverse Gamma", 2), (("stay",), "Beta"))
+def regimes(m):
+    """Mean and variance chosen by a switch."""
+
+    def prior():
+        return {
+            "mu": Normal(np.zeros(2), sd=3),
+            "v": InverseGamma(np.array([3.0, 4.0]), scale=1),
+            "stay": Beta(3, 2),
+        }
+
+    def transition(x, stay):
+        return {"x": Bernoulli(np.where(x < 0.5, 1 - stay, stay))}
+
+    def observation(x, mu, v):
+        return {"y": Normal(mu[x], variance=np.where(x == 1, v[1], v[0]))}
+
+    def initial():
+        return {"x": Bernoulli(0.5)}
+
+    laws(m, prior, transition, initial, observation)
+
+
+# -- counts: detection and survival, exposure in a state
+@expects((("p",), "Beta"), (("s",), "Beta"))
+def thinned_counts(m):
+    def prior():
+        return {"p": Beta(2, 2), "s": Uniform(0.2, 0.9)}
+
+    def initial():
+        return {"x": Binomial(20, 0.5)}
+
+    def transition(x, s):
+        return {"x": Binomial(x, s)}
+
+    def observation(x, p):
+        return {"y": Binomial(x, 1 - p)}
+
+    laws(m, prior, transition, initial, observation)
+
+
+@expects((("lam",), "Gamma", 2))
+def exposed_state(m):
+    def prior():
+        return {"lam": Gamma(np.array([2.0, 3.0]), rate=1)}
+
+    def initial():
+        return {"x": LogNormal(0, sd=1)}
+
+    def transition(x):
+        return {"x": LogNormal(0.5 * np.log(x), sd=1)}
+
+    def observation(x, lam):
+        return {"y": Poisson(lam[0] * x), "n": Poisson(np.exp(np.log(lam[1]) + np.log(x)))}
+
+    laws(m, prior, transition, initial, observation)
+
+
+# -- rates and scales of positive laws
+@expects((("b",), "Gamma"), (("v",), "inverse Gamma", 2), (("w",), "inverse Gamma"))
+def scales_of_scales(m):
+    """The scale of inverse Gamma priors, and of an exponential and a Gamma law."""
+
+    def first():
+        return {"b": Gamma(2, rate=1), "w": InverseGamma(3, scale=2)}
+
+    def prior(b):
+        return {"v": InverseGamma(np.array([2.0, 3.0]), scale=b)}
+
+    def initial():
+        return {"x": LogNormal(0, sd=1)}
+
+    def transition(x, v):
+        return {"x": LogNormal(0.5 * np.log(x), sd=np.sqrt(v[0]))}
+
+    def observation(x, v, w):
+        return {
+            "y": LogNormal(np.log(x), sd=np.exp(np.log(v[1]) / 2)),
+            "gap": Exponential(scale=w * x),
+            "size": Gamma(2.5, rate=2.5 / (w * x)),
+        }
+
+    m.prior(first)
+    laws(m, prior, transition, initial, observation)
+
+
+@expects((("b",), "Gamma"), (("Q",), "inverse Wishart"))
+def scale_of_a_covariance(m):
+    def first():
+        return {"b": Gamma(2, rate=1)}
+
+    def prior(b):
+        return {"Q": InverseWishart(5, scale=b * np.array([[1.0, 0.2], [0.2, 1.0]]))}
+
+    def transition(x, Q):
+        return {"x": MvNormal(0.5 * x, covariance=Q)}
+
+    m.prior(first)
+    laws(m, prior, transition, two_states)

@@ -6,7 +6,7 @@ from scipy import stats
 from ssmppl.analysis import check
 from ssmppl.analysis.conjugacy import draw
 from ssmppl.analysis.density import terms
-from ssmppl.analysis.families import lower_half
+from ssmppl.analysis.families_matrix import lower_half
 from ssmppl.analysis.pythontext import DOMAIN, python_function
 from ssmppl.analysis.sampler import sampler_of
 from ssmppl.expressions.evaluate import evaluate
@@ -69,10 +69,14 @@ class Conditional:
 
     def density(self, points):
         """Unnormalised density at points, (dimension, n)."""
-        values = dict(zip(self.update.components, points, strict=True))
-        logs = np.broadcast_to(evaluate(self.log_density, values), points.shape[1:]).copy()
+        logs = self.log_density_at(points).copy()
         logs[np.isnan(logs)] = -np.inf
         return np.exp(logs - logs.max())
+
+    def log_density_at(self, points):
+        """Log density, up to a constant, at points (dimension, n)."""
+        values = dict(zip(self.update.components, points, strict=True))
+        return np.broadcast_to(evaluate(self.log_density, values), np.shape(points)[1:])
 
     # -- quadrature on an unconstrained grid
     def coordinates(self, draws):
@@ -151,7 +155,7 @@ class Conditional:
         d = len(z)
         low, high = z.min(1), z.max(1)
         reach = 0.6 * (high - low) + 1e-9
-        n = {1: 6000, 2: 420, 3: 80}[d]
+        n = {1: 6000, 2: 420, 3: 60}[d]
         axes = [np.linspace(a - r, b + r, n) for a, b, r in zip(low, high, reach, strict=True)]
         points = np.array(np.meshgrid(*axes, indexing="ij")).reshape(d, -1)
         with np.errstate(all="ignore"):

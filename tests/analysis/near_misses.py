@@ -9,17 +9,26 @@ import numpy as np
 from ssmppl.language.distributions import (
     Bernoulli,
     Beta,
+    Binomial,
+    Categorical,
+    Cauchy,
     Dirac,
+    Dirichlet,
     Exponential,
+    Flat,
     Gamma,
     HalfNormal,
     InverseGamma,
+    InverseWishart,
     Laplace,
+    LogNormal,
+    MvNormal,
     Normal,
     Poisson,
     StudentT,
     Truncated,
     Uniform,
+    Wishart,
 )
 from ssmppl.language.model import Model
 from tests.analysis.corpus import laws, with_inputs
@@ -325,3 +334,213 @@ def semi_conjugate(m):
         return {"x": Normal(b * x, variance=q)}
 
     laws(m, prior, transition)
+
+
+# -- of vectors and matrices
+def two_states():
+    return {"x": Normal(np.zeros(2), sd=1)}
+
+
+def noise_prior():
+    return {"Q": InverseWishart(5, scale=np.eye(2))}
+
+
+def damped(x, Q):
+    return {"x": MvNormal(0.5 * x, covariance=Q)}
+
+
+def stationary(m):
+    """x_1 has the covariance that A = diag(a) and Q settle at: S = A S A' + Q."""
+
+    def prior():
+        return {"a": Normal(np.zeros(2), sd=0.4), "Q": InverseWishart(5, scale=np.eye(2))}
+
+    def initial(a, Q):
+        return {"x": MvNormal(np.zeros(2), covariance=Q / (1 - np.outer(a, a)))}
+
+    def transition(x, a, Q):
+        return {"x": MvNormal(np.diag(a) @ x, covariance=Q)}
+
+    laws(m, prior, transition, initial)
+
+
+@refused("a", "joint Normal", "covariance=Q / (1 - np.outer(a, a))", "initial of x", "logdet")
+def stationary_coefficients(m):
+    """Corrected: the initial law counts, though it does not separate."""
+    stationary(m)
+
+
+@refused("Q", "inverse Wishart", "covariance=Q / (1 - np.outer(a, a))", "initial of x", "logdet")
+def stationary_covariance(m):
+    stationary(m)
+
+
+@refused("Q", "inverse Wishart", "Wishart(5, scale=np.eye(2))", "prior law of Q")
+def wishart_on_a_covariance(m):
+    def prior():
+        return {"Q": Wishart(5, scale=np.eye(2))}
+
+    laws(m, prior, damped, two_states)
+
+
+@refused("Q", "slice", "covariance=Q + 0.1 * np.eye(2)", "transition of x", "inverse(")
+def covariance_with_a_nugget(m):
+    def transition(x, Q):
+        return {"x": MvNormal(0.5 * x, covariance=Q + 0.1 * np.eye(2))}
+
+    laws(m, noise_prior, transition, two_states)
+
+
+@refused("Q", "slice", "variance=b @ Q @ b", "observation of y")
+def variance_of_a_projection(m):
+    """One number made of Q: its inverse is no part of Q's."""
+
+    def observation(x, Q):
+        b = np.array([1.0, 0.5])
+        return {"y": Normal(x[0], variance=b @ Q @ b)}
+
+    laws(m, noise_prior, damped, two_states, observation)
+
+
+@refused("Q", "inverse Wishart", "InverseWishart(5, scale=np.eye(2))")
+def one_column_apart(m):
+    """Prior of one column not scaled by Q: both conditionals are known, their joint is not."""
+
+    def prior(Q):
+        return {
+            "a0": MvNormal(np.zeros(2), covariance=2 * Q),
+            "a1": MvNormal(np.zeros(2), covariance=np.eye(2)),
+        }
+
+    def transition(x, a0, a1, Q):
+        return {"x": MvNormal(a0 * x[0] + a1 * x[1], covariance=Q)}
+
+    m.prior(noise_prior)
+    laws(m, prior, transition, two_states)
+
+
+@refused("Q", "inverse Wishart", "InverseWishart(5, scale=np.eye(2))")
+def regressors_of_their_own(m):
+    """As many coefficients in each equation, but of different regressors."""
+
+    def prior():
+        return {"a": Flat((2,)), "Q": InverseWishart(5, scale=np.eye(2))}
+
+    def transition(x, a, Q):
+        return {"x": MvNormal(a * x, covariance=Q)}
+
+    laws(m, prior, transition, two_states)
+
+
+@refused("Q", "inverse Wishart", "InverseWishart(5, scale=np.eye(2))")
+def rows_of_different_scale(m):
+    """A prior covariance of A that holds Q, but not as Q (x) V."""
+
+    def prior(Q):
+        scale = np.diag([1.0, 1.0, 2.0, 2.0])
+        spread = scale @ np.kron(Q, np.eye(2)) @ scale
+        return {"a": MvNormal(np.zeros(4), covariance=spread)}
+
+    def transition(x, a, Q):
+        return {"x": MvNormal(np.reshape(a, (2, 2)) @ x, covariance=Q)}
+
+    m.prior(noise_prior)
+    laws(m, prior, transition, two_states)
+
+
+@refused("b", "Normal", "Cauchy(mu, scale=1)", "prior of b", "log1p")
+def cauchy_around_another(m):
+    """Corrected by the log joint: the prior ties b to mu inside a logarithm."""
+
+    def first():
+        return {"mu": Normal(0, sd=1)}
+
+    def prior(mu):
+        return {"b": Cauchy(mu, scale=1)}
+
+    def transition(x, b):
+        return {"x": Normal(b * x, sd=1)}
+
+    m.prior(first)
+    laws(m, prior, transition)
+
+
+@refused("a", "slice", "Normal(a**2 * z, sd=1)", "transition of z", "a**4")
+def squared_elsewhere(m):
+    """Linear in one equation, squared in the other."""
+
+    def initial():
+        return {"x": Normal(0, sd=1), "z": Normal(0, sd=1)}
+
+    def transition(x, z, a):
+        return {
+            "x": Normal(a * x, sd=1),
+            "z": Normal(a**2 * z, sd=1),
+        }
+
+    laws(m, normal_prior, transition, initial)
+
+
+# -- of probabilities, counts and positive numbers
+@refused("p", "slice", "Categorical(0.9 * p + 0.1 / 3)", "observation of y", "log(")
+def contaminated_classes(m):
+    def prior():
+        return {"p": Dirichlet([2.0, 1.0, 1.5])}
+
+    def observation(x, p):
+        return {"y": Categorical(0.9 * p + 0.1 / 3)}
+
+    laws(m, prior, walk, None, observation)
+
+
+@refused("p", "slice", "Binomial(5, p * q)", "observation of y")
+def detection_of_the_present(m):
+    """Present with q, seen with p: only their product is a probability of the law."""
+
+    def prior():
+        return {"p": Beta(2, 2), "q": Beta(2, 2)}
+
+    def observation(x, p, q):
+        return {"y": Binomial(5, p * q)}
+
+    laws(m, prior, walk, None, observation)
+
+
+@refused("v", "slice", "LogNormal(x - v / 2, sd=np.sqrt(v))", "observation of y")
+def mean_of_a_log_normal(m):
+    """The variance is in the mean as well: v beside 1 / v."""
+
+    def prior():
+        return {"v": InverseGamma(3, scale=1)}
+
+    def observation(x, v):
+        return {"y": LogNormal(x - v / 2, sd=np.sqrt(v))}
+
+    laws(m, prior, walk, None, observation)
+
+
+@refused("q", "slice", "variance=q + 0.5", "observation of y")
+def added_variance(m):
+    """The variance of a step, and of the same step seen with noise."""
+
+    def prior():
+        return {"q": InverseGamma(3, scale=1)}
+
+    def transition(x, q):
+        return {"x": Normal(x, variance=q)}
+
+    def observation(x, q):
+        return {"y": Normal(x, variance=q + 0.5)}
+
+    laws(m, prior, transition, None, observation)
+
+
+@refused("b", "slice", "Gamma(b, rate=b)", "gammaln(b)", "observation of y")
+def shape_and_rate(m):
+    def prior():
+        return {"b": Gamma(2, rate=1)}
+
+    def observation(x, b):
+        return {"y": Gamma(b, rate=b)}
+
+    laws(m, prior, walk, None, observation)

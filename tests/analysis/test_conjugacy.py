@@ -68,3 +68,19 @@ def test_explanations_have_every_part(name):
         assert update.needs_log_joint or explanation.statistics
         assert update.where is not None
         assert all(len(line) < 700 for line in str(explanation).splitlines())
+
+
+def test_matrices_are_told_in_matrix_notation():
+    told = {u.block: u.explanation for u in derive_updates(trace(build("vector_regression")[0]))}
+    normal, wishart = told["A", "B", "c"], told["Q",]
+    assert normal.title == "(A, B, c) jointly"
+    assert normal.statistics == (
+        "H: prior + sum_{t=2}^T kron(Q^-1, z z')",
+        "h: prior + sum_{t=2}^T Q^-1 x z'",
+        "z = (x_prev, u_prev, 1) in the mean of x",
+    )
+    assert wishart.conditional == "Q ~ inverse Wishart(df = 5 + (T - 1), scale S)"
+    assert wishart.statistics == (
+        "S: [[1, 0], [0, 1]] + sum_{t=2}^T r r'",
+        "r = x - (A x_prev + B u_prev + c)",
+    )

@@ -12,8 +12,8 @@ from ssmppl.analysis.families import (
     Normal,
     NormalGamma,
     Wishart,
-    symmetric,
 )
+from ssmppl.analysis.families_matrix import symmetric
 from ssmppl.analysis.modes import mode
 from ssmppl.analysis.mstep import counted, derive_m_step
 from ssmppl.analysis.sufficient import complete_data

@@ -21,7 +21,22 @@ def test_near_miss(name):
     assert "near_misses.py" in text or not words
 
 
-@pytest.mark.parametrize("name", [n for n in NEAR_MISSES if n != "deterministic"])
+LONG = {  # slices on a matrix or a simplex, each a pass over the whole density
+    "stationary_coefficients",
+    "stationary_covariance",
+    "wishart_on_a_covariance",
+    "covariance_with_a_nugget",
+    "variance_of_a_projection",
+    "contaminated_classes",
+}
+DRAWN = [
+    pytest.param(n, marks=pytest.mark.slow if n in LONG else ())
+    for n in NEAR_MISSES
+    if n != "deterministic"
+]
+
+
+@pytest.mark.parametrize("name", DRAWN)
 def test_its_draws_follow_the_exact_conditional(name):
     model, *_ = build(name)
     for conditional in conditionals(model):

@@ -333,3 +333,13 @@ def test_the_text_of_a_distribution_has_the_users_names():
 
 def test_cases_can_be_built_and_named():
     assert all(isinstance(c, Case) and c.id for c in CASES)
+
+
+@pytest.mark.parametrize("spread", ["covariance", "precision"])
+def test_no_density_where_a_matrix_is_not_positive_definite(spread):
+    a = symbol("parameter", "a")
+    law = D.MvNormal(np.zeros(2), **{spread: a * np.array([[1.0, 0.3], [0.3, 1.0]])})
+    density = law.log_density(np.ones(2))
+    found = evaluate(density, {a: np.array([2.0, -2.0])})  # -2: determinant positive all the same
+    assert np.isfinite(found[0])
+    assert found[1] == -np.inf

@@ -353,3 +353,72 @@ def counts_transition(x, mu, phi, tau):
 @counts.observation
 def counts_observation(x):
     return {"y": ssm.Poisson(np.exp(x))}
+
+
+# A vector autoregression with its conjugate prior, observed with gaps; one with a prior that is not
+# scaled by the noise; and a hidden Markov model with a Dirichlet law for each row of its matrix.
+
+vector_ar = ssm.Model("vector ar")
+vector_ar_apart = ssm.Model("vector ar apart")
+
+
+@vector_ar.prior
+@vector_ar_apart.prior
+def noise_prior():
+    return {"Q": ssm.InverseWishart(8, scale=np.array([[3.0, 1.0], [1.0, 2.0]]))}
+
+
+@vector_ar.prior
+def vector_ar_prior(Q):
+    spread = np.array([[0.06, 0.02], [0.02, 0.04]])
+    return {"a": ssm.MvNormal([0.6, 0.2, -0.2, 0.5], covariance=np.kron(Q, spread))}
+
+
+@vector_ar.transition
+def vector_ar_transition(x, a, Q):
+    return {"x": ssm.MvNormal(np.reshape(a, (2, 2)) @ x, covariance=Q)}
+
+
+@vector_ar_apart.prior
+def vector_ar_apart_prior():
+    return {"a": ssm.Normal([0.6, 0.2, -0.2, 0.5], sd=0.2)}
+
+
+vector_ar_apart.transition(vector_ar_transition)
+
+
+@vector_ar.initial
+@vector_ar_apart.initial
+def vector_ar_initial(Q):
+    return {"x": ssm.MvNormal(np.zeros(2), covariance=2 * Q)}
+
+
+@vector_ar.observation
+@vector_ar_apart.observation
+def vector_ar_observation(x):
+    return {"y": ssm.Normal(x, sd=0.3)}
+
+
+three_regimes = ssm.Model("three regimes")
+
+
+@three_regimes.prior
+def three_regimes_prior():
+    rows = {f"row{i}": ssm.Dirichlet(1.0 + 4.0 * np.eye(3)[i]) for i in range(3)}
+    level = ssm.Normal(np.array([-3.0, 0.0, 3.0]), sd=0.4)
+    return {**rows, "level": level, "v": ssm.InverseGamma(8, scale=4)}
+
+
+@three_regimes.initial
+def three_regimes_initial():
+    return {"k": ssm.Categorical([0.4, 0.3, 0.3])}
+
+
+@three_regimes.transition
+def three_regimes_transition(k, row0, row1, row2):
+    return {"k": ssm.Categorical(np.stack([row0, row1, row2])[k])}
+
+
+@three_regimes.observation
+def three_regimes_observation(k, level, v):
+    return {"y": ssm.Normal(level[k], variance=v)}

@@ -35,7 +35,10 @@ TABLE = Path(__file__).parents[2] / "docs" / "figures" / "calibration.csv"
 
 @dataclass(frozen=True)
 class Study:
-    """A model, how it is sampled, and what is ranked: its parameters, and a state half-way."""
+    """A model, how it is sampled, and what is ranked: its parameters, and a state half-way.
+
+    An entry of a vector or matrix is ranked by its name: "Q[0, 1]".
+    """
 
     model: str
     method: ssm.PMMH | ssm.PGAS | ssm.Gibbs | ssm.MetropolisHastings
@@ -60,11 +63,17 @@ MODELS = {
 LINEAR = {  # for the methods with exact likelihood and trajectories
     "stationary": (("phi", "tau"), "x"),
 }
+BLOCKS = {  # joint conjugate blocks, states drawn exactly
+    "vector_ar": (("a[0]", "a[1]", "a[3]", "Q[0, 0]", "Q[0, 1]", "Q[1, 1]"), "x"),
+    "vector_ar_apart": (("a[0]", "a[1]", "a[3]", "Q[0, 0]", "Q[0, 1]", "Q[1, 1]"), "x"),
+    "three_regimes": (("row0[0]", "row1[0]", "row2[1]", "level[0]", "level[1]", "v"), "k"),
+}
 METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100))
 EXACT = (ssm.Gibbs(), ssm.MetropolisHastings())
+MISSING = {"vector_ar", "vector_ar_apart"}  # of their data, some steps and single entries
 STUDIES = {
     study.name: study
-    for models_, methods in ((MODELS, METHODS), (LINEAR, EXACT))
+    for models_, methods in ((MODELS, METHODS), (LINEAR, EXACT), (BLOCKS, EXACT[:1]))
     for name, (parameters, state) in models_.items()
     for method in methods
     for study in [Study(name, method, parameters, state)]
@@ -85,18 +94,29 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     walks = isinstance(study.method, (ssm.PMMH, ssm.MetropolisHastings))
     warmup = 600 if walks else 200  # random walks adapt during it
     truth = ssm.simulate(model, steps=STEPS, inputs=u or None, seed=first)
-    data = {"y": truth["y"].values[0]} | u
+    y = truth["y"].values[0].copy()
+    if study.model in MISSING:
+        y[10:13] = y[20:25, 0] = y[40, 1] = np.nan
+    data = {"y": y} | u
     idata = ssm.sample(
         model, data, study.method, draws=draws, warmup=warmup, chains=1, thin=thin, progress=False,
         seed=second,
     )  # fmt: skip
     posterior = idata["posterior"]
     middle = STEPS // 2
-    known = [float(truth[p].values[0]) for p in study.parameters]
-    drawn = [posterior[p].values[0] for p in study.parameters]
-    known.append(float(truth[study.state].values[0, middle]))
-    drawn.append(posterior[study.state].values[0, :, middle])
-    return np.array(known), np.array(drawn)
+    known = [entry(truth, p)[0] for p in study.parameters]
+    drawn = [entry(posterior, p) for p in study.parameters]
+    known.append(truth[study.state].values[0, middle].ravel()[0])
+    drawn.append(posterior[study.state].values[0, :, middle].reshape(draws, -1)[:, 0])
+    return np.array(known, dtype=float), np.array(drawn, dtype=float)
+
+
+def entry(dataset, name: str) -> np.ndarray:
+    """Draws (draw,) of a parameter, or of the entry of one that "name[i, j]" stands for."""
+    name, _, index = name.partition("[")
+    values = dataset[name].isel(chain=0) if "chain" in dataset[name].dims else dataset[name]
+    where = tuple(int(i) for i in index.rstrip("]").split(",")) if index else ()
+    return values.values[(slice(None), *where)]
 
 
 def iterations_per_draw(study: Study, replication: int) -> np.ndarray:
@@ -107,9 +127,11 @@ def iterations_per_draw(study: Study, replication: int) -> np.ndarray:
 
 
 def rank(study: Study, replication: int, thin: int) -> np.ndarray:
-    """Rank of the truth among `KEPT` draws, for every ranked quantity."""
+    """Rank of the truth among `KEPT` draws, for every ranked quantity; ties broken at random."""
     known, drawn = draws_of(study, replication, KEPT, thin, "data")
-    return (drawn < known[:, None]).sum(axis=1)
+    ties = (drawn == known[:, None]).sum(axis=1)
+    rng = np.random.default_rng(seed_of("ties", study.name, replication))
+    return (drawn < known[:, None]).sum(axis=1) + rng.integers(0, ties + 1)
 
 
 def calibrate(study: Study, replications: int, pilots: int = 8) -> tuple[np.ndarray, int]:

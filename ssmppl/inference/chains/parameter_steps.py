@@ -90,14 +90,12 @@ def draw_parameters(
         where = steps.where[k]
         rest = ThetaValues(steps.index, theta)
         totals = _totals(steps, k, theta, paths)
+        exact = update.needs_log_joint or update.left
+        density = partial(_with, steps, theta, where, paths=paths) if exact else None
+        values, info = draw(update, totals, theta[where], rest, generator, density)
+        theta[where] = values
         if update.needs_log_joint:
-            density = partial(_with, steps, theta, where, paths=paths)
-            values, info = draw(update, totals, theta[where], rest, generator, density)
-            theta[where] = values
             log_joint(steps, theta, paths)  # sets what is deterministic in the trajectories
-        else:
-            values, info = draw(update, totals, theta[where], rest, generator)
-            theta[where] = values
         infos.append(info.accepted)
     return infos
 
