@@ -44,7 +44,13 @@ class Study:
 
     @property
     def name(self) -> str:
-        return f"{self.model} {type(self.method).__name__}"
+        return f"{self.model} {self.label}"
+
+    @property
+    def label(self) -> str:
+        """The method; PGAS and Gibbs interweaved in every sweep are studied beside the plain ones."""
+        woven = getattr(self.method, "interweave", False) is True
+        return type(self.method).__name__ + (" interweaved" if woven else "")
 
     @property
     def ranked(self) -> tuple[str, ...]:
@@ -60,8 +66,12 @@ MODELS = {
 LINEAR = {  # for the methods with exact likelihood and trajectories
     "stationary": (("phi", "tau"), "x"),
 }
-METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100))
-EXACT = (ssm.Gibbs(), ssm.MetropolisHastings())
+METHODS = (
+    ssm.PGAS(particles=20, interweave=False),
+    ssm.PGAS(particles=20, interweave=True),
+    ssm.PMMH(particles=100),
+)
+EXACT = (ssm.Gibbs(interweave=False), ssm.Gibbs(interweave=True), ssm.MetropolisHastings())
 STUDIES = {
     study.name: study
     for models_, methods in ((MODELS, METHODS), (LINEAR, EXACT))
@@ -162,7 +172,7 @@ def main(replications: int, chosen: list[str]) -> None:
             p = uniform_p(column)
             print(f"{name:24} {quantity:12} thin {thin:4} p {p:.3f}", flush=True)
             own += [
-                (study.model, type(study.method).__name__, quantity, thin, i, count)
+                (study.model, study.label, quantity, thin, i, count)
                 for i, count in enumerate(histogram(column))
             ]
         write_table(read_table() | {name: own})

@@ -24,9 +24,12 @@ from ssmppl.codegen.kernels.guide_back import factorise
 @exact
 def linearise(
     prepare, step, linear_initial, linear, look_at, sizes,
-    theta, y, seen, u, x, rest, jacobian, spread, spread_initial, g, h,
+    theta, y, seen, u, x, looking, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
-    """The model's derivatives at theta along a given trajectory x (T, D); False if no number."""
+    """The model's derivatives at theta along a given trajectory x (T, D); False if no number.
+
+    looking : whether to write g and h too, which may be known from another theta.
+    """
     n_steps, d = x.shape
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
@@ -44,11 +47,26 @@ def linearise(
         else:
             linear(theta, c, s, before, now, told)
             spread_out(told, rest[t], jacobian[t], spread[t])
-        if not abs(look_at(theta, c, s, now, seen_so, g[t], h[t])) < np.inf:
+        if looking and not abs(look_at(theta, c, s, now, seen_so, g[t], h[t])) < np.inf:
             return False
         for i in range(d):
             before[i, 0] = now[i, 0]
     return True
+
+
+@exact
+def look_back_scalar(x, rest, jacobian, spread, spread_initial, g, h, a, pull):
+    """`guide_back.look_back` for one state with one noise, where its matrices are numbers."""
+    a_next, g_next = 0.0, 0.0
+    for t in range(x.shape[0] - 1, -1, -1):
+        a[t, 0, 0] = h[t, 0, 0] + a_next
+        pull[t, 0] = g[t, 0] + g_next
+        size = spread[t, 0, 0] if t > 0 else spread_initial[0, 0]
+        left = 1.0 / (1.0 + size * size * a[t, 0, 0])
+        bar = left * a[t, 0, 0]
+        g_next = jacobian[t, 0, 0] * (left * pull[t, 0] - bar * (rest[t, 0] - x[t, 0]))
+        a_next = jacobian[t, 0, 0] * jacobian[t, 0, 0] * bar
+    return abs(a[0, 0, 0]) < np.inf and abs(pull[0, 0]) < np.inf
 
 
 @exact
@@ -58,6 +76,14 @@ def noise_law(a, pull, centre, rest, spread, r, factor, mean):
     rest (D,), spread (D, R') : at x_{t-1}, of which the first r columns count.
     """
     d = rest.size
+    if d == 1 and r == 1:
+        size = spread[0, 0]
+        precision = 1.0 + size * a[0, 0] * size
+        if not precision > 0.0:
+            return np.nan
+        factor[0, 0] = math.sqrt(precision)
+        mean[0] = size * (pull[0] - a[0, 0] * (rest[0] - centre[0])) / precision
+        return 0.5 * math.log(precision)
     for k in range(r):
         mean[k] = 0.0
         for n in range(r):

@@ -26,7 +26,7 @@ approximation to p(x | y, theta) take the data into the map: on a linear Gaussia
 exact, pi(theta, x) is p(theta | y) times a function of e alone, a Metropolis step on the marginal;
 elsewhere nearly so. (Compare Murray and Adams 2010, "Slice sampling covariance hyperparameters of
 latent Gaussian models"; Tan 2023, "Efficient data augmentation techniques for some classes of state
-space models", *Statistical Science* 38, of which the plain and the data-informed map are two ends.)
+space models", *Statistical Science* 38, where the data choose location and scale of the states.)
 Where the states can be drawn exactly, the step is on p(theta | y) itself, before they are drawn.
 
 All choices are made in the warmup: which parameters move (those slow in the plain chain at its
@@ -58,7 +58,7 @@ from ssmppl.language.transforms import (
     unconstrain,
 )
 
-PROPOSALS = 3  # a sweep
+PROPOSALS = 4  # a sweep
 LEAST_WARMUP = 200  # sweeps, below which "auto" has no time to look and to tune
 LOOK = 0.25  # share of the warmup in which "auto" looks at the plain chain
 LONGEST_LOOK = 400  # sweeps
@@ -72,8 +72,8 @@ WALK = RandomWalk()
 class Interweaving:
     """The further steps of a chain, as far as they are the same for all chains.
 
-    moves : what can be held fixed. names : of the numbers on the unconstrained scale. movable :
-    their positions in the free ones that may move. scale : (d,) of the first steps.
+    moves : what can be held fixed. movable : positions, among the free numbers on the unconstrained
+    scale, of those that may move. scale : (d,) of the first steps.
     adapting : sweeps of the warmup. looking : of these, the first, plain, by which "auto" decides.
     bounds : of all components of theta, where they are numbers.
     """

@@ -20,6 +20,8 @@ from ssmppl.analysis.noises import Noises
 from ssmppl.codegen.interweaving import compile_noises
 from ssmppl.codegen.twisted import TwistedFilter, backward_passes
 from ssmppl.data import Experiment
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.exact.models import ExactModel
 from ssmppl.inference.problem import Problem
 
@@ -113,16 +115,34 @@ class NoiseMove:
             return None
         steps, d = x.shape
         r, r_initial = len(self.found.transition.noise), len(self.found.initial.noise)
-        shapes = (steps, d), (steps, d, d), (steps, d, r), (d, r_initial), (steps, d), (steps, d, d)
+        shapes = (steps, d), (steps, d, d), (steps, d, r), (d, r_initial)
         derivatives = [np.zeros(s) for s in shapes]
-        if not self.module.linearise(theta, e.y, e.seen, e.u, x, *derivatives):
+        looking = i not in self.looks
+        g, h = (np.empty((steps, d)), np.empty((steps, d, d))) if looking else self.looks[i]
+        given = (theta, e.y, e.seen, e.u, x, looking)
+        if not self.module.linearise(*given, *derivatives, g, h):
             return None
-        widest = max(r, r_initial)
+        if looking and not self.data_told_by:
+            self.looks[i] = g, h
         a, pull = np.empty((steps, d, d)), np.empty((steps, d))
-        rest = np.empty((steps, widest)), np.empty((steps, widest, d))
-        if not backward_passes().look_back(x, *derivatives, 0, a, pull, *rest):
-            return None
-        return a, pull, x
+        if hasattr(self.module, "look_back_scalar"):
+            fine = self.module.look_back_scalar(x, *derivatives, g, h, a, pull)
+        else:
+            widest = max(r, r_initial)
+            rest = np.empty((steps, widest)), np.empty((steps, widest, d))
+            fine = backward_passes().look_back(x, *derivatives, g, h, 0, a, pull, *rest)
+        return (a, pull, x) if fine else None
+
+    @cached_property
+    def looks(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """By experiment, what the data say of the reference, where no parameter stands in it."""
+        return {}
+
+    @cached_property
+    def data_told_by(self) -> bool:
+        """Whether a parameter is in the law of an observation."""
+        assert not isinstance(self.found.guide, NotApplicable)
+        return any(s.data[0] == "parameter" for s in symbols_of(self.found.guide.observed))
 
 
 _NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
