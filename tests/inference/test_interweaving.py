@@ -48,7 +48,11 @@ def posed(name, i, draws=8, seed=3):
     return problem, theta, paths
 
 
-@pytest.mark.parametrize(("name", "steered"), CASES)
+# A vector takes long to compile.
+SHAPES = [pytest.param(*c, marks=[pytest.mark.slow] * (c[0] == "vector")) for c in CASES]
+
+
+@pytest.mark.parametrize(("name", "steered"), SHAPES)
 def test_noises_and_back(name, steered):
     for i in range(3):
         problem, theta, paths = posed(name, i)
@@ -66,7 +70,7 @@ def test_noises_and_back(name, steered):
         np.testing.assert_allclose(held_there[0], held[0], rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize(("name", "steered"), CASES)
+@pytest.mark.parametrize(("name", "steered"), SHAPES)
 def test_volume_is_that_of_finite_differences(name, steered):
     """log |dx / de| over the states that move, against a determinant of central differences."""
     problem, theta, paths = posed(name, 1)

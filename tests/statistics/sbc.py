@@ -48,7 +48,7 @@ class Study:
 
     @property
     def label(self) -> str:
-        """The method; PGAS and Gibbs interweaved in every sweep are studied beside the plain ones."""
+        """The method; those interweaved in every sweep are studied beside the plain ones."""
         woven = getattr(self.method, "interweave", False) is True
         return type(self.method).__name__ + (" interweaved" if woven else "")
 
