@@ -292,6 +292,7 @@ def test_several_experiments_and_fixed_parameters(method):
     assert np.all(np.isfinite(idata["sample_stats"]["lp"]))
 
 
+@pytest.mark.slow
 def test_blocks_and_executors_change_nothing():
     method, data = ssm.PGAS(particles=5, interweave=True), series(8)
     here = ssm.sample(models.linear, data, method, draws=20, warmup=20, **SHORT)
@@ -329,8 +330,9 @@ def test_finite_states_are_left_alone(method):
     data = {"y": [0.1, 1.2, 0.8, -0.3]}
     with pytest.raises(ArgumentError, match="does not apply"):
         ssm.sample(coin, data, method(interweave=True), draws=1, **SHORT)
-    idata = ssm.sample(coin, data, method(), draws=5, warmup=200, **SHORT)
-    assert idata["posterior"].attrs["interweaving"].startswith("none")
+    if method is ssm.Gibbs:  # particles would have to be compiled
+        idata = ssm.sample(coin, data, method(), draws=5, warmup=200, **SHORT)
+        assert idata["posterior"].attrs["interweaving"].startswith("none")
 
 
 def test_plan_says_who_moves_and_why():

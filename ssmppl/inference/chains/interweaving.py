@@ -203,7 +203,7 @@ def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noise
     return found
 
 
-def _asked(
+def asked(
     problem: Problem, setting: str | bool, model: ExactModel | None
 ) -> Noises | NotApplicable:
     if not (setting is True or setting is False or setting == "auto"):
@@ -231,7 +231,7 @@ def interweaving(
     ------
     ArgumentError : `interweave` is neither "auto" nor a truth value, or is True and cannot be.
     """
-    found = _asked(setup.problem, setting, model)
+    found = asked(setup.problem, setting, model)
     if isinstance(found, NotApplicable):
         return None, f"none: {found.reason}"
     space, adapting = setup.space, setup.warmup * setup.thin

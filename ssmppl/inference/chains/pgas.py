@@ -14,7 +14,7 @@ import numpy as np
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.inference.chains.interweaving import Interweaving, Tuning, interweaving
+from ssmppl.inference.chains.interweaving import Interweaving, Tuning, asked, interweaving
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
@@ -45,6 +45,7 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
         proposal = pgas_proposal(problem)
     problem.proposal(proposal)
     settings = FilterSettings(int(particles), proposal)
+    asked(problem, method.interweave, None)  # refused before anything is compiled
     if space.where.size:
         pilot = find_mode(space, setup.root)
     else:
