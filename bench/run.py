@@ -16,6 +16,7 @@ SCRIPTS = (
     "proposals.py",
     "smoothing.py",
     "samplers.py",
+    "interweaving.py",
     "updates.py",
     "kalman.py",
 )

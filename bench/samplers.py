@@ -45,6 +45,7 @@ METHODS: dict[str, Any] = {
     "PMH2": ssm.PMMH(order=2),
     "correlated, rho 0.99": ssm.PMMH(particles=100, correlation=0.99, proposal="bootstrap"),
     "correlated, rho 0.9": ssm.PMMH(particles=200, correlation=0.9, proposal="bootstrap"),
+    "PGAS, plain": ssm.PGAS(interweave=False),
     "PGAS": ssm.PGAS(),
 }
 

@@ -107,7 +107,7 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
             return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new
-        sample = array(d.sample(_Given(site.name, new))).ravel()
+        sample = array(d.sample(given_draws(site.name, new))).ravel()
         value.update(zip(own, sample, strict=True))
         recovered += list(d.standard(site.value).ravel())
     return NoiseForm(tuple(noise), array([value[s] for s in states]), array(recovered))
@@ -122,6 +122,11 @@ class _Given(Draws):
 
     def normal(self) -> Expr:
         return next(self._next)
+
+
+def given_draws(site: str, symbols: list[Expr]) -> Draws:
+    """Draws of a sampler that takes normals only, which are these symbols, in turn."""
+    return _Given(site, symbols)
 
 
 def guided(trace: Trace, missing: Missing) -> Guided | NotApplicable:

@@ -49,7 +49,7 @@ MATRIX_CALLS = {"cholesky": "cholesky", "inverse": "inverse", "logdet": "logdet"
 DRAWS = {"normal": "normal", "uniform": "uniform", "gamma": "gamma", "poisson": "poisson",
          "binomial": "binomial"}  # fmt: skip
 _OWN_NAMES = """theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng
-    log_w out inf nan reference look trajectory total entry kernel np prev"""
+    log_w out inf nan reference look trajectory total entry kernel np prev noise kept"""
 RESERVED = frozenset([
     *CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values(), *keyword.kwlist, *dir(builtins),
     *_OWN_NAMES.split(),

@@ -78,18 +78,17 @@ class TwistedFilter:
         out[:, : u.shape[1]] = u
         ones = [k for k, s in enumerate(self.order) if _on_diagonal(s)]
         out[0, u.shape[1] + np.array(ones, dtype=int)] = 1.0
-        reference = _Reference.empty(steps, d, *size)
-        covariance = np.empty((steps, d, d))
+        reference, covariance = self._empty(steps)
         where = reference.x, covariance, *reference.derivatives
         if not self.module.follow_filter(*given, *where):
             return out
         reference = self._climbed(given, reference)
         back = _Back.empty(steps, d, max(size))
-        if _look_back()(reference.x, *reference.derivatives, horizon, *back.arrays):
+        if backward_passes().look_back(reference.x, *reference.derivatives, horizon, *back.arrays):
             found = out.copy()
             spread = reference.derivatives[3]
             where = back.precision, back.pull, reference.x, u, back.aim[0], spread, found
-            if _write_guide()(*where) and np.all(np.isfinite(found)):
+            if backward_passes().write_guide(*where) and np.all(np.isfinite(found)):
                 return found
         return out
 
@@ -98,14 +97,28 @@ class TwistedFilter:
         """The guide's symbols, in the order of its columns."""
         return guide_order(len(self.trace.state_symbols), len(self.found.initial.noise))
 
+    def mode(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> np.ndarray | None:
+        """About the likeliest trajectory (T, D) given theta; None where it comes to no number."""
+        given = (theta, y, seen, u)
+        found, covariance = self._empty(len(y))
+        if not self.module.follow_filter(*given, found.x, covariance, *found.derivatives):
+            return None
+        x = self._climbed(given, found).x
+        return x if np.all(np.isfinite(x)) else None
+
+    def _empty(self, steps: int) -> tuple[_Reference, np.ndarray]:
+        d = len(self.trace.state_symbols)
+        size = len(self.found.transition.noise), len(self.found.initial.noise)
+        return _Reference.empty(steps, d, *size), np.empty((steps, d, d))
+
     def filtered(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Means (T, D) and covariances (T, D, D) of the extended Kalman filter; None where it
         comes to no number."""
-        steps, d = len(y), len(self.trace.state_symbols)
-        size = len(self.found.transition.noise), len(self.found.initial.noise)
-        found, covariance = _Reference.empty(steps, d, *size), np.empty((steps, d, d))
+        found, covariance = self._empty(len(y))
         where = found.x, covariance, *found.derivatives
         fine = self.module.follow_filter(theta, y, seen, u, *where)
         return (found.x, covariance) if fine else None
@@ -116,7 +129,7 @@ class TwistedFilter:
         widest = first.e.shape[1]
         for k in range(MOST_STEPS):
             back = _Back.empty(len(best.x), best.x.shape[1], widest)
-            if not _look_back()(best.x, *best.derivatives, 0, *back.arrays):
+            if not backward_passes().look_back(best.x, *best.derivatives, 0, *back.arrays):
                 break
             for share in SHARES if k else (1.0,):
                 new = best.like()
@@ -214,11 +227,6 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
 def guide_kit(layout: Layout, trace: Trace, found: Guided) -> Section:
     """The functions by which the guide's kernels know the model; all of one particle."""
     section = Section(layout, "guide")
-    d = len(trace.state_symbols)
-
-    def listed(values: Any) -> list[Target]:
-        return [Target(f"out[{k}, i]", e) for k, e in enumerate(values)]
-
     for role, form, arguments in (
         ("begin", found.initial, "theta, c, s, noise, states"),
         ("follow", found.transition, "theta, c, s, states_prev, noise, states"),
@@ -227,22 +235,32 @@ def guide_kit(layout: Layout, trace: Trace, found: Guided) -> Section:
         targets = [Target(f"states[{k}, i]", e) for k, e in enumerate(form.value)]
         section.particle_pass(role, "x by the noise that drives it.", arguments, targets,
                               scalars=given)  # fmt: skip
+    linear_passes(section, trace, found)
+    return section
+
+
+def linear_passes(section: Section, trace: Trace, found: Guided) -> None:
+    """The model and the observation's density made linear and quadratic, of one particle."""
+    d = len(trace.state_symbols)
     first, later = found.initial, found.transition
     section.particle_pass(
         "linear_initial", "x_1 without noise, and its derivatives in the noise.",
-        "theta, c, s, states, out", listed([*first.at_rest(), *first.spread().ravel()]),
+        "theta, c, s, states, out", _listed([*first.at_rest(), *first.spread().ravel()]),
     )  # fmt: skip
     section.particle_pass(
         "linear", "x_t without noise, its derivatives in x_{t-1} and in the noise.",
         "theta, c, s, states_prev, states, out",
-        listed([*later.at_rest(), *jacobian(later, trace).ravel(), *later.spread().ravel()]),
+        _listed([*later.at_rest(), *jacobian(later, trace).ravel(), *later.spread().ravel()]),
     )  # fmt: skip
     lower = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
     section.particle_pass(
         "look", "log g(y_t | x_t), its slope, minus its curvature.", "theta, c, s, states, out",
-        listed([found.observed, *found.slope, *lower]),
+        _listed([found.observed, *found.slope, *lower]),
     )  # fmt: skip
-    return section
+
+
+def _listed(values: Any) -> list[Target]:
+    return [Target(f"out[{k}, i]", e) for k, e in enumerate(values)]
 
 
 HEAD = '''"""Generated by ssmppl: backward passes of the guide, the same for all models."""
@@ -256,7 +274,7 @@ import numpy as np
 
 
 @once
-def _backward() -> ModuleType:
+def backward_passes() -> ModuleType:
     """The kernels that know no model, compiled once for all."""
     made = [specialise(k, k.__name__, {}) for k in (guide_back.look_back, guide_back.write_guide)]
     names = {n: home for m in made for n, home in m.imports.items() if n != "exact"}
@@ -264,11 +282,3 @@ def _backward() -> ModuleType:
     lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]
     texts = [m.text.replace("@exact", "@entry", 1) for m in made]
     return cache.load("guide", HEAD + "\n".join(lines) + "\n\n".join(texts))
-
-
-def _look_back() -> Callable[..., Any]:
-    return _backward().look_back
-
-
-def _write_guide() -> Callable[..., Any]:
-    return _backward().write_guide

@@ -11,11 +11,13 @@ from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linea
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.finite import FiniteStates, finite_states
+from ssmppl.analysis.noises import Noises, noises
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.chains.interweaving import applicable, with_states
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.method_choice import (
     choose_maximiser,
@@ -38,7 +40,8 @@ class Plan:
     states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
-    memory : see `structure.deterministic_memory`.
+    memory : see `structure.deterministic_memory`. noises : what drives the states, or why it cannot
+    be told.
     """
 
     trace: Trace
@@ -48,6 +51,7 @@ class Plan:
     proposals: dict[str, Proposal | NotApplicable]
     updates: tuple[Update, ...]
     memory: int | None
+    noises: Noises | NotApplicable
     data: str = ""
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -70,6 +74,7 @@ class Plan:
         out.append(("Chosen, unless a method is named", self._choices()))
         if self.updates:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
+            out.append(("Interweaved with these, where asked for", self._interweaved()))
         return [(title, rows) for title, rows in out if rows]
 
     def _structure(self) -> list[tuple[str, str]]:
@@ -98,6 +103,18 @@ class Plan:
             choices["maximize"] = choose_maximiser(kind, self.trace)
         choices["smooth"] = choose_smoother(kind)
         return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
+
+    def _interweaved(self) -> list[tuple[str, str]]:
+        exact = exact_model(self.trace)
+        found = applicable(self.noises, None if isinstance(exact, NotApplicable) else exact)
+        if isinstance(found, NotApplicable):
+            return [("nothing", _reason(found))]
+        rows = [("PGAS", with_states(found))]
+        if not isinstance(exact, NotApplicable):
+            rows.insert(0, ("Gibbs", f"{', '.join(found.tied)}: moved with the states "
+                            "integrated out, if the warmup finds a parameter slow given the states")
+                        )  # fmt: skip
+        return rows
 
     def _trajectories(self) -> str:
         flat = [s.name for s in self.trace.initial.values() if not s.distribution.proper]
@@ -207,6 +224,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         program.proposals,
         tuple(derive_updates(traced, (), missing)),
         deterministic_memory(traced),
+        noises(traced, missing),
         bound,
     )
 

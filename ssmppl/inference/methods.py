@@ -33,8 +33,15 @@ class MetropolisHastings:
 class Gibbs:
     """Gibbs sampling of a linear Gaussian model (Schön et al. 2015, section 4.2): trajectories by
     exact backward sampling (Frühwirth-Schnatter 1994; Carter and Kohn 1994), parameters by the
-    updates that were derived for them. It has no settings.
+    updates that were derived for them.
+
+    Parameters
+    ----------
+    interweave : whether each sweep also moves the parameters with the states integrated out, by a
+        random walk on the exact likelihood: True, False, or "auto", as in `PGAS`.
     """
+
+    interweave: bool | str = False
 
 
 @dataclass(frozen=True)
@@ -98,11 +105,18 @@ class PGAS:
     proposal : "auto", "bootstrap", "guided", "auxiliary" or "user".
     log_likelihood : whether to estimate log p(y_t | y_1:t-1, theta) at each draw too, by a particle
         filter, for the group `log_likelihood`.
+    interweave : whether each sweep also moves parameters together with the trajectories, holding
+        fixed the noises that drive these (Yu and Meng 2011). True: from the first sweep, all
+        parameters that can. "auto": the first quarter of the warmup (at most 400 sweeps) runs
+        without; then each chain moves the parameters that mixed slowly in it (lag-1 autocorrelation
+        above 0.5 on the unconstrained scale), if there are any; never with a warmup of fewer than
+        200 sweeps. The walk adapts during warmup.
     """
 
     particles: int | None = None
     proposal: str = "auto"
     log_likelihood: bool = False
+    interweave: bool | str = False
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class Transform:
         lower = np.broadcast_to(evaluate(array(support.lower), known), value.shape).ravel()
         upper = np.broadcast_to(evaluate(array(support.upper), known), value.shape).ravel()
         pairs = zip(value.ravel(), lower, upper, strict=True)
-        return np.array([_free(v, a, b) for v, a, b in pairs])
+        return np.array([free_number(v, a, b) for v, a, b in pairs])
 
 
 def transforms(trace: Trace) -> list[Transform]:
@@ -96,7 +96,8 @@ def _bounded(z: Expr, lower: Expr, upper: Expr) -> tuple[Expr, Expr]:
     return lower + (upper - lower) * share, apply("log", upper - lower) + tails
 
 
-def _free(value: float, lower: float, upper: float) -> float:
+def free_number(value: float, lower: float, upper: float) -> float:
+    """A number between bounds, on the unconstrained scale."""
     # a search that ran towards a bound ends on it by rounding
     if value == lower:
         value = math.nextafter(lower, math.inf)
@@ -147,6 +148,21 @@ def _cholesky(z: list[Expr], p: int, site: Site) -> tuple[list[Expr], Expr]:
     matrix = array(root) @ array(root).T
     place = {s: i for i, s in reversed(list(enumerate(site.value.ravel())))}
     return [matrix.ravel()[place[s]] for s in site.components], log_jacobian
+
+
+def constant_bounds(trace: Trace) -> list[tuple[float, float]] | None:
+    """Bounds of every component; None where some depend on other parameters, or a parameter is
+    not made of free numbers (a simplex, a positive definite matrix)."""
+    out = []
+    for site in trace.parameters.values():
+        support = site.distribution.support()
+        if support.kind in ("simplex", "positive definite"):
+            return None
+        for pair in zip(array(support.lower).ravel(), array(support.upper).ravel(), strict=True):
+            if any(e.op != "const" for e in pair):
+                return None
+            out.append((pair[0].data, pair[1].data))
+    return out
 
 
 def unconstrain(trace: Trace, theta: np.ndarray, values: dict[str, np.ndarray]) -> np.ndarray:

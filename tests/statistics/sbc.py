@@ -47,7 +47,13 @@ class Study:
 
     @property
     def name(self) -> str:
-        return f"{self.model} {type(self.method).__name__}"
+        return f"{self.model} {self.label}"
+
+    @property
+    def label(self) -> str:
+        """The method; those interweaved in every sweep are studied beside the plain ones."""
+        woven = getattr(self.method, "interweave", False) is True
+        return type(self.method).__name__ + (" interweaved" if woven else "")
 
     @property
     def ranked(self) -> tuple[str, ...]:
@@ -68,8 +74,12 @@ BLOCKS = {  # joint conjugate blocks, states drawn exactly
     "vector_ar_apart": (("a[0]", "a[1]", "a[3]", "Q[0, 0]", "Q[0, 1]", "Q[1, 1]"), "x"),
     "three_regimes": (("row0[0]", "row1[0]", "row2[1]", "level[0]", "level[1]", "v"), "k"),
 }
-METHODS = (ssm.PGAS(particles=20), ssm.PMMH(particles=100))
-EXACT = (ssm.Gibbs(), ssm.MetropolisHastings())
+METHODS = (
+    ssm.PGAS(particles=20, interweave=False),
+    ssm.PGAS(particles=20, interweave=True),
+    ssm.PMMH(particles=100),
+)
+EXACT = (ssm.Gibbs(interweave=False), ssm.Gibbs(interweave=True), ssm.MetropolisHastings())
 MISSING = {"vector_ar", "vector_ar_apart"}  # of their data, some steps and single entries
 STUDIES = {
     study.name: study
@@ -184,7 +194,7 @@ def main(replications: int, chosen: list[str]) -> None:
             p = uniform_p(column)
             print(f"{name:24} {quantity:12} thin {thin:4} p {p:.3f}", flush=True)
             own += [
-                (study.model, type(study.method).__name__, quantity, thin, i, count)
+                (study.model, study.label, quantity, thin, i, count)
                 for i, count in enumerate(histogram(column))
             ]
         write_table(read_table() | {name: own})

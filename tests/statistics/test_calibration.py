@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from .checks import LEVEL
-from .sbc import BINS, KEPT, STUDIES, calibrate, histogram, uniform_p
+from .sbc import BINS, BLOCKS, KEPT, STUDIES, calibrate, histogram, uniform_p
 
 SETS = int(os.environ.get("SSMPPL_SBC_SETS", "40"))  # `make exhaustive` asks for 100
 QUANTITIES = sum(len(study.ranked) for study in STUDIES.values())
@@ -25,8 +25,13 @@ def test_statistic_knows_uniform_from_not():
     assert uniform_p(narrow) < LEVEL
 
 
+# The studies of joint blocks and of interweaved moves take an hour together.
+LONG = [n for n, s in STUDIES.items() if s.model in BLOCKS or "interweaved" in s.method_name]
+NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STUDIES)
+@pytest.mark.parametrize("name", NAMES)
 def test_ranks_are_uniform(name):
     """Every parameter, and the state in the middle, over the first data sets."""
     study = STUDIES[name]

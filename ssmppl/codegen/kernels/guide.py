@@ -31,6 +31,9 @@ ROUND = 1e-14
 def lift(h):
     """h (D, D) <- its positive semidefinite part, by Jacobi's method; h is symmetric."""
     d = h.shape[0]
+    if d == 1:
+        h[0, 0] = max(h[0, 0], 0.0)
+        return
     v = np.eye(d)
     a = h.copy()
     for _ in range(SWEEPS):

@@ -51,16 +51,18 @@ def solve(root, b, column):
 
 
 @exact
-def carry_information(a, g, away, jacobian, spread, aim, gain, a_before, g_before):
+def carry_information(
+    a, g, away, jacobian, spread, aim, gain, a_before, g_before, la, m, left, al, bar, pull
+):  # fmt: skip
     """One step back: from psi_t to what x_{t-1} can expect of it; False where it is no number.
 
     a (D, D), g (D,) : of psi_t about its centre. away (D,) : rest less that centre. aim (R',), gain
     (R', D) : e at the old x_{t-1}, and for each unit away from it; R of the rows are written, as
-    are a_before and g_before.
+    are a_before and g_before. la (R, D), m (R, R), left, al, bar (D, D), pull (D,) : room to work
+    in, which would cost more to find anew at every step than the step itself.
     """
     d, r = spread.shape
-    la = np.empty((r, d))  # L' A
-    m = np.empty((r, r))
+    # la: L' A
     for k in range(r):
         for j in range(d):
             total = 0.0
@@ -88,7 +90,6 @@ def carry_information(a, g, away, jacobian, spread, aim, gain, a_before, g_befor
     for j in range(d):
         solve(m, la, j)  # la <- (I + L'AL)^-1 L' A, the noise that takes a unit of `away` back
     # left = I - L la; the information of both the rest and the noise, each a square
-    left, al = np.empty((d, d)), np.empty((d, d))
     for i in range(d):
         for j in range(d):
             total = 1.0 if i == j else 0.0
@@ -101,7 +102,6 @@ def carry_information(a, g, away, jacobian, spread, aim, gain, a_before, g_befor
             for k in range(d):
                 total += a[i, k] * left[k, j]
             al[i, j] = total
-    bar, pull = np.empty((d, d)), np.empty(d)
     for i in range(d):
         for j in range(i + 1):
             total = 0.0
@@ -154,6 +154,10 @@ def look_back(x, rest, jacobian, spread, spread_initial, g, h, horizon, a, pull,
     n_steps, d = x.shape
     away, nowhere = np.empty(d), np.zeros((d, d))
     a_next, g_next = np.zeros((d, d)), np.zeros(d)
+    r, r_initial = spread.shape[2], spread_initial.shape[1]
+    la, m = np.empty((r, d)), np.empty((r, r))
+    la_initial, m_initial = np.empty((r_initial, d)), np.empty((r_initial, r_initial))
+    left, al, bar, room = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d)
     for t in range(n_steps - 1, -1, -1):
         blind = t == n_steps - 1 or (horizon > 0 and (t + 1) % horizon == 0)
         for i in range(d):
@@ -163,12 +167,14 @@ def look_back(x, rest, jacobian, spread, spread_initial, g, h, horizon, a, pull,
                 a[t, i, j] = h[t, i, j] + (0.0 if blind else a_next[i, j])
         if t > 0:
             fine = carry_information(
-                a[t], pull[t], away, jacobian[t], spread[t], aim[t], gain[t], a_next, g_next
-            )
+                a[t], pull[t], away, jacobian[t], spread[t], aim[t], gain[t], a_next, g_next,
+                la, m, left, al, bar, room,
+            )  # fmt: skip
         else:
             fine = carry_information(
-                a[t], pull[t], away, nowhere, spread_initial, aim[t], gain[t], a_next, g_next
-            )
+                a[t], pull[t], away, nowhere, spread_initial, aim[t], gain[t], a_next, g_next,
+                la_initial, m_initial, left, al, bar, room,
+            )  # fmt: skip
         if not fine:
             return False
     return True

@@ -9,11 +9,12 @@ derived updates.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
 
+from ssmppl.inference.chains.interweaving import Interweaving, Tuning, interweaving
 from ssmppl.inference.chains.metropolis import needed_model
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
@@ -30,11 +31,20 @@ from ssmppl.inference.runner import Block
 
 @dataclass(frozen=True)
 class GibbsState:
-    """Where a chain stands: theta (P,) and its random states; the trajectories are drawn anew."""
+    """Where a chain stands: theta (P,), its random states, and how its further steps are tuned; the
+    trajectories are drawn anew."""
 
     theta: np.ndarray
     generator: np.random.Generator
     stream: np.ndarray
+    tuning: Tuning | None = None
+
+
+@dataclass(frozen=True)
+class GibbsSteps(ParameterSteps):
+    """A problem with its updates. interweaving : the further steps of a sweep."""
+
+    interweaving: Interweaving | None = None
 
 
 def prepare(setup: Setup, method: Gibbs) -> Sampler:
@@ -45,38 +55,48 @@ def prepare(setup: Setup, method: Gibbs) -> Sampler:
     ArgumentError : the states cannot be drawn exactly; gives the reason and the line.
     """
     problem, space = setup.problem, setup.space
-    kind = filter_of(needed_model(problem, "Gibbs"))
-    steps = ParameterSteps(problem, plan_updates(problem, setup.held))
+    model = needed_model(problem, "Gibbs")
+    kind = filter_of(model)
     if space.where.size:
         pilot = find_mode(space, setup.root, kind)
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
+    further, interweaved = interweaving(setup, method.interweave, pilot, model)
+    steps = GibbsSteps(problem, plan_updates(problem, setup.held), further)
     states = []
     for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, kind)):
         generator, stream = setup.streams(chain)
         theta = space.parameters(z)[0] if len(z) else space.theta
-        states.append(GibbsState(theta.copy(), generator, stream))
+        tuning = further.begin() if further is not None else None
+        states.append(GibbsState(theta.copy(), generator, stream, tuning))
     report = {
         "trajectories": "exact, by backward sampling",
+        "settings": asdict(method),
         "plan": "\n".join(str(u.explanation) for u in steps.updates),
+        "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
     return Sampler(partial(gibbs_block, steps, setup.thin), states, report)
 
 
 def gibbs_block(
-    steps: ParameterSteps, thin: int, state: GibbsState, n: int
+    steps: GibbsSteps, thin: int, state: GibbsState, n: int
 ) -> tuple[GibbsState, Block]:
     """n draws of one chain, each after `thin` sweeps."""
     model = needed_model(steps.problem, "Gibbs")
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
-    theta = state.theta.copy()
+    theta, tuning, further = state.theta.copy(), state.tuning, steps.interweaving
     draws: dict[str, list[np.ndarray]] = {"theta": []}
     draws |= {f"path_{i}": [] for i in range(len(steps.problem.experiments))}
     stats: dict[str, list[float]] = {"lp": [], "acceptance_rate": []}
+    if further is not None:
+        stats["interweaved"] = []
     for _ in range(n):
-        accepted, made = 0, 0
+        accepted, made, interweaved = 0, 0, 0.0
         for _ in range(thin):
+            if further is not None and tuning is not None:
+                tuning, share = further.step(tuning, theta, [], generator)
+                interweaved += share / thin
             paths = draw_paths(steps, model, theta, stream)
             infos = draw_parameters(steps, theta, paths, generator)
             accepted, made = accepted + sum(infos), made + len(infos)
@@ -85,10 +105,12 @@ def gibbs_block(
             draws[f"path_{i}"].append(path)
         stats["lp"].append(log_joint(steps, theta, paths))
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
+        if further is not None:
+            stats["interweaved"].append(interweaved)
     block = Block(
         {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
     )
-    return GibbsState(theta, generator, stream), block
+    return GibbsState(theta, generator, stream, tuning), block
 
 
 def draw_paths(

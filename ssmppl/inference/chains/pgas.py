@@ -14,6 +14,7 @@ import numpy as np
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.inference.chains.interweaving import Interweaving, Tuning, asked, interweaving
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
@@ -44,11 +45,13 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
         proposal = pgas_proposal(problem)
     problem.proposal(proposal)
     settings = FilterSettings(int(particles), proposal)
-    sweeper = Sweeper(problem, plan_updates(problem, setup.held), settings)
+    asked(problem, method.interweave, None)  # refused before anything is compiled
     if space.where.size:
         pilot = find_mode(space, setup.root)
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
+    further, interweaved = interweaving(setup, method.interweave, pilot)
+    sweeper = Sweeper(problem, plan_updates(problem, setup.held), settings, further)
     states = []
     for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
         generator, stream = setup.streams(chain)
@@ -60,6 +63,7 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
         "settings": asdict(method),
         "ancestor_sampling": memory is not None,
         "plan": "\n".join(str(u.explanation) for u in sweeper.updates),
+        "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
     step = partial(pgas_block, sweeper, setup.thin, method.log_likelihood)
@@ -81,20 +85,23 @@ def pgas_proposal(problem: Problem) -> str:
 class Sweeper(ParameterSteps):
     """A problem with its updates: what one iteration of PGAS needs.
 
-    settings : of the conditional particle filter.
+    settings : of the conditional particle filter. interweaving : the further steps of a sweep.
     """
 
     settings: FilterSettings
+    interweaving: Interweaving | None = None
 
 
 @dataclass(frozen=True)
 class PGASState:
-    """Where a chain stands: theta (P,), one trajectory (T, D) per experiment, random states."""
+    """Where a chain stands: theta (P,), one trajectory (T, D) per experiment, random states, and
+    how its further steps are tuned."""
 
     theta: np.ndarray
     paths: tuple[np.ndarray, ...]
     generator: np.random.Generator
     stream: np.ndarray
+    tuning: Tuning | None = None
 
 
 def start_chain(
@@ -118,7 +125,9 @@ def start_chain(
         if status != OK:
             raise failure(problem, theta, status, t, e)
         paths.append(path)
-    return PGASState(theta.copy(), tuple(paths), generator, stream)
+    further = sweeper.interweaving
+    tuning = further.begin() if further is not None else None
+    return PGASState(theta.copy(), tuple(paths), generator, stream, tuning)
 
 
 def pgas_block(
@@ -129,15 +138,21 @@ def pgas_block(
     predictive : whether to estimate log p(y_t | y_1:t-1, theta) at each, by a particle filter.
     """
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
-    theta, paths = state.theta.copy(), [p.copy() for p in state.paths]
+    theta, paths, tuning = state.theta.copy(), [p.copy() for p in state.paths], state.tuning
+    further = sweeper.interweaving
     draws: dict[str, list[np.ndarray]] = {"theta": []}
     draws |= {f"path_{i}": [] for i in range(len(paths))}
     stats: dict[str, list[float]] = {"lp": [], "update_rate": [], "ess": [], "acceptance_rate": []}
+    if further is not None:
+        stats["interweaved"] = []
     for _ in range(n):
-        moved, ess, accepted, made = 0.0, 0.0, 0, 0
+        moved, ess, accepted, made, interweaved = 0.0, 0.0, 0, 0, 0.0
         for _ in range(thin):
             rates = _trajectories(sweeper, theta, paths, stream)
             infos = draw_parameters(sweeper, theta, paths, generator)
+            if further is not None and tuning is not None:
+                tuning, share = further.step(tuning, theta, paths, generator)
+                interweaved += share / thin
             moved, ess = moved + rates[0] / thin, ess + rates[1] / thin
             accepted, made = accepted + sum(infos), made + len(infos)
         draws["theta"].append(theta.copy())
@@ -150,10 +165,12 @@ def pgas_block(
         stats["update_rate"].append(moved)
         stats["ess"].append(ess)
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
+        if further is not None:
+            stats["interweaved"].append(interweaved)
     block = Block(
         {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
     )
-    return PGASState(theta, tuple(paths), generator, stream), block
+    return PGASState(theta, tuple(paths), generator, stream, tuning), block
 
 
 def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:

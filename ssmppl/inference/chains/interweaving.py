@@ -1,0 +1,287 @@
+"""Gibbs sampling interweaved with moves of the parameters that take the states along.
+
+Given the states, a parameter is known much better than given the data alone where the states carry
+what the data tell of it: the scale of their noise above all. Gibbs sampling then crawls, however
+well the states mix. So each sweep has further steps, in which theta moves while not the states x
+are held but what drives them (Yu and Meng 2011, "To center or not to center: that is not the
+question - an ancillarity-sufficiency interweaving strategy (ASIS)", *JCGS* 20; Kastner and
+Frühwirth-Schnatter 2014 for state space models):
+
+1. e = T_theta(x), the noises of the trajectory (`codegen/kernels/interweaving.py`), T_theta one to
+   one for every theta;
+2. theta' by a symmetric random walk on the unconstrained scale z, x' = T_theta'^{-1}(e);
+3. accepted with probability min(1, pi(theta', x') / pi(theta, x)), where
+
+       pi(theta, x) = p(theta, x, y) |d theta / dz| |dx / de|.
+
+Why this leaves p(theta, x | y) invariant: (z, e) is a change of variables of (theta, x), whose
+Jacobian is block triangular (theta depends on z alone), |d theta / dz| |dx / de|. So pi is the
+density of (z, e) given y, and steps 2 and 3 are a Metropolis step on z given e, in detailed balance
+with it; step 1 and its inverse change variables only. (It is a group move in the sense of Liu and
+Sabatti 2000, "Generalised Gibbs sampler", *Biometrika* 87, with Metropolis in place of a draw.) The
+map may depend on data and on anything fixed before the chains start, but on no state of a chain.
+
+Two maps are at hand. The noises of the model's laws are plain non-centring. Those of a Gaussian
+approximation to p(x | y, theta) take the data into the map: on a linear Gaussian model, where it is
+exact, pi(theta, x) is p(theta | y) times a function of e alone, a Metropolis step on the marginal;
+elsewhere nearly so. (Compare Murray and Adams 2010, "Slice sampling covariance hyperparameters of
+latent Gaussian models"; Tan 2023, "Efficient data augmentation techniques for some classes of state
+space models", *Statistical Science* 38, where the data choose location and scale of the states.)
+Where the states can be drawn exactly, the step is on p(theta | y) itself, before they are drawn.
+
+All choices are made in the warmup: which parameters move (those slow in the plain chain at its
+beginning), the walk's covariance, which of the maps; afterwards the kernel is fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.noises import Noises, noises
+from ssmppl.data import unpack_parameters
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.chains.noise_moves import Collapsed, Move, NoiseMove, Paths
+from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.walk import RandomWalk
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov
+from ssmppl.inference.exact.models import ExactModel
+from ssmppl.inference.particles.pilot import Pilot, Space
+from ssmppl.inference.problem import Problem
+from ssmppl.language.transforms import (
+    constant_bounds,
+    free_number,
+    transforms,
+    unconstrain,
+)
+
+PROPOSALS = 4  # a sweep
+LEAST_WARMUP = 200  # sweeps, below which "auto" has no time to look and to tune
+LOOK = 0.25  # share of the warmup in which "auto" looks at the plain chain
+LONGEST_LOOK = 400  # sweeps
+FEW = 6  # numbers that a random walk moves at once without trouble
+SLOW = 0.5  # lag-1 autocorrelation from which a parameter moves
+
+WALK = RandomWalk()
+
+
+@dataclass(frozen=True)
+class Interweaving:
+    """The further steps of a chain, as far as they are the same for all chains.
+
+    moves : what can be held fixed. movable : positions, among the free numbers on the unconstrained
+    scale, of those that may move. scale : (d,) of the first steps.
+    adapting : sweeps of the warmup. looking : of these, the first, plain, by which "auto" decides.
+    bounds : of all components of theta, where they are numbers.
+    """
+
+    space: Space
+    moves: tuple[Move, ...]
+    movable: np.ndarray
+    scale: np.ndarray
+    adapting: int
+    looking: int
+    bounds: list[tuple[float, float]] | None
+
+    def begin(self) -> Tuning:
+        """What a new chain begins with."""
+        if self.looking:
+            return Tuning(0, None, (), None, ())
+        return self._tune(Tuning(0, None, (), None, ()), self.movable)
+
+    def _tune(self, tuning: Tuning, where: np.ndarray) -> Tuning:
+        size = 2.4 / np.sqrt(max(len(where), 1))
+        factors = tuple(size * np.diag(self.scale[where]) for _ in self.moves)
+        chosen = 0 if len(self.moves) == 1 or not self.adapting else None
+        return replace(tuning, where=where, factors=factors, chosen=chosen, seen=())
+
+    def step(
+        self, tuning: Tuning, theta: np.ndarray, paths: Paths, generator: np.random.Generator
+    ) -> tuple[Tuning, float]:
+        """One sweep's steps; theta and paths in place. Returns the share that was accepted."""
+        sweep = tuning.sweep
+        if tuning.where is None:
+            tuning = replace(tuning, seen=(*tuning.seen, self._free(theta)))
+            if sweep + 1 >= self.looking:
+                tuning = self._tune(tuning, self._slow(tuning.seen))
+            return replace(tuning, sweep=sweep + 1), 0.0
+        accepted, made = 0, 0
+        if len(tuning.where):
+            if tuning.chosen is None and sweep >= self.adapting:
+                tuning = replace(tuning, chosen=int(np.argmax(_volumes(tuning.factors))))
+            for k in range(len(self.moves)):
+                if tuning.chosen is None or tuning.chosen == k:
+                    factor, won = self._propose(k, tuning, theta, paths, generator)
+                    accepted, made = accepted + won, made + PROPOSALS
+                    factors = (*tuning.factors[:k], factor, *tuning.factors[k + 1 :])
+                    tuning = replace(tuning, factors=factors)
+        return replace(tuning, sweep=sweep + 1), accepted / made if made else 0.0
+
+    def _propose(
+        self, k: int, tuning: Tuning, theta: np.ndarray, paths: Paths,
+        generator: np.random.Generator,
+    ) -> tuple[np.ndarray, int]:  # fmt: skip
+        """Metropolis steps with one thing held fixed; (adapted factor, number accepted)."""
+        move, where, factor = self.moves[k], tuning.where, tuning.factors[k]
+        assert where is not None
+        value, held = move.stand(theta, paths)
+        z = self._free(theta)
+        _, prior = self.space.parameters(z)
+        value += prior
+        if not abs(value) < np.inf:
+            return factor, 0
+        d, won = len(where), 0
+        target = 0.44 if d == 1 else 0.35 if d == 2 else 0.234
+        for j in range(PROPOSALS):
+            normals = generator.standard_normal(d)
+            trial = z.copy()
+            trial[where] += factor @ normals
+            new, prior = self.space.parameters(trial)
+            probability, moved = 0.0, paths
+            if prior > -np.inf:
+                log_density, moved = move.at(new, held, paths)
+                change = log_density + prior - value
+                probability = min(1.0, float(np.exp(min(change, 0.0))))
+            if generator.uniform() < probability:
+                theta[:], z, value = new, trial, value + change
+                paths[:] = moved
+                won += 1
+            if tuning.sweep < self.adapting:
+                at = (tuning.sweep - self.looking) * PROPOSALS + j
+                factor = WALK.adapt(factor, normals, probability - target, at)
+        return factor, won
+
+    def _free(self, theta: np.ndarray) -> np.ndarray:
+        """The free numbers on the unconstrained scale."""
+        trace = self.space.problem.trace
+        if self.bounds is not None:  # much the fastest, and most models are so
+            pairs = zip(theta.tolist(), self.bounds, strict=True)
+            return np.array([free_number(v, *b) for v, b in pairs])[self.space.where]
+        return unconstrain(trace, theta, unpack_parameters(trace, theta))[self.space.where]
+
+    def _slow(self, seen: Sequence[np.ndarray]) -> np.ndarray:
+        """Which numbers move: those whose plain chain is slow, by the lag-1 autocorrelation of its
+        later half (a drift towards the posterior counts as slow); where some are and there are few,
+        all, as they may depend on each other."""
+        z = np.array(seen)[len(seen) // 2 :]
+        z = z - z.mean(axis=0)
+        lagged = (z[1:] * z[:-1]).sum(axis=0) / np.maximum((z**2).sum(axis=0), 1e-300)
+        slow = lagged[self.movable] > SLOW
+        if slow.any() and len(slow) <= FEW:
+            return self.movable
+        return self.movable[slow]
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What a chain has learned; part of its state.
+
+    sweep : how many it has made. where : positions of the numbers that move; None while it looks,
+    empty where none does. factors : of each move's walk, (d, d). chosen : the move that is made;
+    None while all are tried. seen : (d_free,) of each sweep while it looks.
+    """
+
+    sweep: int
+    where: np.ndarray | None
+    factors: tuple[np.ndarray, ...]
+    chosen: int | None
+    seen: tuple[np.ndarray, ...]
+
+
+def _volumes(factors: Sequence[np.ndarray]) -> list[float]:
+    """log |S| of each walk. All are tuned to one rate of acceptance: the widest goes farthest."""
+    return [float(np.sum(np.log(np.diag(f)))) for f in factors]
+
+
+def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noises | NotApplicable:
+    """The model by its noises, or why nothing is interweaved. model : the exact form, if any."""
+    if isinstance(model, HiddenMarkov):
+        return NotApplicable("the states take finitely many values")
+    return found
+
+
+def asked(
+    problem: Problem, setting: str | bool, model: ExactModel | None
+) -> Noises | NotApplicable:
+    if not (setting is True or setting is False or setting == "auto"):
+        raise ArgumentError(f"interweave={setting!r}", fix='use "auto", True or False')
+    if setting is False:
+        return NotApplicable("interweave=False")
+    found = applicable(noises(problem.trace, problem.program.missing), model)
+    if isinstance(found, NotApplicable) and setting is True:
+        raise ArgumentError(
+            f"interweave=True does not apply: {found.reason}",
+            fix='use interweave="auto" or False',
+            where=found.where,
+        )
+    return found
+
+
+def interweaving(
+    setup: Setup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
+) -> tuple[Interweaving | None, str]:
+    """The further steps of a method's chains, and in words what they are or why there are none.
+
+    model : where the states are drawn exactly, and so can be integrated out.
+
+    Raises
+    ------
+    ArgumentError : `interweave` is neither "auto" nor a truth value, or is True and cannot be.
+    """
+    found = asked(setup.problem, setting, model)
+    if isinstance(found, NotApplicable):
+        return None, f"none: {found.reason}"
+    space, adapting = setup.space, setup.warmup * setup.thin
+    if not len(space.where):
+        return None, "none: no parameter is free"
+    if setting == "auto" and adapting < LEAST_WARMUP:
+        return None, f"none: fewer than {LEAST_WARMUP} sweeps of warmup, too few to tune them"
+    near = space.parameters(pilot.z)[0]
+    steered = not isinstance(found.guide, NotApplicable)
+    moves: list[Any] = []
+    if model is not None:
+        moves = [Collapsed(setup.problem, model)]
+    else:
+        moves += [NoiseMove(setup.problem, found, True, near)] if steered else []
+        moves += [NoiseMove(setup.problem, found, False, near)] if found.parameters else []
+    names = found.tied if steered or model is not None else found.parameters
+    owner = [t.site.name for t in transforms(setup.problem.trace) for _ in t.free]
+    movable = np.array([k for k, i in enumerate(space.where) if owner[i] in names], dtype=int)
+    if not len(movable):
+        return None, "none: no free parameter is in the law of a state"
+    looking = 0 if setting is True else min(int(LOOK * adapting), LONGEST_LOOK)
+    bounds = constant_bounds(setup.problem.trace)
+    steps = Interweaving(space, tuple(moves), movable, pilot.scale, adapting, looking, bounds)
+    moved = ", ".join(dict.fromkeys(owner[space.where[k]] for k in movable))
+    who = f"those slow in the plain chain, of {moved}" if looking else moved
+    return steps, f"{who}: moved with {describe(found, model)}"
+
+
+def describe(found: Noises, model: ExactModel | None) -> str:
+    """What is held fixed, in words."""
+    if model is not None:
+        return "the states integrated out"
+    held = []
+    if not isinstance(found.guide, NotApplicable):
+        held.append("the noises of a Gaussian approximation to the states' posterior")
+    if found.parameters:
+        held.append("the noises of the transition")
+    text = " or ".join(held) + " held fixed"
+    return text + ", whichever goes farther" if len(held) > 1 else text
+
+
+def with_states(found: Noises) -> str:
+    """Who may move with the trajectory, how and why: a line of the plan."""
+    steered = not isinstance(found.guide, NotApplicable)
+    who = ", ".join(found.tied if steered else found.parameters)
+    text = (
+        f"{who}: may mix slowly given the states, which carry what the data tell of them; if the "
+    )
+    text += f"warmup finds it so, moved with the trajectory, {describe(found, None)}"
+    if isinstance(found.guide, NotApplicable):
+        text += f" (no approximation: {found.guide.reason})"
+    stays = dict.fromkeys((*found.initial.stays, *found.transition.stays))
+    return text + (f"; stays where it is: {', '.join(stays)}" if stays else "")
