@@ -18,6 +18,7 @@ from ssmppl.inference.likelihood import log_likelihood
 from ssmppl.inference.maximize import maximize
 from ssmppl.inference.methods import (
     EM,
+    IF2,
     PGAS,
     PMMH,
     PSAEM,
@@ -71,6 +72,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "EM",
+    "IF2",
     "PGAS",
     "PMMH",
     "PSAEM",

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CLIMBERS: dict[str, Any] = {
     "do": ssm.DirectOptimization, "score": ssm.ScoreAscent, "em": ssm.EM,
-    "particle-em": ssm.ParticleEM, "psaem": ssm.PSAEM,
+    "particle-em": ssm.ParticleEM, "psaem": ssm.PSAEM, "if2": ssm.IF2,
 }  # fmt: skip
 ASSIGNMENTS = ("--parameters", "-p", "--fixed", "--start")
 
