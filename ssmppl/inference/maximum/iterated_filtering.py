@@ -33,7 +33,7 @@ from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, listing
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import starts
-from ssmppl.inference.maximum.summit import Summit, information_of_fit, summit
+from ssmppl.inference.maximum.summit import Summit, fitted_curvature, summit
 from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swarm_block
 from ssmppl.inference.methods import IF2
 from ssmppl.inference.particles.filtering import check_count, random_state
@@ -82,7 +82,8 @@ def climb(setup: Setup, method: IF2) -> Ascent:
         report["impossible_rows"] = int(stats["impossible"][top.best, -averaged:].sum())
     information = None
     if isinstance(setup.exact, NotApplicable) and not interrupted:
-        information = information_of_fit(setup, method, top.z, report)
+        report["information"] = "from a quadratic fitted to estimates of the log-likelihood"
+        information = fitted_curvature(setup, method, top.z)
     point, error = setup.chart.at(top.z), None
     if top.spread is not None:
         error = point.jacobian @ top.spread @ point.jacobian.T

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.chains.curvature import fitted_information
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.methods import IF2
-from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     log_of_mean,
@@ -105,28 +102,13 @@ def _estimates(
         return error
 
 
-def information_of_fit(
-    setup: Setup, method: IF2, z: np.ndarray, report: dict[str, Any]
-) -> np.ndarray | None:
-    """(P, P) observed information where Fisher's identity is of no use: minus the curvature of a
-    quadratic fitted to estimates of the log-likelihood round z (F,), as in Monte Carlo profiles
-    (Ionides, Bretó, Park, Smith and King 2017). None where the identity does better; the reason
-    goes into `report`.
-    """
-    found = ""
-    if deterministic_memory(setup.problem.trace) is None:
-        found = "a deterministic state never forgets its past, which rules backward simulation out"
-    else:
-        try:
-            complete_scores(setup.problem, setup.held)
-            return None
-        except ArgumentError as reason:
-            found = reason.found
-    report["information"] = (
-        f"from a quadratic fitted to estimates of the log-likelihood, as {found}"
-    )
+def fitted_curvature(setup: Setup, method: IF2, z: np.ndarray) -> np.ndarray:
+    """(P, P) observed information by what iterated filtering itself needs, no density of the
+    transition: minus the curvature of a quadratic fitted to estimates of the log-likelihood round
+    z (F,), as in Monte Carlo profiles (Ionides, Bretó, Park, Smith and King 2017)."""
     problem, seed = setup.problem, setup.seed(8)
-    settings = FilterSettings(method.particles, "bootstrap")
+    theta, _ = setup.space.parameters(z)
+    settings = FilterSettings(method.particles, choose(problem, theta.copy(), exact=False).name)
 
     def log_likelihood(z: np.ndarray) -> float:
         theta, log_prior = setup.space.parameters(z)
