@@ -272,7 +272,36 @@ class IF2:
     evaluations: int = 10
 
 
-Method = MetropolisHastings | Gibbs | PMMH | PGAS
+@dataclass(frozen=True)
+class SMC2:
+    """SMC^2 (Chopin, Jacob and Papaspiliopoulos 2013): particles in the parameters, each with a
+    particle filter of its own, go through the data from the prior to the posterior, and estimate
+    the evidence on the way. No start, no warmup and no tuning of a walk; priors must be proper.
+
+    In `sample` the chains are independent runs, whose draws have equal weight, and no trajectories
+    are kept (`smooth` has them at given parameters).
+
+    Parameters
+    ----------
+    parameters : number M of particles in the parameters; None: as many as `sample` is to draw, 500
+        for `evidence`.
+    particles : number N of each filter at the beginning. It doubles where moves are refused.
+    ess_threshold : parameters are resampled and moved when their effective number falls below this
+        share of M.
+    moves : particle Metropolis-Hastings steps of each parameter then.
+    acceptance : rate of these below which N doubles.
+    proposal : of the filters: "auto", "bootstrap", "guided" or "user".
+    """
+
+    parameters: int | None = None
+    particles: int = 100
+    ess_threshold: float = 0.5
+    moves: int = 3
+    acceptance: float = 0.15
+    proposal: str = "auto"
+
+
+Method = MetropolisHastings | Gibbs | PMMH | PGAS | SMC2
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ transforms", gives the Jacobians.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -177,8 +177,15 @@ def _cholesky(z: list[Expr], p: int, site: Site) -> tuple[list[Expr], Expr]:
     return [matrix.ravel()[place[s]] for s in site.components], log_jacobian
 
 
-def unconstrain(trace: Trace, theta: np.ndarray, values: dict[str, np.ndarray]) -> np.ndarray:
-    """The unconstrained numbers of all parameters, given theta (P,) and its values by name."""
+def unconstrain(
+    trace: Trace, theta: np.ndarray, values: dict[str, np.ndarray],
+    made: Sequence[Transform] | None = None,
+) -> np.ndarray:  # fmt: skip
+    """The unconstrained numbers of all parameters, given theta (P,) and its values by name.
+
+    made : the transforms, for those who ask for many points.
+    """
     known = dict(zip(trace.parameter_symbols, theta, strict=True))
-    parts = [t.inverse(np.asarray(values[t.site.name]), known) for t in transforms(trace)]
+    known_as = transforms(trace) if made is None else made
+    parts = [t.inverse(np.asarray(values[t.site.name]), known) for t in known_as]
     return np.concatenate([*parts, np.empty(0)])

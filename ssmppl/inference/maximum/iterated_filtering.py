@@ -179,7 +179,7 @@ def _report(
         "converged": None if len(ends) == 1 else agree > 1,
         "estimate": f"mean over the rows and the last {averaged} passes of {what}, out of "
         f"{len(ends)}: the highest log-likelihood ({top.value:.3f}{noise})",
-        "perturbation": dict(zip(map(repr, setup.chart.z), scales.tolist(), strict=True)),
+        "perturbation": dict(zip(_labels(setup), scales.tolist(), strict=True)),
         "initial_law_only": _named(names, model.acting & ~model.moving),
         "best_start": top.best,
         "starts_that_agree": np.flatnonzero(top.near).tolist(),
@@ -195,6 +195,14 @@ def _report(
             "larger perturbations or more starts"
         )
     return report
+
+
+def _labels(setup: Setup) -> list[str]:
+    """(F,) the unconstrained numbers by name, with an index where a parameter has several."""
+    names = _owners(setup)
+    return [
+        n if names.count(n) == 1 else repr(s) for n, s in zip(names, setup.chart.z, strict=True)
+    ]
 
 
 def _named(names: list[str], which: np.ndarray) -> list[str]:
