@@ -8,7 +8,10 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.inference.chains.smc2 import Filters
+from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.smc2 import Filters, begin, exchange, one_row
+from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.problem import pose
 from tests.statistics import models
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 
@@ -26,10 +29,15 @@ TINY = [{"y": np.array([0.5, np.nan, 1.2])}, {"y": np.array([0.9, 2.0])}]
 
 def tiny_evidence():
     """By the Kalman likelihood on a grid of m; the trapezoidal rule is exact to rounding here."""
-    grid, h = np.linspace(-7, 7, 281, retstep=True)
+    grid, log_p = tiny_posterior()
+    return float(np.logaddexp.reduce(log_p) + np.log(grid[1] - grid[0]))
+
+
+def tiny_posterior():
+    """A grid of m, and log p(y, k, m) on it."""
+    grid = np.linspace(-7, 7, 281)
     log_p = [ssm.log_likelihood(tiny, TINY, {"m": m, "k": 1.5})[0] for m in grid]
-    log_p += stats.norm.logpdf(grid) + stats.norm.logpdf(1.5, grid, 2)
-    return float(np.logaddexp.reduce(log_p) + np.log(h))
+    return grid, log_p + stats.norm.logpdf(grid) + stats.norm.logpdf(1.5, grid, 2)
 
 
 @pytest.mark.parametrize(("name", "settings", "runs"), [
@@ -73,6 +81,39 @@ def test_posterior_moments(exact_values):
     assert attrs["method"] == "SMC2"
     assert attrs["warmup"] == 0
     assert attrs["log_evidence"] == pytest.approx(exact["log_evidence"], abs=1.5)
+
+
+def test_an_informative_prior_counts_in_the_moves():
+    """First two moments by the grid; many moves, so that nothing else decides where draws end."""
+    grid, log_p = tiny_posterior()
+    w = np.exp(log_p - log_p.max())
+    w /= w.sum()
+    method = ssm.SMC2(particles=20, moves=6, acceptance=0.0, proposal="bootstrap")
+    m = ssm.sample(tiny, TINY, method, draws=60, chains=8, fixed={"k": 1.5}, progress=False,
+                   seed=seed_of("smc2", "prior"))["posterior"]["m"].values  # fmt: skip
+    for power in (1, 2):
+        runs = (m**power).mean(axis=1)
+        off = abs(runs.mean() - w @ grid**power)
+        assert off < stats.t.isf(LEVEL / 4, 7) * runs.std(ddof=1) / np.sqrt(8)
+
+
+def test_an_exchange_weighs_by_the_ratio_of_the_likelihoods():
+    problem = pose(tiny, TINY)
+    held = {"k": np.array(1.5)}
+    space = space_of(problem, held, {})
+    method = ssm.SMC2(parameters=10, particles=5, ess_threshold=0.0)
+    setup, filters = (
+        Setup(problem, space, held, 1, 0, 1, np.random.SeedSequence(1), False),
+        Filters(space, method, "bootstrap"),
+    )
+    state, _, _ = one_row(filters, begin(filters, setup, 0))
+    new = exchange(filters, state, 10)
+    assert new.size == 10
+    ratio = new.log_z - state.log_z
+    assert np.ptp(ratio) > 0.1
+    np.testing.assert_allclose(new.log_w - state.log_w, ratio)
+    mean = np.log(state.weights() @ np.exp(ratio))
+    assert new.log_evidence - state.log_evidence == pytest.approx(mean)
 
 
 def test_a_vector_a_simplex_and_a_seed():
