@@ -19,9 +19,11 @@ from ssmppl.inference.likelihood import log_likelihood
 from ssmppl.inference.maximize import maximize
 from ssmppl.inference.methods import (
     EM,
+    IF2,
     PGAS,
     PMMH,
     PSAEM,
+    SMC2,
     DirectOptimization,
     FFBSi,
     FixedLag,
@@ -72,9 +74,11 @@ __version__ = "0.1.0"
 
 __all__ = [
     "EM",
+    "IF2",
     "PGAS",
     "PMMH",
     "PSAEM",
+    "SMC2",
     "ArgumentError",
     "Bernoulli",
     "Beta",

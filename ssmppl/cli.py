@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CLIMBERS: dict[str, Any] = {
     "do": ssm.DirectOptimization, "score": ssm.ScoreAscent, "em": ssm.EM,
-    "particle-em": ssm.ParticleEM, "psaem": ssm.PSAEM,
+    "particle-em": ssm.ParticleEM, "psaem": ssm.PSAEM, "if2": ssm.IF2,
 }  # fmt: skip
 ASSIGNMENTS = ("--parameters", "-p", "--fixed", "--start")
 
@@ -204,9 +204,10 @@ def simulate(
 @MODEL
 @click.argument("data", nargs=-1, required=True, type=CSV, metavar="DATA.csv...")
 @click.option(
-    "--method", type=click.Choice(["mh", "gibbs", "pmmh", "pgas"], case_sensitive=False),
+    "--method", type=click.Choice(["mh", "gibbs", "pmmh", "pgas", "smc2"], case_sensitive=False),
     help="Exact likelihood and states, for linear Gaussian models: Metropolis-Hastings or Gibbs. "
-    "By particles: Metropolis-Hastings (pmmh) or Gibbs (pgas). [default: chosen by the model]",
+    "By particles: Metropolis-Hastings (pmmh), Gibbs (pgas), SMC^2 (smc2). "
+    "[default: chosen by the model]",
 )  # fmt: skip
 @click.option("--particles", type=int, help="Number of particles [default: tuned].")
 @click.option("--draws", type=int, default=1000, show_default=True, help="Kept draws of a chain.")
@@ -234,12 +235,13 @@ def sample(
         ssmppl sample model.py data.csv -o posterior.nc
         ssmppl sample model.py day1.csv day2.csv --method pmmh --fixed mass=1.2 --seed 1
     """
-    by_particles: dict[str, Any] = {"pgas": ssm.PGAS, "pmmh": ssm.PMMH}
+    by_particles: dict[str, Any] = {"pgas": ssm.PGAS, "pmmh": ssm.PMMH, "smc2": ssm.SMC2}
     exact: dict[str, Any] = {"mh": ssm.MetropolisHastings, "gibbs": ssm.Gibbs}
     name = method.lower() if method else ""
     if particles is not None and name not in by_particles:
-        raise click.UsageError("--particles needs --method pgas or --method pmmh.")
-    chosen: Any = by_particles[name](particles=particles) if name in by_particles else None
+        raise click.UsageError("--particles needs --method pgas, pmmh or smc2.")
+    given = {} if particles is None else {"particles": particles}
+    chosen: Any = by_particles[name](**given) if name in by_particles else None
     loaded = load_model(model)
     idata = ssm.sample(
         loaded,

@@ -115,7 +115,7 @@ def to_inference_data(
 def to_dataset(
     variables: Mapping[str, np.ndarray],
     *,
-    sample_dim: str | None = "draw",
+    sample_dim: str | tuple[str, ...] | None = "draw",
     over_time: Collection[str] | None = None,
     time: Any = None,
     dims: Mapping[str, Sequence[str]] | None = None,
@@ -128,15 +128,17 @@ def to_dataset(
     ----------
     variables
         Arrays of shape (draws, T, ...), or (draws, ...) for names that are not in `over_time`;
-        without the first axis if `sample_dim` is None.
+        without the first axis if `sample_dim` is None, with as many as it has names if it is a
+        tuple.
     over_time
         Names with a time axis; None means all.
     time, dims, coords, attrs
         As in `to_inference_data`.
     """
+    leading = (sample_dim,) if isinstance(sample_dim, str) else sample_dim or ()
     return _dataset(
         variables,
-        sample_dims=() if sample_dim is None else (sample_dim,),
+        sample_dims=leading,
         over_time=variables if over_time is None else over_time,
         time=time,
         dims=dims or {},

@@ -49,11 +49,12 @@ def weight_targets(weight: Sequence[Term]) -> list[Target]:
 
 
 def moves(
-    section: Section, initial: dict[Expr, Expr], draw: dict[Expr, Expr], arguments: str = DRAW
-) -> None:
-    """`draw_initial` and `draw`: how particles are born and move."""
+    section: Section, initial: dict[Expr, Expr], draw: dict[Expr, Expr], arguments: str = DRAW,
+    begin: str = DRAW_INITIAL,
+) -> None:  # fmt: skip
+    """`draw_initial` and `draw`: how particles are born and move; with these arguments."""
     section.particle_pass(
-        "draw_initial", "Draw x_1 for each particle.", DRAW_INITIAL,
+        "draw_initial", "Draw x_1 for each particle.", begin,
         _state_targets(section.layout, initial),
     )  # fmt: skip
     section.particle_pass(
@@ -62,8 +63,8 @@ def moves(
     )  # fmt: skip
 
 
-def filter_kit(layout: Layout, proposal: Proposal) -> Section:
-    """The particle filter's functions under one proposal."""
+def filter_kit(layout: Layout, proposal: Proposal, begin: str = DRAW_INITIAL) -> Section:
+    """The particle filter's functions under one proposal; `begin`: arguments of `draw_initial`."""
     section = Section(layout, proposal.name)
     level = depends(proposal.fit, level_of)
     section.fits.update(
@@ -74,7 +75,7 @@ def filter_kit(layout: Layout, proposal: Proposal) -> Section:
             "fit", "What the proposal knows of x_t from x_{t-1} and y_t.", FIT,
             [Target(f"fits[{k}, i]", e) for e, k in section.fits.items()],
         )  # fmt: skip
-    moves(section, proposal.initial_draw, proposal.draw, FITTED_DRAW)
+    moves(section, proposal.initial_draw, proposal.draw, FITTED_DRAW, begin)
     section.particle_pass(
         "weigh_initial", "Log weight of x_1.", WEIGH_INITIAL,
         weight_targets(proposal.initial_weight), accumulate="log_w",

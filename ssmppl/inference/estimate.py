@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,8 @@ class Estimate:
     standard_errors : roots of its diagonal, by name, as `parameters`; without the fixed ones.
     log_likelihood : at the estimate; with particles an estimate, whose standard error is
         `attrs["log_likelihood_error"]`.
-    iterates : Dataset with dim `iteration`, the way to the estimate.
+    iterates : Dataset with dim `iteration`, the way to the estimate; of `IF2` with dim `start` too,
+        and with `perturbed_log_likelihood`, what the swarm's particle filter made of each pass.
     attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random
         numbers were used, `monte_carlo_errors`: the estimate's own standard errors by component.
     """
@@ -119,18 +121,21 @@ def table(labels: list[str], matrix: np.ndarray) -> pd.DataFrame:
 def make_estimate(
     trace: Trace, theta: np.ndarray, covariance: np.ndarray, log_likelihood: float,
     iterates: np.ndarray, held: dict[str, np.ndarray], attrs: dict[str, Any],
+    figures: Mapping[str, np.ndarray] | None = None,
 ) -> Estimate:  # fmt: skip
     """An Estimate from arrays over all P components: theta (P,), covariance (P, P), iterates
-    (K, P).
+    (K, P), or (starts, K, P); figures, (K,) or (starts, K), go with the iterates.
 
     Rows and columns of fixed parameters are left out of the covariance.
     """
+    dims = ("start", "iteration")[3 - iterates.ndim :]
     free = free_components(trace, held)
     labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
     errors = np.full(len(theta), np.nan)
     with np.errstate(invalid="ignore"):
         errors[free] = np.sqrt(np.diagonal(covariance)[free])
     variables = unpack_parameters(trace, iterates) if len(theta) else {}
+    variables |= figures or {}
     return Estimate(
         parameters=by_name(trace, theta),
         covariance=table(labels, covariance[np.ix_(free, free)]),
@@ -138,9 +143,9 @@ def make_estimate(
         log_likelihood=log_likelihood,
         iterates=to_dataset(
             variables,
-            sample_dim="iteration",
+            sample_dim=dims,
             over_time=(),
-            coords={"iteration": np.arange(len(iterates))},
+            coords={d: np.arange(n) for d, n in zip(dims, iterates.shape, strict=False)},
             attrs={k: v for k, v in attrs.items() if v is not None},
         ),
         attrs=attrs,

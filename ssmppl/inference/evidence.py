@@ -23,13 +23,16 @@ from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
+from ssmppl.inference.chains import smc2
 from ssmppl.inference.chains.bridge import Bridge, bridge, importance
+from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.models import exact_log_likelihood, exact_model, filter_of
-from ssmppl.inference.methods import PMMH, MetropolisHastings
+from ssmppl.inference.methods import PMMH, SMC2, MetropolisHastings
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     check_count,
     log_likelihood_estimate,
+    log_of_mean,
     random_state,
     repeated_estimates,
     seed_sequence,
@@ -45,6 +48,7 @@ from ssmppl.language.transforms import unconstrain
 DEGREES = 7.0  # of freedom of the law bridged to: tails heavier than a posterior's
 TASKS = 16
 TARGET_SD = 1.0
+PARAMETERS = 500  # particles of SMC^2
 REPEATS = 200  # estimates of the likelihood where there is no parameter to integrate out
 
 
@@ -73,7 +77,7 @@ class Evidence:
 def evidence(
     model: Model,
     data: Any,
-    method: PMMH | MetropolisHastings | None = None,
+    method: PMMH | MetropolisHastings | SMC2 | None = None,
     *,
     draws: int = 2000,
     warmup: int = 1000,
@@ -95,7 +99,8 @@ def evidence(
     data, start, fixed, seed, executor, progress : as in `sample`. Fixed parameters are held, not
         integrated over.
     method : `ssm.PMMH(...)`, or `ssm.MetropolisHastings(...)` for linear Gaussian models; None:
-        the exact one where it applies.
+        the exact one where it applies. `ssm.SMC2(...)` estimates it without a bridge, by `chains`
+        independent runs, at least two, whose spread gives the error.
     draws, warmup, chains : of the sampler.
 
     Raises
@@ -108,9 +113,13 @@ def evidence(
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     _refuse_improper(problem, held)
-    chosen = _chosen(problem, method)
     root = seed_sequence(seed)
     space = space_of(problem, held, near)
+    if isinstance(method, SMC2):
+        check_count("chains", chains, 2)
+        setup = Setup(problem, space, held, chains, 0, 1, root, False)
+        return _by_smc2(setup, method, executor, progress)
+    chosen = _chosen(problem, method)
     if isinstance(chosen, PMMH):
         chosen = _settled(problem, space, chosen, root)
     if not space.where.size:
@@ -138,6 +147,15 @@ def evidence(
         found.log_constant - known, found.standard_error,
         _report(chosen, own_ratio, replace(check, log_constant=check.log_constant - known)),
     )  # fmt: skip
+
+
+def _by_smc2(setup: Setup, method: SMC2, executor: Executor | None, progress: bool) -> Evidence:
+    """The mean over independent runs, each of which estimates p(y) without bias."""
+    found = smc2.run_smc2(
+        setup, replace(method, parameters=method.parameters or PARAMETERS), executor, progress
+    )
+    value, error = log_of_mean(found.log_evidence)
+    return Evidence(value, error, {"method": "SMC2", **found.report})
 
 
 def _refuse_improper(problem: Problem, held: Mapping[str, np.ndarray]) -> None:
@@ -174,7 +192,7 @@ def _chosen(
     if not isinstance(method, (PMMH, MetropolisHastings)):
         raise ArgumentError(
             f"method={method!r} gives no estimates of the likelihood to bridge with",
-            fix="use ssm.PMMH(...), ssm.MetropolisHastings(...) or None",
+            fix="use ssm.PMMH(...), ssm.MetropolisHastings(...), ssm.SMC2(...) or None",
         )
     if isinstance(method, PMMH) and method.correlation:
         raise ArgumentError(

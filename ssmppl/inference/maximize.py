@@ -15,12 +15,24 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import kind_of
-from ssmppl.inference.maximum import direct_optimization, em, particle_em, psaem, score_ascent
+from ssmppl.inference.maximum import (
+    direct_optimization,
+    em,
+    iterated_filtering,
+    particle_em,
+    psaem,
+    score_ascent,
+)
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.method_choice import choose_maximiser
-from ssmppl.inference.methods import EM, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
+from ssmppl.inference.methods import EM, IF2, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
 from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, seed_sequence
+from ssmppl.inference.particles.filtering import (
+    FilterSettings,
+    estimates_task,
+    log_of_mean,
+    seed_sequence,
+)
 from ssmppl.inference.particles.particle_score import Smoothing, combine, several_runs
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
@@ -35,6 +47,7 @@ CLIMBS: dict[type, Callable[[Setup, Any], Ascent]] = {
     ParticleEM: particle_em.climb,
     PSAEM: psaem.climb,
     ScoreAscent: score_ascent.climb,
+    IF2: iterated_filtering.climb,
 }
 OBJECTIVES = ("likelihood", "posterior")
 PARTICLES, REPEATS = 1000, 16  # of the log-likelihood and the information at the estimate
@@ -130,8 +143,9 @@ def maximize(
         }
     attrs["seconds"] = time.perf_counter() - began
     return make_estimate(
-        problem.trace, ascent.theta, covariance, value, ascent.iterates, held, attrs
-    )
+        problem.trace, ascent.theta, covariance, value, ascent.iterates, held, attrs,
+        ascent.figures,
+    )  # fmt: skip
 
 
 def choose_method(setup: Setup) -> tuple[Any, str]:
@@ -156,11 +170,10 @@ def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> floa
         log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
     except (SamplingError, KeyboardInterrupt):
         return np.nan
-    share = np.exp(log_z - log_z.max()) if np.max(log_z) > -np.inf else np.zeros(REPEATS)
-    if not share.any():
-        return -np.inf
-    attrs["log_likelihood_error"] = float(share.std(ddof=1) / share.mean() / np.sqrt(REPEATS))
-    return float(log_z.max() + np.log(share.mean()))
+    value, error = log_of_mean(log_z)
+    if value > -np.inf:
+        attrs["log_likelihood_error"] = error
+    return value
 
 
 def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:

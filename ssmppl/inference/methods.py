@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -250,7 +250,72 @@ class ScoreAscent:
     kernel: str = "auto"
 
 
-Method = MetropolisHastings | Gibbs | PMMH | PGAS
+@dataclass(frozen=True)
+class IF2:
+    """Iterated filtering (Ionides, Nguyen, Atchadé, Stoev and King 2015, algorithm IF2): a particle
+    filter passes over the data again and again, its particles carrying parameters that take random
+    steps on the unconstrained scale, smaller ones in each pass.
+
+    The transition is only simulated: it may have no density (deterministic components, discrete
+    states, primitives). Parameters that act in the initial law alone are found in the model and
+    take their step at the first row only. Several experiments are passed over one after another.
+
+    Parameters
+    ----------
+    particles : N of the swarm, and of the filters that evaluate the likelihood at its end.
+    iterations : passes over the data.
+    cooling : what is left of the steps' standard deviation after 50 iterations; it falls
+        geometrically, from row to row. 1: no cooling.
+    perturbation : standard deviation of a step at the beginning, on the unconstrained scale (of log
+        theta, for a positive parameter): one number, or by the names of parameters. Those that are
+        not named have 0.02. A parameter of the initial law alone has the root of the number of rows
+        times as much, at most ten times, unless it is named.
+    starts : number of swarms, the first at the start, the others dispersed round it; or a list of
+        their parameter values. The end of highest log-likelihood is the estimate, or the mean of
+        those that agree with it where that is higher still.
+    averaged : last iterations that the estimate is the mean of, on the unconstrained scale.
+    evaluations : estimates of the likelihood at each end.
+    """
+
+    particles: int = 2000
+    iterations: int = 100
+    cooling: float = 0.5
+    perturbation: float | Mapping[str, float] = 0.02
+    starts: int | Sequence[Mapping[str, Any]] = 4
+    averaged: int = 25
+    evaluations: int = 10
+
+
+@dataclass(frozen=True)
+class SMC2:
+    """SMC^2 (Chopin, Jacob and Papaspiliopoulos 2013): particles in the parameters, each with a
+    particle filter of its own, go through the data from the prior to the posterior, and estimate
+    the evidence on the way. No start, no warmup and no tuning of a walk; priors must be proper.
+
+    In `sample` the chains are independent runs, whose draws have equal weight, and no trajectories
+    are kept (`smooth` has them at given parameters).
+
+    Parameters
+    ----------
+    parameters : number M of particles in the parameters; None: as many as `sample` is to draw, 500
+        for `evidence`.
+    particles : number N of each filter at the beginning. It doubles where moves are refused.
+    ess_threshold : parameters are resampled and moved when their effective number falls below this
+        share of M.
+    moves : particle Metropolis-Hastings steps of each parameter then.
+    acceptance : rate of these below which N doubles.
+    proposal : of the filters: "auto", "bootstrap", "guided" or "user".
+    """
+
+    parameters: int | None = None
+    particles: int = 100
+    ess_threshold: float = 0.5
+    moves: int = 3
+    acceptance: float = 0.15
+    proposal: str = "auto"
+
+
+Method = MetropolisHastings | Gibbs | PMMH | PGAS | SMC2
 
 
 @dataclass(frozen=True)

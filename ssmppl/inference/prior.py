@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from ssmppl.errors import ArgumentError
@@ -12,8 +14,11 @@ from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Trace
 
 
-def draw_prior(trace: Trace, rng: np.random.Generator, draws: int) -> np.ndarray:
-    """(draws, P) independent draws of theta, parents before children.
+def draw_prior(
+    trace: Trace, rng: np.random.Generator, draws: int,
+    held: Mapping[str, np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
+    """(draws, P) independent draws of theta, parents before children; those held keep their value.
 
     Raises
     ------
@@ -23,6 +28,10 @@ def draw_prior(trace: Trace, rng: np.random.Generator, draws: int) -> np.ndarray
     source = numpy_draws(rng, (draws,))
     for site in trace.parameters.values():
         d = site.distribution
+        if held is not None and site.name in held:
+            for s, v in zip(site.value.ravel(), held[site.name].ravel(), strict=True):
+                values.setdefault(s, np.full(draws, v))
+            continue
         if not d.proper:
             raise ArgumentError(
                 f"the prior of {site.name!r} is {type(d).__name__}, which is improper: nothing "

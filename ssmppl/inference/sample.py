@@ -11,13 +11,13 @@ import numpy as np
 
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh
+from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.labels import Labels
 from ssmppl.inference.method_choice import choose_sampler
-from ssmppl.inference.methods import PGAS, PMMH, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
@@ -56,12 +56,12 @@ def sample(
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
-        of finitely many states, `ssm.PMMH(...)` or `ssm.PGAS(...)` for all. None: for the former
-        Gibbs if every parameter has a closed-form conditional, else a random walk on the exact
-        likelihood while the parameters are few; for the others PGAS. `explain` and the attributes
-        say which, and why.
+        of finitely many states, `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
+        None: for the former Gibbs if every parameter has a closed-form conditional, else a random
+        walk on the exact likelihood while the parameters are few; for the others PGAS. `explain`
+        and the attributes say which, and why.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
-        warmup.
+        warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
         there.
     fixed : parameters held at these values.
@@ -100,24 +100,32 @@ def sample(
     near = check_values(problem.trace, start, argument="start")
     chosen, reason = (method, "") if method is not None else _chosen(problem, held)
     prepare = PREPARE.get(type(chosen))
-    if prepare is None:
+    if prepare is None and not isinstance(chosen, SMC2):
+        names = ", ".join(f"ssm.{m.__name__}(...)" for m in (*PREPARE, SMC2))
         raise ArgumentError(
-            f"method={method!r} is no method of sampling",
-            fix=f"use {', '.join(f'ssm.{m.__name__}(...)' for m in PREPARE)} or None",
+            f"method={method!r} is no method of sampling", fix=f"use {names} or None"
         )
     root = seed_sequence(seed)
     space = space_of(problem, held, near)
-    sampler = prepare(Setup(problem, space, held, chains, warmup, thin, root, states), chosen)
-    result = run_chains(
-        sampler.step_block, sampler.states, draws, warmup, executor=executor, progress=progress,
-        title=type(chosen).__name__,
-    )  # fmt: skip
+    setup = Setup(problem, space, held, chains, warmup, thin, root, states)
+    report: dict[str, Any]
+    if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
+        result, report = smc2.drawn(setup, chosen, draws, executor, progress)
+        states, warmup, thin = False, 0, 1
+    else:
+        assert prepare is not None
+        sampler = prepare(setup, chosen)
+        result = run_chains(
+            sampler.step_block, sampler.states, draws, warmup, executor=executor,
+            progress=progress, title=type(chosen).__name__,
+        )  # fmt: skip
+        report = sampler.report
     attrs = {
         "model": problem.trace.name,
         "method": type(chosen).__name__,
         "method_chosen": "by the user" if method is not None else "automatically",
         **({"method_reason": reason} if reason else {}),
-        **sampler.report,
+        **report,
         "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
         "interrupted": any(c.interrupted for c in result),
         "seconds": time.perf_counter() - began,

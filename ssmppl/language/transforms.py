@@ -9,13 +9,14 @@ transforms", gives the Jacobians.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, apply, constant, symbol
+from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
 from ssmppl.language.trace import Site, Trace
 
 
@@ -52,6 +53,33 @@ class Transform:
 def transforms(trace: Trace) -> list[Transform]:
     """The transform of each parameter, in the trace's order."""
     return [_transform(site) for site in trace.parameters.values()]
+
+
+@dataclass(frozen=True)
+class Unconstrained:
+    """The free parameters of a trace on their unconstrained scale.
+
+    z : symbols of the unconstrained numbers. values : symbol of a free parameter -> expression in
+    z and in the parameters that are not free. log_jacobian : log |d values / d z|.
+    """
+
+    z: tuple[Expr, ...]
+    values: dict[Expr, Expr]
+    log_jacobian: Expr
+
+
+def unconstrained(trace: Trace, free: Iterable[bool]) -> Unconstrained:
+    """The parameters that `free` says are free, one truth value for each site of the trace."""
+    z: list[Expr] = []
+    values: dict[Expr, Expr] = {}
+    log_jacobian = constant(0.0)
+    for t, is_free in zip(transforms(trace), free, strict=True):
+        if is_free:
+            z += t.free
+            *own, part = substitute([*t.values, t.log_jacobian], values)
+            values.update(zip(t.components, own, strict=True))
+            log_jacobian = log_jacobian + part
+    return Unconstrained(tuple(z), values, log_jacobian)
 
 
 def _transform(site: Site) -> Transform:
@@ -165,8 +193,15 @@ def constant_bounds(trace: Trace) -> list[tuple[float, float]] | None:
     return out
 
 
-def unconstrain(trace: Trace, theta: np.ndarray, values: dict[str, np.ndarray]) -> np.ndarray:
-    """The unconstrained numbers of all parameters, given theta (P,) and its values by name."""
+def unconstrain(
+    trace: Trace, theta: np.ndarray, values: dict[str, np.ndarray],
+    made: Sequence[Transform] | None = None,
+) -> np.ndarray:  # fmt: skip
+    """The unconstrained numbers of all parameters, given theta (P,) and its values by name.
+
+    made : the transforms, for those who ask for many points.
+    """
     known = dict(zip(trace.parameter_symbols, theta, strict=True))
-    parts = [t.inverse(np.asarray(values[t.site.name]), known) for t in transforms(trace)]
+    known_as = transforms(trace) if made is None else made
+    parts = [t.inverse(np.asarray(values[t.site.name]), known) for t in known_as]
     return np.concatenate([*parts, np.empty(0)])

@@ -26,7 +26,7 @@ def test_statistic_knows_uniform_from_not():
 
 
 # The studies of joint blocks and of interweaved moves take an hour together.
-LONG = [n for n, s in STUDIES.items() if s.model in BLOCKS or "interweaved" in s.method_name]
+LONG = [n for n, s in STUDIES.items() if s.model in BLOCKS or "interweaved" in s.label]
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
 
 

@@ -28,18 +28,21 @@ def fitted_covariance(
     d = len(w)
     factor = np.diag(scale)
     for _ in range(rounds if d else 0):
-        information = _information(log_density, w, factor, rng)
+        information = fitted_information(log_density, w, factor, rng)
         values, vectors = np.linalg.eigh(information)
         root = vectors / np.sqrt(np.clip(values, LEAST, MOST**2))
         factor = np.linalg.cholesky(factor @ root @ root.T @ factor.T)
     return factor @ factor.T
 
 
-def _information(
+def fitted_information(
     log_density: Callable[[np.ndarray], float], w: np.ndarray, factor: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
-    """Minus the second derivatives in u, where w + factor u is the point; NaN-free."""
+    """Minus the second derivatives in u, where w + factor u is the point; NaN-free.
+
+    The identity where too few points have a finite density to fit it.
+    """
     d = len(w)
     pairs = [(i, j) for i in range(d) for j in range(i + 1)]
     n = max(4 * (1 + d + len(pairs)), 30)

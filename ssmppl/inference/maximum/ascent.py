@@ -30,6 +30,8 @@ class Ascent:
     iterates : (K, P), the last one not necessarily theta. report : what is to be told of the run,
     `converged` above all. information : (P, P), minus the second derivatives of the log-likelihood
     in theta, where the method has them. error : (P, P), the Monte Carlo covariance of theta itself.
+    Of several starts the iterates are (starts, K, P); figures : what else is known of each iterate,
+    (K,) or (starts, K), by name.
     """
 
     theta: np.ndarray
@@ -39,6 +41,7 @@ class Ascent:
     information: np.ndarray | None = None
     error: np.ndarray | None = None
     interrupted: bool = False
+    figures: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

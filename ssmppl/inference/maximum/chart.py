@@ -19,7 +19,7 @@ from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute
 from ssmppl.inference.particles.pilot import Space
-from ssmppl.language.transforms import transforms
+from ssmppl.language.transforms import unconstrained
 
 STEP = 1e-5  # of the central differences where a prior has no derivative in closed form
 
@@ -65,16 +65,8 @@ class Chart:
         self.space = space
         trace = space.problem.trace
         self.symbols = trace.parameter_symbols
-        self.z: list[Expr] = []
-        value: dict[Expr, Expr] = {}
-        log_jacobian = constant(0.0)
-        for t, free in zip(transforms(trace), space.free, strict=True):
-            if not free:
-                continue
-            self.z += t.free
-            *own, part = substitute([*t.values, t.log_jacobian], value)
-            value.update(zip(t.components, own, strict=True))
-            log_jacobian = log_jacobian + part
+        found = unconstrained(trace, space.free)
+        self.z, value, log_jacobian = list(found.z), found.values, found.log_jacobian
         log_prior = constant(0.0)
         for term in terms(trace, "prior", guard=False):
             log_prior = log_prior + term.log_density

@@ -125,6 +125,19 @@ def repeated_estimates(
     )
 
 
+def log_of_mean(log_z: np.ndarray) -> tuple[float, float]:
+    """log of the mean of independent estimates Z, (R,) logs, and its standard error.
+
+    -inf where all are zero; the error of a single one is nan.
+    """
+    top = np.max(log_z)
+    if not top > -np.inf:
+        return -np.inf, np.nan
+    share = np.exp(log_z - top)
+    error = share.std(ddof=1) / share.mean() / np.sqrt(len(share)) if len(share) > 1 else np.nan
+    return float(top + np.log(share.mean())), float(error)
+
+
 @dataclass(frozen=True)
 class FilterRun:
     """What one run of the filter tells about one experiment (T steps, D states, K channels).

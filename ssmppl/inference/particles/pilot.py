@@ -136,7 +136,7 @@ def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "boots
     if not len(best):
         return Pilot(best, best, value)
     averaged = averaged_density(space, seed, proposal, SCALE_REPEATS)
-    return Pilot(best, _scale(best, averaged), value)
+    return Pilot(best, scale_of(best, averaged), value)
 
 
 def climb_to_mode(
@@ -241,7 +241,7 @@ def finite_point(
     )
 
 
-def _scale(z: np.ndarray, log_density: Callable[[np.ndarray], float]) -> np.ndarray:
+def scale_of(z: np.ndarray, log_density: Callable[[np.ndarray], float]) -> np.ndarray:
     """Per coordinate the standard deviation of a Gaussian that falls as log p does.
 
     Measured where log p has fallen by several units, as the estimates are noisy.

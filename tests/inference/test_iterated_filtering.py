@@ -1,0 +1,347 @@
+"""IF2: its kernel against exact likelihoods, its steps in closed form, its ends at exact maxima."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import ssmppl as ssm
+from ssmppl import datasets
+from ssmppl.analysis.perturbed import perturbed
+from ssmppl.inference.maximum import summit
+from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.iterated_filtering import climb, step_scales
+from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swarm_block
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
+from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.problem import pose
+from tests.statistics import models
+from tests.statistics.checks import LEVEL, mean_one_p, seed_of
+
+LGSS = {"y": datasets.load("lgss_main_text")["y"]}
+
+# phi, q and r act at every row, m in the initial law alone, a as a bound of phi, h in priors.
+series = ssm.Model("series", inputs=("u",))
+
+
+@series.prior
+def series_prior():
+    return {"a": ssm.HalfNormal(sd=1), "h": ssm.Gamma(2, rate=1), "m": ssm.Normal(0, sd=3)}
+
+
+@series.prior
+def series_later(a, h):
+    return {"phi": ssm.Uniform(-a, 1), "q": ssm.Exponential(rate=h), "r": ssm.Exponential(rate=h)}
+
+
+@series.initial
+def series_initial(m):
+    return {"x": ssm.Normal(m, sd=0.5)}
+
+
+@series.transition
+def series_transition(x, u, phi, q):
+    return {"x": ssm.Normal(phi * x + u, sd=q)}
+
+
+@series.observation
+def series_observation(x, r):
+    return {"y": ssm.Normal(x, sd=r)}
+
+
+VALUES = {"a": 0.5, "h": 1.0, "m": 1.0, "phi": 0.7, "q": 0.6, "r": 0.3}
+
+
+def simulated(steps, *name, parameters=VALUES, model=series):
+    u = np.sin(np.arange(steps) / 2.0)
+    inputs = {"u": u} if model.inputs else None
+    found = ssm.simulate(model, parameters, steps=steps, inputs=inputs, seed=seed_of(*name))
+    return {"y": found["y"].values[0]} | (inputs or {})
+
+
+def setup_of(model, data, fixed=None, start=None, objective="likelihood", seed=1):
+    problem = pose(model, data)
+    held = {k: np.asarray(v, dtype=float) for k, v in (fixed or {}).items()}
+    near = {k: np.asarray(v, dtype=float) for k, v in (start or {}).items()}
+    return Setup(problem, space_of(problem, held, near), objective, held, near, seed_sequence(seed))
+
+
+def swarms_of(setup, method):
+    model = perturbed_model(setup.space, setup.with_prior)
+    scales = step_scales(setup, method, model)
+    return Swarms(setup.space, setup.with_prior, scales, model.moving, method.cooling)
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_each_particle_carries_its_own_parameters(with_prior):
+    """A swarm of two atoms that does not step: Z and the final share of an atom are unbiased for
+    the mean of the atoms' likelihoods, and for an atom's part of it (times its prior)."""
+    data = [simulated(6, "atoms"), simulated(4, "more atoms")]
+    data[0]["y"][2] = np.nan
+    objective = "posterior" if with_prior else "likelihood"
+    setup = setup_of(series, data, {"a": 0.5, "h": 1.0}, VALUES, objective)
+    swarms = swarms_of(setup, ssm.IF2())
+    swarms = Swarms(swarms.space, with_prior, 0.0 * swarms.perturbation, swarms.moving, 0.5)
+    one = setup.space.z[setup.space.where]
+    atoms = [one, one + np.array([0.3, 0.4, -0.3, 0.5])]  # m, phi, q, r
+    exact = []
+    for z in atoms:
+        theta, _ = setup.space.parameters(z)
+        log_p = setup.exact.log_likelihood(setup.problem.experiments, theta.copy())
+        exact.append(log_p + (setup.chart.at(z).log_prior if with_prior else 0.0))
+    assert abs(exact[0] - exact[1]) < 3.0  # both count
+    stream, n = random_state(setup.seed(1)), 40
+    whole, part = [], []
+    for _ in range(1500):
+        swarm = np.repeat(np.array(atoms).T, n // 2, axis=1)
+        _, increments = swarms.one_pass(swarm, 1, stream)
+        log_z = increments.sum() - (np.logaddexp(*exact) - np.log(2.0))  # less that of the mean
+        share = np.mean(swarm[0] == atoms[0][0])
+        whole.append(log_z)
+        with np.errstate(divide="ignore"):
+            part.append(log_z + np.log(share) - exact[0] + np.logaddexp(*exact))
+    assert mean_one_p(whole) > LEVEL
+    assert mean_one_p(part) > LEVEL
+
+
+def test_the_steps_cool_as_they_should():
+    """Without measurements the swarm is a random walk: its variance is the sum of s^2, of all
+    rows for what acts at them, of the first one for what acts in the initial law alone."""
+    rows, passes, n, cooling, scale = 7, 30, 20_000, 0.2, {"m": 0.3, "q": 0.05}
+    data = [{"y": np.full(t, np.nan), "u": np.zeros(t)} for t in (rows, 3)]
+    setup = setup_of(series, data, {"a": 0.5, "h": 1.0, "phi": 0.5, "r": 1.0})
+    swarms = swarms_of(setup, ssm.IF2(cooling=cooling, perturbation=scale))
+    state = State(np.zeros((2, n)), random_state(setup.seed(2)), 0)
+    state, _ = swarm_block(swarms, state, 10)
+    state, _ = swarm_block(swarms, state, passes - 10)
+    m, q = np.arange(passes)[:, None], np.arange(rows + 3)[None]
+    factor = cooling ** ((m + q / (rows + 3)) / 50.0)
+    first = np.zeros(rows + 3)
+    first[[0, rows]] = 1.0
+    variance = [np.sum((0.3 * factor * first) ** 2), np.sum((0.05 * factor) ** 2)]
+    assert [s.data[1] for s in setup.chart.z] == ["m", "q"]
+    low, high = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], n) / n
+    for drawn, expected in zip(state.swarm, variance, strict=True):
+        assert low < np.mean(drawn**2) / expected < high
+
+
+def test_what_acts_where_is_found_in_the_model():
+    problem = pose(series, simulated(3, "found"))
+    free, missing = [True] * 6, problem.program.missing
+    for with_prior in (False, True):
+        found = perturbed(problem.trace, missing, free, with_prior)
+        assert found.moving.tolist() == [
+            True,
+            False,
+            False,
+            True,
+            True,
+            True,
+        ]  # a by the bound of phi
+        assert found.acting.tolist() == [True, with_prior, True, True, True, True]
+    held = perturbed(problem.trace, missing, [False, True, True, False, True, True])
+    assert held.moving.tolist() == [False, False, True, True]  # h, m, q, r
+
+
+def test_names_of_the_model_are_kept_apart():
+    model = ssm.Model("taken", inputs=("perturbation",))
+    model.prior(lambda: {"prior_counts": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"unconstrained": ssm.Normal(0, sd=1)})
+
+    @model.transition
+    def transition(unconstrained, prior_counts, perturbation):
+        mean = prior_counts * unconstrained + perturbation
+        return {"unconstrained": ssm.Normal(mean, sd=1)}
+
+    model.observation(lambda unconstrained: {"y": ssm.Normal(unconstrained, sd=1)})
+    data = {"y": np.array([0.3, -0.2, 0.5]), "perturbation": np.ones(3)}
+    setup = setup_of(model, data, objective="posterior")
+    swarms, swarm = swarms_of(setup, ssm.IF2()), np.zeros((1, 50))
+    mean, _ = swarms.one_pass(swarm, 1, random_state(setup.seed(1)))
+    assert 0.0 < abs(mean[0]) < 0.5
+
+
+def check_ends(found, exact):
+    """The ends of eight swarms lie round the exact top as far as their own spread allows; the bias
+    of steps that have not vanished is below a fifth of the standard error."""
+    for name, sd in exact.standard_errors.items():
+        ends = np.array([e[name] for e in found.attrs["start_parameters"]])
+        error = ends.std(ddof=1) / np.sqrt(8)
+        off = abs(ends.mean() - exact.parameters[name])
+        assert off < stats.t.isf(LEVEL / 2 / len(exact.standard_errors), 7) * error + 0.2 * sd
+        assert error < 0.2 * sd
+
+
+def test_a_linear_gaussian_maximum(exact_values):
+    exact = exact_values["lgss_main_text"]
+    found = ssm.maximize(models.lgss, LGSS, ssm.IF2(starts=8, iterations=80, particles=1000),
+                         fixed={"c": 0.5}, seed=seed_of("if2"), progress=False)  # fmt: skip
+    direct = ssm.maximize(models.lgss, LGSS, fixed={"c": 0.5}, progress=False)
+    assert direct.parameters["theta"] == pytest.approx(exact["mle"], abs=1e-6)
+    check_ends(found, direct)
+    gap = exact["max_log_likelihood"] - found.log_likelihood
+    assert 0.0 <= gap < 0.02
+    values = [ssm.log_likelihood(models.lgss, LGSS, e)[0] for e in found.attrs["start_parameters"]]
+    np.testing.assert_allclose(found.attrs["start_log_likelihoods"], values, atol=1e-9)
+    assert found.log_likelihood >= max(values) - 1e-9
+    assert found.attrs["converged"]
+    assert "highest log-likelihood" in found.attrs["estimate"]
+
+
+def test_the_iterates_of_every_start():
+    given = [{"theta": 0.3}, {"theta": 2.0}]
+    method = ssm.IF2(particles=100, iterations=5, starts=given, averaged=2)
+    found = ssm.maximize(models.lgss, LGSS, method, fixed={"c": 0.5}, seed=3, progress=False)
+    assert found.iterates["theta"].dims == ("start", "iteration")
+    assert dict(found.iterates.sizes) == {"start": 2, "iteration": 6}
+    np.testing.assert_allclose(found.iterates["theta"].values[:, 0], [0.3, 2.0])
+    log_p = found.iterates["perturbed_log_likelihood"].values
+    assert np.all(np.isnan(log_p[:, 0]))
+    last = {"theta": found.iterates["theta"].values[0, -1], "c": 0.5}
+    assert log_p[0, -1] == pytest.approx(ssm.log_likelihood(models.lgss, LGSS, last)[0], abs=6.0)
+    z = np.log(found.iterates["theta"].values[:, -2:]).mean(axis=1)
+    ends = [e["theta"] for e in found.attrs["start_parameters"]]
+    np.testing.assert_allclose(np.exp(z), ends)
+    again = ssm.maximize(models.lgss, LGSS, method, fixed={"c": 0.5}, seed=3, progress=False)
+    assert again.parameters == found.parameters
+
+
+@pytest.mark.parametrize(
+    "objective", [pytest.param("likelihood", marks=pytest.mark.slow), "posterior"]
+)
+def test_several_experiments(objective):
+    """Three free parameters, an input, missing rows, two experiments."""
+    data = [simulated(40, "first"), simulated(25, "second")]
+    data[0]["y"][10:13] = np.nan
+    fixed = {"a": 0.5, "h": 1.0, "r": 0.3}
+    exact = ssm.maximize(series, data, fixed=fixed, objective=objective, seed=1, progress=False)
+    method = ssm.IF2(particles=1000, iterations=60, starts=8)
+    found = ssm.maximize(series, data, method, fixed=fixed, objective=objective,
+                         seed=seed_of("several"), progress=False)  # fmt: skip
+    assert found.attrs["initial_law_only"] == ["m"]
+    assert found.attrs["perturbation"]["m"] == pytest.approx(0.02 * np.sqrt(32.5))
+    check_ends(found, exact)
+
+
+@ssm.primitive
+def grow(n, r, e):
+    return n * np.exp(r - n + e)
+
+
+def ricker(growth):
+    model = ssm.Model("ricker")
+    model.prior(lambda: {"r": ssm.Normal(3, sd=1), "sd": ssm.HalfNormal(sd=1)})
+    model.prior(lambda: {"scale": ssm.Gamma(2, rate=0.2), "n0": ssm.Gamma(2, rate=0.2)})
+    model.initial(lambda n0, sd: {"n": ssm.Dirac(n0), "e": ssm.Normal(0, sd=sd)})
+    model.transition(lambda n, e, r, sd: {"n": ssm.Dirac(growth(n, r, e)),
+                                          "e": ssm.Normal(0, sd=sd)})  # fmt: skip
+    model.observation(lambda n, scale: {"y": ssm.Poisson(scale * n + 1e-9)})
+    return model
+
+
+@pytest.mark.parametrize("growth", [
+    pytest.param(lambda n, r, e: n * np.exp(r - n + e), id="formula"),
+    pytest.param(grow, id="primitive", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_counts_of_a_deterministic_state(growth):
+    truth = {"r": 3.6, "sd": 0.3, "scale": 10.0, "n0": 7.0}
+    model = ricker(growth)
+    data = simulated(30, "ricker", parameters=truth, model=model)
+    found = ssm.maximize(model, data, ssm.IF2(particles=1000, iterations=60, starts=2),
+                         seed=seed_of("ricker"), progress=False)  # fmt: skip
+    assert found.attrs["initial_law_only"] == ["n0"]
+    at_truth = ssm.log_likelihood(model, data, truth, particles=4000, repeats=8, seed=1)
+    best = np.logaddexp.reduce(at_truth) - np.log(8)
+    assert found.log_likelihood > best - 4 * found.attrs["log_likelihood_error"]
+    assert "a quadratic fitted" in found.attrs["information"]
+    for name, value in truth.items():
+        assert abs(found.parameters[name] - value) < 4 * found.standard_errors[name], name
+
+
+def test_an_epidemic_of_discrete_states():
+    model = ssm.Model("epidemic")
+    model.prior(lambda: {"beta": ssm.Gamma(2, rate=1), "rho": ssm.Beta(2, 2)})
+    model.initial(lambda: {"s": ssm.Dirac(300.0), "i": ssm.Poisson(5.0)})
+
+    @model.transition
+    def transition(s, i, beta):
+        force = beta * i / 300.0
+        return {"s": ssm.Binomial(s, np.exp(-force)), "i": ssm.Poisson(0.3 * i + force * s)}
+
+    model.observation(lambda i, rho: {"y": ssm.Binomial(i, rho)})
+    data = simulated(20, "epidemic", parameters={"beta": 0.9, "rho": 0.6}, model=model)
+    found = ssm.maximize(model, data, ssm.IF2(particles=500, iterations=40, starts=2), seed=2,
+                         start={"beta": 0.7, "rho": 0.5}, progress=False)  # fmt: skip
+    assert found.parameters["beta"] == pytest.approx(0.9, abs=0.3)
+    assert np.isfinite(found.log_likelihood)
+
+
+def test_the_quadratic_gives_the_information():
+    """By estimates of the likelihood: within a fifth of the exact information."""
+    setup = setup_of(models.lgss, LGSS, {"c": 0.5}, {"theta": 0.76})
+    z, method = np.log([0.757987]), ssm.IF2(particles=500)
+    found = summit.fitted_curvature(setup, method, z)
+    exact = setup.exact.information(setup.problem.experiments, np.array([0.757987, 0.5]))
+    assert found[0, 0] == pytest.approx(exact[0, 0], rel=0.2)
+
+
+def test_a_row_that_no_particle_can_produce_is_counted():
+    model = ssm.Model("bounded")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, a: {"x": ssm.Normal(a * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Uniform(x - 1, x + 1)})
+    data = {"y": np.array([0.1, 0.3, 60.0, 0.2])}
+    setup = setup_of(model, data)
+    swarms = swarms_of(setup, ssm.IF2())
+    state = State(np.zeros((1, 50)), random_state(setup.seed(1)), 0)
+    _, block = swarm_block(swarms, state, 2)
+    assert block.stats["impossible"].tolist() == [1, 1]
+    assert np.all(np.isfinite(block.draws["z"]))
+    assert np.all(block.stats["perturbed_log_likelihood"] == -np.inf)
+
+
+def test_an_interrupt_keeps_the_passes_made(monkeypatch):
+    plain, seen = Swarms.one_pass, []
+
+    def one_pass(self, swarm, iteration, stream):
+        seen.append(iteration)
+        if len(seen) > 60:
+            raise KeyboardInterrupt
+        return plain(self, swarm, iteration, stream)
+
+    monkeypatch.setattr(Swarms, "one_pass", one_pass)
+    setup = setup_of(models.lgss, LGSS, {"c": 0.5}, {"theta": 1.0})
+    found = climb(setup, ssm.IF2(particles=50, starts=2, iterations=1000))
+    assert found.interrupted
+    assert 1 < found.iterates.shape[1] < 70
+    assert np.all(np.isfinite(found.theta))
+
+
+def test_swarms_travel_to_other_processes():
+    setup = setup_of(models.lgss, LGSS)
+    swarms = swarms_of(setup, ssm.IF2())
+    state = State(np.zeros((2, 50)), random_state(setup.seed(1)), 0)
+    here = swarm_block(swarms, state, 2)[1].draws["z"]
+    there = swarm_block(pickle.loads(pickle.dumps(swarms)), state, 2)[1].draws["z"]
+    np.testing.assert_array_equal(here, there)
+
+
+@pytest.mark.parametrize(("method", "words"), [
+    (ssm.IF2(cooling=0.0), r"cooling=0\.0"),
+    (ssm.IF2(cooling=1.5), r"cooling=1\.5"),
+    (ssm.IF2(perturbation=-1.0), r"perturbation=-1\.0"),
+    (ssm.IF2(perturbation={"c": 0.1}), r"names 'c', which is no free parameter.*theta"),
+    (ssm.IF2(perturbation={"theta": "0.1"}), r"perturbation=.*positive numbers"),
+    (ssm.IF2(starts=0), r"starts=0"),
+    (ssm.IF2(starts=[]), r"starts is empty"),
+    (ssm.IF2(starts=[{"thta": 1.0}]), r"starts\[0\] names 'thta'"),
+    (ssm.IF2(particles=1), r"particles=1"),
+    (ssm.IF2(evaluations=1), r"evaluations=1"),
+])  # fmt: skip
+def test_what_is_refused(method, words):
+    with pytest.raises(ssm.ArgumentError, match=f"(?s){words}"):
+        ssm.maximize(models.lgss, LGSS, method, fixed={"c": 0.5}, progress=False)
