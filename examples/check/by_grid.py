@@ -73,7 +73,7 @@ def stochastic_volatility() -> Iterator[Row]:
     yield Row(
         "stochastic_volatility", stated(theta), "particles", "point-mass filter",
         log_likelihood("stochastic_volatility", theta, particles=2000, repeats=40),
-        converged(on, 401),
+        converged(on, 321),
     )  # fmt: skip
 
 
