@@ -8,6 +8,7 @@
 #   make gap        the blind benchmark of the diagnosis: of 24 sets what eight minutes allow
 #   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
+#   make check      the examples against statsmodels, hmmlearn and particles
 #   make docs       the documentation, notebooks executed, warnings are errors
 #   make bench      speed against plain C and other packages
 #   make format     put the code into shape
@@ -24,7 +25,7 @@ PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow exhaustive tables gap examples docs bench format clean
+.PHONY: help demo test slow exhaustive tables gap examples check docs bench format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -41,6 +42,10 @@ $(VENV)/.installed-run: pyproject.toml | $(BIN)/python
 
 $(VENV)/.installed-dev: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[dev]'
+	@touch $@ $(VENV)/.installed-run
+
+$(VENV)/.installed-check: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[check]'
 	@touch $@ $(VENV)/.installed-run
 
 $(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
@@ -82,6 +87,9 @@ examples: $(VENV)/.installed-run
 	$(BIN)/ssmppl explain examples/heating/model.py examples/heating/data.csv
 	$(BIN)/ssmppl sample examples/heating/model.py examples/heating/data.csv --draws 500 --seed 1 \
 	    -o build/heating.nc
+
+check: $(VENV)/.installed-check
+	$(BIN)/python -m examples.check
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -T -W --keep-going -b html docs docs/_build/html

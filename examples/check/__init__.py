@@ -1,0 +1,1 @@
+"""The examples against answers by other programs: `python -m examples.check`."""
