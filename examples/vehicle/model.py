@@ -21,7 +21,7 @@ def prior():
         "c_front": ssm.Normal(6, sd=3),
         "c_rear": ssm.Normal(6, sd=3),
         "q_v": ssm.InverseGamma(3, scale=1e-3),
-        "q_w": ssm.InverseGamma(3, scale=1e-5),
+        "q_w": ssm.InverseGamma(3, scale=5e-5),
         "r_gyro": ssm.InverseGamma(3, scale=1e-3),
         "r_position": ssm.InverseGamma(3, scale=1e-1),
     }
