@@ -63,3 +63,6 @@ def spread_items(app, what, name, obj, options, lines):
 
 def setup(app):
     app.connect("autodoc-process-docstring", spread_items, priority=100)  # before numpydoc
+    # Pages are read, and their notebooks run, side by side: the extension that copies MathJax keeps
+    # nothing while they are read, and does not say so.
+    app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True

@@ -39,7 +39,7 @@ def test_there_is_a_page_a_line_and_a_check(name):
     assert name in {one.example for one in rows.CHECKS}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive  # the examples' scripts and pages draw longer chains in every run
 @pytest.mark.parametrize("name", NAMES)
 def test_a_short_chain(name):
     model, data = example(name)
