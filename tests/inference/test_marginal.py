@@ -17,7 +17,7 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.particles.marginal import draw_given
-from ssmppl.inference.particles.marginal_backward import marginal_paths
+from ssmppl.inference.particles.marginal_backward import backward_pass, marginal_paths
 from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
 from tests.inference.conditional_models import THETA, enumerated, four_states, regimes
@@ -281,18 +281,22 @@ def test_smoothed_paths_with_coupled_states(sampled_pair):
     problem = sampled_pair
     (experiment,) = problem.experiments
     smoothed = kalman_model(problem.trace).smooth(experiment, np.empty(0))
-    first, second = [], []
+    first, second, backward = [], [], []
     for i in range(24):
         stream = random_state(seed_sequence(seed_of("coupled")), i)
         system = particle_system(
             problem, np.empty(0), FilterSettings(400, "marginal"), experiment, stream
         )
-        x = marginal_paths(problem, np.empty(0), experiment, system, 100, stream)
+        given = problem, np.empty(0), experiment, system, 200, stream
+        x = marginal_paths(*given)
         first.append(x.mean(axis=0))
         second.append(np.einsum("mti,mtj->tij", x, x) / len(x))
+        _, z = backward_pass(*given)
+        backward.append(np.einsum("mti,mtj->tij", z, z) / len(z))
     _agree(np.array(first), smoothed.mean)
     product = np.einsum("ti,tj->tij", smoothed.mean, smoothed.mean)
     _agree(np.array(second), smoothed.covariance + product)
+    _agree(np.array(backward), (smoothed.covariance + product)[:, 2:, 2:])
 
 
 @pytest.mark.slow

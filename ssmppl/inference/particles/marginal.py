@@ -209,7 +209,6 @@ def _draw_part(
     ]  # fmt: skip
     c, exact = list(columns.channels), list(columns.coupled)
     told = np.ones((paths.shape[1], len(exact)))
-    told[0] = 0.0  # the start is given x_1 already
     seen_rows = np.ascontiguousarray(np.hstack([experiment.seen[:, c], told]))
     for i, path in enumerate(paths):
         model = Matrices(entries[0][i, 0], entries[1][i, 0], *(e[i] for e in entries[2:]))

@@ -85,6 +85,15 @@ def marginal_paths(
     trajectories: int, stream: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Trajectories (M, T, D) of all states; `system` holds the particles of the marginal model."""
+    paths, _ = backward_pass(problem, theta, experiment, system, trajectories, stream)
+    return draw_given(problem, experiment, theta, paths, stream)
+
+
+def backward_pass(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, system: ParticleSystem,
+    trajectories: int, stream: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Paths of the particles (M, T, D') and of z (M, T, n), drawn backwards together."""
     steps, d, n = system.particles.shape
     law = _Law(problem, experiment, theta, system)
     index = draw_particles(system.weights[-1], trajectories, stream)
@@ -92,6 +101,8 @@ def marginal_paths(
     paths[:, -1] = system.particles[-1][:, index].T
     mean, covariance = law.filtered(steps - 1)
     z = _gaussian(mean[:, index], covariance[:, :, index], stream)
+    linear = np.empty((trajectories, steps, len(z)))
+    linear[:, -1] = z.T
     for t in range(steps - 2, -1, -1):
         x = paths[:, t + 1].T
         uniforms, chosen = np.empty(trajectories), np.empty(trajectories, dtype=np.int64)
@@ -103,8 +114,8 @@ def marginal_paths(
             log_w = step.log_weights(x[:, part], z[:, part])
             chosen[part] = _drawn_indices(log_w, uniforms[part])
         z = step.draw(x, z, chosen, stream)
-        paths[:, t] = system.particles[t][:, chosen].T
-    return draw_given(problem, experiment, theta, paths, stream)
+        paths[:, t], linear[:, t] = system.particles[t][:, chosen].T, z.T
+    return paths, linear
 
 
 def _drawn_indices(log_w: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
