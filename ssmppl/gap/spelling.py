@@ -94,7 +94,7 @@ class Lines:
         self.special = False  # whether scipy.special is needed
         self._texts: dict[Expr, Text] = {}
         self._taken = set(taken)
-        self._whole = {tuple(map(id, np.asarray(v, dtype=object).ravel())): n
+        self._whole = {_key(np.shape(v), np.asarray(v, dtype=object).ravel()): n
                        for n, v in quantities.items() if np.shape(v)}  # fmt: skip
         self._primitive = primitive
         roots = list(roots)
@@ -209,13 +209,18 @@ class Lines:
         """The text of an array of nodes; scalar: one node will do where all are the same."""
         values = array(values)
         nodes = list(values.ravel())
-        whole = self._whole.get(tuple(map(id, nodes)))
+        whole = self._whole.get(_key(values.shape, nodes))
         if values.ndim == 0 or (scalar and all(n is nodes[0] for n in nodes)):
             return self.text(nodes[0])
         if whole is not None:
             return whole
         if all(n.op == "const" for n in nodes):
-            return constant_array(np.array([n.data for n in nodes]).reshape(values.shape))
+            numbers = np.array([n.data for n in nodes]).reshape(values.shape)
+            text = constant_array(numbers)
+            if values.ndim == 2 and len(text) > WIDTH:
+                rows = [f"[{', '.join(map(number, row))}]" for row in numbers.tolist()]
+                return _listed("np.array", rows)
+            return text
         alike = all(n is nodes[0] for n in nodes)  # whose text would be that of a scalar
         vectorised = None if alike else self._elementwise(values)
         if vectorised is not None and len(vectorised[0]) <= WIDTH:
@@ -243,7 +248,7 @@ class Lines:
             return None
         if all(n is flat[0] for n in flat):
             return self.text(flat[0]), self._texts[flat[0]][1]
-        whole = self._whole.get(tuple(map(id, flat)))
+        whole = self._whole.get(_key(values.shape, flat))
         if whole is not None:
             return whole, _ATOM
         product = self._product(values)
@@ -285,9 +290,15 @@ class Lines:
             list(map(id, (b for _, b in row))) != list(map(id, vector)) for row in columns
         ):
             return None
-        matrix = self._whole.get(tuple(id(a) for row in columns for a, _ in row))
-        right = self._whole.get(tuple(map(id, vector)))
+        factors = [a for row in columns for a, _ in row]
+        matrix = self._whole.get(_key((len(columns), len(vector)), factors))
+        right = self._whole.get(_key((len(vector),), vector))
         return f"{matrix} @ {right}" if matrix and right else None
+
+
+def _key(shape: tuple[int, ...], nodes: Iterable[Expr]) -> tuple:
+    """What an array is known by: a vector of the same nodes is no matrix."""
+    return shape, *map(id, nodes)
 
 
 def _reshaped(nodes: Sequence[Expr], shape: tuple[int, ...]) -> Any:

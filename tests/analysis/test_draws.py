@@ -128,7 +128,13 @@ def _compare_matrix_normal(conditional, draws):
         assert stats.ks_2samp(measure(values), measure(others)).pvalue > LEVEL
 
 
-@pytest.mark.parametrize("name", CORPUS)
+# Tens of thousands of draws each; one case of a matrix with its coefficients stays.
+LONG = ("conjugate_columns", "flat_coefficients", "conjugate_precision", "noise_through_a_matrix")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LONG)) for n in CORPUS]
+)
 def test_draws_follow_the_exact_conditional(name):
     model, *_ = build(name)
     for conditional in conditionals(model):

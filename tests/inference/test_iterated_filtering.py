@@ -261,6 +261,7 @@ def test_counts_of_a_deterministic_state(growth):
         assert abs(found.parameters[name] - value) < 4 * found.standard_errors[name], name
 
 
+@pytest.mark.slow
 def test_an_epidemic_of_discrete_states():
     model = ssm.Model("epidemic")
     model.prior(lambda: {"beta": ssm.Gamma(2, rate=1), "rho": ssm.Beta(2, 2)})

@@ -130,7 +130,9 @@ def test_likelihood_is_unbiased_over_regimes(name, ess_threshold, data, exact):
     assert 0.05 < found.std() < 1.0
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [NAMES[0], *(pytest.param(n, marks=pytest.mark.slow) for n in NAMES[1:])]
+)
 def test_likelihood_is_unbiased_with_coupled_states(name, sampled_pair):
     problem = sampled_pair
     exact = kalman_model(problem.trace).log_likelihood(problem.experiments, np.empty(0))
