@@ -29,11 +29,16 @@ LONG = {  # slices on a matrix or a simplex, each a pass over the whole density
     "variance_of_a_projection",
     "contaminated_classes",
 }
-DRAWN = [
-    pytest.param(n, marks=pytest.mark.slow if n in LONG else ())
-    for n in NEAR_MISSES
-    if n != "deterministic"
-]
+LONGEST = LONG - {"wishart_on_a_covariance", "contaminated_classes"}  # a minute and more each
+
+
+def _mark(name):
+    if name in LONGEST:
+        return pytest.mark.exhaustive
+    return pytest.mark.slow if name in LONG else ()
+
+
+DRAWN = [pytest.param(n, marks=_mark(n)) for n in NEAR_MISSES if n != "deterministic"]
 
 
 @pytest.mark.parametrize("name", DRAWN)

@@ -10,7 +10,7 @@ import pytest
 from .checks import LEVEL
 from .sbc import BINS, BLOCKS, KEPT, STUDIES, calibrate, histogram, uniform_p
 
-SETS = int(os.environ.get("SSMPPL_SBC_SETS", "40"))  # `make exhaustive` asks for 100
+SETS = int(os.environ.get("SSMPPL_SBC_SETS", "24"))  # `make exhaustive` asks for 100
 QUANTITIES = sum(len(study.ranked) for study in STUDIES.values())
 
 
