@@ -308,9 +308,10 @@ def _reshaped(nodes: Sequence[Expr], shape: tuple[int, ...]) -> Any:
 
 
 def _listed(function: str, texts: Sequence[str]) -> str:
-    """function([...]), on one line or with a line for each element."""
+    """function([...]), on one line, which may stand behind the name of an argument, or with a line
+    for each element."""
     line = f"{function}([{', '.join(texts)}])"
-    if len(line) <= WIDTH and "\n" not in line:
+    if len(line) <= WIDTH - 8 and "\n" not in line:
         return line
     inside = "".join(f"        {t},\n".replace("\n", "\n" + " " * 8, t.count("\n")) for t in texts)
     return f"{function}(\n    [\n{inside}    ]\n)"
