@@ -208,8 +208,8 @@ def _draw_part(
         for f in fields
     ]  # fmt: skip
     c, exact = list(columns.channels), list(columns.coupled)
-    told = np.ones((paths.shape[1], len(exact)))
-    seen_rows = np.ascontiguousarray(np.hstack([experiment.seen[:, c], told]))
+    known = np.ones((paths.shape[1], len(exact)))
+    seen_rows = np.ascontiguousarray(np.hstack([experiment.seen[:, c], known]))
     for i, path in enumerate(paths):
         model = Matrices(entries[0][i, 0], entries[1][i, 0], *(e[i] for e in entries[2:]))
         y = np.ascontiguousarray(np.hstack([experiment.y[:, c], path[:, exact]]))
