@@ -37,7 +37,15 @@ def gaussian_fit(
         limit = LONGEST_STEP * spread
         x = array(x + np.minimum(np.maximum(step, -limit), limit))
     _, w = _at(block, x, slope, curvature)
-    return x, _factor(w, precision)
+    factor = _factor(w, precision)
+    # slope or curvature over- or underflowed: the transition itself is a valid proposal
+    total = constant(0.0)
+    for e in (*x, *np.diagonal(factor.view(np.ndarray))):
+        total = total + e
+    finite: Any = apply("lt", apply("abs", total), np.inf)
+    return array(np.where(finite, x, block.mean)), array(
+        np.where(finite, factor, written_cholesky(precision))
+    )
 
 
 def _at(

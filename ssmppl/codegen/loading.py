@@ -16,13 +16,14 @@ from typing import Any
 from numba import config
 
 from ssmppl.codegen import cache
-from ssmppl.codegen.kernels.guide import look_at
+from ssmppl.codegen.kernels.guide import look_at, most_likely
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.entries import entry
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import ModuleText
 
-HELPERS: dict[str, Any] = {"look_at": look_at}  # specialised functions that kernels call
+# specialised functions that kernels call
+HELPERS: dict[str, Any] = {"look_at": look_at, "most_likely": most_likely}
 # Arguments of a filter that only its compiled variant knows: what is not None needs Numba's.
 SCHEME, MOMENTS = 5, 10
 

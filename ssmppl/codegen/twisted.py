@@ -205,6 +205,8 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     own = {"flat": str(found.flat)}
     out.algorithm(guide.look_at, "look_at", section, "exact", own)
     own["look_at"] = "look_at"
+    out.algorithm(guide.most_likely, "most_likely", section, "exact", own)
+    own["most_likely"] = "most_likely"
     for kernel in (guide.follow_filter, guide.follow_gains):
         out.algorithm(kernel, kernel.__name__, section, "entry", own)
     prediction = prediction_kit(trace, layout, bootstrap(trace, missing))

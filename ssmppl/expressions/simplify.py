@@ -74,6 +74,30 @@ def _begins_with_positive(a: Expr, op: str) -> bool:
     return _begins_with_number(a, op) and a.args[0].data > 0
 
 
+def _without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
+    """(b, e) with a = b exp(e), for products and quotients; no e where no factor is an exp."""
+    if a.op == "exp":
+        return constant(1.0), a.args[0]
+    if a.op == "neg":
+        rest, exponent = _without_exponentials(a.args[0])
+        return (-rest, exponent) if exponent is not None else (a, None)
+    if a.op not in ("mul", "div"):
+        return a, None
+    (left, up), (right, down) = map(_without_exponentials, a.args)
+    if up is None and down is None:
+        return a, None
+    if down is not None and a.op == "div":
+        down = -down
+    parts = [e for e in (up, down) if e is not None]
+    return apply(a.op, left, right), parts[0] if len(parts) == 1 else parts[0] + parts[1]
+
+
+def _log_without_exponentials(a: Expr) -> Expr:
+    rest, exponent = _without_exponentials(a)
+    assert exponent is not None
+    return apply("log", rest) + exponent
+
+
 # By operation: the mathematics (c, d are numbers), where the rule applies, what it gives. The first
 # that applies is taken. Arguments that are all numbers are folded before.
 Rule = tuple[str, Callable[..., bool], Callable[..., Expr]]
@@ -117,6 +141,8 @@ RULES: dict[str, tuple[Rule, ...]] = {
     ),
     "log": (
         ("log(exp x) = x", lambda a: a.op == "exp", lambda a: a.args[0]),
+        ("log(b exp(x)) = log b + x, also where exp(x) under- or overflows",
+         lambda a: _without_exponentials(a)[1] is not None, _log_without_exponentials),
         ("log(c x) = log c + log x, c > 0",
          lambda a: _begins_with_positive(a, "mul"),
          lambda a: math.log(a.args[0].data) + apply("log", a.args[1])),

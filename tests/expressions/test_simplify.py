@@ -13,6 +13,7 @@ X, Y = symbol("state", "x"), symbol("state", "y")
 AT = {X: np.array([0.7, 1.3, 2.9]), Y: np.array([1.9, 0.4, 0.8])}
 NUMBERS = [constant(v) for v in (0.0, 1.0, -1.0, 0.5, 2.5)]
 SYMBOLIC = [X, Y, -X, 2.5 * X, 2.5 / Y, np.exp(X), X + Y]
+PRODUCTS = [Y * np.exp(X), np.exp(X) / Y, Y / np.exp(X), np.exp(-X) * X * np.exp(Y), 2 * np.exp(X)]
 CONDITIONS = [constant(1.0), constant(0.0), X < Y]
 
 
@@ -20,6 +21,8 @@ def arguments(op):
     """Arguments as `apply` hands them to the rules: not all of them numbers."""
     first = CONDITIONS if op == "where" else NUMBERS + SYMBOLIC
     count = {"log": 1, "neg": 1, "where": 3}.get(op, 2)
+    if op == "log":
+        yield from ((a,) for a in PRODUCTS)
     for args in itertools.product(first, *[NUMBERS + SYMBOLIC] * (count - 1)):
         if any(a.op != "const" for a in args):
             yield args
@@ -47,3 +50,13 @@ def test_simplifying_again_changes_nothing(op):
         once = apply(op, *args)
         if once.op in RULES:
             assert apply(once.op, *once.args) is once
+
+
+@pytest.mark.parametrize("x", [-800.0, 800.0])
+def test_logarithms_of_products_neither_underflow_nor_overflow(x):
+    at = {X: np.array([x]), Y: np.array([3.0])}
+    for product, expected in [
+        (Y * np.exp(X), np.log(3) + x), (np.exp(X) / Y, x - np.log(3)),
+        (Y / np.exp(X), np.log(3) - x), (np.exp(X) * Y * np.exp(-X), np.log(3)),
+    ]:  # fmt: skip
+        assert evaluate(np.log(product), at)[0] == pytest.approx(expected, rel=1e-14)

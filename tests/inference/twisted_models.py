@@ -110,6 +110,36 @@ def ricker_log_likelihood(y, points=1600):
     return point_mass(stats.norm.pdf(z, 1.0, 0.7), move, log_g, h)
 
 
+# The same in the logarithm of the population, which falls by hundreds after a good year: its
+# exponential underflows, and a linearised prediction is off by hundreds of standard deviations.
+crash = ssm.Model("crash")
+RATE, BIRTHS, COUNTED = 3.94, 1.56, 10.16
+
+
+@crash.initial
+def crash_initial():
+    return {"x": ssm.Normal(0, sd=1)}
+
+
+@crash.transition
+def crash_transition(x):
+    return {"x": ssm.Normal(x + RATE - np.exp(x), variance=BIRTHS)}
+
+
+@crash.observation
+def crash_observation(x):
+    return {"y": ssm.Poisson(COUNTED * np.exp(x))}
+
+
+def crash_log_likelihood(y, points=4000):
+    """By a point-mass filter."""
+    x, h = np.linspace(-60, 12, points, retstep=True)
+    move = stats.norm.pdf(x[:, None], (x + RATE - np.exp(x))[None, :], BIRTHS**0.5) * h
+    log_g = stats.poisson.logpmf(np.nan_to_num(np.asarray(y))[:, None], COUNTED * np.exp(x))
+    log_g[np.isnan(y)] = 0.0
+    return point_mass(stats.norm.pdf(x, 0.0, 1.0), move, log_g, h)
+
+
 def point_mass(density, move, log_g, h):
     """log p(y) from the first state's density (n,), the masses moved (n, n), log g (T, n).
 

@@ -19,18 +19,13 @@ import numpy as np
 from ssmppl.codegen.kernels.conditional_smc import draw_index
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import (
-    APPROXIMATE,
-    GUIDED,
-    GUIDED_SHARE,
     NO_LOOK_AHEAD,
-    PLAIN_SHARE,
     add,
     any_finite,
     copy,
     gather,
-    mix,
+    look_ahead_weights,
     second_stage,
-    take_log,
 )
 from ssmppl.codegen.kernels.resampling import PADDING
 from ssmppl.codegen.kernels.special import ndtr
@@ -160,17 +155,9 @@ def correlated_path(
                 if sizes[5] > 0:
                     fit(theta, c, s, history[t - 1], fits_prev)
                 look_ahead(theta, c, s, history[t - 1], fits_prev, log_v)
-                take_log(w, log_base)
-                add(log_v, log_base)
-                _, _, status = normalise(log_v, p)
-                if status == NAN and any_finite(log_v):
-                    return status, t, -np.inf
+                _, status = look_ahead_weights(log_v, w, log_base, ahead, p)
                 if status != OK:
-                    copy(w, p)
-                elif ahead == APPROXIMATE:
-                    mix(p, w, PLAIN_SHARE)
-                elif ahead == GUIDED:
-                    mix(p, w, GUIDED_SHARE)
+                    return status, t, -np.inf
             order_of(history[t - 1], order)
             ordered_systematic(to_uniform(points[t]), p, order, ancestors)
             gather(history[t - 1], ancestors, x_prev)

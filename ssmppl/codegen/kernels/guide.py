@@ -21,8 +21,9 @@ import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
 
-NEWTON_STEPS = 3  # of the filter's update where the curvature varies
-FARTHEST = 2.0  # standard deviations that one of them goes
+NEWTON_STEPS = 10  # at most, of the filter's update where the curvature varies
+HALVINGS = 40  # of one of them, until the density grows: a slope can lead a thousand sds astray
+CLOSE = 0.05  # nats of improvement with which they end
 SWEEPS = 12  # of Jacobi's method; a handful suffice
 ROUND = 1e-14
 
@@ -164,8 +165,60 @@ def spread_out(told, rest, jacobian, spread):
 
 
 @exact
+def most_likely(
+    look_at, flat, theta, c, s, rest, p, seen_so, now, g, h, after, toward, move, lead, target
+):  # fmt: skip
+    """x_t after the filter's update: the mode of N(x; rest, P) g(y_t | x), by Newton's method.
+
+    now (D, 1), g (D,), h (D, D), after (D, D) : the mode, slope and curvature of log g there, and
+    the covariance, written; False where it comes to no number. The rest is room to work in. P may
+    be singular: x - rest is P times `lead`, so that the density of x is known without P's inverse.
+    """
+    d = g.size
+    for i in range(d):
+        now[i, 0], lead[i], toward[i] = rest[i], 0.0, 0.0
+    value = look_at(theta, c, s, now, seen_so, g, h)
+    height = value
+    if not update(p, h, g, toward, after, move):
+        return False
+    for _ in range(1 if flat else NEWTON_STEPS):
+        for i in range(d):
+            target[i] = g[i]
+            for j in range(d):
+                target[i] += h[i, j] * (toward[j] - move[j])
+        share = 1.0
+        for _ in range(HALVINGS):
+            new = 0.0
+            for i in range(d):
+                gone = toward[i] + share * (move[i] - toward[i])
+                now[i, 0] = rest[i] + gone
+                new -= 0.5 * (lead[i] + share * (target[i] - lead[i])) * gone
+            value = look_at(theta, c, s, now, seen_so, g, h)
+            new += value
+            if flat or new >= height or (abs(new) < np.inf and not abs(height) < np.inf):
+                break
+            share *= 0.5
+        else:  # as high as it gets
+            for i in range(d):
+                now[i, 0] = rest[i] + toward[i]
+            value = look_at(theta, c, s, now, seen_so, g, h)
+            break
+        gained, height = new - height, new
+        for i in range(d):
+            lead[i] += share * (target[i] - lead[i])
+            toward[i] = now[i, 0] - rest[i]
+        if flat:
+            break
+        if not update(p, h, g, toward, after, move):
+            return False
+        if gained < CLOSE:
+            break
+    return abs(value) < np.inf
+
+
+@exact
 def follow_filter(
-    prepare, step, linear_initial, linear, look_at, sizes, flat,
+    prepare, step, linear_initial, linear, look_at, most_likely, sizes, flat,
     theta, y, seen, u, x, covariance, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
     """The first reference: an extended Kalman filter; False where it comes to no number.
@@ -181,7 +234,7 @@ def follow_filter(
     told_initial = np.empty((d + d * r_initial, 1))
     seen_so = np.empty((1 + d + d * (d + 1) // 2, 1))
     p, after, jp = np.zeros((d, d)), np.empty((d, d)), np.empty((d, d))
-    toward, move = np.empty(d), np.empty(d)
+    toward, move, target, lead = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
@@ -211,24 +264,10 @@ def follow_filter(
                     for k in range(r):
                         total += spread[t, i, k] * spread[t, j, k]
                     p[i, j] = total
-        for i in range(d):
-            now[i, 0] = rest[t, i]
-        for _ in range(1 if flat else NEWTON_STEPS):
-            look_at(theta, c, s, now, seen_so, g[t], h[t])
-            for i in range(d):
-                toward[i] = now[i, 0] - rest[t, i]
-            if not update(p, h[t], g[t], toward, after, move):
-                return False
-            size = 1.0
-            if not flat:
-                for i in range(d):
-                    far = abs(move[i] - toward[i])
-                    if far * size > FARTHEST * math.sqrt(p[i, i]):
-                        size = FARTHEST * math.sqrt(p[i, i]) / far
-            for i in range(d):
-                now[i, 0] += size * (move[i] - toward[i])
-        value = look_at(theta, c, s, now, seen_so, g[t], h[t])
-        if not abs(value) < np.inf:
+        fine = most_likely(
+            theta, c, s, rest[t], p, seen_so, now, g[t], h[t], after, toward, move, lead, target
+        )
+        if not fine:
             return False
         for i in range(d):
             if not abs(now[i, 0]) < np.inf:

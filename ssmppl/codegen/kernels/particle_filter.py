@@ -99,6 +99,37 @@ def any_finite(log_v):
 
 
 @exact
+def look_ahead_weights(log_v, w, log_base, ahead, p):
+    """p <- what to resample by: the weights w times the look-ahead values exp(log_v).
+
+    Returns (effective size of p, status). log_v and log_base (N,) are overwritten. A look-ahead
+    that is no number rules its particle out where that cannot bias anything: the particle has no
+    weight, or a share of the plain weights is mixed in. Where nothing is left to go by, p = w.
+    """
+    take_log(w, log_base)
+    add(log_v, log_base)
+    _, size, status = normalise(log_v, p)
+    if status == NAN:
+        for i in range(log_v.size):
+            if log_v[i] != log_v[i] and (w[i] == 0.0 or ahead != EXACT):
+                log_v[i] = -np.inf
+        _, size, status = normalise(log_v, p)
+        if status == NAN and any_finite(log_v):
+            return 0.0, status
+    if status != OK:
+        copy(w, p)
+        squares = 0.0
+        for i in range(p.size):
+            squares += p[i] * p[i]
+        return 1.0 / squares, OK
+    if ahead == APPROXIMATE:
+        mix(p, w, PLAIN_SHARE)
+    elif ahead == GUIDED:
+        mix(p, w, GUIDED_SHARE)
+    return size, OK
+
+
+@exact
 def particle_filter(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh, predict,
     sizes, ahead, theta, y, seen, u, particles, scheme, ess_threshold, rng,
@@ -136,18 +167,9 @@ def particle_filter(
                 if sizes[5] > 0:
                     fit(theta, c, s, x, fits_prev)
                 look_ahead(theta, c, s, x, fits_prev, log_v)
-                take_log(w, log_base)
-                add(log_v, log_base)
-                _, current_ess, status = normalise(log_v, p)
-                if status == NAN and any_finite(log_v):
+                current_ess, status = look_ahead_weights(log_v, w, log_base, ahead, p)
+                if status != OK:
                     return status, t
-                if status != OK:  # nowhere to go by the look-ahead: go by the weights
-                    copy(w, p)
-                    current_ess = ess[t - 1]
-                elif ahead == APPROXIMATE:
-                    mix(p, w, PLAIN_SHARE)
-                elif ahead == GUIDED:
-                    mix(p, w, GUIDED_SHARE)
             else:
                 p, w = w, p
             if ess_threshold >= 1.0 or current_ess < ess_threshold * n:
