@@ -36,13 +36,13 @@ from ssmppl.expressions.calculus import (
     lower_inverse,
 )
 from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, symbol
-from ssmppl.expressions.linear import cholesky
 from ssmppl.language.distributions import Dirac, Draws, LogNormal, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace
 
 DEFENSIVE = 0.02  # share of the transition in the proposal's mixture
-MOST_NOISES = 16  # two minutes of compilation; at forty it takes more than 20 GB
-WRITTEN_OUT = 6  # noises up to which the factorisation is written out, and so vectorises
+# Noises up to which the matrices are written out, in which LLVM finds what they have in common;
+# beyond, compilation takes minutes, at forty more than 20 GB: see `codegen/kernels/steering.py`.
+WRITTEN_OUT = 6
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,15 @@ class NoiseForm:
         shape = (len(self.noise), len(self.value))
         return array(array(flat).reshape(shape).T)
 
+    def padded(self, noises: int) -> NoiseForm:
+        """The same with so many noises, of which the last move nothing and are 0."""
+        more = range(len(self.noise), noises)
+        return NoiseForm(
+            (*self.noise, *(symbol("noise", "noise", (k,)) for k in more)),
+            self.value,
+            array([*self.recovered, *(constant(0.0) for _ in more)]),
+        )
+
 
 @dataclass(frozen=True)
 class Guided:
@@ -90,6 +99,11 @@ class Guided:
     slope: ExprArray
     curvature: ExprArray
     flat: bool
+
+    @property
+    def written_out(self) -> bool:
+        """Whether the matrices of the moves are few enough to be written out in scalars."""
+        return len(self.transition.noise) <= WRITTEN_OUT and len(self.initial.noise) <= WRITTEN_OUT
 
 
 def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicable:
@@ -148,12 +162,8 @@ def guided(trace: Trace, missing: Missing) -> Guided | NotApplicable:
     if not transition.noise:
         return NotApplicable("no state has noise", where)
     noises = max(len(initial.noise), len(transition.noise))
-    if noises > MOST_NOISES:
-        return NotApplicable(
-            f"there are {noises} noises, more than the {MOST_NOISES} up to which their matrices "
-            "compile in reasonable time",
-            where,
-        )
+    if noises > WRITTEN_OUT:
+        initial, transition = initial.padded(noises), transition.padded(noises)
     total = constant(0.0)
     for t in terms(trace, "observation", missing, guard=False):
         total = total + t.guarded()
@@ -210,10 +220,16 @@ def guide_order(d: int, r: int) -> list[Expr]:
 
 
 def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
-    """The proposal, in terms of the guide's symbols."""
+    """The proposal, in terms of the guide's symbols; its laws only where they are written out."""
     found = guided(trace, missing)
     if isinstance(found, NotApplicable):
         return found
+    explanation = (
+        "twisted: particles move and are resampled by a Gaussian approximation to what "
+        f"all later observations say, mixed with {DEFENSIVE:.0%} of the transition"
+    )
+    if not found.written_out:
+        return Proposal("twisted", {}, (), {}, (), None, explanation=explanation)
     observed = tuple(terms(trace, "observation", missing))
     states = trace.state_symbols
     start, move = _start(found.initial, states), _move(found.transition, states)
@@ -226,8 +242,7 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         (*observed, Term(site, -move.log_ratio, None)),
         move.ahead,
         fit=move.fit,
-        explanation="twisted: particles move and are resampled by a Gaussian approximation to what "
-        f"all later observations say, mixed with {DEFENSIVE:.0%} of the transition",
+        explanation=explanation,
     )
 
 
@@ -256,7 +271,7 @@ def _move(form: NoiseForm, states: list[Expr]) -> _Law:
     steered = array(pull - precision @ away)
     spread = form.spread()
     middle = array(np.eye(r) + array(spread.T @ precision @ spread))
-    factor = written_cholesky(middle) if r <= WRITTEN_OUT else cholesky(middle)
+    factor = written_cholesky(middle)
     root = lower_inverse(factor)
     half = array(root @ array(spread.T @ steered))  # C^-1 h, C C' = I + L'AL
     ahead = pull @ away - 0.5 * (away @ precision @ away) + 0.5 * np.sum(array(half**2))

@@ -16,14 +16,21 @@ from typing import Any
 from numba import config
 
 from ssmppl.codegen import cache
-from ssmppl.codegen.kernels.guide import look_at, most_likely
+from ssmppl.codegen.kernels import guide, steering
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.entries import entry
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import ModuleText
 
-# specialised functions that kernels call
-HELPERS: dict[str, Any] = {"look_at": look_at, "most_likely": most_likely}
+# Specialised functions that kernels call, some of them in place of a model's own.
+HELPERS: dict[str, Any] = {
+    name: vars(home)[name]
+    for home, names in (
+        (guide, ("look_at", "most_likely")),
+        (steering, steering.SPECIALISED),
+    )
+    for name in names
+}
 # Arguments of a filter that only its compiled variant knows: what is not None needs Numba's.
 SCHEME, MOMENTS = 5, 10
 
@@ -56,7 +63,7 @@ class Loaded:
         if config.DISABLE_JIT:  # type: ignore[attr-defined]
             return numba_made
         section = algorithm.section
-        helpers = tuple((HELPERS[n], n) for n in algorithm.bound if n in HELPERS)
+        helpers = tuple((HELPERS[n], n) for n in algorithm.bound.values() if n in HELPERS)
         try:
             found = addresses(f"{self._name}_{section.suffix}", self._out.texts[id(section)])
             places = {r: found[section.name(r)] for r in section.roles}

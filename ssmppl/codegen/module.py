@@ -180,7 +180,7 @@ class Section:
     ) -> None:  # fmt: skip
         """Name the rows of the particles' arrays that the loop reads."""
         for node in topological_until(roots, names):
-            if node.op != "symbol" or level_of(node) != PARTICLE:
+            if node.op != "symbol" or level_of(node) != PARTICLE or node in names:
                 continue
             if node in scalars:
                 names[node] = reserved.fresh(symbol_name(node))

@@ -36,7 +36,7 @@ entry = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 '''
 
-TEXTS = ("flat",)  # parameters that decide what is compiled
+TEXTS = ("flat", "varies")  # parameters that decide what is compiled
 NUMBERS = ("ahead", "horizon")  # parameters that are handed over when it runs
 # The functions that a model may lack; they are never called then.
 OPTIONAL: Mapping[str, str] = {
@@ -121,7 +121,8 @@ def entry(algorithm: Algorithm, places: Mapping[str, int], helpers: tuple[Any, .
     places : address of each of the section's functions, by role. helpers : as in `by_address`.
     """
     section, bound = algorithm.section, algorithm.bound
-    fixed = tuple((n, bound[n]) for n in TEXTS if n in bound)
+    named = {name for _, name in helpers}
+    fixed = tuple((n, text) for n, text in bound.items() if n in TEXTS or text in named)
     run, order = by_address(algorithm.function, section.roles, helpers, fixed)
     codes = np.array([places.get(r, 0) for r in order], dtype=np.int64)
     values: dict[str, Any] = {"sizes": algorithm.sizes}
