@@ -7,7 +7,7 @@ the loop over particles. A `Section` is one algorithm's functions over one pair 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ssmppl.codegen.render import Names, Writer, comment, depends, symbol_name, topological_until
@@ -38,6 +38,12 @@ class Target:
     text: str
     expression: Expr
     guard: Expr | None = None
+
+
+def listed(values: Iterable[Expr]) -> list[Target]:
+    """Rows of `out`, which begins at 0: of large matrices most entries are, and stay so."""
+    found = [Target(f"out[{k}, i]", e) for k, e in enumerate(values)]
+    return [t for t in found if not (t.expression.op == "const" and t.expression.data == 0.0)]
 
 
 class Layout:

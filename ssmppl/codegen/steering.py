@@ -6,7 +6,7 @@ from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.twisted import Guided, guide_order
 from ssmppl.codegen.kernels import steering
 from ssmppl.codegen.kits import conditional_passes
-from ssmppl.codegen.module import PARTICLE, Layout, Section, Target, level_of
+from ssmppl.codegen.module import PARTICLE, Layout, Section, Target, level_of, listed
 from ssmppl.codegen.render import depends
 from ssmppl.codegen.text import ModuleText
 from ssmppl.expressions.expr import constant, symbol
@@ -33,14 +33,13 @@ def steered_section(trace: Trace, layout: Layout, found: Guided, plain: Proposal
     )  # fmt: skip
     section.particle_pass(
         "spread", "dx_t / de without noise.", "theta, c, s, states_prev, states, out",
-        [Target(f"out[{k}, i]", e) for k, e in enumerate(later.spread().ravel())],
+        listed(later.spread().ravel()),
     )  # fmt: skip
     for role, form, arguments in (
         ("recover_initial", first, "theta, c, s, states, out"),
         ("recover", later, "theta, c, s, states_prev, states, out"),
     ):
-        targets = [Target(f"out[{k}, i]", e) for k, e in enumerate(form.recovered)]
-        section.particle_pass(role, "The noise by x.", arguments, targets)
+        section.particle_pass(role, "The noise by x.", arguments, listed(form.recovered))
     conditional_passes(trace, layout, section, plain)
     kept = 1 + (len(later.noise) * (len(later.noise) + 1) // 2 if varies(found) else 0)
     extra = [symbol("guide", "kept", (k,)) for k in range(kept)]

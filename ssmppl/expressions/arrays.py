@@ -171,8 +171,25 @@ def matmul(a: Any, b: Any) -> Any:
         refuse("@ with a scalar", "use * for a scalar factor")
     if a.shape[-1] != b.shape[-2 if b.ndim > 1 else 0]:
         refuse(f"@ of shapes {a.shape} and {b.shape}", "make the inner dimensions agree")
-    # NumPy's matmul of object arrays is sum_k a_ik * b_kj through + and *.
-    return scalar_or_array(np.matmul(a, b))
+    if a.ndim > 2 or b.ndim > 2:  # sum_k a_ik * b_kj through + and *
+        return scalar_or_array(np.matmul(a, b))
+    rows, columns = np.atleast_2d(a), b.reshape(len(b), -1)
+    out = np.empty((len(rows), columns.shape[1]), dtype=object)
+    entries = [[(k, e) for k, e in enumerate(c) if not _zero(e)] for c in columns.T]
+    for i, row in enumerate(rows):
+        full = [not _zero(e) for e in row]
+        for j, column in enumerate(entries):
+            total: Any = constant(0.0)
+            for k, e in column:
+                if full[k]:
+                    total = total + row[k] * e
+            out[i, j] = total
+    return scalar_or_array(out.reshape(a.shape[:-1] + b.shape[1:]))
+
+
+def _zero(e: Any) -> bool:
+    """Whether an entry is the number 0: most of a large matrix's are."""
+    return isinstance(e, Expr) and e.op == "const" and e.data == 0.0
 
 
 def dot(a: Any, b: Any) -> Any:

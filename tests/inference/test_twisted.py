@@ -3,12 +3,16 @@ turns to it where nothing else will do."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
+
 import numpy as np
 import pytest
 from scipy import stats
 
 import ssmppl as ssm
+from ssmppl.analysis import twisted as analysis
 from ssmppl.analysis.twisted import DEFENSIVE
+from ssmppl.codegen import program
 from ssmppl.codegen.kernels.particle_filter import GUIDED_SHARE
 from ssmppl.datasets import ice_varves
 from ssmppl.errors import ArgumentError, SamplingError
@@ -359,10 +363,76 @@ def test_the_pendulum_chooses_it_and_the_varves_do_not(monkeypatch):
     assert not generated(problem)
 
 
-def test_too_many_noises_are_refused_before_they_are_compiled():
-    model = ssm.Model("wide")
-    model.initial(lambda: {"x": ssm.Normal(np.zeros(17), sd=1)})
-    model.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=1)})
-    model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
-    with pytest.raises(ArgumentError, match="17 noises, more than the 16"):
-        ssm.log_likelihood(model, {"y": np.zeros(3)}, {}, proposal="twisted")
+# -- many noises: the moves in loops
+@pytest.fixture
+def in_loops(monkeypatch):
+    """Models of few noises take the road of those with many; programs are forgotten afterwards."""
+    monkeypatch.setattr(analysis, "WRITTEN_OUT", 0)
+    monkeypatch.setattr(program, "_programs", OrderedDict())
+
+
+@pytest.mark.parametrize("case", some(["vehicle", "volatility", "ricker"], 1))
+def test_moves_in_loops(case, in_loops):
+    """Fewer noises in x_t than in x_1; a spread of each particle; noise in an exponent."""
+    combination, parameters = ("twisted", "systematic", 1.0), {}
+    if case == "vehicle":
+        model, parameters, y = models.vehicle, {"h": 0.5}, vehicle_rows(25, 0.5, "rows")
+        exact = vehicle_exact(y, 0.5)
+    elif case == "volatility":
+        model, parameters, y = volatility, {"hole": -5.0, "sigma": 0.5}, 5 * RETURNS
+        exact = volatility_log_likelihood(y, -5.0, 0.5)
+    else:
+        model, y, exact = ricker, COUNTS, ricker_log_likelihood(COUNTS)
+    table = Table(1)
+    log_z = estimates(model, {"y": y}, parameters, combination, 100, 1000, seed_of("loops", case))
+    table.cell(f"loops {case}", log_z, exact, 100, len(y))
+    table.judge()
+    assert not pose(model, {"y": y}).program.twisted.found.written_out
+
+
+RING = 20
+
+
+def ring_matrices():
+    """Twenty states in a ring, each pulled to its neighbour; every other one is seen."""
+    A = 0.7 * np.eye(RING) + 0.25 * np.roll(np.eye(RING), 1, axis=0)
+    C = np.eye(RING)[::2]
+    one, noise = np.eye(RING), {"Q": 0.09 * np.eye(RING), "R": 0.04 * np.eye(len(C))}
+    return {"m": np.zeros(RING), "P": one, "A": A, "b": 0.0, "C": C, "d": 0.0, **noise}
+
+
+@pytest.fixture(scope="module")
+def ring():
+    """The model, rows of which a few are missing, and the exact answer."""
+    ring = ssm.Model("ring")
+    ring.initial(lambda: {"x": ssm.Normal(np.zeros(RING), sd=1)})
+    ring.transition(lambda x: {"x": ssm.Normal(0.7 * x + 0.25 * np.roll(x, 1), sd=0.3)})
+    ring.observation(lambda x: {"y": ssm.Normal(x[::2], sd=0.2)})
+    y = ssm.simulate(ring, {}, steps=20, seed=seed_of("ring"))["y"].values[0]
+    y[4, 3] = y[9] = np.nan
+    return ring, y, DenseGaussian(y, **ring_matrices())
+
+
+def test_twenty_noises(ring):
+    """More than can be written out, in a moderate dimension; the guide is exact here, so that the
+    variance is little, where the transition's is hopeless."""
+    (ring, y, dense), table = ring, Table(1)
+    exact = dense.log_likelihood
+    log_z = estimates(
+        ring, {"y": y}, {}, ("twisted", "systematic", 1.0), 50, 300, seed_of("ring z")
+    )
+    assert np.std(log_z) < 0.5
+    table.cell("ring", log_z, exact, 50, len(y))
+    table.judge()
+    plain = estimates(ring, {"y": y}, {}, ("bootstrap", "systematic", 1.0), 50, 20, seed_of("r"))
+    assert np.median(plain) < exact - 20
+
+
+@pytest.mark.slow
+def test_conditional_smc_with_twenty_noises(ring):
+    ring, y, dense = ring
+    idata = ssm.sample(
+        ring, {"y": y}, ssm.PGAS(particles=5, proposal="twisted"), draws=400, warmup=20, chains=2,
+        progress=False, seed=seed_of("ring pgas"),
+    )  # fmt: skip
+    assert_moments(idata["posterior"]["x"].values, dense, "ring", 1)

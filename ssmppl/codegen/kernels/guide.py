@@ -230,9 +230,9 @@ def follow_filter(
     r, r_initial = spread.shape[2], spread_initial.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.empty((d + d * d + d * r, 1))
-    told_initial = np.empty((d + d * r_initial, 1))
-    seen_so = np.empty((1 + d + d * (d + 1) // 2, 1))
+    told = np.zeros((d + d * d + d * r, 1))
+    told_initial = np.zeros((d + d * r_initial, 1))
+    seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     p, after, jp = np.zeros((d, d)), np.empty((d, d)), np.empty((d, d))
     toward, move, target, lead = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
     prepare(theta, c)
@@ -295,9 +295,9 @@ def follow_gains(
     r, r_initial = spread.shape[2], spread_initial.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.empty((d + d * d + d * r, 1))
-    told_initial = np.empty((d + d * r_initial, 1))
-    seen_so = np.empty((1 + d + d * (d + 1) // 2, 1))
+    told = np.zeros((d + d * d + d * r, 1))
+    told_initial = np.zeros((d + d * r_initial, 1))
+    seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     total = 0.0
     prepare(theta, c)
     for t in range(n_steps):

@@ -68,7 +68,7 @@ def spread_of(spread, varies, theta, c, s, x):
         at = np.empty((d, 1))
         for j in range(d):
             at[j, 0] = x[j, 0]
-    out = np.empty((d * r, at.shape[1]))
+    out = np.zeros((d * r, at.shape[1]))
     spread(theta, c, s, at, np.empty_like(at), out)
     return out
 
@@ -246,7 +246,7 @@ def steered_weigh(
 ):  # fmt: skip
     """Log weight of x_t: log f + log g - log q."""
     root = kept_factors(theta, c, s, states_prev, fits)
-    e = np.empty((int(s[0]), states.shape[1]))
+    e = np.zeros((int(s[0]), states.shape[1]))
     recover(theta, c, s, states_prev, states, e)
     weigh_observed(theta, c, s, states, log_w)
     steered_ratio(e, fits[: int(s[0])], root, log_w)
@@ -277,7 +277,7 @@ def steered_weigh_initial(
 ):  # fmt: skip
     """Log weight of x_1."""
     mean, root = start_of(s, states.shape[0])
-    e = np.empty((int(s[0]), states.shape[1]))
+    e = np.zeros((int(s[0]), states.shape[1]))
     recover_initial(theta, c, s, states, e)
     weigh_observed(theta, c, s, states, log_w)
     steered_ratio(e, mean, root, log_w)
