@@ -109,8 +109,8 @@ def test_particle_filters(case):
     program, numbers = case
     rng = np.random.default_rng(6)
     for name, p in program.proposals.items():
-        if isinstance(p, NotApplicable):
-            continue
+        if isinstance(p, NotApplicable) or not p.draw:
+            continue  # not derived, or made in loops: `test_moves_in_loops`
         for t in range(STEPS):
             generated = Generated(program, numbers, name, t)
             if t == 0:
@@ -184,6 +184,36 @@ def test_guide_of_the_twisted_filter(case):
         out = np.zeros((len(seen), PARTICLES))  # entries that are always 0 are not written
         generated.pass_("look", numbers.states[t], out)
         check_rows(generated, out, seen, t, "look")
+
+
+def test_moves_in_loops(case):
+    """What the loops know of a model of many noises, for every particle."""
+    program, numbers = case
+    found = guided(program.trace, program.missing)
+    if isinstance(found, NotApplicable) or found.written_out:
+        return
+    rng, d = np.random.default_rng(10), len(program.trace.state_symbols)
+    for t in range(STEPS):
+        generated = Generated(program, numbers, "twisted", t)
+        form = found.transition if t else found.initial
+        before = [numbers.states[t - 1]] if t else []
+        assert generated.s[0] == len(form.noise)
+        guide = [generated.numbers.values(t)[g] for g in program.twisted.order]
+        np.testing.assert_array_equal(generated.s[1 : 1 + len(guide)], guide)
+        e = rng.normal(size=(len(form.noise), PARTICLES))
+        noise, out = dict(zip(form.noise, e, strict=True)), np.full((d, PARTICLES), np.nan)
+        generated.pass_("follow" if t else "begin", *before, e, out)
+        check_rows(generated, out, form.value, t, "by noise", noise)
+        out = np.zeros((len(form.noise), PARTICLES))
+        generated.pass_("recover" if t else "recover_initial", *before, numbers.states[t], out)
+        check_rows(generated, out, form.recovered, t, "recovered")
+        if t:
+            out = np.full((d, PARTICLES), np.nan)
+            generated.pass_("rest", *before, out)
+            check_rows(generated, out, form.at_rest(), t, "rest")
+            out = np.zeros((d * len(form.noise), PARTICLES))
+            generated.pass_("spread", *before, numbers.states[t], out)
+            check_rows(generated, out, form.spread().ravel(), t, "spread")
 
 
 def check_rows(generated, out, expressions, t, what, more=None):
