@@ -104,6 +104,30 @@ def regimes_observation(z):
     return {"y": ssm.Normal(z[0], sd=0.3)}
 
 
+def lorenz(states: int, step: float) -> ssm.Model:
+    """The atmosphere of E. N. Lorenz, "Predictability: a problem partly solved" (1996), with
+    forcing 8, by Heun's method; every other component is seen, with noise of sd 0.5."""
+    model = ssm.Model(f"Lorenz-96, {states} states")
+
+    def drift(x):
+        return (np.roll(x, -1) - np.roll(x, 2)) * np.roll(x, 1) - x + 8.0
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(8.0 * np.ones(states), sd=2.0)}
+
+    @model.transition
+    def transition(x):
+        first = drift(x)
+        return {"x": ssm.Normal(x + 0.5 * step * (first + drift(x + step * first)), sd=0.1)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x[::2], sd=0.5)}
+
+    return model
+
+
 @dataclass(frozen=True)
 class Case:
     """A model with data and parameters at which its likelihood is estimated."""

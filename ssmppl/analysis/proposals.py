@@ -56,6 +56,8 @@ class Proposal:
     exact_look_ahead: bool = False
     fit: tuple[Expr, ...] = ()
     explanation: str = ""
+    # of a proposal that is made in loops, not written out: how many multiplications per particle
+    looped: int = 0
 
 
 def bootstrap(trace: Trace, missing: Missing) -> Proposal:

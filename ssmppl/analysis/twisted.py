@@ -229,7 +229,9 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         f"all later observations say, mixed with {DEFENSIVE:.0%} of the transition"
     )
     if not found.written_out:
-        return Proposal("twisted", {}, (), {}, (), None, explanation=explanation)
+        d, r = len(trace.state_symbols), len(found.transition.noise)
+        looped = d * d + 2 * r * r
+        return Proposal("twisted", {}, (), {}, (), explanation=explanation, looped=looped)
     observed = tuple(terms(trace, "observation", missing))
     states = trace.state_symbols
     start, move = _start(found.initial, states), _move(found.transition, states)

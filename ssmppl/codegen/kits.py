@@ -67,9 +67,8 @@ def filter_kit(layout: Layout, proposal: Proposal, begin: str = DRAW_INITIAL) ->
     """The particle filter's functions under one proposal; `begin`: arguments of `draw_initial`."""
     section = Section(layout, proposal.name)
     level = depends(proposal.fit, level_of)
-    section.fits.update(
-        (e, k) for k, e in enumerate(f for f in proposal.fit if level[f] == PARTICLE)
-    )
+    kept = dict.fromkeys(f for f in proposal.fit if level[f] == PARTICLE)  # each once
+    section.fits.update((e, k) for k, e in enumerate(kept))
     if section.fits:
         section.particle_pass(
             "fit", "What the proposal knows of x_t from x_{t-1} and y_t.", FIT,

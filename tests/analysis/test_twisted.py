@@ -381,9 +381,10 @@ def test_what_psi_can_be_expected_to_be(name):
 
 @pytest.mark.parametrize("role", ["initial", "transition"])
 @pytest.mark.parametrize("name", [*LAWS, "mixed", *AFFINE])
-def test_moves_have_the_law_that_they_are_weighed_by(name, role):
+def test_moves_have_the_law_that_they_are_weighed_by(name, role, monkeypatch):
     """Affine or not: what is drawn is, by its noise, a mixture of two Gaussians, and q / f is the
     mixture's density over the standard normal one."""
+    monkeypatch.setattr("ssmppl.analysis.twisted.WRITTEN_OUT", 50)  # however many noises
     rng = np.random.default_rng(4)
     traced = AFFINE[name]() if name in AFFINE else traced_of(name)
     found, order, form = twisted(traced, COMPLETE), traced.state_symbols, form_of(traced, role)

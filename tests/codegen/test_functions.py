@@ -1,12 +1,15 @@
 """Every generated function computes what the interpreter computes, for a corpus of models."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals import bootstrap
 from ssmppl.analysis.twisted import guided, jacobian
-from ssmppl.codegen.kits import observation_draws
+from ssmppl.codegen.kits import filter_kit, observation_draws
+from ssmppl.codegen.module import Layout
 from ssmppl.codegen.program import compile_trace
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
@@ -124,6 +127,18 @@ def test_particle_filters(case):
                 generated.pass_("look_ahead", numbers.states[t - 1], *fitted(generated, t), log_v)
                 expected = evaluate(p.look_ahead, generated.numbers.values(t))
                 close(log_v, expected, f"{name} look_ahead t={t}")
+
+
+def test_what_is_kept_of_a_fit_has_a_row_of_its_own(case):
+    """Also where two of its numbers are the same expression, as entries of a factor can be."""
+    program, numbers = case
+    for p in program.proposals.values():
+        if isinstance(p, NotApplicable) or not p.fit:
+            continue
+        twice = replace(p, fit=(p.fit[0], p.fit[0], *p.fit))
+        for proposal in (p, twice):
+            rows = filter_kit(Layout(numbers.traced), proposal).fits.values()
+            assert sorted(rows) == list(range(len(rows)))
 
 
 def test_joining_a_reference(case):

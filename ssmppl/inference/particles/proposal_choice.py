@@ -47,9 +47,10 @@ CHEAP_OPERATIONS = frozenset(
 )
 STEP = 2.6  # normalise, resample, gather
 NORMAL, UNIFORM = 1.5, 0.6
+LOOPED = 0.4  # a multiplication in a loop over matrices
 LOOK_AHEAD = 4.0  # one more normalisation and the second-stage weights
 PILOT_PARTICLES, PILOT_REPEATS, PILOT_STEPS = 100, 24, 400
-ENOUGH = 3.0  # sd of log Z in the pilot up to which the twisted proposal is not tried
+ENOUGH = 1.2  # sd of log Z up to which the twisted proposal is not tried; what PMMH asks for
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,10 @@ def cost(proposal: Proposal) -> float:
     """Estimated nanoseconds per particle and step."""
     fit = list(proposal.fit)  # computed once, and read by the other passes
     later = [list(proposal.draw.values()), [t.guarded() for t in proposal.weight]]
-    extra = 0.0
+    extra = LOOPED * proposal.looped
     if proposal.look_ahead is not None:
         later.append([proposal.look_ahead])
-        extra = LOOK_AHEAD
+        extra += LOOK_AHEAD
     known = dict.fromkeys(fit, True)
     return STEP + extra + _pass_cost(fit, {}) + sum(_pass_cost(p, known) for p in later)
 
