@@ -18,7 +18,7 @@ import numpy as np
 from models import Case, cases
 from table import show
 
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.errors import NotApplicable

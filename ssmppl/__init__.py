@@ -11,8 +11,9 @@ from ssmppl.gap.diagnose import diagnose
 from ssmppl.gap.effect import effect
 from ssmppl.gap.report import GapReport
 from ssmppl.inference.evidence import Evidence, evidence
+from ssmppl.inference.exact_filters import forward_filter, kalman_filter
 from ssmppl.inference.explain import compile, explain
-from ssmppl.inference.filters import kalman_filter, particle_filter
+from ssmppl.inference.filters import particle_filter
 from ssmppl.inference.forecast import forecast
 from ssmppl.inference.leave_future_out import leave_future_out
 from ssmppl.inference.likelihood import log_likelihood
@@ -128,6 +129,7 @@ __all__ = [
     "evidence",
     "explain",
     "forecast",
+    "forward_filter",
     "kalman_filter",
     "leave_future_out",
     "log_likelihood",

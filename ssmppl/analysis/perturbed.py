@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.proposals import Proposal, bootstrap
+from ssmppl.analysis.moves import Proposal, bootstrap
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed, substitute, symbol, symbols_of

@@ -1,11 +1,4 @@
-"""Proposals of the particle filter, derived from the model.
-
-A `Proposal` says how a particle moves and what it weighs, as expressions:
-
-* `draw` gives x_t from x_{t-1} and random draws, `initial_draw` gives x_1;
-* `weight` are the terms of log [ f(x_t | x_{t-1}) g(y_t | x_t) / q(x_t | x_{t-1}, y_t) ];
-* `look_ahead` approximates log p(y_t | x_{t-1}), the auxiliary weight of Pitt and Shephard (1999);
-* `fit` are subexpressions of these, functions of x_{t-1} and y_t, that are computed once.
+"""Proposals of the particle filter, derived from the model; see `moves.py` for what one is.
 
 Tiers, best first (Doucet, Godsill and Andrieu 2000, section II): the locally optimal proposal of
 a Gaussian transition with an observation affine in the state; a Laplace approximation to it
@@ -15,83 +8,31 @@ with the transition); the transition itself (bootstrap).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
 from ssmppl.analysis.laplace import NEWTON_STEPS, gaussian_fit
-from ssmppl.analysis.structure import GaussianBlock, affine_observation, flat_start, gaussian_block
+from ssmppl.analysis.moves import Proposal, Split, bootstrap, draws_of, resolved, split
+from ssmppl.analysis.structure import GaussianBlock, affine_observation, flat_start
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
 from ssmppl.expressions.expr import (
     Expr,
     apply,
-    attributed,
     constant,
     depends_on,
     substitute,
-    topological,
 )
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import Draws
-from ssmppl.language.trace import Site, Trace, seen
+from ssmppl.language.trace import Trace, seen
 
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
 LARGEST_EXPONENT = 600.0  # of q / f where exp is taken
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """How particles move and what they weigh; see the module's docstring."""
-
-    name: str
-    initial_draw: dict[Expr, Expr]
-    initial_weight: tuple[Term, ...]
-    draw: dict[Expr, Expr]
-    weight: tuple[Term, ...]
-    look_ahead: Expr | None = None
-    exact_look_ahead: bool = False
-    fit: tuple[Expr, ...] = ()
-    explanation: str = ""
-    # of a proposal that is made in loops, not written out: how many multiplications per particle
-    looped: int = 0
-
-
-def bootstrap(trace: Trace, missing: Missing) -> Proposal:
-    """Move by the transition, weigh by the observation (Gordon, Salmond and Smith 1993)."""
-    observed = tuple(terms(trace, "observation", missing))
-    return Proposal(
-        "bootstrap",
-        _resolved(_draws(trace, list(trace.initial.values()))),
-        observed,
-        _resolved(_draws(trace, list(trace.transition.values()))),
-        observed,
-        explanation="particles move by the transition and are weighed by the observation",
-    )
-
-
-def _draws(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
-    out: dict[Expr, Expr] = {}
-    for site in sites:
-        law = site.distribution
-        with attributed(trace.locations, law.location):
-            # of a flat law NaN, for code that is never run: no algorithm starts from it
-            sample = array(law.sample(Draws(site.name)) if law.proper else law.mean())
-        out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
-    return out
-
-
-def _resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:
-    """Components that follow from others of the same step, in terms of what these are."""
-    if not any(depends_on(e, list(values)) for e in values.values()):
-        return values
-    known: dict[Expr, Expr] = {}
-    for s, e in values.items():  # what follows stands behind what it follows from
-        (known[s],) = substitute([e], known)
-    return known
 
 
 def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:
@@ -130,39 +71,6 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
     return found
 
 
-@dataclass(frozen=True)
-class _Split:
-    """The states of one law: Gaussian ones, and the others with their draws.
-
-    following : those of the others that are functions of the Gaussian ones of the same step.
-    """
-
-    gaussian: GaussianBlock
-    others: dict[Expr, Expr]
-    random: bool  # whether some other state is random
-    following: dict[Expr, Expr]
-
-    def insert(self, expressions: dict[Expr, Expr]) -> dict[Expr, Expr]:
-        """`expressions` with the other states replaced by their draws."""
-        values = substitute(list(expressions.values()), self.others)
-        return dict(zip(expressions, values, strict=True))
-
-    def complete(self, draw: dict[Expr, Expr]) -> dict[Expr, Expr]:
-        """The draws of all states, given those of the Gaussian ones."""
-        draw = self.insert(draw)
-        after = substitute(list(self.following.values()), draw)
-        return {**self.others, **draw, **dict(zip(self.following, after, strict=True))}
-
-
-def _split(trace: Trace, sites: list[Site]) -> _Split:
-    block = gaussian_block(sites)
-    own = set(block.symbols)
-    others = {s: e for s, e in _draws(trace, sites).items() if s not in own}
-    following = {s: e for s, e in others.items() if depends_on(e, block.symbols)}
-    random = any(n.op == "random" for n in topological(others.values()))
-    return _Split(block, others, random, following)
-
-
 # -- tier 2: locally optimal
 
 
@@ -170,7 +78,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
-    move = _split(trace, list(trace.transition.values()))
+    move = split(trace, list(trace.transition.values()))
     if not len(move.gaussian):
         where = next(iter(trace.transition.values())).distribution.location
         return NotApplicable("no state has a Gaussian transition", where)
@@ -185,7 +93,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     masks = None if missing.none else array([seen(s) for s in observation.symbols])
     y = array(list(observation.symbols))
 
-    def law(split: _Split) -> tuple[dict[Expr, Expr], Expr]:
+    def law(split: Split) -> tuple[dict[Expr, Expr], Expr]:
         """Draw of x given y, and log p(y | x_prev), for a Gaussian block of states."""
         h, d, r = observation.matrix, observation.offset, observation.covariance
         block = split.gaussian
@@ -197,7 +105,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         return split.complete(draw), predictive
 
     draw, predictive = law(move)
-    start = _split(trace, list(trace.initial.values()))
+    start = split(trace, list(trace.initial.values()))
     same = set(start.gaussian.symbols) == set(move.gaussian.symbols)
     if same and not move.following:
         place = {s: i for i, s in enumerate(start.gaussian.symbols)}  # no .index: == is symbolic
@@ -207,7 +115,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         site = sites[0]
         initial_weight: tuple[Term, ...] = (Term(site, initial_predictive, None),)
     else:
-        initial_draw = _resolved(_draws(trace, list(trace.initial.values())))
+        initial_draw = resolved(draws_of(trace, list(trace.initial.values())))
         initial_weight = tuple(terms(trace, "observation", missing))
     weight = Term(sites[0], predictive, None)
     look_ahead = None if move.random else move.insert({predictive: predictive})[predictive]
@@ -275,7 +183,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     total = constant(0.0)
     for t in smooth:
         total = total + t.guarded()
-    move = _split(trace, list(trace.transition.values()))
+    move = split(trace, list(trace.transition.values()))
     (total,) = substitute([total], move.following)
     where = sites[0].distribution.location
     if not len(move.gaussian):
@@ -294,7 +202,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     correction = Term(observed[0].site, -log_ratio, None)
     return Proposal(
         "guided",
-        _resolved(_draws(trace, list(trace.initial.values()))),
+        resolved(draws_of(trace, list(trace.initial.values()))),
         tuple(observed),
         draw,
         (*observed, correction),
@@ -307,7 +215,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
 
 
 def _newton(
-    move: _Split, total: Expr, slope: ExprArray, curvature: ExprArray
+    move: Split, total: Expr, slope: ExprArray, curvature: ExprArray
 ) -> tuple[dict[Expr, Expr], tuple[Expr, ...], Expr, Expr]:
     """(draw, fit, log (q / f)(x_t | x_{t-1}, y_t), log of Laplace's approximation to
     p(y_t | x_{t-1})) of a few Newton steps from the mean of the transition."""

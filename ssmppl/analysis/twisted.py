@@ -24,7 +24,8 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.laplace import written_cholesky
-from ssmppl.analysis.proposals import LARGEST_EXPONENT, Proposal
+from ssmppl.analysis.moves import Proposal
+from ssmppl.analysis.proposals import LARGEST_EXPONENT
 from ssmppl.analysis.structure import flat_start
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.structure import deterministic
 from ssmppl.codegen.module import (
     PARTICLE,
@@ -170,7 +170,7 @@ def prediction_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
     targets = []
     k = 0
     for site in trace.observations.values():
-        for mean, variance, below, strictly in _predictive(site):
+        for mean, variance, below, strictly in predictive(site):
             for j, e in enumerate((mean, variance, below, strictly)):
                 targets.append(Target(f"out[{4 * k + j}, i]", e))
             k += 1
@@ -181,7 +181,7 @@ def prediction_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
     return section
 
 
-def _predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
+def predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
     """(mean, variance, P(Y <= y), P(Y < y)) for every component; nan where there is none."""
     d = site.distribution
     y = site.value

@@ -13,7 +13,8 @@ from typing import Any
 from ssmppl.analysis.conditional import ConditionallyLinear
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.marginal import Marginal, marginal
-from ssmppl.analysis.proposals import Proposal, bootstrap, derive
+from ssmppl.analysis.moves import Proposal, bootstrap
+from ssmppl.analysis.proposals import derive
 from ssmppl.codegen.kernels.conditional_smc import filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step

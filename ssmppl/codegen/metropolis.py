@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import terms
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.structure import deterministic
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.correlated import correlated_path

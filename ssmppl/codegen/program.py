@@ -18,7 +18,8 @@ from typing import Any
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.heights import transition_height
-from ssmppl.analysis.proposals import Proposal, bootstrap, derive
+from ssmppl.analysis.moves import Proposal, bootstrap
+from ssmppl.analysis.proposals import derive
 from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.analysis.twisted import twisted
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals import bootstrap
+from ssmppl.analysis.moves import bootstrap
 from ssmppl.codegen.kernels.row_scores import complete_rows, row_predictions, row_scores
 from ssmppl.codegen.kits import prediction_kit
 from ssmppl.codegen.loading import Loaded, load

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.codegen.kernels.filter_rows import filter_rows
 from ssmppl.codegen.kits import filter_kit
 from ssmppl.codegen.loading import load

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals import bootstrap
+from ssmppl.analysis.moves import bootstrap
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.smooth_filter import smooth_filter
 from ssmppl.codegen.kits import filter_kit

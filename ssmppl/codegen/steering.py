@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.twisted import Guided, guide_order
 from ssmppl.codegen.kernels import steering
 from ssmppl.codegen.kits import conditional_passes

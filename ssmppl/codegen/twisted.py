@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals import Proposal, bootstrap
+from ssmppl.analysis.moves import Proposal, bootstrap
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.analysis.twisted import Guided, guide_order, guided, jacobian, twisted
 from ssmppl.codegen import cache

@@ -11,8 +11,8 @@ from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linea
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.finite import FiniteStates, finite_states
+from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.noises import Noises, noises
-from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind

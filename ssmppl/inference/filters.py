@@ -1,4 +1,4 @@
-"""The verbs `particle_filter` and `kalman_filter`."""
+"""The verb `particle_filter`, and the form of what a filter tells."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.models import EXACT
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
@@ -85,7 +83,7 @@ def particle_filter(
         problem, theta, particles, proposal, resampling, ess_threshold, integrate=True
     )
     if settings.proposal in EXACT:
-        instead = "kalman_filter" if settings.proposal == "kalman" else "smooth"
+        instead = "kalman_filter" if settings.proposal == "kalman" else "forward_filter"
         raise ArgumentError(
             f'particle_filter with proposal="{settings.proposal}"',
             fix=f"call ssm.{instead} instead",
@@ -100,7 +98,7 @@ def particle_filter(
         "resampling": resampling, "ess_threshold": ess_threshold, "seed": str(root.entropy),
     }  # fmt: skip
     datasets = [
-        _dataset(problem, e, [run[i] for run in runs], levels, attrs, root)
+        filter_dataset(problem, e, [run[i] for run in runs], levels, attrs, root)
         for i, e in enumerate(problem.experiments)
     ]
     return datasets if len(datasets) > 1 else datasets[0]
@@ -118,10 +116,14 @@ def _one_run(
     ]
 
 
-def _dataset(
+def filter_dataset(
     problem: Problem, experiment: Experiment, runs: list[FilterRun], levels: np.ndarray,
     attrs: dict[str, Any], root: np.random.SeedSequence,
 ) -> xr.Dataset:  # fmt: skip
+    """What the runs (one per draw) tell of one experiment; the variables of `particle_filter`.
+
+    root : of the random numbers by which PIT values of discrete channels are spread.
+    """
     trace = problem.trace
     mean = np.stack([r.mean for r in runs])
     covariance = np.stack([r.covariance for r in runs])
@@ -179,47 +181,3 @@ def quantile_levels(quantiles: tuple[float, ...]) -> np.ndarray:
     if levels.ndim != 1 or np.any((levels <= 0) | (levels >= 1)):
         raise ArgumentError(f"quantiles={quantiles!r}", fix="give levels between 0 and 1")
     return levels
-
-
-def kalman_filter(
-    model: Model,
-    data: Any,
-    parameters: Mapping[str, Any],
-    *,
-    quantiles: tuple[float, ...] = LEVELS,
-) -> xr.Dataset | list[xr.Dataset]:
-    """Run the exact filter of a linear Gaussian model (Kalman 1960).
-
-    Returns
-    -------
-    Dataset as of `particle_filter`, with one `draw` and without `ess`; everything is exact.
-
-    Raises
-    ------
-    ArgumentError : the model is not linear and Gaussian; gives the reason and the user's line.
-    """
-    problem = pose(model, data)
-    theta = check_parameters(problem.trace, parameters)
-    settle(problem, theta, 1, "kalman")
-    levels = quantile_levels(quantiles)
-    attrs = {"model": problem.trace.name, "proposal": "kalman"}
-    root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
-    datasets = []
-    for e in problem.experiments:
-        run = _as_run(kalman.kalman_filter(problem.trace, e, theta), e, levels)
-        datasets.append(_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess"))
-    return datasets if len(datasets) > 1 else datasets[0]
-
-
-def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> FilterRun:
-    """Exact moments in the form of a particle filter's."""
-    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
-    with np.errstate(invalid="ignore"):  # nothing is known yet of a flat component
-        quantiles = exact.mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
-    variance = np.diagonal(exact.observation_covariance, axis1=1, axis2=2)
-    below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
-    prediction = np.stack([exact.observation_mean, variance, below, below], axis=1)
-    return FilterRun(
-        exact.log_increments, np.full(e.steps, np.nan), exact.mean, exact.covariance, quantiles,
-        prediction,
-    )  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.marginal import NAMES as MARGINAL
 from ssmppl.codegen.program import Program, compile_trace

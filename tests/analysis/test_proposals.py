@@ -10,7 +10,8 @@ from scipy.integrate import quad
 
 import ssmppl.language.distributions as D
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.proposals import DEFENSIVE, bootstrap, derive
+from ssmppl.analysis.moves import bootstrap
+from ssmppl.analysis.proposals import DEFENSIVE, derive
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssmppl.analysis.density import Missing, terms
-from ssmppl.analysis.proposals import bootstrap
+from ssmppl.analysis.moves import bootstrap
 from ssmppl.analysis.twisted import guided, jacobian
 from ssmppl.codegen.kits import filter_kit, observation_draws
 from ssmppl.codegen.module import Layout

@@ -45,8 +45,69 @@ def test_likelihoods_are_exact(data):
         ssm.log_likelihood(level, data, {}, proposal="forward")
     with pytest.raises(ArgumentError, match="ForwardBackward needs states of finitely many"):
         ssm.smooth(level, data, {}, ssm.ForwardBackward())
-    with pytest.raises(ArgumentError, match=r"call ssm\.smooth"):
+    with pytest.raises(ArgumentError, match=r"call ssm\.forward_filter"):
         ssm.particle_filter(weather(), data, VALUES, proposal="forward")
+
+
+def test_filtering_is_exact(data):
+    """By the smoothing laws of ever longer beginnings, and by hand one step ahead."""
+    found = ssm.forward_filter(weather(), data, VALUES, quantiles=(0.5,)).isel(draw=0)
+    stay, leave, m = VALUES.values()
+    theta, y = np.array(list(VALUES.values())), data["y"]
+    before = leave
+    for t in range(12):
+        (e,) = bind(trace(weather()), {"y": y[: t + 1]})
+        p = hidden_markov(trace(weather())).probabilities(e, theta)[-1, 1]
+        row = found.isel(time=t)
+        np.testing.assert_allclose(row["z"], p, rtol=1e-12)
+        np.testing.assert_allclose(row["z_probability"], [1 - p, p], rtol=1e-12)
+        np.testing.assert_allclose(row["z_sd"] ** 2, p * (1 - p), rtol=1e-9)
+        assert row["z_quantile"].values[0] == float(p > 0.5)
+        np.testing.assert_allclose(row["y_predicted"], before * m, rtol=1e-12)
+        variance = 0.64 + m**2 * before * (1 - before)
+        np.testing.assert_allclose(row["y_predicted_sd"] ** 2, variance, rtol=1e-12)
+        pit = (1 - before) * stats.norm.cdf(y[t], 0, 0.8) + before * stats.norm.cdf(y[t], m, 0.8)
+        np.testing.assert_allclose(row["y_pit"], pit, rtol=1e-12)
+        before = p * stay + (1 - p) * leave
+    exact = independent(list(VALUES.values()), y)
+    np.testing.assert_allclose(found["log_likelihood_increment"].sum(), exact, rtol=1e-12)
+    assert list(found["z_value"].values) == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("name", ["patches", "second order"])
+def test_filtering_agrees_with_particles(name):
+    """Inputs, counts, vectors missing in part, a lagged copy: within Monte Carlo error."""
+    build, values = MODELS[name]
+    model = build()
+    inputs = {"u": np.sin(np.arange(12.0))} if model.inputs else None
+    parameters = dict(zip(model_parameters(model), values, strict=True))
+    made = ssm.simulate(model, parameters, steps=12, inputs=inputs, seed=seed_of(name))
+    data = {k: made[k].values[0].astype(float) for k in observed(model)} | (inputs or {})
+    if name == "patches":
+        data["n"][2] = data["y"][3] = data["y"][5, 0] = np.nan
+    exact = ssm.forward_filter(model, data, parameters, seed=1)
+    particles = ssm.particle_filter(
+        model, data, parameters, particles=4000, repeats=40, proposal="bootstrap", seed=2
+    )
+    checked = 0
+    for variable in particles.data_vars:
+        if variable == "ess" or variable.endswith(("quantile", "_pit")):
+            continue
+        runs = particles[variable].values
+        error = runs.std(axis=0, ddof=1) / np.sqrt(len(runs))
+        off = np.abs(runs.mean(axis=0) - exact[variable].values[0])
+        # a finite N biases ratios by about its variance, that is a fraction of the error
+        assert np.all(off <= 5 * error + 1e-3 * np.abs(exact[variable].values[0]) + 1e-9), variable
+        checked += 1
+    assert checked > 6
+
+
+def observed(model):
+    return list(trace(model).observations)
+
+
+def model_parameters(model):
+    return list(trace(model).parameters)
 
 
 def test_smoothing_is_exact(data):

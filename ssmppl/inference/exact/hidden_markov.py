@@ -17,6 +17,7 @@ from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.codegen.kernels import hidden_markov as kernel
 from ssmppl.codegen.kernels.random import fill_uniform
+from ssmppl.codegen.kits import predictive
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.calculus import differentiate
@@ -145,6 +146,24 @@ class HiddenMarkov:
             reached = below[:, None, :] >= levels[None, :, None] - 1e-12
             out[:, :, d] = values[np.argmax(reached, axis=2)]
         return out
+
+    def predicted_observations(
+        self, e: Experiment, theta: np.ndarray, law: np.ndarray
+    ) -> np.ndarray:
+        """(T, 4, K): mean, variance, P(Y <= y) and P(Y < y) of each channel, by the laws (T, K)
+        of the combinations that are predicted."""
+        out = []
+        for site in self.trace.observations.values():
+            for figures in predictive(site):
+                mean, variance, below, strictly = (
+                    self._over_values(f, e, theta, "observation") for f in figures
+                )
+                middle = np.sum(law * mean, axis=1)
+                square = np.sum(law * (variance + mean**2), axis=1)
+                shares = [np.sum(law * np.broadcast_to(b, law.shape), axis=1)
+                          for b in (below, strictly)]  # fmt: skip
+                out.append(np.stack([middle, square - middle**2, *shares], axis=1))
+        return np.stack(out, axis=2)
 
     # -- derivatives
     def score(

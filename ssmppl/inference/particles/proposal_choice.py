@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssmppl.analysis.proposals import Proposal
+from ssmppl.analysis.moves import Proposal
 from ssmppl.codegen.marginal import MarginalFilter
 from ssmppl.codegen.module import PARTICLE, level_of
 from ssmppl.codegen.render import depends, is_small_power, topological_until

@@ -1,0 +1,133 @@
+"""The verbs `kalman_filter` and `forward_filter`: filters that are exact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from ssmppl.data import Experiment, check_parameters
+from ssmppl.inference.exact import kalman
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
+from ssmppl.inference.filters import LEVELS, filter_dataset, quantile_levels
+from ssmppl.inference.likelihood import settle
+from ssmppl.inference.particles.filtering import FilterRun, seed_sequence
+from ssmppl.inference.problem import pose
+from ssmppl.language.model import Model
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def kalman_filter(
+    model: Model,
+    data: Any,
+    parameters: Mapping[str, Any],
+    *,
+    quantiles: tuple[float, ...] = LEVELS,
+) -> xr.Dataset | list[xr.Dataset]:
+    """Run the exact filter of a linear Gaussian model (Kalman 1960).
+
+    Returns
+    -------
+    Dataset as of `particle_filter`, with one `draw` and without `ess`; everything is exact.
+
+    Raises
+    ------
+    ArgumentError : the model is not linear and Gaussian; gives the reason and the user's line.
+    """
+    problem = pose(model, data)
+    theta = check_parameters(problem.trace, parameters)
+    settle(problem, theta, 1, "kalman")
+    levels = quantile_levels(quantiles)
+    attrs = {"model": problem.trace.name, "proposal": "kalman"}
+    root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
+    datasets = []
+    for e in problem.experiments:
+        run = _as_run(kalman.kalman_filter(problem.trace, e, theta), e, levels)
+        datasets.append(filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess"))
+    return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> FilterRun:
+    """Exact moments in the form of a particle filter's."""
+    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    with np.errstate(invalid="ignore"):  # nothing is known yet of a flat component
+        quantiles = exact.mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
+    variance = np.diagonal(exact.observation_covariance, axis1=1, axis2=2)
+    below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
+    prediction = np.stack([exact.observation_mean, variance, below, below], axis=1)
+    return FilterRun(
+        exact.log_increments, np.full(e.steps, np.nan), exact.mean, exact.covariance, quantiles,
+        prediction,
+    )  # fmt: skip
+
+
+def forward_filter(
+    model: Model,
+    data: Any,
+    parameters: Mapping[str, Any],
+    *,
+    quantiles: tuple[float, ...] = LEVELS,
+    seed: int | None = None,
+) -> xr.Dataset | list[xr.Dataset]:
+    """Run the exact filter of a model whose states take finitely many values.
+
+    The forward algorithm (Rabiner 1989, section III.A), scaled at every step. `seed` is for the
+    PIT values of discrete channels, which are spread uniformly over their jump.
+
+    Returns
+    -------
+    Dataset as of `particle_filter`, with one `draw` and without `ess`, everything exact; and for
+    each state x
+
+        * ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate holds
+          the values.
+
+    Raises
+    ------
+    ArgumentError : some state takes more values; gives the reason and the user's line.
+    SamplingError : no value is possible at some row; names the row and the parameters.
+    """
+    problem = pose(model, data)
+    theta = check_parameters(problem.trace, parameters)
+    settle(problem, theta, 1, "forward")
+    exact = hidden_markov(problem.trace)
+    assert isinstance(exact, HiddenMarkov)
+    levels, root = quantile_levels(quantiles), seed_sequence(seed)
+    attrs = {"model": problem.trace.name, "proposal": "forward", "seed": str(root.entropy)}
+    datasets = []
+    for e in problem.experiments:
+        found = exact.filter(e, theta)
+        x, law = exact.values, found.filtered
+        mean, square = law @ x, np.einsum("tk,ki,kj->tij", law, x, x)
+        run = FilterRun(
+            found.log_increments, np.full(e.steps, np.nan), mean,
+            square - mean[:, :, None] * mean[:, None, :], exact.quantiles(law, levels),
+            exact.predicted_observations(e, theta, found.predicted),
+        )  # fmt: skip
+        dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")
+        datasets.append(dataset.assign(_probabilities(exact, law, dataset)))
+    return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _probabilities(
+    exact: HiddenMarkov, law: np.ndarray, dataset: xr.Dataset
+) -> dict[str, xr.DataArray]:
+    """Of each state's values, from the laws (T, K) of their combinations."""
+    import xarray as xr
+
+    out = {}
+    for name, site in exact.trace.transition.items():
+        own = [k for k, s in enumerate(exact.trace.state_symbols) if s.data[1] == name]
+        columns = exact.values[:, own]
+        values, index = np.unique(columns, return_inverse=True)
+        shares = np.eye(len(values))[index.reshape(columns.shape)]  # (K, size, values)
+        chances = np.einsum("tk,kdv->tdv", law, shares).reshape(-1, *site.shape, len(values))
+        out[f"{name}_probability"] = xr.DataArray(
+            chances[None], dims=(*dataset[name].dims, f"{name}_value"),
+            coords={**dataset[name].coords, f"{name}_value": values},
+        )  # fmt: skip
+    return out
