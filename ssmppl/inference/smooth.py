@@ -29,6 +29,7 @@ from ssmppl.inference.methods import (
     SmoothingMethod,
 )
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
+from ssmppl.inference.particles.degeneracy import collapse, distinct
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     check_count,
@@ -63,6 +64,7 @@ NAMES: dict[str, SmoothingMethod] = {
     "fixed_lag": FixedLag(),
     "pgas": PGAS(),
 }
+COLLAPSED = 'Use more particles, proposal="twisted", or method=ssm.PGAS().'
 
 
 def smooth(
@@ -268,7 +270,9 @@ def _ffbsi(call: _Call, method: FFBSi) -> list[_Found]:
             "particles": settings.particles, "proposal": settings.proposal, "kernel": kernel,
             "kernel_chosen": why, "log_likelihood": system.log_Z,
         }  # fmt: skip
-        over_time = {"distinct": _distinct(paths), "ess": system.ess}
+        over_time = {"distinct": distinct(paths), "ess": system.ess}
+        if not marginal:
+            report |= collapse(over_time["distinct"], system.particles, draws, e, COLLAPSED)
         out.append(_Found(report, paths=paths, over_time=over_time))
     return out
 
@@ -294,6 +298,8 @@ def _fixed_lag(call: _Call, method: FixedLag) -> list[_Found]:
         }  # fmt: skip
         moments = m.mean, m.covariance, m.cross, m.quantiles
         over_time = {"distinct": m.distinct, "ess": system.ess}
+        n = settings.particles
+        report |= collapse(m.distinct, system.particles, n, e, COLLAPSED)
         out.append(_Found(report, moments=moments, over_time=over_time))
     return out
 
@@ -316,13 +322,8 @@ def _pgas(call: _Call, method: PGAS) -> list[_Found]:
     out = []
     for i in range(len(call.problem.experiments)):
         paths = chain.draws[f"path_{i}"]
-        out.append(_Found(report, paths=paths, over_time={"distinct": _distinct(paths)}))
+        out.append(_Found(report, paths=paths, over_time={"distinct": distinct(paths)}))
     return out
-
-
-def _distinct(paths: np.ndarray) -> np.ndarray:
-    """How many values x_t has among draws (M, T, D): (T,)."""
-    return np.array([len(np.unique(paths[:, t], axis=0)) for t in range(paths.shape[1])])
 
 
 def _dataset(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -166,3 +168,39 @@ def test_refusals(args, more, words):
 def test_kalman_on_a_nonlinear_model():
     with pytest.raises(ArgumentError, match=r"(?s)varves_observation.*y is Gamma.*ssm.FFBSi"):
         ssm.smooth(models.varves, {"y": [1.0, 2.0]}, {"phi": 0.9, "tau": 20}, "kalman")
+
+
+def still(sd):
+    """A level that hardly moves, or moves, seen through its cube root."""
+    model = ssm.Model("still")
+    model.initial(lambda: {"x": ssm.Normal(0, sd=30)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=sd)})
+    model.observation(lambda x: {"y": ssm.Normal(np.arctan(x), sd=0.2)})
+    return model
+
+
+@pytest.mark.parametrize("method", ["ffbsi", "fixed_lag"])
+def test_a_smoother_that_collapsed_says_so(method):
+    """Where x hardly moves, one of the first particles is the ancestor of all."""
+    y = np.arctan(0.7) + 0.2 * np.random.default_rng(4).normal(size=60)
+    call = {"particles": 400, "seed": 5}
+    if method == "fixed_lag":
+        method = ssm.FixedLag(lag=60)
+    with pytest.warns(UserWarning, match=r"collapsed: at t=.* share . values? of the states"):
+        found = ssm.smooth(still(1e-7), {"y": y}, {}, method, **call)
+    assert "Use more particles" in found.attrs["smoothing_warning"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ssm.smooth(still(0.3), {"y": y}, {}, "ffbsi", **call)
+    assert "smoothing_warning" not in found.attrs
+
+
+def test_few_values_are_no_collapse():
+    """Of a discrete state, and of a start that is known."""
+    model = ssm.Model("counts of a switch")
+    model.initial(lambda: {"k": ssm.Bernoulli(0.5), "x": ssm.Dirac(0.0)})
+    model.transition(lambda k, x: {"k": ssm.Bernoulli(0.2 + 0.6 * k), "x": ssm.Normal(x, sd=1)})
+    model.observation(lambda k, x: {"y": ssm.StudentT(4, x + k, scale=1.0)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ssm.smooth(model, {"y": np.zeros(10)}, {}, "ffbsi", particles=300, seed=1)

@@ -1,0 +1,41 @@
+"""A warning where a particle smoother has collapsed: its draws of a state share a few values."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+
+from ssmppl.data import Experiment
+
+FEW = 0.01  # of the values that there could be, below which the spread of the draws means little
+
+
+def distinct(paths: np.ndarray) -> np.ndarray:
+    """How many values x_t has among draws (M, T, D): (T,)."""
+    return np.array([len(np.unique(paths[:, t], axis=0)) for t in range(paths.shape[1])])
+
+
+def collapse(
+    found: np.ndarray, particles: np.ndarray, draws: int, experiment: Experiment, fix: str
+) -> dict[str, Any]:
+    """What goes to the attributes: nothing, or the warning, which is also given.
+
+    found : (T,) distinct values that are left. particles (T, D, N) : of the filter, for how many
+    values there could be, since a discrete state or a known start has few of its own. draws : M.
+    """
+    suspect = np.flatnonzero(found < FEW * min(draws, particles.shape[2]))
+    rows = [t for t in suspect if found[t] < FEW * len(np.unique(particles[t], axis=1).T)]
+    if not rows:
+        return {}
+    worst = min(rows, key=lambda t: found[t])
+    label = "" if experiment.time is None else f" (time {experiment.time[worst]})"
+    count = int(found[worst])
+    text = (
+        f"the smoother has collapsed: at t={worst + 1}{label} its {draws} draws share {count} "
+        f"value{'s' if count > 1 else ''} of the states, so that their spread is not that of the "
+        f"posterior, there and at {len(rows) - 1} other rows. {fix}"
+    )
+    warnings.warn(text, stacklevel=4)
+    return {"smoothing_warning": text}
