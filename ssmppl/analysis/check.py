@@ -186,8 +186,9 @@ def _fill(site: Site, values: Point, rng: np.random.Generator) -> None:
     support = site.distribution.support()
     components = site.components
     if support.kind == "simplex":
-        draws = rng.dirichlet(np.full(len(components), 3.0), POINTS).T
-        values.update(zip(components, draws, strict=True))
+        for row in site.value.reshape(-1, site.shape[-1]).view(np.ndarray):
+            draws = rng.dirichlet(np.full(len(row), 3.0), POINTS).T
+            values.update(zip(row, draws, strict=True))
         return
     if support.kind == "positive definite":
         p = site.shape[0]

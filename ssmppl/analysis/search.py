@@ -56,11 +56,16 @@ class Search:
             self.single[unit] = self._alone(unit)
 
     def _units(self) -> list[tuple[Expr, ...]]:
-        """What is drawn at least together: a matrix, a simplex, else one component."""
+        """What is drawn at least together: a matrix, shares of one whole, else one component."""
         out: list[tuple[Expr, ...]] = []
         for site in self.sites.values():
-            whole = kind_of(site) != "real"
-            out += [tuple(site.components)] if whole else [(c,) for c in site.components]
+            kind = kind_of(site)
+            if kind == "simplex":  # a vector, or each row of a matrix
+                out += [tuple(row) for row in site.value.reshape(-1, site.shape[-1])]
+            elif kind == "matrix":
+                out.append(tuple(site.components))
+            else:
+                out += [(c,) for c in site.components]
         return out
 
     def site(self, component: Expr) -> Site:

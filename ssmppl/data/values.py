@@ -175,18 +175,19 @@ def _bound(bounds: np.ndarray, env: Values, rows: int, none: float) -> np.ndarra
 
 
 def _outside_simplex(distribution: Distribution, values: np.ndarray) -> Fault | None:
-    for row, p in enumerate(values):
+    for index in np.ndindex(values.shape[:-1]):  # the row of the data, and of a matrix
+        p = values[index]
         if not np.isfinite(p).all():
             continue
         if (p <= 0).any() or (p >= 1).any():
             k = int(np.argmax((p <= 0) | (p >= 1)))
             return Fault(
-                (row, k),
+                (*index, k),
                 f"{number(p[k])} is outside the support of {name_of(distribution)}, (0, 1)",
                 "shares strictly between 0 and 1",
             )
         if abs(p.sum() - 1.0) > 1e-6:
-            return Fault((row,), f"the shares {p.tolist()} sum to {number(p.sum())}, not to 1",
+            return Fault(index, f"the shares {p.tolist()} sum to {number(p.sum())}, not to 1",
                          "shares divided by their sum")  # fmt: skip
     return None
 

@@ -157,14 +157,15 @@ def _surely_positive(m: ExprArray) -> bool:
 
 
 class Dirichlet(_Joint):
-    """Dirichlet(concentration), concentration of shape (K,)."""
+    """Dirichlet(concentration): shares (K,), or for concentrations (R, K) independent rows (R, K)
+    of shares, as in the transition matrix of a Markov chain."""
 
     def __init__(self, concentration: Any):
         self._set(concentration=concentration)
-        if self.concentration.ndim != 1 or len(self.concentration) < 2:
+        if self.concentration.ndim not in (1, 2) or self.concentration.shape[-1] < 2:
             raise ModelError(
                 f"Dirichlet: concentration has shape {self.concentration.shape}",
-                fix="give a vector of at least two concentrations",
+                fix="give a vector of at least two concentrations, or a matrix of such rows",
                 where=self.location,
             )
         self._require("concentration", 0.0)
@@ -173,25 +174,35 @@ class Dirichlet(_Joint):
     def support(self):
         return Support("simplex", self._full(0.0), self._full(1.0))
 
+    def _rows(self):
+        return [array(a) for a in self.concentration.reshape(-1, self.shape[-1]).view(np.ndarray)]
+
     def log_densities(self, value):
-        a, v = self.concentration, array(value)
-        norm = np.sum(array(ew("gammaln", a))) - ew("gammaln", np.sum(a))
-        return array(np.sum((a - 1.0) * ew("log", v)) - norm)
+        total, rows = constant(0.0), array(value).reshape(-1, self.shape[-1]).view(np.ndarray)
+        for a, v in zip(self._rows(), rows, strict=True):
+            norm = np.sum(array(ew("gammaln", a))) - ew("gammaln", np.sum(a))
+            total = total + np.sum((a - 1.0) * ew("log", array(v))) - norm
+        return array(total)
 
     def sample(self, draws):
-        if not needs_log_gamma(self.concentration):
-            g = array([draws.gamma(a) for a in self.concentration])
+        rows = [self._draw(a, draws) for a in self._rows()]
+        return array(np.concatenate([r.view(np.ndarray) for r in rows]).reshape(self.shape))
+
+    @staticmethod
+    def _draw(concentration, draws):
+        if not needs_log_gamma(concentration):
+            g = array([draws.gamma(a) for a in concentration])
             return array(g / np.sum(g))
-        log_g = array([log_gamma_draw(draws, a) for a in self.concentration])
+        log_g = array([log_gamma_draw(draws, a) for a in concentration])
         g = array(ew("exp", log_g - np.max(log_g)))
         return array(g / np.sum(g))
 
     def mean(self):
-        return array(self.concentration / np.sum(self.concentration))
+        return array(self.concentration / np.sum(self.concentration, axis=-1, keepdims=True))
 
     def variance(self):
-        m = self.mean()
-        return array(m * (1.0 - m) / (np.sum(self.concentration) + 1.0))
+        m, total = self.mean(), np.sum(self.concentration, axis=-1, keepdims=True)
+        return array(m * (1.0 - m) / (total + 1.0))
 
 
 def _log_gamma_p(x: Any, p: int) -> Any:

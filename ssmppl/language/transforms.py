@@ -19,6 +19,8 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
 from ssmppl.language.trace import Site, Trace
 
+ZERO = constant(0.0)
+
 
 @dataclass(frozen=True)
 class Transform:
@@ -39,7 +41,7 @@ class Transform:
         """The unconstrained numbers of a value (the site's shape), numerically."""
         support = self.site.distribution.support()
         if support.kind == "simplex":
-            return _unstick(value)
+            return np.concatenate([_unstick(row) for row in value.reshape(-1, value.shape[-1])])
         if support.kind == "positive definite":
             root = np.linalg.cholesky(value)
             out = [math.log(root[i, i]) if i == j else root[i, j] for i, j in _lower(len(value))]
@@ -86,8 +88,12 @@ def _transform(site: Site) -> Transform:
     support = site.distribution.support()
     components = tuple(site.components)
     if support.kind == "simplex":
-        z = _free_symbols(site, len(components) - 1)
-        values, log_jacobian = _stick(z)
+        k = site.shape[-1]
+        z, values, log_jacobian = _free_symbols(site, len(components) // k * (k - 1)), [], ZERO
+        for first in range(0, len(z), k - 1):  # of each row
+            row, part = _stick(z[first : first + k - 1])
+            values += row
+            log_jacobian = log_jacobian + part
     elif support.kind == "positive definite":
         p = site.shape[0]
         z = _free_symbols(site, p * (p + 1) // 2)

@@ -889,6 +889,16 @@ def rows_by_index(m):
     laws(m, rows_prior, transition, three_values)
 
 
+@expects(*((("P",), "Dirichlet") for _ in range(3)))
+def rows_of_a_matrix(m):
+    """One parameter, each of whose rows is a block of its own."""
+
+    def transition(x, P):
+        return {"x": Categorical(P[x])}
+
+    laws(m, lambda: {"P": Dirichlet(1.0 + np.eye(3))}, transition, three_values)
+
+
 @expects(*ROWS)
 def rows_by_indicators(m):
     """A sum over the values that the state may have, of which one counts."""

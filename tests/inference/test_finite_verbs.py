@@ -247,3 +247,41 @@ def test_explain_says_so():
     text = str(ssm.explain(second_order()))
     assert "4 combinations of values: the likelihood is exact, by the forward algorithm" in text
     assert "ForwardBackward: the model is of finitely many states" in " ".join(text.split())
+
+
+def regimes(matrix):
+    """Three regimes, whose transition matrix is one parameter, or one for each row."""
+    model, strength = ssm.Model("regimes"), 1.0 + 4.0 * np.eye(3)
+    if matrix:
+        model.prior(lambda: {"P": ssm.Dirichlet(strength)})
+        model.transition(lambda k, P: {"k": ssm.Categorical(P[k])})
+    else:
+        model.prior(lambda: {f"P{i}": ssm.Dirichlet(strength[i]) for i in range(3)})
+        model.transition(lambda k, P0, P1, P2: {"k": ssm.Categorical(np.stack([P0, P1, P2])[k])})
+    model.initial(lambda: {"k": ssm.Categorical([0.4, 0.3, 0.3])})
+    model.observation(lambda k: {"y": ssm.Normal(2.0 * k, sd=1)})
+    return model
+
+
+@pytest.mark.parametrize("method", [ssm.Gibbs(), ssm.MetropolisHastings()])
+def test_a_matrix_of_shares_is_its_rows(method):
+    """The same draws, whichever way the transition matrix is declared; and the same maximum."""
+    P = np.array([[0.8, 0.1, 0.1], [0.2, 0.7, 0.1], [0.1, 0.3, 0.6]])
+    y = ssm.simulate(regimes(True), {"P": P}, steps=60, seed=3)["y"].values[0]
+    call = {"draws": 30, "warmup": 30, "chains": 1, "seed": 4, "progress": False}
+    whole = ssm.sample(regimes(True), {"y": y}, method, **call)["posterior"]["P"].values
+    rows = ssm.sample(regimes(False), {"y": y}, method, **call)["posterior"]
+    apart = np.stack([rows[f"P{i}"].values for i in range(3)], axis=2)
+    np.testing.assert_allclose(whole, apart, rtol=1e-10)
+    np.testing.assert_allclose(whole.sum(axis=-1), 1.0)
+    if isinstance(method, ssm.Gibbs):
+        top = ssm.maximize(regimes(True), {"y": y}, objective="posterior", progress=False)
+        other = ssm.maximize(regimes(False), {"y": y}, objective="posterior", progress=False)
+        own = np.stack([other.parameters[f"P{i}"] for i in range(3)])
+        np.testing.assert_allclose(top.parameters["P"], own, atol=1e-5)
+
+
+def test_a_row_that_does_not_sum_to_one_is_named():
+    P = np.array([[0.8, 0.1, 0.1], [0.3, 0.7, 0.1], [0.1, 0.3, 0.6]])
+    with pytest.raises(ArgumentError, match=r"'P'\[1\]: the shares .* sum to 1\.1"):
+        ssm.simulate(regimes(True), {"P": P}, steps=3)

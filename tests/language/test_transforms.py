@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.expressions.arrays import array
@@ -34,3 +35,37 @@ def test_there_and_back(values):
     known = dict(zip([s for m in made for s in m.free], z, strict=True))
     back = np.concatenate([evaluate(array(list(m.values)), known) for m in made])
     np.testing.assert_allclose(back, theta, atol=1e-12)
+
+
+def test_rows_of_shares_there_and_back_with_their_volume():
+    """Each row breaks a stick of its own; the Jacobian is that of differences, without the last
+    column, which follows."""
+    model = ssm.Model("rows")
+    model.prior(lambda: {"P": ssm.Dirichlet(np.ones((2, 3)))})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, P: {"x": ssm.Normal(P[0, 1] * x, sd=P[1, 0])})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    (made,) = transforms(trace(model))
+    shares = np.array([[0.2, 0.5, 0.3], [0.05, 0.15, 0.8]])
+    z = made.inverse(shares, {})
+    assert len(z) == len(made.free) == 4
+
+    def back(z):
+        known = dict(zip(made.free, z, strict=True))
+        return np.array(evaluate(array(list(made.values)), known)).reshape(2, 3)
+
+    np.testing.assert_allclose(back(z), shares, rtol=1e-12)
+    columns = [(back(z + e) - back(z - e))[:, :2].ravel() / 2e-6 for e in 1e-6 * np.eye(4)]
+    found = evaluate(made.log_jacobian, dict(zip(made.free, z, strict=True)))
+    assert found == pytest.approx(np.linalg.slogdet(np.array(columns))[1], abs=1e-7)
+
+
+def test_rows_of_shares_have_the_density_of_independent_ones():
+    concentration = np.array([[2.0, 1.0, 3.0], [0.5, 4.0, 1.5]])
+    shares = np.array([[0.2, 0.5, 0.3], [0.05, 0.15, 0.8]])
+    law = ssm.Dirichlet(concentration)
+    expected = sum(stats.dirichlet.logpdf(p, a) for p, a in zip(shares, concentration, strict=True))
+    assert float(evaluate(law.log_density(array(shares)), {})) == pytest.approx(expected)
+    each = [stats.dirichlet(a) for a in concentration]
+    np.testing.assert_allclose(evaluate(law.mean(), {}), [d.mean() for d in each])
+    np.testing.assert_allclose(evaluate(law.variance(), {}), [d.var() for d in each])
