@@ -8,6 +8,7 @@ Numba from the very same text.
 
 from __future__ import annotations
 
+import inspect
 import threading
 from collections.abc import Callable
 from types import ModuleType
@@ -24,7 +25,7 @@ from ssmppl.codegen.text import ModuleText
 
 HELPERS: dict[str, Any] = {"look_at": look_at}  # specialised functions that kernels call
 # Arguments of a filter that only its compiled variant knows: what is not None needs Numba's.
-SCHEME, MOMENTS = 5, 10
+VARIANTS = ("scheme", "moments")
 
 
 class Loaded:
@@ -65,10 +66,13 @@ class Loaded:
             return numba_made
         if "predict" not in algorithm.bound:
             return run
+        given = inspect.signature(getattr(algorithm.function, "py_func", algorithm.function))
+        names = list(given.parameters)
+        own = [names.index(v) - names.index("theta") for v in VARIANTS if v in names]
 
         def call(*args: Any) -> Any:
             """The filter; with moments or another scheme by Numba's variant."""
-            plain = args[SCHEME] is None and args[MOMENTS] is None
+            plain = all(args[i] is None for i in own)
             return (run if plain else numba_made)(*args)
 
         return call

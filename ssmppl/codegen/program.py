@@ -21,6 +21,7 @@ from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.analysis.twisted import twisted
+from ssmppl.codegen.kernels.alive_filter import alive_filter
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
 from ssmppl.codegen.kernels.backward_pairs import (
     backward_mcmc,
@@ -180,6 +181,7 @@ def _write(
             ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
         own = {"ahead": ahead, "predict": "predict"}
         out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
+        out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
         own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)

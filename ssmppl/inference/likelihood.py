@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ def log_likelihood(
     proposal: str = "auto",
     resampling: str = "systematic",
     ess_threshold: float = 1.0,
+    rescue: int = 0,
     seed: int | None = None,
     executor: Executor | None = None,
 ) -> np.ndarray:
@@ -59,6 +61,11 @@ def log_likelihood(
         2005), and the others move by the transition or the two better proposals; "auto" tries them.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
+    rescue : where all N particles have weight zero, go on drawing, up to `rescue` times N at a row,
+        as the alive particle filter (Del Moral, Jasra, Lee, Yau and Zhang 2015): at every row until
+        N + 1 have a positive weight, the last of which is left out. 0: no. The estimate stays
+        unbiased, whatever the limit; -inf where none is alive at the limit. With it ancestors are
+        drawn independently at every row. Exact likelihoods need none.
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.
     executor : any `concurrent.futures.Executor`; None: threads.
 
@@ -76,8 +83,9 @@ def log_likelihood(
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
     settings = settle(
-        problem, theta, particles, proposal, resampling, ess_threshold, whole=True, integrate=True
-    )
+        problem, theta, particles, proposal, resampling, ess_threshold, rescue, whole=True,
+        integrate=True,
+    )  # fmt: skip
     if settings.proposal in EXACT:
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
@@ -94,6 +102,7 @@ def settle(
     proposal: str,
     resampling: str = "systematic",
     ess_threshold: float = 1.0,
+    rescue: int = 0,
     *,
     whole: bool = False,
     integrate: bool = False,
@@ -102,10 +111,10 @@ def settle(
 
     whole, integrate : as in `choose`.
     """
-    settings = filter_settings(particles, proposal, resampling, ess_threshold)
+    settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
     if proposal == "auto":
         chosen = choose(problem, theta, whole=whole, integrate=integrate).name
-        return filter_settings(particles, chosen, resampling, ess_threshold)
+        return replace(settings, proposal=chosen)
     if proposal in EXACT:
         found = exact_model(problem.trace)
         if isinstance(found, NotApplicable) or filter_of(found) != proposal:
