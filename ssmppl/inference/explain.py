@@ -14,6 +14,7 @@ from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.noises import Noises, noises
 from ssmppl.analysis.proposals import Proposal
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
+from ssmppl.analysis.tempered import tempered
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable
@@ -29,6 +30,10 @@ from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
 
 PAGE = 100  # columns
+TEMPERED = (
+    "for rows that tell far more than the transition: particles are weighed by rising powers of "
+    "the observation's density, and take Metropolis steps between them"
+)
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,11 @@ class Plan:
         if self.data:
             out.append(("Data", [("bound", self.data)]))
         out.append(("Structure", self._structure()))
-        out.append(("Particle filter", [self._proposal(n, p) for n, p in self.proposals.items()]))
+        rows = [self._proposal(n, p) for n, p in self.proposals.items()]
+        guided = self.proposals.get("guided")
+        if isinstance(guided, NotApplicable) and tempered(t, Missing()):
+            rows.append(("tempered", TEMPERED))
+        out.append(("Particle filter", rows))
         out.append(("Trajectories", [("PGAS", self._trajectories())]))
         out.append(("Chosen, unless a method is named", self._choices()))
         if self.updates:

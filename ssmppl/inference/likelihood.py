@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact.hidden_markov import hidden_markov
@@ -51,14 +52,21 @@ def log_likelihood(
     parameters : value of each parameter of the model, {} where it has none.
     particles : number N of particles.
     repeats : number of independent estimates.
-    proposal : "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted", or "user"
-        where the model has a @proposal. "auto" is exact on linear Gaussian models and on those of
-        finitely many states (the forward algorithm), else the proposal with the least variance for
-        its cost in a pilot; "twisted", which looks ahead to the end of the data, is tried where the
-        others tell log Z to no better than 3 at 100 particles. "marginal", "marginal_guided" and
-        "marginal_auxiliary" are Rao-Blackwellised: states that are linear and Gaussian given the
-        others are integrated out by a Kalman filter per particle (Schön, Gustafsson and Nordlund
-        2005), and the others move by the transition or the two better proposals; "auto" tries them.
+    proposal : "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted",
+        "tempered", or "user" where the model has a @proposal. "auto" is exact on linear Gaussian
+        models and on those of finitely many states (the forward algorithm), else the proposal with
+        the least variance for its cost in a pilot; "twisted", which looks ahead to the end of the
+        data, is tried where the others tell log Z to no better than 3 at 100 particles. "marginal",
+        "marginal_guided" and "marginal_auxiliary" are Rao-Blackwellised: states that are linear and
+        Gaussian given the others are integrated out by a Kalman filter per particle (Schön,
+        Gustafsson and Nordlund 2005), and the others move by the transition or the two better
+        proposals; "auto" tries them.
+        "tempered" takes a sharp likelihood in by degrees: at each row particles are weighed by
+        rising powers of the observation's density, resampled, and moved by Metropolis steps between
+        them (Herbst and Schorfheide 2019), for continuous states of any law and observations that
+        no derivative is known of; a pilot of its own random numbers fixes powers and steps for each
+        estimate. It costs tens of times what "bootstrap" does, and "auto" tries it where no
+        guided proposal is derived and others tell log Z to no better than 3.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     rescue : where all N particles have weight zero, go on drawing, up to `rescue` times N at a row,
@@ -113,7 +121,9 @@ def settle(
     """
     settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
     if proposal == "auto":
-        chosen = choose(problem, theta, whole=whole, integrate=integrate).name
+        fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
+        flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
+        chosen = choose(problem, theta, **flags).name
         return replace(settings, proposal=chosen)
     if proposal in EXACT:
         found = exact_model(problem.trace)

@@ -76,7 +76,10 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     plain = method.order == 0 and not method.correlation  # others know no guide
     choice = None
     if method.proposal == "auto":
-        choice = choose(problem, theta, exact=False, whole=plain, integrate=plain)
+        temper = plain and not method.rescue
+        choice = choose(
+            problem, theta, exact=False, whole=plain, integrate=plain, temper=temper
+        )  # fmt: skip
     proposal = choice.name if choice else method.proposal
     problem.proposal(proposal, integrate=plain)
     particles, tuned = method.particles, None
@@ -137,6 +140,10 @@ def check_settings(method: PMMH) -> None:
             f"rescue={method.rescue} together with order={method.order}, correlation="
             f"{method.correlation}: the filters of these draw a fixed number of particles",
             fix="use ssm.PMMH(rescue=...) with order=0 and correlation=0.0",
+        )
+    if method.rescue and method.proposal == "tempered":
+        raise ArgumentError(
+            f'rescue={method.rescue} together with proposal="tempered"', fix="use one of them"
         )
     if method.order and method.correlation:
         raise ArgumentError(

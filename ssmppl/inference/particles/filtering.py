@@ -72,6 +72,12 @@ def filter_settings(
             "itself, at every row",
             fix="leave resampling= and ess_threshold= out",
         )
+    if proposal == "tempered" and (rescue or resampling != "systematic" or ess_threshold < 1.0):
+        raise ArgumentError(
+            f"proposal='tempered' together with resampling={resampling!r}, ess_threshold="
+            f"{ess_threshold}, rescue={rescue}: it resamples systematically at every temperature",
+            fix="leave the others out",
+        )
     return FilterSettings(
         int(particles), proposal, SCHEMES[resampling], float(ess_threshold), int(rescue)
     )
