@@ -28,6 +28,7 @@ from ssmppl.inference.method_choice import (
 from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
+from ssmppl.language.transforms import transforms
 
 PAGE = 100  # columns
 TEMPERED = (
@@ -107,11 +108,17 @@ class Plan:
     def _choices(self) -> list[tuple[str, str]]:
         exact = exact_model(self.trace)
         kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
-        choices: dict[str, tuple[Any, str]] = {"sample": choose_sampler(kind, self.updates)}
+        choices: dict[str, tuple[Any, str]] = {
+            "sample": choose_sampler(kind, self.updates, self._numbers(), self.memory)
+        }
         if self.trace.parameters:
             choices["maximize"] = choose_maximiser(kind, self.trace)
         choices["smooth"] = choose_smoother(kind)
         return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
+
+    def _numbers(self) -> int:
+        """How many numbers the parameters have on the unconstrained scale."""
+        return sum(len(p.free) for p in transforms(self.trace))
 
     def _interweaved(self) -> list[tuple[str, str]]:
         exact = exact_model(self.trace)

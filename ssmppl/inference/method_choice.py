@@ -9,6 +9,7 @@ from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.methods import (
     PGAS,
+    PMMH,
     DirectOptimization,
     FFBSi,
     ForwardBackward,
@@ -23,28 +24,53 @@ FEW = 6  # numbers that a random walk moves at once without trouble
 
 
 def choose_sampler(
-    kind: str | NotApplicable, updates: Sequence[Update]
-) -> tuple[MetropolisHastings | Gibbs | PGAS, str]:
+    kind: str | NotApplicable, updates: Sequence[Update], numbers: int, memory: int | None
+) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
 
     kind : "linear Gaussian" or "of finitely many states", whose states are drawn exactly, or why it
-    is neither. Gibbs then needs no tuning where every
-    parameter has a closed-form conditional; where some have none, slices given the states mix
-    slowly and cost a pass over the data each, and a random walk on the exact likelihood, which
-    integrates the states out, is better as long as the parameters are few.
+    is neither. Gibbs then needs no tuning where every parameter has a closed-form conditional;
+    those that mix slowly given the states are moved with them integrated out besides. Where some
+    have none, slices given the states mix slowly and cost a pass over the data each, and a random
+    walk on the exact likelihood, which integrates the states out, is better as long as the
+    parameters are few.
+    updates : where the states are drawn exactly. numbers : of the free parameters. memory : as of
+    `deterministic_memory`. Where it is None no ancestor can be sampled for the reference trajectory
+    of PGAS: its early states then change the less the more rows there are (Lindsten, Jordan and
+    Schön 2014; Lindsten, Bunch, Singh and Schön 2015), and the parameters with them; PMMH draws all
+    of the trajectory anew.
     """
     if isinstance(kind, NotApplicable):
-        return PGAS(), "the model is not linear Gaussian: trajectories by conditional SMC"
+        if memory is not None:
+            return PGAS(), "the model is not linear Gaussian: trajectories by conditional SMC"
+        stuck = (
+            "a deterministic component never forgets its past, so that PGAS cannot join a "
+            "trajectory to other ancestors and moves it slowly"
+        )
+        if numbers <= FEW:
+            return PMMH(), f"{stuck}: a random walk on the particle filter's likelihood"
+        return PGAS(), (
+            f"{stuck}, but {numbers} numbers are too many for a random walk: conditional SMC "
+            "without ancestor sampling; see the attribute trajectory_update_rate, and take more "
+            "particles where it is low"
+        )
     open_ = [c for u in updates if u.conditional is None for c in u.block]
     if not open_:
-        return Gibbs(), (
+        if not updates:
+            return Gibbs(), (
+                f"{kind}, without free parameters: exact trajectories by backward sampling"
+            )
+        reason = (
             f"{kind}, and every parameter has a closed-form conditional: exact trajectories by "
             "backward sampling"
-            if updates
-            else f"{kind}, without free parameters: exact trajectories by backward sampling"
+        )
+        if kind != "linear Gaussian":
+            return Gibbs(), reason
+        return Gibbs(interweave="auto"), (
+            f"{reason}; parameters that the warmup finds slow given the states are moved with the "
+            "states integrated out too"
         )
     named = ", ".join(dict.fromkeys(open_))
-    numbers = sum(len(u.components) for u in updates)
     if numbers <= FEW:
         return MetropolisHastings(), (
             f"{kind}, but {named} has no closed-form conditional: a random walk on the "
