@@ -24,6 +24,7 @@ from ssmppl.inference.method_choice import (
     choose_maximiser,
     choose_sampler,
     choose_smoother,
+    why_stuck,
 )
 from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
@@ -47,7 +48,7 @@ class Plan:
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
     memory : see `structure.deterministic_memory`. noises : what drives the states, or why it cannot
-    be told.
+    be told. rows : of the longest data set, where there are data.
     """
 
     trace: Trace
@@ -59,6 +60,7 @@ class Plan:
     memory: int | None
     noises: Noises | NotApplicable
     data: str = ""
+    rows: int | None = None
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(title, rows of (what, how)) for each part of the plan."""
@@ -109,7 +111,9 @@ class Plan:
         exact = exact_model(self.trace)
         kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
         choices: dict[str, tuple[Any, str]] = {
-            "sample": choose_sampler(kind, self.updates, self._numbers(), self.memory)
+            "sample": choose_sampler(
+                kind, self.updates, self._numbers(), why_stuck(self.trace, self.rows)
+            )
         }
         if self.trace.parameters:
             choices["maximize"] = choose_maximiser(kind, self.trace)
@@ -224,11 +228,12 @@ def explain(model: Model, data: Any = None) -> Plan:
     ModelError, DataError : what is wrong, where, and the fix.
     """
     traced = trace(model)
-    missing, bound = Missing(none=True), ""
+    missing, bound, rows = Missing(none=True), "", None
     if data is not None:
         experiments = bind(traced, data)
         missing = missing_of(experiments)
         gaps = sum(int((e.seen == 0).sum()) for e in experiments)
+        rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
     program = compile_trace(traced, missing)
@@ -242,6 +247,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         deterministic_memory(traced),
         noises(traced, missing),
         bound,
+        rows,
     )
 
 

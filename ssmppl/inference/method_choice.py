@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ssmppl.analysis.smooth import smooth_filter_applies
+from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.methods import (
@@ -18,13 +19,15 @@ from ssmppl.inference.methods import (
     MetropolisHastings,
     ScoreAscent,
 )
+from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Trace
 
+ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
 FEW = 6  # numbers that a random walk moves at once without trouble
 
 
 def choose_sampler(
-    kind: str | NotApplicable, updates: Sequence[Update], numbers: int, memory: int | None
+    kind: str | NotApplicable, updates: Sequence[Update], numbers: int, stuck: str = ""
 ) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
 
@@ -34,19 +37,12 @@ def choose_sampler(
     have none, slices given the states mix slowly and cost a pass over the data each, and a random
     walk on the exact likelihood, which integrates the states out, is better as long as the
     parameters are few.
-    updates : where the states are drawn exactly. numbers : of the free parameters. memory : as of
-    `deterministic_memory`. Where it is None no ancestor can be sampled for the reference trajectory
-    of PGAS: its early states then change the less the more rows there are (Lindsten, Jordan and
-    Schön 2014; Lindsten, Bunch, Singh and Schön 2015), and the parameters with them; PMMH draws all
-    of the trajectory anew.
+    updates : where the states are drawn exactly. numbers : of the free parameters. stuck : as of
+    `why_stuck`, for the others.
     """
     if isinstance(kind, NotApplicable):
-        if memory is not None:
+        if not stuck:
             return PGAS(), "the model is not linear Gaussian: trajectories by conditional SMC"
-        stuck = (
-            "a deterministic component never forgets its past, so that PGAS cannot join a "
-            "trajectory to other ancestors and moves it slowly"
-        )
         if numbers <= FEW:
             return PMMH(), f"{stuck}: a random walk on the particle filter's likelihood"
         return PGAS(), (
@@ -80,6 +76,33 @@ def choose_sampler(
         f"{kind}, with {numbers} numbers to move, too many for a random walk: exact "
         f"trajectories, and slices for {named}"
     )
+
+
+def why_stuck(trace: Trace, rows: int | None) -> str:
+    """Why PGAS cannot be relied on to move the trajectories of a model; empty where it can.
+
+    Where a deterministic component never forgets its past, no ancestor can be sampled for the
+    reference trajectory, and its early states change the less the more rows there are for each
+    particle (Lindsten, Jordan and Schön 2014; Lindsten, Bunch, Singh and Schön 2015). PMMH draws
+    all of the trajectory anew. Given a trajectory of counts, parameters can move only little,
+    however well it moves itself.
+
+    rows : of the longest data set; None: not known.
+    """
+    if deterministic_memory(trace) is not None:
+        return ""
+    random = [
+        s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
+    ]
+    reason = (
+        "a deterministic component never forgets its past, so that PGAS cannot join a trajectory "
+        "to other ancestors"
+    )
+    if all(d.support().kind == "integers" for d in random):
+        return f"{reason}, and given a trajectory of counts parameters move slowly"
+    if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
+        return f"{reason}, and over more than {ROWS_WITHOUT_ANCESTORS} rows hardly moves its start"
+    return ""
 
 
 def choose_maximiser(

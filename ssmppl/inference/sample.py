@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
@@ -18,7 +17,7 @@ from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.chains.update_rates import told
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.labels import Labels
-from ssmppl.inference.method_choice import choose_sampler
+from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
 from ssmppl.inference.particles.pilot import space_of
@@ -62,8 +61,9 @@ def sample(
         of finitely many states, `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
         None: for the former Gibbs if every parameter has a closed-form conditional (with
         `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
-        while the parameters are few; for the others PGAS, or PMMH where no ancestors can be sampled
-        and the parameters are few. `explain` and the attributes say which, and why.
+        while the parameters are few; for the others PGAS, or PMMH where no ancestors can be
+        sampled, the data are long or the states counts, and the parameters are few. `explain` and
+        the attributes say which, and why.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
@@ -142,10 +142,10 @@ def sample(
 def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
     exact = exact_model(problem.trace)
     numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
-    memory = deterministic_memory(problem.trace)
+    stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
     if isinstance(exact, NotApplicable):
-        return choose_sampler(exact, (), numbers, memory)
-    return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers, memory)
+        return choose_sampler(exact, (), numbers, stuck)
+    return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers)
 
 
 def _to_arviz(

@@ -37,14 +37,18 @@ def integrated(size=1):
     return model
 
 
-def chosen(model):
-    plan = " ".join(str(ssm.explain(model)).split())
+def chosen(model, data=None):
+    plan = " ".join(str(ssm.explain(model, data)).split())
     return plan[plan.index("unless a method is named") :]
 
 
 def test_pmmh_is_chosen_where_no_ancestor_can_be_sampled_and_parameters_are_few():
     assert "sample PMMH: a deterministic component never forgets its past" in chosen(town())
-    assert "sample PMMH:" in chosen(integrated())
+    assert "parameters move slowly" in chosen(town())
+    assert "sample PMMH:" in chosen(integrated())  # of unknown length
+    assert "sample PMMH:" in chosen(integrated(), {"y": np.zeros(101)})
+    assert "more than 100 rows" in chosen(integrated(), [{"y": np.zeros(101)}, {"y": np.zeros(3)}])
+    assert "sample PGAS: the model is not" in chosen(integrated(), {"y": np.zeros(100)})
     many = chosen(integrated(7))
     assert "sample PGAS: a deterministic component" in many
     assert "7 numbers are too many" in many
@@ -57,8 +61,9 @@ def test_pmmh_is_chosen_where_no_ancestor_can_be_sampled_and_parameters_are_few(
 
 def test_sample_takes_what_explain_says_and_counts_free_parameters_only():
     assert isinstance(_chosen(pose(town(), {"y": np.full(4, 80.0)}), {})[0], ssm.PMMH)
-    problem = pose(integrated(7), {"y": np.zeros(4)})
+    problem = pose(integrated(7), {"y": np.zeros(150)})
     assert isinstance(_chosen(problem, {})[0], ssm.PGAS)
+    assert isinstance(_chosen(pose(integrated(), {"y": np.zeros(9)}), {})[0], ssm.PGAS)
     assert isinstance(_chosen(problem, {"q": np.full(7, 0.2)})[0], ssm.PMMH)
 
 
@@ -112,7 +117,7 @@ def test_discrete_states_count_where_chains_differ():
     paths[:, :, 1] = 2.0  # the data determine it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert told(problem, made_up(paths))["trajectory_update_rate"] > 0.5
+        assert 0.5 < told(problem, made_up(paths))["trajectory_update_rate"] < 1.0
     paths[2:, :, 1] = 3.0
     with pytest.warns(UserWarning, match="1 rows from 2 to 2 "):
         told(problem, made_up(paths))

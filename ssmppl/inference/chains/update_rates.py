@@ -37,9 +37,11 @@ def told(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
             return {}
         free, discrete = random_components(problem, paths.shape[2])
         rate = np.mean(paths[:, 1:] != paths[:, :-1], axis=(0, 1))  # (T, D)
+        # a continuous one that stands still is never right
         counted = free & (~discrete | (gelman_rubin(paths) > APART))
-        if counted.any():
-            least = min(least, float(rate[counted].min()))
+        varied = free & (paths != paths[:1, :1]).any(axis=(0, 1))
+        if (counted | varied).any():
+            least = min(least, float(rate[counted | varied].min()))
         if paths.shape[1] >= FEWEST:
             rows = np.flatnonzero((counted & (rate < LOW)).any(axis=1))
             stuck += [(i, int(rows[0]) + 1, int(rows[-1]) + 1, len(rows))] if len(rows) else []
