@@ -128,6 +128,40 @@ def lorenz(states: int, step: float) -> ssm.Model:
     return model
 
 
+@ssm.primitive
+def sensor(x):
+    """A characteristic that the language does not see through."""
+    return x + 0.3 * np.sin(3.0 * x)
+
+
+sharp = ssm.Model("sharp sensor")
+
+
+@sharp.initial
+def sharp_initial():
+    return {"x": ssm.Normal(np.zeros(2), sd=1.0)}
+
+
+@sharp.transition
+def sharp_transition(x):
+    return {"x": ssm.Normal(0.8 * x, sd=1.0)}
+
+
+@sharp.observation
+def sharp_observation(x):
+    return {"y": ssm.Normal(sensor(x[0]), sd=0.01)}
+
+
+both = ssm.Model("two sharp sensors")
+both.initial(sharp_initial)
+both.transition(sharp_transition)
+
+
+@both.observation
+def both_observation(x):
+    return {"y": ssm.Normal(sensor(x), sd=0.01)}
+
+
 @dataclass(frozen=True)
 class Case:
     """A model with data and parameters at which its likelihood is estimated."""
@@ -144,12 +178,15 @@ def simulated(model: ssm.Model, steps: int) -> dict[str, np.ndarray]:
 
 
 def cases() -> list[Case]:
-    """The varves; an LGSS with observation variance 0.001; Poisson counts around 500; and two
-    models that are linear given some of their states."""
+    """The varves; an LGSS with observation variance 0.001; Poisson counts around 500; two models
+    that are linear given some of their states; and two whose observation is an opaque function,
+    with a hundredth of the noise of their transition."""
     return [
         Case("varves", varves, {"y": ice_varves()}, {"phi": 0.95, "tau": 50.0}),
         Case("LGSS, variance 0.001", precise, simulated(precise, 300), {}),
         Case("Poisson, mean 500", counts, simulated(counts, 300), {}),
         Case("2 + 4 states", mixed, simulated(mixed, 300), {}),
         Case("two regimes", regimes, simulated(regimes, 300), {}),
+        Case("sharp sensor", sharp, simulated(sharp, 100), {}),
+        Case("two sharp sensors", both, simulated(both, 100), {}),
     ]

@@ -1,4 +1,4 @@
-"""How many fell ill, when not all of them report it? PMMH, as `explain` advises for this model."""
+"""How many fell ill, when not all of them report it? by PMMH, which suits this model."""
 
 from pathlib import Path
 

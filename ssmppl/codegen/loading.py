@@ -8,6 +8,7 @@ Numba from the very same text.
 
 from __future__ import annotations
 
+import inspect
 import threading
 from collections.abc import Callable
 from types import ModuleType
@@ -32,7 +33,7 @@ HELPERS: dict[str, Any] = {
     for name in names
 }
 # Arguments of a filter that only its compiled variant knows: what is not None needs Numba's.
-SCHEME, MOMENTS = 5, 10
+VARIANTS = ("scheme", "moments")
 
 
 class Loaded:
@@ -73,10 +74,13 @@ class Loaded:
             return numba_made
         if "predict" not in algorithm.bound:
             return run
+        given = inspect.signature(getattr(algorithm.function, "py_func", algorithm.function))
+        names = list(given.parameters)
+        own = [names.index(v) - names.index("theta") for v in VARIANTS if v in names]
 
         def call(*args: Any) -> Any:
             """The filter; with moments or another scheme by Numba's variant."""
-            plain = args[SCHEME] is None and args[MOMENTS] is None
+            plain = all(args[i] is None for i in own)
             return (run if plain else numba_made)(*args)
 
         return call

@@ -15,6 +15,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.marginal import Marginal, marginal
 from ssmppl.analysis.moves import Proposal, bootstrap
 from ssmppl.analysis.proposals import derive
+from ssmppl.codegen.kernels.alive_filter import alive_filter
 from ssmppl.codegen.kernels.conditional_smc import filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
@@ -77,6 +78,7 @@ def compile_marginal(
             ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
         own = {"ahead": ahead, "predict": "predict"}
         out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
+        out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
         own = {"ahead": ahead}
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
     lines = [

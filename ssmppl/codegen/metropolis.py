@@ -31,7 +31,10 @@ from ssmppl.expressions.expr import Expr, constant, depends_on, topological
 
 XI_INITIAL = "theta, c, s, states, out"
 XI = "theta, c, s, states_prev, states, out"
-STEERED = "these filters do not compute the guide of the twisted proposal"
+STEERED = {
+    "twisted": "these filters do not compute the guide of the twisted proposal",
+    "tempered": "these filters weigh a row once, without temperatures",
+}
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,8 @@ def scored_filter(
     given the states there is then no density for Fisher's identity.
     """
     trace, missing = program.trace, program.missing
-    if proposal.name == "twisted":
-        return NotApplicable(STEERED)
+    if proposal.name in STEERED:
+        return NotApplicable(STEERED[proposal.name])
     for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
         for site in deterministic(list(sites.values())):
             if any(depends_on(e, wanted) for e in array(site.distribution.mean()).ravel()):
@@ -111,8 +114,8 @@ def numbered_filter(program: Program, proposal: Proposal) -> NumberedFilter | No
     NotApplicable where particles are drawn by rejection, which takes a random count of numbers.
     """
     trace = program.trace
-    if proposal.name == "twisted":
-        return NotApplicable(STEERED)
+    if proposal.name in STEERED:
+        return NotApplicable(STEERED[proposal.name])
     for draws, sites in ((proposal.initial_draw, trace.initial), (proposal.draw, trace.transition)):
         for symbol, e in draws.items():
             for node in topological([e]):

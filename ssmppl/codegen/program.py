@@ -22,6 +22,7 @@ from ssmppl.analysis.moves import Proposal, bootstrap
 from ssmppl.analysis.proposals import derive
 from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.analysis.twisted import twisted
+from ssmppl.codegen.kernels.alive_filter import alive_filter
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
 from ssmppl.codegen.kernels.backward_pairs import (
     backward_mcmc,
@@ -46,6 +47,7 @@ from ssmppl.codegen.marginal import NAMES as MARGINAL
 from ssmppl.codegen.marginal import MarginalFilter, compile_marginal
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
+from ssmppl.codegen.tempered import TemperedFilter, compile_tempered
 from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import TwistedFilter, compile_twisted
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -82,11 +84,19 @@ class Program:
         """The Rao-Blackwellised filters, likewise."""
         return compile_marginal(self.trace, self.missing)
 
+    @cached_property
+    def tempered(self) -> TemperedFilter | NotApplicable:
+        """The tempered filter, likewise."""
+        return compile_tempered(self.trace, self.missing)
+
     def proposal(self, name: str) -> Proposal | NotApplicable | None:
         """What was derived under this name, or why nothing was; None where no proposal has it."""
         if name in MARGINAL:
             found = self.marginal
             return found if isinstance(found, NotApplicable) else found.proposals[name]
+        if name == "tempered":
+            own = self.tempered
+            return own if isinstance(own, NotApplicable) else own.proposal
         return self.proposals.get(name)
 
     def carried(self, proposal: str) -> list[Expr]:
@@ -113,6 +123,8 @@ class Program:
         """
         if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
             return self.twisted.entry(name.removesuffix("_twisted"))
+        if name.endswith("_tempered") and isinstance(self.tempered, TemperedFilter):
+            return self.tempered.entry(name.removesuffix("_tempered"))
         if name.endswith(tuple(f"_{own}" for own in MARGINAL)):
             if isinstance(self.marginal, MarginalFilter):
                 return self.marginal.entry(name)
@@ -181,6 +193,7 @@ def _write(
             ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
         own = {"ahead": ahead, "predict": "predict"}
         out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
+        out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
         own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)

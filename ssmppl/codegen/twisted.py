@@ -21,6 +21,7 @@ from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.analysis.twisted import Guided, guide_order, guided, jacobian, twisted
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels import guide, guide_back
+from ssmppl.codegen.kernels.alive_filter import alive_filter
 from ssmppl.codegen.kernels.conditional_smc import conditional_smc, filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
@@ -52,7 +53,8 @@ class TwistedFilter:
     module: Loaded = field(repr=False)
 
     def entry(self, name: str, horizon: int = 0) -> Callable[..., Any]:
-        """`filter`, `filtered_path` or `conditional_smc`, called like those of other proposals.
+        """`filter`, `alive_filter`, `filtered_path` or `conditional_smc`, called like those of
+        other proposals.
 
         horizon : rows after which the guide starts anew and so is blind to what comes later; 0:
         never. Up to the last row of each stretch the particles are worth most as a sample of
@@ -226,6 +228,7 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     memory = deterministic_memory(trace)
     own = own | {"ahead": "GUIDED", "predict": "predict"}
     out.algorithm(particle_filter, "filter_twisted", section, "entry", own)
+    out.algorithm(alive_filter, "alive_filter_twisted", section, "entry", own)
     own = own | {"ahead": "GUIDED", "horizon": "-1" if memory is None else str(memory)}
     out.algorithm(filtered_path, "filtered_path_twisted", section, "entry", own)
     out.algorithm(conditional_smc, "conditional_smc_twisted", section, "entry", own)

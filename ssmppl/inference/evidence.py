@@ -207,14 +207,15 @@ def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedS
     """The method with proposal and particles settled, as the sampler and the bridge share them."""
     proposal, particles = method.proposal, method.particles
     if proposal == "auto" or particles is None:
-        theta, _ = space.parameters(find_mode(space, root).z)
+        theta, _ = space.parameters(find_mode(space, root, rescue=method.rescue).z)
         if proposal == "auto":
             plain = method.order == 0  # filters with scores know all states, and no guide
             choice = choose(problem, theta, exact=False, whole=plain, integrate=plain)
             proposal = choice.name
         problem.proposal(proposal, integrate=method.order == 0)
         if particles is None:
-            particles = tune_particles(problem, theta, proposal, TARGET_SD, root).particles
+            tuned = tune_particles(problem, theta, proposal, TARGET_SD, root, method.rescue)
+            particles = tuned.particles
     return replace(method, proposal=proposal, particles=particles)
 
 
@@ -227,7 +228,7 @@ def _without_parameters(
         exact = model.log_likelihood(problem.experiments, space.theta)
         return Evidence(exact, 0.0, {"method": filter_of(model)})
     assert method.particles is not None
-    settings = FilterSettings(method.particles, method.proposal)
+    settings = FilterSettings(method.particles, method.proposal, rescue=method.rescue)
     found = importance(repeated_estimates(problem, space.theta, settings, root, range(REPEATS)))
     return Evidence(
         found.log_constant, found.standard_error,
@@ -266,7 +267,7 @@ def _log_densities(
             continue
         if isinstance(method, PMMH):
             assert method.particles is not None
-            settings = FilterSettings(method.particles, method.proposal)
+            settings = FilterSettings(method.particles, method.proposal, rescue=method.rescue)
             stream = random_state(root, 2, int(number))
             out[i] = log_likelihood_estimate(problem, theta, settings, stream) + log_prior
         else:

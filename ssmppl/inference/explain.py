@@ -14,6 +14,7 @@ from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.noises import Noises, noises
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
+from ssmppl.analysis.tempered import tempered
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind
 from ssmppl.errors import NotApplicable
@@ -23,12 +24,18 @@ from ssmppl.inference.method_choice import (
     choose_maximiser,
     choose_sampler,
     choose_smoother,
+    why_stuck,
 )
 from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
+from ssmppl.language.transforms import transforms
 
 PAGE = 100  # columns
+TEMPERED = (
+    "for rows that tell far more than the transition: particles are weighed by rising powers of "
+    "the observation's density, and take Metropolis steps between them"
+)
 
 
 @dataclass(frozen=True)
@@ -41,7 +48,7 @@ class Plan:
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
     memory : see `structure.deterministic_memory`. noises : what drives the states, or why it cannot
-    be told.
+    be told. rows : of the longest data set, where there are data.
     """
 
     trace: Trace
@@ -53,6 +60,7 @@ class Plan:
     memory: int | None
     noises: Noises | NotApplicable
     data: str = ""
+    rows: int | None = None
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """(title, rows of (what, how)) for each part of the plan."""
@@ -69,7 +77,11 @@ class Plan:
         if self.data:
             out.append(("Data", [("bound", self.data)]))
         out.append(("Structure", self._structure()))
-        out.append(("Particle filter", [self._proposal(n, p) for n, p in self.proposals.items()]))
+        rows = [self._proposal(n, p) for n, p in self.proposals.items()]
+        guided = self.proposals.get("guided")
+        if isinstance(guided, NotApplicable) and tempered(t, Missing()):
+            rows.append(("tempered", TEMPERED))
+        out.append(("Particle filter", rows))
         out.append(("Trajectories", [("PGAS", self._trajectories())]))
         out.append(("Chosen, unless a method is named", self._choices()))
         if self.updates:
@@ -98,11 +110,19 @@ class Plan:
     def _choices(self) -> list[tuple[str, str]]:
         exact = exact_model(self.trace)
         kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
-        choices: dict[str, tuple[Any, str]] = {"sample": choose_sampler(kind, self.updates)}
+        choices: dict[str, tuple[Any, str]] = {
+            "sample": choose_sampler(
+                kind, self.updates, self._numbers(), why_stuck(self.trace, self.rows)
+            )
+        }
         if self.trace.parameters:
             choices["maximize"] = choose_maximiser(kind, self.trace)
         choices["smooth"] = choose_smoother(kind)
         return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
+
+    def _numbers(self) -> int:
+        """How many numbers the parameters have on the unconstrained scale."""
+        return sum(len(p.free) for p in transforms(self.trace))
 
     def _interweaved(self) -> list[tuple[str, str]]:
         exact = exact_model(self.trace)
@@ -208,11 +228,12 @@ def explain(model: Model, data: Any = None) -> Plan:
     ModelError, DataError : what is wrong, where, and the fix.
     """
     traced = trace(model)
-    missing, bound = Missing(none=True), ""
+    missing, bound, rows = Missing(none=True), "", None
     if data is not None:
         experiments = bind(traced, data)
         missing = missing_of(experiments)
         gaps = sum(int((e.seen == 0).sum()) for e in experiments)
+        rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
     program = compile_trace(traced, missing)
@@ -226,6 +247,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         deterministic_memory(traced),
         noises(traced, missing),
         bound,
+        rows,
     )
 
 

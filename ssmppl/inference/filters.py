@@ -44,6 +44,7 @@ def particle_filter(
     proposal: str = "auto",
     resampling: str = "systematic",
     ess_threshold: float = 1.0,
+    rescue: int = 0,
     quantiles: tuple[float, ...] = LEVELS,
     seed: int | None = None,
     executor: Executor | None = None,
@@ -72,7 +73,8 @@ def particle_filter(
 
     Raises
     ------
-    SamplingError : all weights vanish at some step; names the step, the row and the parameters.
+    SamplingError : all weights vanish at some step, with `rescue` those of all that were drawn;
+        names the step, the row and the parameters.
     """
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
@@ -80,7 +82,7 @@ def particle_filter(
     if proposal == "auto":
         proposal = choose(problem, theta, exact=False, integrate=True).name
     settings = settle(
-        problem, theta, particles, proposal, resampling, ess_threshold, integrate=True
+        problem, theta, particles, proposal, resampling, ess_threshold, rescue, integrate=True
     )
     if settings.proposal in EXACT:
         instead = "kalman_filter" if settings.proposal == "kalman" else "forward_filter"
@@ -95,7 +97,8 @@ def particle_filter(
     runs = run_tasks(task, list(range(repeats)), executor=executor)
     attrs = {
         "model": problem.trace.name, "particles": particles, "proposal": settings.proposal,
-        "resampling": resampling, "ess_threshold": ess_threshold, "seed": str(root.entropy),
+        "resampling": "multinomial" if rescue else resampling, "ess_threshold": ess_threshold,
+        "rescue": rescue, "seed": str(root.entropy),
     }  # fmt: skip
     datasets = [
         filter_dataset(problem, e, [run[i] for run in runs], levels, attrs, root)

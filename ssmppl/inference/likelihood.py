@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact.hidden_markov import hidden_markov
@@ -38,6 +40,7 @@ def log_likelihood(
     proposal: str = "auto",
     resampling: str = "systematic",
     ess_threshold: float = 1.0,
+    rescue: int = 0,
     seed: int | None = None,
     executor: Executor | None = None,
 ) -> np.ndarray:
@@ -49,16 +52,28 @@ def log_likelihood(
     parameters : value of each parameter of the model, {} where it has none.
     particles : number N of particles.
     repeats : number of independent estimates.
-    proposal : "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted", or "user"
-        where the model has a @proposal. "auto" is exact on linear Gaussian models and on those of
-        finitely many states (the forward algorithm), else the proposal with the least variance for
-        its cost in a pilot; "twisted", which looks ahead to the end of the data, is tried where the
-        others tell log Z to no better than 3 at 100 particles. "marginal", "marginal_guided" and
-        "marginal_auxiliary" are Rao-Blackwellised: states that are linear and Gaussian given the
-        others are integrated out by a Kalman filter per particle (Schön, Gustafsson and Nordlund
-        2005), and the others move by the transition or the two better proposals; "auto" tries them.
+    proposal : "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted",
+        "tempered", or "user" where the model has a @proposal. "auto" is exact on linear Gaussian
+        models and on those of finitely many states (the forward algorithm), else the proposal with
+        the least variance for its cost in a pilot; "twisted", which looks ahead to the end of the
+        data, is tried where the others tell log Z to no better than 1.2 at 100 particles.
+        "marginal", "marginal_guided" and "marginal_auxiliary" are Rao-Blackwellised: states that
+        are linear and Gaussian given the others are integrated out by a Kalman filter per particle
+        (Schön, Gustafsson and Nordlund 2005), and the others move by the transition or the two
+        better proposals; "auto" tries them.
+        "tempered" takes a sharp likelihood in by degrees: at each row particles are weighed by
+        rising powers of the observation's density, resampled, and moved by Metropolis steps between
+        them (Herbst and Schorfheide 2019), for continuous states of any law and observations that
+        no derivative is known of; a pilot of its own random numbers fixes powers and steps for each
+        estimate. It costs tens of times what "bootstrap" does, and "auto" tries it where no
+        guided proposal is derived and others tell log Z to no better than 1.2.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
+    rescue : where all N particles have weight zero, go on drawing, up to `rescue` times N at a row,
+        as the alive particle filter (Del Moral, Jasra, Lee, Yau and Zhang 2015): at every row until
+        N + 1 have a positive weight, the last of which is left out. 0: no. The estimate stays
+        unbiased, whatever the limit; -inf where none is alive at the limit. With it ancestors are
+        drawn independently at every row. Exact likelihoods need none.
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.
     executor : any `concurrent.futures.Executor`; None: threads.
 
@@ -76,8 +91,9 @@ def log_likelihood(
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
     settings = settle(
-        problem, theta, particles, proposal, resampling, ess_threshold, whole=True, integrate=True
-    )
+        problem, theta, particles, proposal, resampling, ess_threshold, rescue, whole=True,
+        integrate=True,
+    )  # fmt: skip
     if settings.proposal in EXACT:
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
@@ -94,6 +110,7 @@ def settle(
     proposal: str,
     resampling: str = "systematic",
     ess_threshold: float = 1.0,
+    rescue: int = 0,
     *,
     whole: bool = False,
     integrate: bool = False,
@@ -102,10 +119,12 @@ def settle(
 
     whole, integrate : as in `choose`.
     """
-    settings = filter_settings(particles, proposal, resampling, ess_threshold)
+    settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
     if proposal == "auto":
-        chosen = choose(problem, theta, whole=whole, integrate=integrate).name
-        return filter_settings(particles, chosen, resampling, ess_threshold)
+        fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
+        flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
+        chosen = choose(problem, theta, **flags).name
+        return replace(settings, proposal=chosen)
     if proposal in EXACT:
         found = exact_model(problem.trace)
         if isinstance(found, NotApplicable) or filter_of(found) != proposal:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ssmppl.analysis.smooth import smooth_filter_applies
+from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.methods import (
     PGAS,
+    PMMH,
     DirectOptimization,
     FFBSi,
     ForwardBackward,
@@ -17,34 +19,54 @@ from ssmppl.inference.methods import (
     MetropolisHastings,
     ScoreAscent,
 )
+from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Trace
 
+ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
 FEW = 6  # numbers that a random walk moves at once without trouble
 
 
 def choose_sampler(
-    kind: str | NotApplicable, updates: Sequence[Update]
-) -> tuple[MetropolisHastings | Gibbs | PGAS, str]:
+    kind: str | NotApplicable, updates: Sequence[Update], numbers: int, stuck: str = ""
+) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
 
     kind : "linear Gaussian" or "of finitely many states", whose states are drawn exactly, or why it
-    is neither. Gibbs then needs no tuning where every
-    parameter has a closed-form conditional; where some have none, slices given the states mix
-    slowly and cost a pass over the data each, and a random walk on the exact likelihood, which
-    integrates the states out, is better as long as the parameters are few.
+    is neither. Gibbs then needs no tuning where every parameter has a closed-form conditional;
+    those that mix slowly given the states are moved with them integrated out besides. Where some
+    have none, slices given the states mix slowly and cost a pass over the data each, and a random
+    walk on the exact likelihood, which integrates the states out, is better as long as the
+    parameters are few.
+    updates : where the states are drawn exactly. numbers : of the free parameters. stuck : as of
+    `why_stuck`, for the others.
     """
     if isinstance(kind, NotApplicable):
-        return PGAS(), "the model is not linear Gaussian: trajectories by conditional SMC"
+        if not stuck:
+            return PGAS(), "the model is not linear Gaussian: trajectories by conditional SMC"
+        if numbers <= FEW:
+            return PMMH(), f"{stuck}: a random walk on the particle filter's likelihood"
+        return PGAS(), (
+            f"{stuck}, but {numbers} numbers are too many for a random walk: conditional SMC "
+            "without ancestor sampling; see the attribute trajectory_update_rate, and take more "
+            "particles where it is low"
+        )
     open_ = [c for u in updates if u.conditional is None for c in u.block]
     if not open_:
-        return Gibbs(), (
+        if not updates:
+            return Gibbs(), (
+                f"{kind}, without free parameters: exact trajectories by backward sampling"
+            )
+        reason = (
             f"{kind}, and every parameter has a closed-form conditional: exact trajectories by "
             "backward sampling"
-            if updates
-            else f"{kind}, without free parameters: exact trajectories by backward sampling"
+        )
+        if kind != "linear Gaussian":
+            return Gibbs(), reason
+        return Gibbs(interweave="auto"), (
+            f"{reason}; parameters that the warmup finds slow given the states are moved with the "
+            "states integrated out too"
         )
     named = ", ".join(dict.fromkeys(open_))
-    numbers = sum(len(u.components) for u in updates)
     if numbers <= FEW:
         return MetropolisHastings(), (
             f"{kind}, but {named} has no closed-form conditional: a random walk on the "
@@ -54,6 +76,33 @@ def choose_sampler(
         f"{kind}, with {numbers} numbers to move, too many for a random walk: exact "
         f"trajectories, and slices for {named}"
     )
+
+
+def why_stuck(trace: Trace, rows: int | None) -> str:
+    """Why PGAS cannot be relied on to move the trajectories of a model; empty where it can.
+
+    Where a deterministic component never forgets its past, no ancestor can be sampled for the
+    reference trajectory, and its early states change the less the more rows there are for each
+    particle (Lindsten, Jordan and Schön 2014; Lindsten, Bunch, Singh and Schön 2015). PMMH draws
+    all of the trajectory anew. Given a trajectory of counts, parameters can move only little,
+    however well it moves itself.
+
+    rows : of the longest data set; None: not known.
+    """
+    if deterministic_memory(trace) is not None:
+        return ""
+    random = [
+        s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
+    ]
+    reason = (
+        "a deterministic component never forgets its past, so that PGAS cannot join a trajectory "
+        "to other ancestors"
+    )
+    if all(d.support().kind == "integers" for d in random):
+        return f"{reason}, and given a trajectory of counts parameters move slowly"
+    if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
+        return f"{reason}, and over more than {ROWS_WITHOUT_ANCESTORS} rows hardly moves its start"
+    return ""
 
 
 def choose_maximiser(

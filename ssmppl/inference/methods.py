@@ -78,6 +78,9 @@ class PMMH:
         particles are sorted before they are resampled, so that successive estimates of log Z err
         alike and fewer particles do. 0: fresh random numbers. Only for models whose particles are
         drawn from normals and uniforms; not with orders 1 and 2.
+    rescue : of the particle filter, as in `log_likelihood`: how many times N particles a row may
+        take where weights vanish; 0: N, and the parameters are refused. Not with orders 1 and 2
+        nor `correlation`.
     """
 
     particles: int | None = None
@@ -91,6 +94,7 @@ class PMMH:
     order: int = 0
     lag: int = 12
     correlation: float = 0.0
+    rescue: int = 0
 
 
 @dataclass(frozen=True)
@@ -342,7 +346,7 @@ class FFBSi:
         2013), where the transition density has a bound; "mcmc" (Bunch and Godsill 2013);
         "genealogy", the filter's own ancestors, which all meet in one soon; "auto".
     moves : Metropolis-Hastings steps for each index of "mcmc".
-    proposal, resampling, ess_threshold : of the particle filter, as in `log_likelihood`.
+    proposal, resampling, ess_threshold, rescue : of the particle filter, as in `log_likelihood`.
     """
 
     kernel: str = "auto"
@@ -350,6 +354,7 @@ class FFBSi:
     proposal: str = "auto"
     resampling: str = "systematic"
     ess_threshold: float = 1.0
+    rescue: int = 0
 
 
 @dataclass(frozen=True)

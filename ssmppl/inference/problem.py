@@ -38,9 +38,10 @@ class Problem:
         """
         found = self.program.proposal(name)
         if found is None:
+            known = ["auto", "kalman", *self.program.proposals, *MARGINAL, "tempered"]
             raise ArgumentError(
                 f"proposal={name!r} is not known for this model",
-                fix=f"use one of: {listing(name, ['auto', 'kalman', *self.program.proposals])}",
+                fix=f"use one of: {listing(name, known)}",
             )
         if isinstance(found, NotApplicable):
             fix = 'use proposal="auto" or "bootstrap"'

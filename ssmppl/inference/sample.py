@@ -14,15 +14,17 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.update_rates import told
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.labels import Labels
-from ssmppl.inference.method_choice import choose_sampler
+from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import ChainDraws, run_chains, stack
 from ssmppl.language.model import Model
+from ssmppl.language.transforms import transforms
 from ssmppl.results import to_inference_data
 
 PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
@@ -57,9 +59,11 @@ def sample(
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
         of finitely many states, `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
-        None: for the former Gibbs if every parameter has a closed-form conditional, else a random
-        walk on the exact likelihood while the parameters are few; for the others PGAS. `explain`
-        and the attributes say which, and why.
+        None: for the former Gibbs if every parameter has a closed-form conditional (with
+        `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
+        while the parameters are few; for the others PGAS, or PMMH where no ancestors can be
+        sampled, the data are long or the states counts, and the parameters are few. `explain` and
+        the attributes say which, and why.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
@@ -130,14 +134,18 @@ def sample(
         "interrupted": any(c.interrupted for c in result),
         "seconds": time.perf_counter() - began,
     }  # fmt: skip
+    if isinstance(chosen, PGAS):
+        attrs |= told(problem, result)
     return _to_arviz(problem, result, held, states, attrs)
 
 
 def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
     exact = exact_model(problem.trace)
+    numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
+    stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
     if isinstance(exact, NotApplicable):
-        return choose_sampler(exact, ())
-    return choose_sampler(kind_of(exact), plan_updates(problem, held))
+        return choose_sampler(exact, (), numbers, stuck)
+    return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers)
 
 
 def _to_arviz(

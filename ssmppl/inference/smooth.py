@@ -248,7 +248,7 @@ def _filter(call: _Call, method: FFBSi | FixedLag, integrate: bool = False) -> F
     n = PARTICLES if call.particles is None else call.particles
     return settle(
         call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
-        integrate=integrate,
+        method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
     )  # fmt: skip
 
 

@@ -170,6 +170,7 @@ def test_choice_by_structure_is_told():
     idata = ssm.sample(chosen, {"y": np.array([0.3, 0.1, -0.2])}, **SHORT)
     assert idata["posterior"].attrs["method"] == "Gibbs"
     assert "closed-form" in idata["posterior"].attrs["method_reason"]
+    assert "'interweave': 'auto'" in str(idata["posterior"].attrs["settings"]).replace('"', "'")
 
     model = ssm.Model("no closed form")
     model.initial(chosen_initial)

@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ssmppl.codegen.kernels.random import fill_normal
+from ssmppl.codegen.kernels.conditional_smc import ancestral_path, draw_index
+from ssmppl.codegen.kernels.random import fill_normal, uniform
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
 from ssmppl.codegen.metropolis import (
     NumberedFilter,
@@ -17,7 +18,7 @@ from ssmppl.codegen.metropolis import (
 )
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.walk import Point, Run
-from ssmppl.inference.particles.filtering import FilterSettings, failure
+from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.particles.marginal import draw_given
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
@@ -31,6 +32,8 @@ class ParticleLikelihood:
     settings: FilterSettings
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+        if self.settings.rescue:
+            return self._rescued(theta, stream)
         entry = self.problem.program.entry(f"filtered_path_{self.settings.proposal}")
         carried = len(self.problem.program.carried(self.settings.proposal))
         total, paths, increments = 0.0, [], []
@@ -45,6 +48,31 @@ class ParticleLikelihood:
             if status != OK:
                 raise failure(self.problem, theta, status, t, e)
             total += log_z
+            paths.append(path)
+            increments.append(increment)
+        return Run(total, tuple(paths), tuple(increments))
+
+    def _rescued(self, theta: np.ndarray, stream: np.ndarray) -> Run | None:
+        """By the alive particle filter; Del Moral et al. (2015), section 4, on its use here."""
+        carried = len(self.problem.program.carried(self.settings.proposal))
+        total, paths, increments, n = 0.0, [], [], self.settings.particles
+        for e in self.problem.experiments:
+            path, increment, ess = (
+                np.empty((e.steps, carried)),
+                np.empty(e.steps),
+                np.empty(e.steps),
+            )
+            particles, weights = np.empty((e.steps, carried, n)), np.empty((e.steps, n))
+            kept = particles, weights, np.zeros((e.steps, n), dtype=np.int32)
+            status, t = run_filter(
+                self.problem, theta, self.settings, e, stream, increment, ess, kept=kept
+            )
+            if status == ALL_ZERO:
+                return None
+            if status != OK:
+                raise failure(self.problem, theta, status, t, e)
+            ancestral_path(particles, kept[2], draw_index(weights[-1], uniform(stream)), path)
+            total += float(increment.sum())
             paths.append(path)
             increments.append(increment)
         return Run(total, tuple(paths), tuple(increments))

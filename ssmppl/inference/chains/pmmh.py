@@ -34,7 +34,12 @@ from ssmppl.inference.chains.walk import (
     start_chain,
 )
 from ssmppl.inference.methods import PMMH, MetropolisHastings
-from ssmppl.inference.particles.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.particles.filtering import (
+    FilterSettings,
+    check_count,
+    check_rescue,
+    random_state,
+)
 from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.pilot import (
     SCALE_REPEATS,
@@ -66,19 +71,22 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     where = coordinates(space, method.scale, method.transform)
     if method.covariance is not None:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
-    pilot = find_mode(space, setup.root)
+    pilot = find_mode(space, setup.root, rescue=method.rescue)
     theta, _ = space.parameters(pilot.z)
     plain = method.order == 0 and not method.correlation  # others know no guide
     choice = None
     if method.proposal == "auto":
-        choice = choose(problem, theta, exact=False, whole=plain, integrate=plain)
+        temper = plain and not method.rescue
+        choice = choose(
+            problem, theta, exact=False, whole=plain, integrate=plain, temper=temper
+        )  # fmt: skip
     proposal = choice.name if choice else method.proposal
     problem.proposal(proposal, integrate=plain)
     particles, tuned = method.particles, None
     if particles is None:
         tuned = _tuned(setup, method, theta, proposal)
         particles = tuned.particles
-    settings = FilterSettings(int(particles), proposal)
+    settings = FilterSettings(int(particles), proposal, rescue=int(method.rescue))
     d = len(where)
     factor = walk_factor(setup, method, where, pilot, "bootstrap")
     tuning: Any = factor
@@ -95,7 +103,8 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
         setup.warmup if adapts(method) else 0, method.target_acceptance or usual, setup.thin,
     )  # fmt: skip
     states = []
-    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
+    starts = dispersed(space, pilot, setup.chains, setup.root, "bootstrap", method.rescue)
+    for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         states.append(start_chain(kernel, where.at(z), tuning, generator, stream))
     report = {
@@ -124,6 +133,17 @@ def check_settings(method: PMMH) -> None:
         raise ArgumentError(
             f"correlation={method.correlation!r}",
             fix="give a number from 0 (fresh random numbers) to below 1, as 0.99",
+        )
+    check_rescue(method.rescue)
+    if method.rescue and (method.order or method.correlation):
+        raise ArgumentError(
+            f"rescue={method.rescue} together with order={method.order}, correlation="
+            f"{method.correlation}: the filters of these draw a fixed number of particles",
+            fix="use ssm.PMMH(rescue=...) with order=0 and correlation=0.0",
+        )
+    if method.rescue and method.proposal == "tempered":
+        raise ArgumentError(
+            f'rescue={method.rescue} together with proposal="tempered"', fix="use one of them"
         )
     if method.order and method.correlation:
         raise ArgumentError(
@@ -154,7 +174,9 @@ def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelih
 def _tuned(setup: Setup, method: PMMH, theta: np.ndarray, proposal: str) -> Tuning:
     """The number of particles by the spread of log Z, or of the difference of correlated ones."""
     if not method.correlation:
-        return tune_particles(setup.problem, theta, proposal, method.target_sd, setup.root)
+        return tune_particles(
+            setup.problem, theta, proposal, method.target_sd, setup.root, method.rescue
+        )
 
     def spread(particles: int) -> float:
         settings = FilterSettings(particles, proposal)
@@ -186,15 +208,18 @@ def walk_factor(
     """
     if method.covariance is not None:
         return given_factor(method.covariance, len(where))
-    covariance = pilot_covariance(setup, where, pilot, proposal)
+    rescue = method.rescue if isinstance(method, PMMH) else 0
+    covariance = pilot_covariance(setup, where, pilot, proposal, rescue)
     return np.linalg.cholesky(covariance) * STRETCH / np.sqrt(max(len(where), 1))
 
 
-def pilot_covariance(setup: Setup, where: Coordinates, pilot: Pilot, proposal: str) -> np.ndarray:
+def pilot_covariance(
+    setup: Setup, where: Coordinates, pilot: Pilot, proposal: str, rescue: int = 0
+) -> np.ndarray:
     """The inverse information at the pilot's mode, (d, d) in the coordinates."""
     w = where.at(pilot.z)
     repeats = SCALE_REPEATS if len(w) <= 4 else SCALE_REPEATS // 2
-    density = averaged_density(where, setup.root, proposal, repeats)
+    density = averaged_density(where, setup.root, proposal, repeats, rescue)
     rng = np.random.default_rng(np.random.SeedSequence(setup.root.entropy, spawn_key=(8,)))
     return fitted_covariance(density, w, scales(where, pilot), rng)
 

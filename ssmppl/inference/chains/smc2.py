@@ -357,7 +357,7 @@ def _proposal(setup: Setup, method: SMC2) -> str:
     if name == "auto":
         name = choose(setup.problem, setup.space.theta, exact=False).name
         name = {"auxiliary": "guided", "twisted": "bootstrap"}.get(name, name)
-    if setup.problem.proposal(name).look_ahead is not None or name == "twisted":
+    if setup.problem.proposal(name).look_ahead is not None or name in ("twisted", "tempered"):
         raise ArgumentError(
             f"proposal={name!r} looks ahead, which the filters of SMC2 do not",
             fix='use "auto", "bootstrap" or "guided"',

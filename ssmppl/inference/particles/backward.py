@@ -23,11 +23,10 @@ from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
 from ssmppl.codegen.kernels.random import fill_uniform
-from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure, run_filter
 from ssmppl.inference.problem import Problem
 
 __all__ = [
@@ -82,11 +81,10 @@ def particle_system(
         np.empty((steps, len(problem.program.carried(settings.proposal)), n)), np.empty((steps, n)),
         np.zeros((steps, n), dtype=np.int32), np.empty(steps), np.empty(steps),
     )  # fmt: skip
-    scheme = None if settings.scheme == SYSTEMATIC else settings.scheme
-    status, t = problem.program.entry(f"filter_{settings.proposal}")(
-        theta, experiment.y, experiment.seen, experiment.u, n, scheme, settings.ess_threshold,
-        stream, out.log_increments, out.ess, None, (out.particles, out.weights, out.ancestors),
-    )  # fmt: skip
+    kept = out.particles, out.weights, out.ancestors
+    status, t = run_filter(
+        problem, theta, settings, experiment, stream, out.log_increments, out.ess, kept=kept
+    )
     if status != OK:
         raise failure(problem, theta, status, t, experiment)
     return out

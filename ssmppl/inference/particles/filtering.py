@@ -33,16 +33,19 @@ class FilterSettings:
 
     particles : N. proposal : name of a derived proposal. scheme : code of the resampling scheme.
     ess_threshold : resample when the effective sample size is below this share of N; 1: always.
+    rescue : how many times N particles a row may take until N + 1 have a positive weight, by the
+        alive particle filter; 0: N, whatever they weigh.
     """
 
     particles: int
     proposal: str
     scheme: int = SYSTEMATIC
     ess_threshold: float = 1.0
+    rescue: int = 0
 
 
 def filter_settings(
-    particles: Any, proposal: str, resampling: str, ess_threshold: float
+    particles: Any, proposal: str, resampling: str, ess_threshold: float, rescue: Any = 0
 ) -> FilterSettings:
     """The settings of a call, checked.
 
@@ -61,7 +64,33 @@ def filter_settings(
             f"ess_threshold={ess_threshold!r} is no share of the particles",
             fix="give a number from 0 (never resample) to 1 (always)",
         )
-    return FilterSettings(int(particles), proposal, SCHEMES[resampling], float(ess_threshold))
+    check_rescue(rescue)
+    if rescue and (resampling not in ("systematic", "multinomial") or ess_threshold < 1.0):
+        raise ArgumentError(
+            f"rescue={rescue} together with resampling={resampling!r}, ess_threshold="
+            f"{ess_threshold}: the alive particle filter draws an ancestor for each particle by "
+            "itself, at every row",
+            fix="leave resampling= and ess_threshold= out",
+        )
+    if proposal == "tempered" and (rescue or resampling != "systematic" or ess_threshold < 1.0):
+        raise ArgumentError(
+            f"proposal='tempered' together with resampling={resampling!r}, ess_threshold="
+            f"{ess_threshold}, rescue={rescue}: it resamples systematically at every temperature",
+            fix="leave the others out",
+        )
+    return FilterSettings(
+        int(particles), proposal, SCHEMES[resampling], float(ess_threshold), int(rescue)
+    )
+
+
+def check_rescue(rescue: Any) -> None:
+    """Refuse what is neither 0 nor a whole number that leaves room for more particles."""
+    check_count("rescue", rescue, 0)
+    if rescue == 1:
+        raise ArgumentError(
+            "rescue=1 allows a row the N particles that it has anyway",
+            fix="give how many times N particles a row may take, as rescue=100; 0: no rescue",
+        )
 
 
 def check_count(name: str, value: Any, least: int) -> None:
@@ -86,6 +115,28 @@ def random_state(root: np.random.SeedSequence, *path: int) -> np.ndarray:
     return new_state(np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *path)))
 
 
+Arrays = tuple[np.ndarray, ...]
+
+
+def run_filter(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, experiment: Experiment,
+    rng: np.ndarray, log_increments: np.ndarray, ess: np.ndarray, moments: Arrays | None = None,
+    kept: Arrays | None = None,
+) -> tuple[int, int]:  # fmt: skip
+    """Run the filter over one experiment; (status, t), t the step at which it stopped.
+
+    log_increments, ess : (T,), written. moments, kept : as of the kernel `particle_filter`.
+    """
+    data = theta, experiment.y, experiment.seen, experiment.u, settings.particles
+    out = log_increments, ess, moments, kept
+    if settings.rescue:
+        alive = problem.program.entry(f"alive_filter_{settings.proposal}")
+        return alive(*data, settings.rescue * settings.particles, rng, *out)
+    scheme = None if settings.scheme == SYSTEMATIC and moments is None else settings.scheme
+    run = problem.program.entry(f"filter_{settings.proposal}")
+    return run(*data, scheme, settings.ess_threshold, rng, *out)
+
+
 def log_likelihood_estimate(
     problem: Problem, theta: np.ndarray, settings: FilterSettings, rng: np.ndarray
 ) -> float:
@@ -95,15 +146,10 @@ def log_likelihood_estimate(
     ------
     SamplingError : the weights are NaN or infinite for some particles only.
     """
-    run = problem.program.entry(f"filter_{settings.proposal}")
-    scheme = None if settings.scheme == SYSTEMATIC else settings.scheme
     total = 0.0
     for experiment in problem.experiments:
         increments, ess = np.empty(experiment.steps), np.empty(experiment.steps)
-        status, t = run(
-            theta, experiment.y, experiment.seen, experiment.u, settings.particles,
-            scheme, settings.ess_threshold, rng, increments, ess, None,
-        )  # fmt: skip
+        status, t = run_filter(problem, theta, settings, experiment, rng, increments, ess)
         if status == ALL_ZERO:
             return -np.inf
         if status != OK:
@@ -174,11 +220,10 @@ def full_run(
         np.empty(steps), np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)),
         np.empty((steps, p, d)), np.empty((steps, 4, k)),
     )  # fmt: skip
-    status, t = problem.program.entry(f"filter_{settings.proposal}")(
-        theta, experiment.y, experiment.seen, experiment.u, settings.particles, settings.scheme,
-        settings.ess_threshold, rng, out.log_increments, out.ess,
-        (probabilities, out.mean, out.covariance, out.quantiles, out.prediction),
-    )  # fmt: skip
+    moments = probabilities, out.mean, out.covariance, out.quantiles, out.prediction
+    status, t = run_filter(
+        problem, theta, settings, experiment, rng, out.log_increments, out.ess, moments
+    )
     if status != OK:
         raise failure(problem, theta, status, t, experiment)
     return out
@@ -208,7 +253,8 @@ def failure(
     where: Location = site.distribution.location
     fix = {
         ALL_ZERO: "no particle can have produced this row under these parameters: check the row "
-        "for an outlier, give the observation heavier tails, or use more particles",
+        "for an outlier, give the observation heavier tails, use more particles, or draw until "
+        "some survive (rescue=100; of log_likelihood, particle_filter, FFBSi and PMMH)",
     }.get(status, "some parameter, state or input leads outside the domain of an operation")
     return SamplingError(
         f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "

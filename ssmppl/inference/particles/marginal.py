@@ -23,7 +23,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact import kalman_matrices
 from ssmppl.inference.exact.kalman_moments import Stopped, drawn
-from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, failure
+from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, failure, run_filter
 from ssmppl.inference.problem import Problem
 from ssmppl.language.trace import previous, seen
 
@@ -88,11 +88,10 @@ def marginal_run(
     increments, ess = np.empty(steps), np.empty(steps)
     prediction = np.empty((steps, 4, k))
     moments = nothing, np.empty((steps, d)), np.empty((steps, d, d)), np.empty((steps, 0, d))
-    status, t = problem.program.entry(f"filter_{settings.proposal}")(
-        theta, experiment.y, experiment.seen, experiment.u, n, settings.scheme,
-        settings.ess_threshold, rng, increments, ess, (*moments, prediction),
-        (particles, weights, np.zeros((steps, n), dtype=np.int32)),
-    )  # fmt: skip
+    kept = particles, weights, np.zeros((steps, n), dtype=np.int32)
+    status, t = run_filter(
+        problem, theta, settings, experiment, rng, increments, ess, (*moments, prediction), kept
+    )
     if status != OK:
         raise failure(problem, theta, status, t, experiment)
     size, p = len(problem.trace.state_symbols), len(probabilities)

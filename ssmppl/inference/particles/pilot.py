@@ -125,17 +125,21 @@ class Pilot:
     log_density: float
 
 
-def find_mode(space: Space, seed: np.random.SeedSequence, proposal: str = "bootstrap") -> Pilot:
+def find_mode(
+    space: Space, seed: np.random.SeedSequence, proposal: str = "bootstrap", rescue: int = 0
+) -> Pilot:
     """Climb the estimated log posterior from the space's own point, and measure its scale there.
+
+    rescue : of the filters, as in `FilterSettings`; here and in what follows.
 
     Raises
     ------
     ArgumentError : the likelihood is zero at every point that was tried.
     """
-    best, value = climb_to_mode(space, seed, pilot_likelihood(space.problem, proposal))
+    best, value = climb_to_mode(space, seed, pilot_likelihood(space.problem, proposal, rescue))
     if not len(best):
         return Pilot(best, best, value)
-    averaged = averaged_density(space, seed, proposal, SCALE_REPEATS)
+    averaged = averaged_density(space, seed, proposal, SCALE_REPEATS, rescue)
     return Pilot(best, scale_of(best, averaged), value)
 
 
@@ -177,7 +181,7 @@ def climb_to_mode(
 
 
 def pilot_likelihood(
-    problem: Problem, proposal: str
+    problem: Problem, proposal: str, rescue: int = 0
 ) -> Callable[[np.ndarray, np.random.SeedSequence], float]:
     """(theta, seed) -> log p(y | theta): exact for those of `EXACT`, else a particle filter's
     estimate.
@@ -186,7 +190,7 @@ def pilot_likelihood(
     """
     if proposal in EXACT:
         return lambda theta, _: exact_log_likelihood(problem.trace, problem.experiments, theta)
-    settings = FilterSettings(PILOT_PARTICLES, proposal)
+    settings = FilterSettings(PILOT_PARTICLES, proposal, rescue=rescue)
 
     def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
         try:
@@ -198,13 +202,13 @@ def pilot_likelihood(
 
 
 def averaged_density(
-    space: Region, seed: np.random.SeedSequence, proposal: str, repeats: int
+    space: Region, seed: np.random.SeedSequence, proposal: str, repeats: int, rescue: int = 0
 ) -> Callable[[np.ndarray], float]:
     """The log posterior as a function of the coordinates, from the mean of several estimates of the
     likelihood with common random numbers (exact for `EXACT`)."""
     problem = space.problem
     exact = pilot_likelihood(problem, proposal) if proposal in EXACT else None
-    settings = FilterSettings(PILOT_PARTICLES, proposal)
+    settings = FilterSettings(PILOT_PARTICLES, proposal, rescue=rescue)
 
     def averaged(v: np.ndarray) -> float:
         theta, log_prior = space.parameters(v)
@@ -259,10 +263,11 @@ def scale_of(z: np.ndarray, log_density: Callable[[np.ndarray], float]) -> np.nd
 
 
 def dispersed(
-    space: Space, pilot: Pilot, chains: int, seed: np.random.SeedSequence, proposal: str
-) -> list[np.ndarray]:
+    space: Space, pilot: Pilot, chains: int, seed: np.random.SeedSequence, proposal: str,
+    rescue: int = 0,
+) -> list[np.ndarray]:  # fmt: skip
     """A start for each chain, three scales about the mode, with a finite likelihood."""
-    estimate = pilot_likelihood(space.problem, proposal)
+    estimate = pilot_likelihood(space.problem, proposal, rescue)
     starts = []
     for chain in range(chains):
         child = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 7, chain))
@@ -290,12 +295,13 @@ class Tuning:
 
 
 def tune_particles(
-    problem: Problem, theta: np.ndarray, proposal: str, target: float, seed: np.random.SeedSequence
-) -> Tuning:
+    problem: Problem, theta: np.ndarray, proposal: str, target: float,
+    seed: np.random.SeedSequence, rescue: int = 0,
+) -> Tuning:  # fmt: skip
     """N at which log Z has about the target's standard deviation: var(log Z) falls as 1 / N."""
 
     def spread(particles: int) -> float:
-        settings = FilterSettings(particles, proposal)
+        settings = FilterSettings(particles, proposal, rescue=rescue)
         log_z = repeated_estimates(problem, theta, settings, seed, range(TUNING_REPEATS))
         finite = log_z[np.isfinite(log_z)]
         return float(np.std(finite, ddof=1)) if len(finite) > 0.9 * TUNING_REPEATS else np.inf

@@ -50,7 +50,9 @@ NORMAL, UNIFORM = 1.5, 0.6
 LOOPED = 0.4  # a multiplication in a loop over matrices
 LOOK_AHEAD = 4.0  # one more normalisation and the second-stage weights
 PILOT_PARTICLES, PILOT_REPEATS, PILOT_STEPS = 100, 24, 400
-ENOUGH = 1.2  # sd of log Z up to which the twisted proposal is not tried; what PMMH asks for
+ENOUGH = 1.2  # sd of log Z up to which the last resorts are not tried; what PMMH asks for
+TEMPERING = 50.0  # cost of the tempered filter, in that of the bootstrap filter that it begins with
+TEMPERED_REPEATS = 8  # fewer, as it takes longest
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ _choices: dict[tuple, Choice] = {}
 
 def choose(
     problem: Problem, theta: np.ndarray, exact: bool = True, *, whole: bool = False,
-    integrate: bool = False,
+    integrate: bool = False, temper: bool = False,
 ) -> Choice:  # fmt: skip
     """The exact filter where there is one, the user's proposal where there is one, else the
     winner of a pilot at theta; remembered for each program and data.
@@ -108,6 +110,8 @@ def choose(
     the twisted proposal may be chosen; few of its particles tell what was known at a single row.
     integrate : whether states that are linear given the others may be integrated out; the
     particles are then of the others.
+    temper : whether the tempered filter may be chosen, where no better proposal than the transition
+        is derived.
     """
     found = exact_model(problem.trace)
     if exact and not isinstance(found, NotApplicable):
@@ -118,17 +122,20 @@ def choose(
         n: p for n, p in problem.program.proposals.items() if not isinstance(p, NotApplicable)
     }
     twisted = {n: candidates.pop(n) for n in ("twisted",) if n in candidates}
-    twisted = twisted if whole else {}
+    last = twisted if whole else {}
+    if temper and "guided" not in candidates:
+        tempered = problem.program.proposal("tempered")
+        last |= {"tempered": tempered} if isinstance(tempered, Proposal) else {}
     found_marginal = problem.program.marginal if integrate else None
     if isinstance(found_marginal, MarginalFilter):
         candidates |= {
             n: p for n, p in found_marginal.proposals.items() if not isinstance(p, NotApplicable)
         }
-    if len(candidates) == 1 and not twisted:
+    if len(candidates) == 1 and not last:
         return Choice("bootstrap", {})
-    key = (problem.program.path, _digest(problem), theta.tobytes(), whole, integrate)
+    key = (problem.program.path, _digest(problem), theta.tobytes(), whole, integrate, temper)
     if key not in _choices:
-        _choices[key] = _pilot(problem, theta, candidates, twisted)
+        _choices[key] = _pilot(problem, theta, candidates, last)
     return _choices[key]
 
 
@@ -164,13 +171,16 @@ def _try(
     for name, proposal in candidates.items():
         settings = FilterSettings(PILOT_PARTICLES, name)
         seed = np.random.SeedSequence(20150)
+        repeats, times = PILOT_REPEATS, 1.0
+        if name == "tempered":
+            repeats, times = TEMPERED_REPEATS, TEMPERING
         try:
-            log_z = repeated_estimates(shortened, theta, settings, seed, range(PILOT_REPEATS))
+            log_z = repeated_estimates(shortened, theta, settings, seed, range(repeats))
         except SamplingError:
             continue
         finite = np.isfinite(log_z)
         sd = float(np.std(log_z[finite], ddof=1)) if finite.mean() > 0.9 else float("inf")
-        figures[name] = (sd, cost(proposal))
+        figures[name] = (sd, times * cost(proposal))
 
 
 def _beginning(problem: Problem) -> Problem:

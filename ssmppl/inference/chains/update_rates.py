@@ -1,0 +1,91 @@
+"""How often the states of a chain change, row by row, and a warning where they hardly do.
+
+Particle Gibbs leaves the right law invariant whatever its update rate, but a row that never changes
+has not been sampled: paths of a conditional particle filter meet in the reference, the earlier the
+row the likelier (Lindsten, Jordan and Schön 2014, section 3). The rate by row is their diagnostic.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.inference.problem import Problem
+from ssmppl.inference.runner import ChainDraws
+from ssmppl.language.distributions import Dirac
+from ssmppl.language.trace import Site
+
+LOW = 0.02  # share of draws at which a row changes, below which there is a warning
+APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
+FEWEST = 50  # draws of a chain from which rates are worth a warning
+
+
+def told(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
+    """What goes to the attributes: the least rate over rows, and the warning, which is also given.
+
+    The rate of a row is the share of successive draws between which some component changed that is
+    not deterministic. A discrete state that the data determine need not change: its rows count
+    where the chains differ besides.
+    """
+    least, stuck = 1.0, []
+    for i in range(len(problem.experiments)):
+        paths = np.stack([c.draws[f"path_{i}"] for c in result])  # (chains, draws, T, D)
+        if paths.shape[1] < 2:
+            return {}
+        free, discrete = random_components(problem, paths.shape[2])
+        rate = np.mean(paths[:, 1:] != paths[:, :-1], axis=(0, 1))  # (T, D)
+        # a continuous one that stands still is never right
+        counted = free & (~discrete | (gelman_rubin(paths) > APART))
+        varied = free & (paths != paths[:1, :1]).any(axis=(0, 1))
+        if (counted | varied).any():
+            least = min(least, float(rate[counted | varied].min()))
+        if paths.shape[1] >= FEWEST:
+            rows = np.flatnonzero((counted & (rate < LOW)).any(axis=1))
+            stuck += [(i, int(rows[0]) + 1, int(rows[-1]) + 1, len(rows))] if len(rows) else []
+    if not stuck:
+        return {"trajectory_update_rate": least}
+    several = len(problem.experiments) > 1
+    where = "; ".join(
+        f"{n} rows from {first} to {last}" + (f" of experiment {i + 1}" if several else "")
+        for i, first, last, n in stuck
+    )
+    text = (
+        f"the trajectory hardly ever changed at {where} (fewer than {LOW:.0%} of the draws): these "
+        "states, and parameters that hang on them, were not sampled. Take more particles, or "
+        "ssm.PMMH()"
+    )
+    warnings.warn(text, stacklevel=3)
+    return {"trajectory_update_rate": least, "trajectory_warning": text}
+
+
+def random_components(problem: Problem, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """(T, D) each: which components have a law of their own, and which of them are discrete."""
+    trace = problem.trace
+    place = {s: k for k, s in enumerate(trace.state_symbols)}
+    free = np.zeros((steps, len(place)), dtype=bool)
+    discrete = np.zeros((steps, len(place)), dtype=bool)
+    roles: list[tuple[slice, Sequence[Site]]] = [
+        (slice(0, 1), list(trace.initial.values())),
+        (slice(1, None), list(trace.transition.values())),
+    ]
+    for rows, sites in roles:
+        for site in sites:
+            columns = [place[s] for s in site.components]
+            free[rows, columns] = not isinstance(site.distribution, Dirac)
+            discrete[rows, columns] = site.distribution.support().kind == "integers"
+    return free, discrete
+
+
+def gelman_rubin(paths: np.ndarray) -> np.ndarray:
+    """R-hat (T, D) of draws (chains, draws, T, D) (Gelman and Rubin 1992); 1 where nothing ever
+    varied, infinite where chains stand still apart, and for one chain 1."""
+    if len(paths) < 2:
+        return np.ones(paths.shape[2:])
+    within = paths.var(axis=1, ddof=1).mean(axis=0)
+    between = paths.mean(axis=1).var(axis=0, ddof=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.sqrt(1.0 + between / within)
+    return np.where(between > 0.0, ratio, 1.0)

@@ -1,0 +1,134 @@
+"""Where ancestors cannot be sampled: the choice of the method, update rates and their warning."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.inference.chains.update_rates import gelman_rubin, random_components, told
+from ssmppl.inference.problem import pose
+from ssmppl.inference.runner import ChainDraws
+from ssmppl.inference.sample import _chosen
+
+
+def town():
+    """Deaths, births and a count of people that never forgets them."""
+    model = ssm.Model("town")
+    model.prior(lambda: {"birth": ssm.Gamma(4, rate=1), "seen": ssm.Beta(20, 5)})
+    model.initial(lambda: {"n": ssm.Dirac(100.0), "born": ssm.Dirac(0.0), "died": ssm.Dirac(0.0)})
+    model.transition(lambda n, born, died, birth: {
+        "n": ssm.Dirac(n + born - died), "born": ssm.Poisson(birth),
+        "died": ssm.Binomial(n + born - died, 0.05),
+    })  # fmt: skip
+    model.observation(lambda n, seen: {"y": ssm.Binomial(n, seen)})
+    return model
+
+
+def integrated(size=1):
+    """A position that integrates a velocity, with so many numbers to be estimated."""
+    model = ssm.Model("integrated")
+    model.prior(lambda: {"q": ssm.Gamma(np.full(size, 2.0), rate=2.0)})
+    model.initial(lambda: {"v": ssm.Normal(0, sd=1), "p": ssm.Dirac(0.0)})
+    model.transition(lambda v, p, q: {
+        "v": ssm.Normal(np.sin(v), sd=np.sum(q)), "p": ssm.Dirac(p + v)
+    })  # fmt: skip
+    model.observation(lambda p: {"y": ssm.Normal(p, sd=0.1)})
+    return model
+
+
+def chosen(model, data=None):
+    plan = " ".join(str(ssm.explain(model, data)).split())
+    return plan[plan.index("unless a method is named") :]
+
+
+def test_pmmh_is_chosen_where_no_ancestor_can_be_sampled_and_parameters_are_few():
+    assert "sample PMMH: a deterministic component never forgets its past" in chosen(town())
+    assert "parameters move slowly" in chosen(town())
+    assert "sample PMMH:" in chosen(integrated())  # of unknown length
+    assert "sample PMMH:" in chosen(integrated(), {"y": np.zeros(101)})
+    assert "more than 100 rows" in chosen(integrated(), [{"y": np.zeros(101)}, {"y": np.zeros(3)}])
+    assert "sample PGAS: the model is not" in chosen(integrated(), {"y": np.zeros(100)})
+    many = chosen(integrated(7))
+    assert "sample PGAS: a deterministic component" in many
+    assert "7 numbers are too many" in many
+    free = ssm.Model("free")
+    free.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    free.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=1)})
+    free.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    assert "sample PGAS: the model is not linear Gaussian" in chosen(free)
+
+
+def test_sample_takes_what_explain_says_and_counts_free_parameters_only():
+    assert isinstance(_chosen(pose(town(), {"y": np.full(4, 80.0)}), {})[0], ssm.PMMH)
+    problem = pose(integrated(7), {"y": np.zeros(150)})
+    assert isinstance(_chosen(problem, {})[0], ssm.PGAS)
+    assert isinstance(_chosen(pose(integrated(), {"y": np.zeros(9)}), {})[0], ssm.PGAS)
+    assert isinstance(_chosen(problem, {"q": np.full(7, 0.2)})[0], ssm.PMMH)
+
+
+@pytest.mark.slow
+def test_pgas_with_few_particles_warns_of_itself():
+    y = ssm.simulate(town(), {"birth": 5.0, "seen": 0.8}, steps=100, seed=1)["y"].values[0]
+    with pytest.warns(UserWarning, match="hardly ever changed"):
+        stuck = ssm.sample(
+            town(), {"y": y}, ssm.PGAS(particles=4), draws=300, warmup=50, chains=2, seed=1,
+            progress=False,
+        )  # fmt: skip
+    assert stuck["posterior"].attrs["trajectory_update_rate"] < 0.02
+
+
+def made_up(paths):
+    """Results of chains with these trajectories (chains, draws, T, D)."""
+    return [ChainDraws({"path_0": p}, {}, {}, None) for p in paths]
+
+
+def stuck_draws(steps, until, columns, rng):
+    """Four chains of which the first rows stand still, apart from each other."""
+    paths = rng.normal(size=(4, 100, steps, columns))
+    paths[:, :, :until] = paths[:, :1, :until]
+    return paths
+
+
+def test_rows_that_stand_still_are_told_with_a_warning():
+    problem = pose(integrated(), {"y": np.zeros(9)})
+    paths = stuck_draws(9, 3, 2, np.random.default_rng(1))
+    paths[:, 0:1, 2, 0] += 1.0  # the third row moves once in 99 times
+    with pytest.warns(UserWarning, match="3 rows from 1 to 3 "):
+        attrs = told(problem, made_up(paths))
+    assert attrs["trajectory_update_rate"] == 0.0
+    assert "ssm.PMMH" in attrs["trajectory_warning"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        free = told(problem, made_up(stuck_draws(9, 0, 2, np.random.default_rng(1))))
+        assert free == {"trajectory_update_rate": 1.0}
+
+
+def test_discrete_states_count_where_chains_differ():
+    problem = pose(town(), {"y": np.full(6, 80.0)})
+    free, discrete = random_components(problem, 6)
+    assert not free[0].any()
+    names = [s.data[1] for s in problem.trace.state_symbols]
+    for k, name in enumerate(names):
+        assert np.all(free[1:, k] == (name != "n"))
+        assert np.all(discrete[1:, k] == (name != "n"))
+    rng = np.random.default_rng(2)
+    paths = rng.poisson(4.0, size=(4, 100, 6, 3)).astype(float)
+    paths[:, :, 1] = 2.0  # the data determine it
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert 0.5 < told(problem, made_up(paths))["trajectory_update_rate"] < 1.0
+    paths[2:, :, 1] = 3.0
+    with pytest.warns(UserWarning, match="1 rows from 2 to 2 "):
+        told(problem, made_up(paths))
+
+
+def test_r_hat_of_still_and_of_moving_chains():
+    rng = np.random.default_rng(3)
+    paths = rng.normal(size=(3, 200, 1, 3))
+    paths[:, :, 0, 1] = 1.0
+    paths[:, :, 0, 2] = np.arange(3)[:, None]
+    found = gelman_rubin(paths)[0]
+    assert 1.0 <= found[0] < 1.05
+    assert found[1] == 1.0
+    assert found[2] == np.inf
