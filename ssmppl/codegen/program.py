@@ -181,6 +181,7 @@ def _write(
         own = {"ahead": ahead, "predict": "predict"}
         out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
         own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
+        own["eliminated"] = "0"
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
     if trace.observations:
