@@ -1,8 +1,8 @@
 """What integrating parameters out of PGAS (`eliminate`) buys: effective draws per second.
 
 As `bench/interweaving.py`, whose figures of a run these are, on the varves and on a made-up AR(2)
-process: the plain chain, the interweaved one, the one without the parameters that can be
-eliminated, and both together, by the number of particles.
+process: the plain chain, the interweaved one, and the one without the parameters that can be
+eliminated, each with 20 particles.
 
     python bench/elimination.py [draws] [seeds] [file.csv] [model ...]
 """
@@ -59,30 +59,30 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "plain": {},
     "interweaved": {"interweave": True},
     "eliminated": {"eliminate": True},
-    "both": {"interweave": True, "eliminate": True},
 }
-RUNS = [(name, 20) for name in SETTINGS] + [("plain", 100), ("eliminated", 100)]
+PARTICLES = 20
 
 
 def main() -> None:
     draws, seeds = (int(v) for v in [*sys.argv[1:3], *[DRAWS, SEEDS][len(sys.argv[1:3]) :]])
     warnings.simplefilter("ignore")
     rows: list[list[str]] = []
-    titles = ["model", "chain", "particles", "seed", "parameter", "ESS", "ms", "ESS/s", "MCSE off"]
+    titles = ["model", "chain", "seed", "parameter", "ESS", "ms", "ESS/s", "MCSE off"]
     for case in sys.argv[4:] or ["varves", "autoregression"]:
         model, data, method = CASES[case]
         for settings in SETTINGS.values():  # compile
-            ssm.sample(model, data, method(particles=20, **settings), draws=2, warmup=2, chains=1,
-                       states=False, progress=False, seed=1)  # fmt: skip
+            own = method(particles=PARTICLES, **settings)
+            ssm.sample(model, data, own, draws=2, warmup=2, chains=1, states=False, progress=False,
+                       seed=1)  # fmt: skip
         for seed in range(1, seeds + 1):
-            for name, particles in RUNS:
-                found = run(case, draws, seed, particles=particles, **SETTINGS[name])
+            for name in SETTINGS:
+                found = run(case, draws, seed, particles=PARTICLES, **SETTINGS[name])
                 for parameter in [n for n, v in found.items() if isinstance(v, dict)]:
-                    own = found[parameter]
-                    off = f"{own['off']:+.1f}" if "off" in own else ""
+                    figures = found[parameter]
+                    off = f"{figures['off']:+.1f}" if "off" in figures else ""
                     rows.append([
-                        case, name, str(particles), str(seed), parameter, f"{own['ess']:.0f}",
-                        f"{found['ms']:.2f}", f"{own['rate']:.1f}", off,
+                        case, name, str(seed), parameter, f"{figures['ess']:.0f}",
+                        f"{found['ms']:.2f}", f"{figures['rate']:.1f}", off,
                     ])  # fmt: skip
                     print(*rows[-1], sep=", ", file=sys.stderr, flush=True)
             if sys.argv[3:]:  # after every seed, so that an interrupt keeps what there is

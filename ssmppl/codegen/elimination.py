@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.elimination import Eliminable, Elimination, eliminate
+from ssmppl.analysis.eliminable import Eliminable
+from ssmppl.analysis.elimination import Elimination, eliminate
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.conditional_smc import conditional_smc
 from ssmppl.codegen.kernels.statistics_by_row import statistics_by_row

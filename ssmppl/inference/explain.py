@@ -11,7 +11,7 @@ from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linea
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.describe import joined
-from ssmppl.analysis.elimination import Eliminable, eliminable
+from ssmppl.analysis.eliminable import Eliminable, eliminable
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.noises import Noises, noises
 from ssmppl.analysis.proposals import Proposal

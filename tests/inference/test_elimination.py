@@ -11,7 +11,8 @@ import pytest
 from scipy import integrate, stats
 
 import ssmppl as ssm
-from ssmppl.analysis.elimination import eliminable, eliminate
+from ssmppl.analysis.eliminable import eliminable
+from ssmppl.analysis.elimination import eliminate
 from ssmppl.analysis.families import Beta, Dirichlet, Gamma, Normal, NormalGamma
 from ssmppl.analysis.normalisers import draw_of, log_normaliser
 from ssmppl.data import bind
@@ -19,11 +20,12 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, symbol, symbols_of, topological
 from ssmppl.inference.chains.elimination import Eliminating, Learned, asked, describe
+from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import pose
 from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import previous, seen
-from tests.statistics.checks import LEVEL, assert_within, seed_of, some
+from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some
 from tests.statistics.checks import deviations as deviations_of
 
 from . import elimination_models as models
@@ -222,6 +224,14 @@ class OldBlock(Eliminating):
         return None
 
 
+class StaleBlock(Eliminating):
+    """A mutant: the block is drawn given the trajectory that was left."""
+
+    def trajectory(self, base, rate, rows, e, theta, path, stream):
+        new, _, own = super().trajectory(base, rate, rows, e, theta, path, stream)
+        return new, rows.total, own
+
+
 class WithoutPrior(Eliminating):
     """A mutant: the sweep forgets the prior."""
 
@@ -247,22 +257,24 @@ def changes(name, kind, draws=2000, sweeps=6, names=None):
         steps = replace(first, problem=problem)
         steps.__dict__["made"] = made
         theta, paths = chain_of(problem, out, i)
-        before = functions(theta, paths, problem.experiments[0].y)
+        before = functions(steps, theta, paths)
         for _ in range(sweeps):
             steps.sweep(learned, theta, paths, stream, rng)
-        rows.append(functions(theta, paths, problem.experiments[0].y) - before)
+        rows.append(functions(steps, theta, paths) - before)
     return np.array(rows)
 
 
-def functions(theta, paths, y):
-    """Of theta, the states, and how they go with each other and with the data."""
-    x = paths[0]
+def functions(steps, theta, paths):
+    """Of theta, the states, and how they go with each other and with the data: above all their
+    log density."""
+    x, y = paths[0], steps.problem.experiments[0].y
     z, size = np.tanh(theta), np.log(1e-2 + np.abs(x))
     told = np.nan_to_num(np.tanh(y)).T @ np.tanh(x)
     step = np.tanh(x[1:] * x[:-1])
     rough = np.log(1e-2 + np.concatenate([np.diff(x, axis=0), x]) ** 2).mean(axis=0)
     both = [np.outer(z, f) for f in (size.mean(axis=0), step.mean(axis=0), size[-1], rough, told)]
-    out = [z, z**2, np.tanh(x), size, told, step, rough, *both]
+    joint = log_joint(steps, theta, paths)
+    out = [joint, z, z**2, np.tanh(x), size, told, step, rough, *both]
     return np.concatenate([np.ravel(f) for f in out])
 
 
@@ -295,6 +307,7 @@ MUTANTS = [
     ("shared", AncestorsBlind),
     ("lags", WithoutPrior),
     ("regimes", OldBlock),
+    ("regimes", StaleBlock),
 ]
 
 
@@ -356,6 +369,45 @@ def test_posterior_of_two_experiments_is_exact():
         sd = np.sqrt(marginal @ (grid - mean) ** 2)
         off = deviations_of(np.log(idata["posterior"][name].values), mean=mean, sd=sd)
         found |= {f"{name} {k}": v for k, v in off.items()}
+    assert_within(found)
+
+
+pair = ssm.Model("pair, to be eliminated")
+pair.prior(lambda: {"a": ssm.Flat((4,)), "r": ssm.HalfFlat()})
+pair.initial(lambda: {"x": ssm.Normal(np.zeros(2), sd=1)})
+
+
+@pair.transition
+def pair_transition(x, a):
+    mean = np.array([a[0] * x[0] + a[1] * x[1], a[2] * x[0] + a[3] * x[1]])
+    return {"x": ssm.MvNormal(mean, covariance=np.array([[0.5, 0.2], [0.2, 0.4]]))}
+
+
+@pair.observation
+def pair_observation(x, r):
+    return {"y": ssm.Normal(x, variance=r)}
+
+
+@pytest.mark.slow
+def test_improper_priors_and_correlated_noise_agree_with_gibbs():
+    """Flat priors, which the base must make up for, and a vector with correlated noise: the same
+    posterior as by exact draws of the states."""
+    truth = {"a": np.array([0.6, 0.2, -0.3, 0.5]), "r": 0.3}
+    data = {"y": ssm.simulate(pair, truth, steps=60, seed=5)["y"].values[0]}
+    without, exact = (
+        ssm.sample(pair, data, method, draws=3000, warmup=200, chains=2, progress=False,
+                   seed=seed_of("elimination", "pair", k))["posterior"]
+        for k, method in enumerate((ssm.PGAS(particles=15, eliminate=True), ssm.Gibbs()))
+    )  # fmt: skip
+    assert without.attrs["eliminated"] == (
+        "a[0], a[1], a[2], a[3] (joint Normal); r (inverse Gamma)"
+    )
+    found = {}
+    for name, k in [("a", 0), ("a", 1), ("a", 2), ("a", 3), ("r", None)]:
+        ours, theirs = (p[name].values[..., k] if name == "a" else p[name].values
+                        for p in (without, exact))  # fmt: skip
+        error = np.hypot(mcse_mean(ours), mcse_mean(theirs))
+        found[f"{name} {k}"] = (ours.mean() - theirs.mean()) / error
     assert_within(found)
 
 

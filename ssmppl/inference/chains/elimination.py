@@ -25,7 +25,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ssmppl.analysis.elimination import Eliminable, Elimination, eliminable
+from ssmppl.analysis.eliminable import Eliminable, eliminable
+from ssmppl.analysis.elimination import Elimination
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.elimination import compile_elimination
 from ssmppl.codegen.kernels.weights import OK

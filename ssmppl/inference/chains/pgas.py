@@ -1,6 +1,7 @@
 """PGAS within Gibbs: trajectories by conditional SMC, parameters by their derived updates.
 
-Lindsten, Jordan and Schön (2014), algorithm 3; Schön et al. (2015), algorithm 7.
+Lindsten, Jordan and Schön (2014), algorithm 3; Schön et al. (2015), algorithm 7. Parameters may be
+integrated out of the first of these (`elimination.py`).
 """
 
 from __future__ import annotations
