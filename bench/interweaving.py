@@ -119,12 +119,12 @@ class OneThread(Executor):
         return seconds
 
 
-def run(case: str, interweave: Any, draws: int, seed: int) -> dict[str, Any]:
-    """One run's figures."""
+def run(case: str, draws: int, seed: int, **settings: Any) -> dict[str, Any]:
+    """One run's figures; settings : of the method."""
     model, data, method = CASES[case]
     clock = OneThread()
     idata = ssm.sample(
-        model, data, method(interweave=interweave), draws=draws, warmup=WARMUP, chains=CHAINS,
+        model, data, method(**settings), draws=draws, warmup=WARMUP, chains=CHAINS,
         states=False, progress=False, seed=seed, executor=clock,
     )  # fmt: skip
     seconds, posterior = clock.after_warmup(), idata["posterior"]
@@ -154,7 +154,7 @@ def main() -> None:
             ssm.sample(model, data, method(interweave=setting), draws=2, warmup=2, chains=1,
                        states=False, progress=False, seed=1)  # fmt: skip
         for seed in range(1, seeds + 1):
-            plain, woven = (run(case, s, draws, seed) for s in (False, "auto"))
+            plain, woven = (run(case, draws, seed, interweave=s) for s in (False, "auto"))
             for name in [n for n, v in woven.items() if isinstance(v, dict)]:
                 a, b = plain[name], woven[name]
                 off = [f"{v['off']:+.1f}" if "off" in v else "" for v in (a, b)]

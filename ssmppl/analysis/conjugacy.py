@@ -34,7 +34,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, to_text
 from ssmppl.language.trace import Trace
 
-__all__ = ["Update", "derive_updates", "draw"]
+__all__ = ["Update", "conjugate_update", "derive_updates", "draw"]
 
 
 def derive_updates(
@@ -71,11 +71,11 @@ def _update(
     search: Search, unit: tuple[Expr, ...], found: Found | NotApplicable, refused: bool
 ) -> Update:
     if isinstance(found, Found):
-        return _conjugate(search, found)
+        return conjugate_update(search, found)
     return _slice(search, unit, found, use_statistics=not refused)
 
 
-def _conjugate(search: Search, found: Found) -> Update:
+def conjugate_update(search: Search, found: Found) -> Update:
     """A finding as an update, explained."""
     form, family = found.form, found.family
     site = search.site(found.components[0])

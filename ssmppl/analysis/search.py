@@ -154,6 +154,11 @@ class Search:
         out += [(u, f) for u, f in self.single.items() if taken.isdisjoint(u)]
         return out
 
+    def joint_normals(self) -> list[Found]:
+        """The blocks of several components that are jointly Normal, whatever scales them."""
+        found = [self._joint_normal(block) for block in self._normal_blocks() if len(block) > 1]
+        return [f for f in found if f is not None]
+
     def _is_normal(self, unit: tuple[Expr, ...]) -> bool:
         found = self.single[unit]
         return isinstance(found, Found) and isinstance(found.family, Normal)

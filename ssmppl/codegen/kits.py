@@ -37,7 +37,8 @@ WEIGH = "theta, c, s, states_prev, fits, states, log_w"
 OBSERVE = "theta, c, s, states, out, normals, uniforms, rng"
 
 
-def _state_targets(layout: Layout, draws: dict[Expr, Expr]) -> list[Target]:
+def state_targets(layout: Layout, draws: dict[Expr, Expr]) -> list[Target]:
+    """States as targets, by their rows."""
     ordered = sorted(draws.items(), key=lambda p: layout.column(p[0]))
     return [Target(f"states[{layout.column(s)}, i]", e) for s, e in ordered]
 
@@ -55,11 +56,11 @@ def moves(
     """`draw_initial` and `draw`: how particles are born and move; with these arguments."""
     section.particle_pass(
         "draw_initial", "Draw x_1 for each particle.", begin,
-        _state_targets(section.layout, initial),
+        state_targets(section.layout, initial),
     )  # fmt: skip
     section.particle_pass(
         "draw", "Draw x_t given x_{t-1} for each particle.", arguments,
-        _state_targets(section.layout, draw),
+        state_targets(section.layout, draw),
     )  # fmt: skip
 
 
@@ -100,7 +101,7 @@ def conditional_passes(trace: Trace, layout: Layout, section: Section, plain: Pr
     joined = {s: value.get(s, s) for s in trace.state_symbols}
     section.particle_pass(
         "connect", "The reference's noisy components, with what follows from them and x_{t-1}.",
-        "theta, c, s, states_prev, reference, states", _state_targets(layout, joined),
+        "theta, c, s, states_prev, reference, states", state_targets(layout, joined),
         scalars=given,
     )  # fmt: skip
     noisy = [t for t in terms(trace, "transition") if t.site.value.ravel()[0] not in value]
@@ -126,7 +127,7 @@ def backward_kit(
                              strict=True)}  # fmt: skip
     section.particle_pass(
         "complete", "The deterministic components of x_t, from x_{t-1}.",
-        "theta, c, s, states_prev, states", _state_targets(layout, value),
+        "theta, c, s, states_prev, states", state_targets(layout, value),
     )  # fmt: skip
     given = {s: f"reference[{layout.column(s)}]" for s in trace.state_symbols}
     noisy = [t for t in terms(trace, "transition") if t.site.value.ravel()[0] not in value]

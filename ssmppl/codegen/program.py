@@ -195,6 +195,7 @@ def _write(
         out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
         out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
         own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
+        own["eliminated"] = "0"
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
         out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
     if trace.observations:

@@ -47,7 +47,7 @@ CALLS = {
 MATRIX_CALLS = {"cholesky": "cholesky", "inverse": "inverse", "logdet": "logdet", "det": "det"}
 # Scalar sources of randomness; normals and uniforms come from buffers filled in bulk.
 DRAWS = {"normal": "normal", "uniform": "uniform", "gamma": "gamma", "poisson": "poisson",
-         "binomial": "binomial"}  # fmt: skip
+         "binomial": "binomial", "gamma_by": "gamma_by"}  # fmt: skip
 _OWN_NAMES = """theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng
     log_w out inf nan reference look trajectory total entry kernel np prev noise kept"""
 RESERVED = frozenset([

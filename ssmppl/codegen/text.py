@@ -19,14 +19,15 @@ MODULES = {
     "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
     "special": "lgamma digamma trigamma ndtr log_ndtr ndtri erf erfc",
     "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincinv",
-    "random": "normal uniform gamma poisson binomial",
+    "random": "normal uniform gamma gamma_by poisson binomial",
     "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil "
     "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile cholesky "
     "inverse logdet det",
     "flags": "exact kernel",
 }
 
-OPTIONAL = ("fit", "look_ahead")  # functions that some sections lack, and then are not called
+# Functions that some sections lack, and then are not called.
+OPTIONAL = ("fit", "look_ahead", "weigh_future")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from typing import Any
 from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linear
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
+from ssmppl.analysis.describe import joined
+from ssmppl.analysis.eliminable import Eliminable, eliminable
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.noises import Noises, noises
@@ -48,7 +50,8 @@ class Plan:
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
     memory : see `structure.deterministic_memory`. noises : what drives the states, or why it cannot
-    be told. rows : of the longest data set, where there are data.
+    be told. eliminable : the parameters that PGAS can integrate out, and why not the others.
+    rows : of the longest data set, where there are data.
     """
 
     trace: Trace
@@ -59,6 +62,7 @@ class Plan:
     updates: tuple[Update, ...]
     memory: int | None
     noises: Noises | NotApplicable
+    eliminable: Eliminable
     data: str = ""
     rows: int | None = None
 
@@ -87,6 +91,7 @@ class Plan:
         if self.updates:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
             out.append(("Interweaved with these, where asked for", self._interweaved()))
+            out.append(("Eliminated in PGAS, where asked for", self._eliminated()))
         return [(title, rows) for title, rows in out if rows]
 
     def _structure(self) -> list[tuple[str, str]]:
@@ -135,6 +140,15 @@ class Plan:
                             "integrated out, if the warmup finds a parameter slow given the states")
                         )  # fmt: skip
         return rows
+
+    def _eliminated(self) -> list[tuple[str, str]]:
+        rows = [
+            (joined(u.components), "integrated out while trajectories are drawn, each particle "
+             f"carrying its statistics: {u.family}")
+            for u in self.eliminable.updates
+        ]  # fmt: skip
+        why = self.eliminable.refused.items()
+        return [*rows, *((repr(c), f"stays: {_reason(reason)}") for c, reason in why)]
 
     def _trajectories(self) -> str:
         flat = [s.name for s in self.trace.initial.values() if not s.distribution.proper]
@@ -246,6 +260,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         tuple(derive_updates(traced, (), missing)),
         deterministic_memory(traced),
         noises(traced, missing),
+        eliminable(traced, (), missing),
         bound,
         rows,
     )

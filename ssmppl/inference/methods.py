@@ -115,12 +115,18 @@ class PGAS:
         without; then each chain moves the parameters that mixed slowly in it (lag-1 autocorrelation
         above 0.5 on the unconstrained scale), if there are any; never with a warmup of fewer than
         200 sweeps. The walk adapts during warmup.
+    eliminate : parameters that are integrated out while trajectories are drawn, each particle
+        carrying their statistics, and drawn given the new trajectory (Wigren, Risuleo, Murray and
+        Lindsten 2019). True: all whose conjugate family is exact; "auto": the same, and nothing
+        where there are none or the proposal is not the transition; or a tuple of names. `explain`
+        tells which can be and why others cannot. Particles then move by the transition.
     """
 
     particles: int | None = None
     proposal: str = "auto"
     log_likelihood: bool = False
     interweave: bool | str = False
+    eliminate: bool | str | tuple[str, ...] = False
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,10 @@ class Draws:
         """Gamma with unit rate."""
         return self._node("gamma", shape)
 
+    def gamma_by(self, shape: Any) -> Expr:
+        """The same, made of a normal and a uniform where that will do."""
+        return self._node("gamma_by", shape, self.normal(), self.uniform())
+
     def poisson(self, rate: Any) -> Expr:
         return self._node("poisson", rate)
 

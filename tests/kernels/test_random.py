@@ -57,11 +57,18 @@ def p_value_discrete(x, law):
     return stats.chi2.sf(statistic, max(len(merged_e) - 1, 1))
 
 
+@kernel
+def gamma_by(state, shape):
+    """With the normal and the uniform that a loop would have in its buffers."""
+    return random.gamma_by(state, shape, random.normal(state), random.uniform(state))
+
+
 CONTINUOUS = [
     (random.uniform, (), stats.uniform()),
     (random.normal, (), stats.norm()),
     (random.exponential, (), stats.expon()),
     *((random.gamma, (a,), stats.gamma(a)) for a in (0.1, 0.5, 0.99, 1.0, 1.5, 7.0, 1e3, 1e6)),
+    *((gamma_by, (a,), stats.gamma(a)) for a in (0.3, 1.0, 1.3, 40.0)),
     *((random.log_gamma_draw, (a,), stats.loggamma(a)) for a in (1e-3, 0.02, 0.3, 1.0, 20.0)),
 ]
 

@@ -51,9 +51,12 @@ class Study:
 
     @property
     def label(self) -> str:
-        """The method; those interweaved in every sweep are studied beside the plain ones."""
+        """The method; those interweaved in every sweep, or with parameters eliminated, are studied
+        beside the plain ones."""
         woven = getattr(self.method, "interweave", False) is True
-        return type(self.method).__name__ + (" interweaved" if woven else "")
+        without = getattr(self.method, "eliminate", False) is not False
+        name = type(self.method).__name__
+        return name + " interweaved" * woven + " eliminated" * without
 
     @property
     def ranked(self) -> tuple[str, ...]:
@@ -77,6 +80,7 @@ BLOCKS = {  # joint conjugate blocks, states drawn exactly
 METHODS = (
     ssm.PGAS(particles=20, interweave=False),
     ssm.PGAS(particles=20, interweave=True),
+    ssm.PGAS(particles=20, eliminate=True),
     ssm.PMMH(particles=100),
 )
 EXACT = (ssm.Gibbs(interweave=False), ssm.Gibbs(interweave=True), ssm.MetropolisHastings())

@@ -25,8 +25,11 @@ def test_statistic_knows_uniform_from_not():
     assert uniform_p(narrow) < LEVEL
 
 
-# The studies of joint blocks and of interweaved moves take an hour together.
-LONG = [n for n, s in STUDIES.items() if s.model in BLOCKS or "interweaved" in s.label]
+# The studies of joint blocks, interweaved moves and eliminated parameters take an hour together.
+LONG = [
+    n for n, s in STUDIES.items()
+    if s.model in BLOCKS or "interweaved" in s.label or "eliminated" in s.label
+]  # fmt: skip
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
 
 

@@ -15,6 +15,11 @@ and the new ancestor. Where they forget the ancestor within `horizon` steps, the
 densities of these steps in (section 7.1 there); where they never do, `horizon` is -1 and no
 ancestor is sampled: particle Gibbs as in Andrieu, Doucet and Holenstein (2010).
 
+Where parameters are `eliminated` (`analysis/elimination.py`; Wigren, Risuleo, Murray and Lindsten
+2019), particles carry their running statistics as further deterministic components. These never
+forget the ancestor, but add up: what all later rows of the reference are worth given an ancestor's
+statistics is one number, `weigh_future`.
+
 Notation: N particles, T steps; x : (D, N); reference, trajectory : (T, D); w : (N,).
 """
 
@@ -72,7 +77,7 @@ def ancestral_path(history, ancestry, k, path):
 @exact
 def conditional_smc(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh,
-    connect, weigh_connected, weigh_observed, sizes, ahead, horizon,
+    connect, weigh_connected, weigh_observed, weigh_future, sizes, ahead, horizon, eliminated,
     theta, y, seen, u, particles, rng, reference, trajectory, statistics, paths=None, weights=None,
 ):  # fmt: skip
     """One sweep from `reference` to `trajectory`; returns (status, t).
@@ -123,6 +128,9 @@ def conditional_smc(
                     weigh_observed(theta, c, s_later, joined_next, part)
                     add(log_v, part)
                     joined, joined_next = joined_next, joined
+                if eliminated:
+                    weigh_future(theta, c, s, x_before, joined, part)
+                    add(log_v, part)
                 _, _, status = normalise(log_v, p)
                 if status != OK:
                     return status, t

@@ -181,6 +181,22 @@ def gamma(state, shape):
 
 
 @exact
+def gamma_by(state, shape, x, u):
+    """A Gamma(shape, 1) variate: Marsaglia and Tsang's first try by a given normal and uniform,
+    with their squeeze; `gamma` where it is refused. For loops with buffers of both."""
+    if 1.0 <= shape < np.inf:
+        d = shape - 1.0 / 3.0
+        v = 1.0 + x / np.sqrt(9.0 * d)
+        if v > 0.0:
+            v = v * v * v
+            if u < 1.0 - 0.0331 * (x * x) * (x * x):
+                return d * v
+            if log_normal_number(u) < 0.5 * x * x + d * (1.0 - v + log_normal_number(v)):
+                return d * v
+    return gamma(state, shape)
+
+
+@exact
 def _poisson_log_mass(k, rate):
     if k == 0.0:
         return -rate

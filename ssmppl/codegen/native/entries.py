@@ -37,11 +37,12 @@ entry = numba.njit(cache=True, nogil=True, error_model="numpy")
 '''
 
 TEXTS = ("flat", "varies")  # parameters that decide what is compiled
-NUMBERS = ("ahead", "horizon")  # parameters that are handed over when it runs
+NUMBERS = ("ahead", "horizon", "eliminated")  # parameters that are handed over when it runs
 # The functions that a model may lack; they are never called then.
 OPTIONAL: Mapping[str, str] = {
     "fit": "theta, c, s, states_prev, fits",
     "look_ahead": "theta, c, s, states_prev, fits, log_w",
+    "weigh_future": "theta, c, s, states_prev, states, log_w",
 }
 
 

@@ -1,6 +1,7 @@
 """PGAS within Gibbs: trajectories by conditional SMC, parameters by their derived updates.
 
-Lindsten, Jordan and Schön (2014), algorithm 3; Schön et al. (2015), algorithm 7.
+Lindsten, Jordan and Schön (2014), algorithm 3; Schön et al. (2015), algorithm 7. Parameters may be
+integrated out of the first of these (`elimination.py`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.inference.chains.elimination import Eliminating, Learned, describe
+from ssmppl.inference.chains.elimination import asked as asked_to_eliminate
 from ssmppl.inference.chains.interweaving import Interweaving, Tuning, asked, interweaving
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
@@ -42,8 +45,10 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
     check_count("particles", particles, 2)
     proposal = method.proposal
     if proposal == "auto":
-        proposal = pgas_proposal(problem)
+        by_transition = method.eliminate not in (False, "auto")
+        proposal = "bootstrap" if by_transition else pgas_proposal(problem)
     problem.proposal(proposal)
+    eliminated = asked_to_eliminate(problem, method.eliminate, setup.held, proposal)
     settings = FilterSettings(int(particles), proposal)
     asked(problem, method.interweave, None)  # refused before anything is compiled
     if space.where.size:
@@ -51,7 +56,15 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     further, interweaved = interweaving(setup, method.interweave, pilot)
-    sweeper = Sweeper(problem, plan_updates(problem, setup.held), settings, further)
+    updates = plan_updates(problem, setup.held)
+    plan = "\n".join(str(u.explanation) for u in updates)
+    without = None
+    if not isinstance(eliminated, NotApplicable):
+        adapting = setup.warmup * setup.thin
+        without = Eliminating(problem, eliminated.updates, settings.particles, adapting)
+        gone = set(eliminated.components)
+        updates = tuple(u for u in updates if not gone.issuperset(u.components))
+    sweeper = Sweeper(problem, updates, settings, further, without)
     states = []
     for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
         generator, stream = setup.streams(chain)
@@ -62,7 +75,8 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
         "proposal": proposal,
         "settings": asdict(method),
         "ancestor_sampling": memory is not None,
-        "plan": "\n".join(str(u.explanation) for u in sweeper.updates),
+        "plan": plan,
+        "eliminated": describe(eliminated),
         "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
@@ -86,22 +100,25 @@ class Sweeper(ParameterSteps):
     """A problem with its updates: what one iteration of PGAS needs.
 
     settings : of the conditional particle filter. interweaving : the further steps of a sweep.
+    without : the sweeps where parameters are eliminated; `updates` are those of the others.
     """
 
     settings: FilterSettings
     interweaving: Interweaving | None = None
+    without: Eliminating | None = None
 
 
 @dataclass(frozen=True)
 class PGASState:
     """Where a chain stands: theta (P,), one trajectory (T, D) per experiment, random states, and
-    how its further steps are tuned."""
+    how its further steps are tuned and what it has learned."""
 
     theta: np.ndarray
     paths: tuple[np.ndarray, ...]
     generator: np.random.Generator
     stream: np.ndarray
     tuning: Tuning | None = None
+    learned: Learned | None = None
 
 
 def start_chain(
@@ -127,7 +144,8 @@ def start_chain(
         paths.append(path)
     further = sweeper.interweaving
     tuning = further.begin() if further is not None else None
-    return PGASState(theta.copy(), tuple(paths), generator, stream, tuning)
+    learned = sweeper.without.begin(theta, tuple(paths)) if sweeper.without is not None else None
+    return PGASState(theta.copy(), tuple(paths), generator, stream, tuning, learned)
 
 
 def pgas_block(
@@ -139,7 +157,7 @@ def pgas_block(
     """
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta, paths, tuning = state.theta.copy(), [p.copy() for p in state.paths], state.tuning
-    further = sweeper.interweaving
+    further, without, learned = sweeper.interweaving, sweeper.without, state.learned
     draws: dict[str, list[np.ndarray]] = {"theta": []}
     draws |= {f"path_{i}": [] for i in range(len(paths))}
     stats: dict[str, list[float]] = {"lp": [], "update_rate": [], "ess": [], "acceptance_rate": []}
@@ -148,7 +166,10 @@ def pgas_block(
     for _ in range(n):
         moved, ess, accepted, made, interweaved = 0.0, 0.0, 0, 0, 0.0
         for _ in range(thin):
-            rates = _trajectories(sweeper, theta, paths, stream)
+            if without is not None and learned is not None:
+                learned, rates = without.sweep(learned, theta, paths, stream, generator)
+            else:
+                rates = _trajectories(sweeper, theta, paths, stream)
             infos = draw_parameters(sweeper, theta, paths, generator)
             if further is not None and tuning is not None:
                 tuning, share = further.step(tuning, theta, paths, generator)
@@ -170,7 +191,7 @@ def pgas_block(
     block = Block(
         {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
     )
-    return PGASState(theta, tuple(paths), generator, stream, tuning), block
+    return PGASState(theta, tuple(paths), generator, stream, tuning, learned), block
 
 
 def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:
