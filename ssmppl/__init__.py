@@ -26,11 +26,7 @@ from ssmppl.inference.methods import (
     PSAEM,
     SMC2,
     DirectOptimization,
-    FFBSi,
-    FixedLag,
-    ForwardBackward,
     Gibbs,
-    KalmanSmoother,
     MetropolisHastings,
     ParticleEM,
     ScoreAscent,
@@ -40,6 +36,7 @@ from ssmppl.inference.sample import sample
 from ssmppl.inference.score import score
 from ssmppl.inference.simulation import simulate
 from ssmppl.inference.smooth import smooth
+from ssmppl.inference.smoothing_methods import FFBSi, FixedLag, ForwardBackward, KalmanSmoother
 from ssmppl.language.distributions import (
     Bernoulli,
     Beta,

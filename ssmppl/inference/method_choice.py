@@ -12,13 +12,11 @@ from ssmppl.inference.methods import (
     PGAS,
     PMMH,
     DirectOptimization,
-    FFBSi,
-    ForwardBackward,
     Gibbs,
-    KalmanSmoother,
     MetropolisHastings,
     ScoreAscent,
 )
+from ssmppl.inference.smoothing_methods import FFBSi, ForwardBackward, KalmanSmoother
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Trace
 

@@ -20,14 +20,7 @@ from ssmppl.inference.exact.models import EXACT, exact_model, kind_of
 from ssmppl.inference.filters import LEVELS, quantile_levels
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.method_choice import choose_smoother
-from ssmppl.inference.methods import (
-    PGAS,
-    FFBSi,
-    FixedLag,
-    ForwardBackward,
-    KalmanSmoother,
-    SmoothingMethod,
-)
+from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.degeneracy import collapse, distinct
 from ssmppl.inference.particles.filtering import (
@@ -43,6 +36,13 @@ from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import run_chains
+from ssmppl.inference.smoothing_methods import (
+    FFBSi,
+    FixedLag,
+    ForwardBackward,
+    KalmanSmoother,
+    SmoothingMethod,
+)
 from ssmppl.language.model import Model
 from ssmppl.results import to_dataset
 

@@ -9,7 +9,8 @@ from ssmppl.language.discrete import (
     NegativeBinomial,
     Poisson,
 )
-from ssmppl.language.distribution import Distribution, Draws, Support
+from ssmppl.language.distribution import Distribution, Support
+from ssmppl.language.draws import Draws
 from ssmppl.language.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
 from ssmppl.language.positive import Beta, Exponential, Gamma, InverseGamma
 from ssmppl.language.symmetric import Cauchy, HalfCauchy, HalfNormal, Laplace, StudentT

@@ -19,7 +19,8 @@ from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.expr import as_expr, constant
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.language.continuous import LOG_2PI
-from ssmppl.language.distribution import Distribution, Draws, Support, one_of
+from ssmppl.language.distribution import Distribution, Support, one_of
+from ssmppl.language.draws import Draws
 from ssmppl.language.positive import log_gamma_draw, needs_log_gamma
 
 

@@ -22,7 +22,7 @@ from ssmppl.codegen.text import ModuleText
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.distribution import Draws
+from ssmppl.language.draws import Draws
 from ssmppl.language.rules import is_symmetric
 from ssmppl.language.trace import Site, Trace, symbols, trace
 from tests.codegen.models import declare

@@ -178,4 +178,4 @@ def test_it_is_explained_and_chosen_where_nothing_better_is_derived():
     problem = pose(model, {"y": np.array([0.3, -1.2, 2.0, 4.0, 3.0])})
     assert choose(problem, np.empty(0), whole=True, temper=True).name == "tempered"
     assert choose(problem, np.empty(0), whole=True).name == "bootstrap"
-    assert "tempered" not in str(ssm.explain(PAIR))
+    assert "rising powers" not in str(ssm.explain(PAIR))

@@ -11,7 +11,7 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.distribution import Draws
+from ssmppl.language.draws import Draws
 from tests.language.distribution_table import TRUNCATED_CASES
 from tests.statistics.checks import some
 

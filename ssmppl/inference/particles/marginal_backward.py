@@ -22,7 +22,6 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.methods import FFBSi
 from ssmppl.inference.particles.backward import ParticleSystem, draw_particles
 from ssmppl.inference.particles.marginal import (
     MOST_VALUES,
@@ -35,6 +34,7 @@ from ssmppl.inference.particles.marginal import (
     values_of,
 )
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.smoothing_methods import FFBSi
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import previous
 

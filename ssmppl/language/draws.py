@@ -1,0 +1,44 @@
+"""Random draws as nodes of expressions: standard normal, uniform, gamma, Poisson, binomial ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ssmppl.expressions.expr import Expr, constant
+
+
+class Draws:
+    """Makes the "random" nodes of one sampler; each draw is a node of its own."""
+
+    def __init__(self, owner: str):
+        self.owner, self.count = owner, 0
+
+    def _node(self, kind: str, *args: Any) -> Expr:
+        self.count += 1
+        return Expr("random", tuple(map(_node, args)), (kind, (self.owner, self.count)))
+
+    def normal(self) -> Expr:
+        """Standard normal."""
+        return self._node("normal")
+
+    def uniform(self) -> Expr:
+        """Uniform on the open interval (0, 1)."""
+        return self._node("uniform")
+
+    def gamma(self, shape: Any) -> Expr:
+        """Gamma with unit rate."""
+        return self._node("gamma", shape)
+
+    def gamma_by(self, shape: Any) -> Expr:
+        """The same, made of a normal and a uniform where that will do."""
+        return self._node("gamma_by", shape, self.normal(), self.uniform())
+
+    def poisson(self, rate: Any) -> Expr:
+        return self._node("poisson", rate)
+
+    def binomial(self, n: Any, p: Any) -> Expr:
+        return self._node("binomial", n, p)
+
+
+def _node(value: Any) -> Expr:
+    return value if isinstance(value, Expr) else constant(value)
