@@ -174,7 +174,7 @@ def test_it_is_explained_and_chosen_where_nothing_better_is_derived():
     model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
     model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
     model.observation(lambda x: {"y": ssm.Normal(opaque(x), sd=0.01)})
-    assert "tempered" in str(ssm.explain(model))
+    assert "rising powers" in str(ssm.explain(model))
     problem = pose(model, {"y": np.array([0.3, -1.2, 2.0, 4.0, 3.0])})
     assert choose(problem, np.empty(0), whole=True, temper=True).name == "tempered"
     assert choose(problem, np.empty(0), whole=True).name == "bootstrap"
