@@ -47,18 +47,18 @@ def log_parts(family: Family, c: Sequence[Expr]) -> list[Expr]:
 def draw_of(family: Family, c: Sequence[Expr], draws: Draws) -> list[Expr]:
     """A draw of the block's components, from the law with density exp(C s) / Z(C)."""
     if isinstance(family, Gamma):
-        g = draws.gamma_by((c[family.log] + 1.0) / family.power) / -c[family.pow]
+        g = draws.gamma((c[family.log] + 1.0) / family.power, buffered=True) / -c[family.pow]
         return [_root(g, family.power)]
     if isinstance(family, Normal):
         return _Solved(family, c).draw(draws, constant(1.0))
     if isinstance(family, NormalGamma):
         form = _Solved(family.normal, c)
         shape, rate = _of_precision(family, form, c)
-        g = draws.gamma_by(shape) / rate
+        g = draws.gamma(shape, buffered=True) / rate
         return [*form.draw(draws, apply("sqrt", g)), _root(g, family.power)]
     if isinstance(family, (Beta, Dirichlet)):
         places = (family.first, family.second) if isinstance(family, Beta) else family.logs
-        parts = [draws.gamma_by(c[k] + 1.0) for k in places]
+        parts = [draws.gamma(c[k] + 1.0, buffered=True) for k in places]
         shares = [p / _total(parts) for p in parts]
         return shares[:1] if isinstance(family, Beta) else shares
     raise TypeError(type(family).__name__)

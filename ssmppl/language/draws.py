@@ -25,13 +25,11 @@ class Draws:
         """Uniform on the open interval (0, 1)."""
         return self._node("uniform")
 
-    def gamma(self, shape: Any) -> Expr:
-        """Gamma with unit rate."""
+    def gamma(self, shape: Any, buffered: bool = False) -> Expr:
+        """Gamma with unit rate; buffered: made of a normal and a uniform where these will do."""
+        if buffered:
+            return self._node("gamma_by", shape, self.normal(), self.uniform())
         return self._node("gamma", shape)
-
-    def gamma_by(self, shape: Any) -> Expr:
-        """The same, made of a normal and a uniform where that will do."""
-        return self._node("gamma_by", shape, self.normal(), self.uniform())
 
     def poisson(self, rate: Any) -> Expr:
         return self._node("poisson", rate)
