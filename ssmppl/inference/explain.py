@@ -90,7 +90,7 @@ class Plan:
         out.append(("Chosen, unless a method is named", self._choices()))
         if self.updates:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
-            out.append(("Interweaved with these, where asked for", self._interweaved()))
+            out.append(("Interweaved with these, where parameters mix slowly", self._interweaved()))
             out.append(("Eliminated in PGAS, where asked for", self._eliminated()))
         return [(title, rows) for title, rows in out if rows]
 

@@ -61,9 +61,9 @@ def sample(
         of finitely many states, `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
         None: for the former Gibbs if every parameter has a closed-form conditional (with
         `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
-        while the parameters are few; for the others PGAS, or PMMH where no ancestors can be
-        sampled, the data are long or the states counts, and the parameters are few. `explain` and
-        the attributes say which, and why.
+        while the parameters are few; for the others PGAS, likewise with `interweave="auto"`, or
+        PMMH where no ancestors can be sampled, the data are long or the states counts, and the
+        parameters are few. `explain` and the attributes say which, and why.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
