@@ -65,7 +65,7 @@ VARVE_RUNS = [
     pytest.param("PGAS plain", ssm.PGAS(interweave=False), 20_000, 500, False, id="PGAS-plain",
                  marks=pytest.mark.slow),
     pytest.param("PGAS without tau", ssm.PGAS(particles=20, eliminate=("tau",)), 10_000, 500, False,
-                 id="PGAS-eliminated", marks=pytest.mark.slow),
+                 id="PGAS-eliminated", marks=[pytest.mark.slow, pytest.mark.exhaustive]),
     pytest.param("PMMH", ssm.PMMH(), 10_000, 1_000, True, id="PMMH-long", marks=pytest.mark.slow),
 ]  # fmt: skip
 
