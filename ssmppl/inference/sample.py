@@ -88,7 +88,9 @@ def sample(
           leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
         * observed_data, constant_data (inputs).
 
-        Attributes name method, settings, seed, versions, the plan, and the time taken.
+        Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS
+        also trajectory_update_rate, the least share of draws between which a row of the trajectory
+        changed, and where rows hardly do trajectory_warning, which is given as a warning too.
         Ctrl-C returns what was drawn, with the attribute `interrupted`.
 
     Raises
