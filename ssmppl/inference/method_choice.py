@@ -41,8 +41,8 @@ def choose_sampler(
     if isinstance(kind, NotApplicable):
         if not stuck:
             return PGAS(interweave="auto"), (
-                "the model is not linear Gaussian: trajectories by conditional SMC; parameters that "
-                "the warmup finds slow given the states are moved along with these"
+                "the model is not linear Gaussian: trajectories by conditional SMC; parameters "
+                "that the warmup finds slow given the states are moved along with these"
             )
         if numbers <= FEW:
             return PMMH(), f"{stuck}: a random walk on the particle filter's likelihood"
