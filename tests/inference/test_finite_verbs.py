@@ -74,7 +74,7 @@ def test_filtering_is_exact(data):
     assert list(found["z_value"].values) == [0.0, 1.0]
 
 
-@pytest.mark.parametrize("name", ["patches", "second order"])
+@pytest.mark.parametrize("name", ["patches", pytest.param("second order", marks=pytest.mark.slow)])
 def test_filtering_agrees_with_particles(name):
     """Inputs, counts, vectors missing in part, a lagged copy: within Monte Carlo error."""
     build, values = MODELS[name]
@@ -214,6 +214,7 @@ def posterior_by_grid(y):
     return mean, np.sqrt((grid - mean[:, None]) ** 2 @ w)
 
 
+@pytest.mark.slow
 def test_gibbs_is_chosen_and_has_the_right_posterior(data):
     """Every parameter has a closed-form conditional: Beta rows of the transition, Normal mean."""
     idata = ssm.sample(weather(), data, draws=3000, warmup=200, seed=5, progress=False)
@@ -263,6 +264,7 @@ def regimes(matrix):
     return model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ssm.Gibbs(), ssm.MetropolisHastings()])
 def test_a_matrix_of_shares_is_its_rows(method):
     """The same draws, whichever way the transition matrix is declared; and the same maximum."""

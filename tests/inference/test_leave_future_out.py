@@ -49,7 +49,7 @@ def exact(y):
     return logsumexp(given[:, 1:], axis=0) - logsumexp(given[:, :-1], axis=0)
 
 
-@pytest.mark.parametrize("threshold", [0.7, -2.0])
+@pytest.mark.parametrize("threshold", [0.7, pytest.param(-2.0, marks=pytest.mark.slow)])
 def test_scores_are_those_of_the_grid(threshold, y, exact):
     """With weighted draws all along, and with new ones for many a row."""
     found = ssm.leave_future_out(

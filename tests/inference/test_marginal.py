@@ -278,6 +278,7 @@ def test_smoothed_paths_are_those_of_the_enumeration(data, exact):
     _agree(np.array([r[1] for r in runs]), second[:, 1:, 1:])
 
 
+@pytest.mark.slow
 def test_smoothed_paths_with_coupled_states(sampled_pair):
     """Against the Kalman smoother."""
     problem = sampled_pair

@@ -179,7 +179,7 @@ def still(sd):
     return model
 
 
-@pytest.mark.parametrize("method", ["ffbsi", "fixed_lag"])
+@pytest.mark.parametrize("method", [pytest.param("ffbsi", marks=pytest.mark.slow), "fixed_lag"])
 def test_a_smoother_that_collapsed_says_so(method):
     """Where x hardly moves, one of the first particles is the ancestor of all."""
     y = np.arctan(0.7) + 0.2 * np.random.default_rng(4).normal(size=60)
@@ -195,6 +195,7 @@ def test_a_smoother_that_collapsed_says_so(method):
     assert "smoothing_warning" not in found.attrs
 
 
+@pytest.mark.slow
 def test_few_values_are_no_collapse():
     """Of a discrete state, and of a start that is known."""
     model = ssm.Model("counts of a switch")

@@ -75,7 +75,8 @@ def test_unbiased_with_a_positive_state():
     assert_mean_one(found - exact + np.sum(np.log(y)))
 
 
-@pytest.mark.parametrize("kernel", ["genealogy", pytest.param("exact", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kernel", ["genealogy", "exact"])
 def test_genealogies_and_backward_draws_against_the_kalman_smoother(kernel):
     data, runs = pair_data(), 20
     exact = ssm.smooth(PAIR, data, AT)

@@ -371,7 +371,7 @@ def in_loops(monkeypatch):
     monkeypatch.setattr(program, "_programs", OrderedDict())
 
 
-@pytest.mark.parametrize("case", some(["vehicle", "volatility", "ricker"], 1))
+@pytest.mark.parametrize("case", some(["vehicle", "volatility", "ricker"], 0))
 def test_moves_in_loops(case, in_loops):
     """Fewer noises in x_t than in x_1; a spread of each particle; noise in an exponent."""
     combination, parameters = ("twisted", "systematic", 1.0), {}
