@@ -311,7 +311,7 @@ MUTANTS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "kind"), some(MUTANTS, 1))
+@pytest.mark.parametrize(("name", "kind"), some(MUTANTS, 1, pytest.mark.exhaustive))
 def test_mutants_are_found(name, kind):
     """Each beyond the limit that the law itself is held to."""
     found = changes(name, kind)

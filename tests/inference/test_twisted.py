@@ -371,7 +371,13 @@ def in_loops(monkeypatch):
     monkeypatch.setattr(program, "_programs", OrderedDict())
 
 
-@pytest.mark.parametrize("case", some(["vehicle", "volatility", "ricker"], 0))
+@pytest.mark.parametrize(
+    "case",
+    [
+        *some(["vehicle", "volatility"], 0),
+        *some(["ricker"], 0, pytest.mark.exhaustive),
+    ],
+)
 def test_moves_in_loops(case, in_loops):
     """Fewer noises in x_t than in x_1; a spread of each particle; noise in an exponent."""
     combination, parameters = ("twisted", "systematic", 1.0), {}
