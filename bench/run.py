@@ -11,6 +11,7 @@ from table import machine, versions
 
 HERE = Path(__file__).parent
 SCRIPTS = (
+    "against.py",
     "filters.py",
     "start.py",
     "proposals.py",
@@ -19,6 +20,8 @@ SCRIPTS = (
     "interweaving.py",
     "updates.py",
     "kalman.py",
+    "scaling.py",
+    "cores.py",
 )
 
 

@@ -1,15 +1,21 @@
 """A probabilistic-programming language for state space models.
 
 Declare priors, initial law, transition and observation as decorated functions of a `Model`; the
-verbs below derive and compile the rest.
+verbs below derive and compile the rest. The diagnosis and its plots are imported when they are
+first asked for: most sessions never do, and they make up a third of the package.
 """
 
-from ssmppl import plots
-from ssmppl.errors import ArgumentError, DataError, ModelError, SamplingError, SSMError
-from ssmppl.gap.catalogue import effects
-from ssmppl.gap.diagnose import diagnose
-from ssmppl.gap.effect import effect
-from ssmppl.gap.report import GapReport
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from ssmppl.errors import (
+    ArgumentError,
+    DataError,
+    ExecutorError,
+    ModelError,
+    SamplingError,
+    SSMError,
+)
 from ssmppl.inference.evidence import Evidence, evidence
 from ssmppl.inference.exact_filters import forward_filter, kalman_filter
 from ssmppl.inference.explain import compile, explain
@@ -68,7 +74,39 @@ from ssmppl.language.model import Model
 from ssmppl.language.primitive import primitive
 from ssmppl.results import summary
 
+if TYPE_CHECKING:
+    from ssmppl import plots
+    from ssmppl.gap.catalogue import effects
+    from ssmppl.gap.diagnose import diagnose
+    from ssmppl.gap.effect import effect
+    from ssmppl.gap.report import GapReport
+    from ssmppl.plots import (
+        plot_ancestry,
+        plot_filter,
+        plot_forecast,
+        plot_likelihood,
+        plot_maximization,
+        plot_predictions,
+        plot_prior_posterior,
+        plot_states,
+    )
+
 __version__ = "0.1.0"
+
+_LATER = {
+    "GapReport": "gap.report",
+    "diagnose": "gap.diagnose",
+    "effect": "gap.effect",
+    "effects": "gap.catalogue",
+    "plot_ancestry": "plots.filters",
+    "plot_filter": "plots.filters",
+    "plot_forecast": "plots.states",
+    "plot_likelihood": "plots.likelihood",
+    "plot_maximization": "plots.parameters",
+    "plot_predictions": "plots.predictions",
+    "plot_prior_posterior": "plots.parameters",
+    "plot_states": "plots.states",
+}
 
 __all__ = [
     "EM",
@@ -88,6 +126,7 @@ __all__ = [
     "DirectOptimization",
     "Dirichlet",
     "Evidence",
+    "ExecutorError",
     "Exponential",
     "FFBSi",
     "FixedLag",
@@ -132,6 +171,14 @@ __all__ = [
     "log_likelihood",
     "maximize",
     "particle_filter",
+    "plot_ancestry",
+    "plot_filter",
+    "plot_forecast",
+    "plot_likelihood",
+    "plot_maximization",
+    "plot_predictions",
+    "plot_prior_posterior",
+    "plot_states",
     "plots",
     "predict",
     "primitive",
@@ -141,3 +188,17 @@ __all__ = [
     "smooth",
     "summary",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "plots" and name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    plots = importlib.import_module(f"{__name__}.plots")  # a report has to know who draws it
+    if name == "plots":
+        return plots
+    globals()[name] = value = getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

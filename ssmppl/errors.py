@@ -7,6 +7,7 @@ ModelError          the model file: function, file, line, what was found, what t
 DataError           the data: data set, variable, row (and column), the value, what to change
 ArgumentError       the call: the argument, its value, the valid options
 SamplingError       the numbers at run time: time step, site, the user's line, parameter values
+ExecutorError       the executor or its workers: what happened to them, what to start anew
 ==================  =========================================================================
 
 Everything derives from `SSMError`, so that `except ssm.SSMError` catches all of it.
@@ -17,6 +18,7 @@ from __future__ import annotations
 import difflib
 import linecache
 import os
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -36,14 +38,23 @@ class Location:
         return linecache.getline(self.file, self.line).strip()
 
     @property
+    def cell(self) -> str:
+        """`In[3]` where the file is a cell of a notebook, as its own tracebacks say; else empty."""
+        shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+        named = getattr(getattr(shell, "compile", None), "format_code_name", lambda file: None)
+        found = named(self.file)
+        return str(found[1]) if found else ""
+
+    @property
     def short(self) -> str:
         """`varves.py:12: <the line>`, for reading rather than for finding."""
-        place = f"{os.path.basename(self.file)}:{self.line}"
+        place = f"{self.cell or os.path.basename(self.file)}:{self.line}"
         return f"{place}: {self.text}" if self.text else place
 
     def __str__(self) -> str:
         inside = f" in {self.function}()" if self.function else ""
-        return f'File "{self.file}", line {self.line}{inside}'
+        place = f"Cell {self.cell}" if self.cell else f'File "{self.file}"'
+        return f"{place}, line {self.line}{inside}"
 
 
 class SSMError(Exception):
@@ -98,6 +109,10 @@ class SamplingError(SSMError):
     """Something went wrong numerically while an algorithm ran."""
 
 
+class ExecutorError(SSMError):
+    """The executor failed, not the task: a worker died, or cannot restore what it was sent."""
+
+
 @dataclass(frozen=True)
 class NotApplicable:
     """The outcome of an analysis that does not apply: the reason and the line it stems from."""
@@ -112,13 +127,13 @@ class NotApplicable:
         return f"{self.reason} ({self.where})" if self.where else self.reason
 
 
-def nearest_first(name: str, known: Iterable[str]) -> list[str]:
-    """`known` with the spellings closest to `name` first."""
-    known = list(known)
-    score = {k: difflib.SequenceMatcher(None, name.lower(), k.lower()).ratio() for k in known}
+def nearest_first(name: Any, known: Iterable[str]) -> list[str]:
+    """`known` with the spellings closest to `name` first; a user's name may be anything."""
+    known, given = list(known), str(name).lower()
+    score = {k: difflib.SequenceMatcher(None, given, k.lower()).ratio() for k in known}
     return sorted(known, key=lambda k: (-score[k], k))
 
 
-def listing(name: str, known: Iterable[str]) -> str:
+def listing(name: Any, known: Iterable[str]) -> str:
     """`known` as text, nearest spelling to `name` first; "none" when empty."""
     return ", ".join(nearest_first(name, known)) or "none"

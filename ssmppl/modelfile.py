@@ -1,4 +1,4 @@
-"""What the command line is given, read: model files, CSV files, and values of parameters.
+"""What the command line is given, read: model files, CSV files, values of parameters, settings.
 
 Every fault is one of the user's files or words, and is raised as an error that shows the place.
 """
@@ -21,7 +21,7 @@ from ssmppl.language.model import Model
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["load_model", "parse_assignments", "read_csv"]
+__all__ = ["labelled", "load_model", "parse_assignments", "parse_settings", "read_csv"]
 
 
 def load_model(spec: str) -> Model:
@@ -127,10 +127,16 @@ def read_csv(path: Path) -> pd.DataFrame:
             fix="give a text file with the names of its columns in the first line, values "
             "separated by commas",
         ) from error
+    return labelled(table)
+
+
+def labelled(table: pd.DataFrame) -> pd.DataFrame:
+    """A table as it was read, with the labels of its rows recognised: a first column without a
+    name, or `time`, whose text becomes dates where it is of such."""
     table.columns = table.columns.map(lambda name: str(name).strip())
     first = table.columns[0] if len(table.columns) else ""
     label = first if first.startswith("Unnamed:") or first == "" else "time"
-    if label in table.columns and table[label].dtype.kind not in "iuf":
+    if label in table.columns and table[label].dtype.kind not in "iufM":
         table[label] = _dates(table[label])
     if label != "time" and label in table.columns:
         table = table.set_index(label).rename_axis("time")
@@ -153,7 +159,22 @@ def parse_assignments(texts: Iterable[str], option: str) -> dict[str, Any]:
     ------
     ArgumentError : one is written otherwise, or a name stands twice.
     """
-    values: dict[str, Any] = {}
+    return {name: _value(value, name, option) for name, value in _split_all(texts, option)}
+
+
+def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
+    """`name=value` for each of `texts`; a value is a number, true, false, none, a list, a mapping
+    as JSON writes it, or else text.
+
+    Raises
+    ------
+    ArgumentError : one is written otherwise, or a name stands twice.
+    """
+    return {name: _setting(value) for name, value in _split_all(texts, option)}
+
+
+def _split_all(texts: Iterable[str], option: str) -> list[tuple[str, str]]:
+    values: dict[str, str] = {}
     for text in texts:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals or not name.isidentifier():
@@ -163,8 +184,19 @@ def parse_assignments(texts: Iterable[str], option: str) -> dict[str, Any]:
             )
         if name in values:
             raise ArgumentError(f"{option} gives {name!r} twice", fix="give it once")
-        values[name] = _value(value, name, option)
-    return values
+        values[name] = value
+    return list(values.items())
+
+
+def _setting(text: str) -> Any:
+    words = {"true": True, "false": False, "none": None, "null": None}
+    if text.lower() in words:
+        return words[text.lower()]
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        return text
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _value(text: str, name: str, option: str) -> Any:

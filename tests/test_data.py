@@ -357,3 +357,9 @@ def test_states_and_observations_unpack():
     assert_array_equal(observed["C"], [[3, 4], [4, 5]])
     with pytest.raises(ValueError, match="last axis must have length 3: x, z"):
         unpack_states(t, np.zeros(4))
+
+
+def test_an_index_of_tuples_labels_rows_by_their_text():
+    index = pd.Index([("a", 1), ("a", 2)], tupleize_cols=False)
+    e = one(scalar(), pd.DataFrame({"y": [1.0, 2.0]}, index=index))
+    assert list(e.time) == ["('a', 1)", "('a', 2)"]

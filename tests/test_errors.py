@@ -9,6 +9,8 @@ import math
 import pickle
 import random
 import statistics
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -17,7 +19,14 @@ import scipy.linalg
 import xarray as xr
 
 from ssmppl.data import bind, bind_inputs, check_parameters, check_values
-from ssmppl.errors import ArgumentError, DataError, ModelError, SSMError, UnsupportedOperation
+from ssmppl.errors import (
+    ArgumentError,
+    DataError,
+    Location,
+    ModelError,
+    SSMError,
+    UnsupportedOperation,
+)
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model import Model
 from ssmppl.language.trace import trace
@@ -79,7 +88,7 @@ def inputs_is_a_number():
     return Model("m", inputs=3)  # HERE
 
 
-@bad("input 'w' of length 0", "positive whole number")
+@bad("input 'w' of length 0", "positive whole number, None stands for a number")
 def input_of_no_length():
     return Model("m", inputs={"w": 0})  # HERE
 
@@ -976,6 +985,7 @@ def test_missing_and_contradicting_parameters():
 def test_errors_cross_process_borders():
     with pytest.raises(ModelError) as caught:
         trace(python_if())
+    assert caught.value.__cause__ is not caught.value
     copy = pickle.loads(pickle.dumps(caught.value))
     assert str(copy) == str(caught.value)
     assert type(copy) is type(caught.value)
@@ -987,3 +997,17 @@ def test_the_families_of_errors():
     assert issubclass(UnsupportedOperation, TypeError)
     for error in (ModelError, DataError, ArgumentError, UnsupportedOperation):
         assert issubclass(error, SSMError)
+
+
+def test_cells_of_a_notebook_have_the_names_that_its_tracebacks_use(monkeypatch):
+    names = {"kernel/123.py": ("Cell", "In[4]")}
+    shell = SimpleNamespace(compile=SimpleNamespace(format_code_name=names.get))
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    cell = Location("kernel/123.py", 3, "prior")
+    assert str(cell) == "Cell In[4], line 3 in prior()"
+    assert cell.short == "In[4]:3"
+    file = Location("models/model.py", 3, "prior")
+    assert str(file) == 'File "models/model.py", line 3 in prior()'
+    assert file.short == "model.py:3"
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
+    assert cell.short == "123.py:3"

@@ -1,6 +1,7 @@
 """Results under whichever ArviZ is installed: 0.2x (InferenceData) or 1.x (DataTree)."""
 
 import json
+import tracemalloc
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,6 +117,23 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
         results.save(Unwritable(), path)
     assert path.read_text() == "earlier"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_draws_on_disk_are_saved_without_being_taken_into_memory(tmp_path):
+    shape = (2, 500, 8_000)
+    draws = np.lib.format.open_memmap(tmp_path / "x.npy", "w+", float, shape)
+    draws[:] = np.arange(8_000.0)
+    idata = results.to_inference_data(posterior={"x": draws}, over_time=("x",))
+    results.save(idata, tmp_path / "warm.nc")  # imports what it needs
+    tracemalloc.start()
+    try:
+        results.save(idata, tmp_path / "out.nc")
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < draws.nbytes / 8
+    read = results.arviz().from_netcdf(tmp_path / "out.nc")
+    np.testing.assert_array_equal(read.posterior["x"][1, 499], np.arange(8_000.0))
 
 
 @pytest.mark.parametrize(

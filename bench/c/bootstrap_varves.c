@@ -13,13 +13,9 @@
  * Output: one line for each N with ns per particle and step (the median over the repeats) and
  * the mean of the log-likelihood estimates with its standard error.
  */
-#include <ctype.h>
-#include <math.h>
+#include "yardstick.h"
+
 #include <stdint.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <time.h>
 
 #define SHAPE 6.25
 #define RATE 0.256
@@ -138,50 +134,6 @@ static double filter(rng_t *g, const double *y, int T, int N, double phi, double
         x_next = swap;
     }
     return log_likelihood;
-}
-
-/* ---- input, timing, output ---- */
-
-static int read_series(const char *path, double **series)
-{
-    FILE *file = fopen(path, "r");
-    if (!file) {
-        perror(path);
-        exit(1);
-    }
-    int n = 0, room = 1024;
-    double *y = malloc(room * sizeof *y);
-    char line[4096];
-    while (fgets(line, sizeof line, file)) {
-        char *text = strrchr(line, ','); /* the last column of a CSV file */
-        text = text ? text + 1 : line;
-        for (;;) {
-            char *end;
-            double value = strtod(text, &end);
-            if (end == text)
-                break;
-            if (n == room)
-                y = realloc(y, (room *= 2) * sizeof *y);
-            y[n++] = value;
-            text = end;
-        }
-    }
-    fclose(file);
-    *series = y;
-    return n;
-}
-
-static double now(void)
-{
-    struct timespec t;
-    clock_gettime(CLOCK_MONOTONIC, &t);
-    return t.tv_sec + 1e-9 * t.tv_nsec;
-}
-
-static int by_size(const void *a, const void *b)
-{
-    double u = *(const double *)a, v = *(const double *)b;
-    return (u > v) - (u < v);
 }
 
 int main(int argc, char **argv)

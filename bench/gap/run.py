@@ -71,7 +71,7 @@ def diagnosed(
     path = path_of(id, name, both)
     if path.exists():
         return parse(path.read_text())
-    verb: Any = diagnose or vars(ssm)["diagnose"]
+    verb: Any = diagnose or ssm.diagnose
     began = time.perf_counter()
     try:
         model = load_model(str(folder / "model.py"))

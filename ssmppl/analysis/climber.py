@@ -14,7 +14,7 @@ from functools import partial
 from itertools import compress
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ssmppl.analysis.pythontext import DOMAIN, Function, straight_function
 from ssmppl.expressions.arrays import array
@@ -170,10 +170,12 @@ class Climber:
             return (-out[0] if len(out) > 1 else 1e300), -slope
 
         if self.order == 1:
-            found = minimize(negative, z, jac=True, method="BFGS", options={"gtol": 1e-9})
+            found = scipy.optimize.minimize(
+                negative, z, jac=True, method="BFGS", options={"gtol": 1e-9}
+            )
         else:
             options = {"maxfev": 400 * n, "xatol": 1e-9, "fatol": 1e-12}
-            found = minimize(negative, z, method="Nelder-Mead", options=options)
+            found = scipy.optimize.minimize(negative, z, method="Nelder-Mead", options=options)
         return found.x if -found.fun >= self._at(z, rest)[0] else z
 
 

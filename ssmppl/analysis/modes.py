@@ -17,7 +17,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import lsq_linear
+import scipy
 
 from ssmppl.analysis.families import (
     Beta,
@@ -116,7 +116,9 @@ def _quadratic(
     if all(low < x < high for x, (low, high) in zip(theta, limits, strict=True)):
         return theta
     low, high = (np.array(b) for b in zip(*limits, strict=True))
-    found = lsq_linear(root.T, target, bounds=(low - present, high - present), method="bvls")
+    found = scipy.optimize.lsq_linear(
+        root.T, target, bounds=(low - present, high - present), method="bvls"
+    )
     moved = present + found.x
     return np.array([inside(x, *b) for x, b in zip(moved, limits, strict=True)])
 

@@ -10,11 +10,12 @@ A `Proposal` says how a particle moves and what it weighs, as expressions:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.structure import GaussianBlock, gaussian_block
-from ssmppl.expressions.arrays import array
+from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, attributed, depends_on, substitute, topological
 from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Site, Trace
@@ -50,15 +51,26 @@ def bootstrap(trace: Trace, missing: Missing) -> Proposal:
 
 
 def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
-    """A draw from the law of every component, which may name others of the same step."""
+    """A draw from the law of every component, which may name others of the same step; NaN where a
+    parameter of the law is out of its range."""
     out: dict[Expr, Expr] = {}
     for site in sites:
         law = site.distribution
         with attributed(trace.locations, law.location):
-            # of a flat law NaN, for code that is never run: no algorithm starts from it
-            sample = array(law.sample(Draws(site.name)) if law.proper else law.mean())
+            sample = drawn(site)
         out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
     return out
+
+
+def drawn(site: Site) -> ExprArray:
+    """A draw from a law, of its shape; NaN where a parameter is out of its range.
+
+    Of a flat law NaN, for code that is never run: no algorithm starts from it.
+    """
+    law = site.distribution
+    sample = array(law.sample(Draws(site.name)) if law.proper else law.mean())
+    inside = law.in_range()
+    return sample if inside is None else array(elementwise("where", inside, sample, math.nan))
 
 
 def resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:

@@ -286,5 +286,6 @@ def _user(trace: Trace, missing: Missing) -> Proposal:
         name="user",
         draw=draw,
         weight=(*base.weight, *ratio),
-        explanation=f"as written: {next(iter(trace.proposal.values())).where.short}",
+        # no file and line: a generated text must not change with the number of a notebook's cell
+        explanation=f"as written in {next(iter(trace.proposal.values())).where.function}()",
     )

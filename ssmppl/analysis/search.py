@@ -124,7 +124,8 @@ class Search:
         positions = growing or others or list(range(len(form.functions)))
         if not positions:
             where = self.site(form.components[0]).distribution.location
-            return NotApplicable(f"no density depends on {names}, an improper prior", where)
+            reason = f"no density depends on {names}: a constant prior, and no law names it"
+            return NotApplicable(reason, where)
         factor = form.origins[form.monomials[positions[0]]][-1]
         text = ", ".join(shorten(to_text(form.functions[i])) for i in positions[:4])
         more = ", ..." if len(positions) > 4 else ""

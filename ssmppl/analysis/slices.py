@@ -82,6 +82,8 @@ def _acceptable(
     differ = False
     while right - left > 1.1 * width:
         middle = 0.5 * (left + right)
+        if not left < middle < right:  # no number between them: far out, where the width is none
+            break
         differ = differ or (x < middle) != (new < middle)
         if new < middle:
             right = middle

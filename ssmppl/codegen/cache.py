@@ -13,9 +13,11 @@ import hashlib
 import importlib.util
 import os
 import platform
+import stat
 import sys
 import tempfile
 import threading
+import warnings
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -29,12 +31,37 @@ _lock = threading.Lock()
 
 
 def cache_folder() -> Path:
-    """`$SSMPPL_CACHE`, else ssmppl's folder in the user's cache."""
-    chosen = os.environ.get("SSMPPL_CACHE")
-    if chosen:
-        return Path(chosen).expanduser() / "ssmppl"
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "ssmppl"
+    """`$SSMPPL_CACHE`, else ssmppl's folder in the user's cache; a temporary one in place of one
+    that others can write to.
+
+    What lies there is executed: it has to be the user's own.
+    """
+    chosen = os.environ.get("SSMPPL_CACHE") or os.environ.get("XDG_CACHE_HOME")
+    base = Path(chosen).expanduser() if chosen else Path.home() / ".cache"
+    folder = base / "ssmppl"
+    return folder if _is_private(folder) else Path(_temporary_folder())
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else can put anything into a folder, which is made if need be.
+
+    A folder that cannot be made is none that others write to: what is kept there fails later.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        found = folder.stat()
+    except OSError:
+        return True
+    others_write = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    if not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not others_write):
+        return True
+    whose = "others can write to it" if others_write else "it belongs to somebody else"
+    warnings.warn(
+        f"compiled models are not kept in {folder}: {whose}, and what lies there would be run. "
+        f"Remove the folder, or name one of your own: export SSMPPL_CACHE=...",
+        stacklevel=2,
+    )
+    return False
 
 
 @cache
@@ -101,7 +128,6 @@ def keep_bytes(name: str, suffix: str, content: bytes) -> None:
     """Keep bytes, with their digest behind them."""
     folder = cache_folder()
     with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         _write_atomically(folder / f"{name}{suffix}", content + hashlib.sha256(content).digest())
 
 
@@ -114,7 +140,6 @@ def _write(file: str, text: str) -> Path:
     except OSError:
         pass
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         _write_atomically(path, text)
     except OSError:
         path = Path(_temporary_folder()) / file

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.moves import Proposal
+from ssmppl.analysis.moves import Proposal, drawn
 from ssmppl.analysis.structure import deterministic
 from ssmppl.codegen.module import (
     PARTICLE,
@@ -22,7 +22,7 @@ from ssmppl.codegen.render import Names, Writer, depends
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed, constant
-from ssmppl.language.distributions import Categorical, Draws, MvNormal, Normal
+from ssmppl.language.distributions import Categorical, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace
 from ssmppl.language.transforms import transforms
 
@@ -149,7 +149,7 @@ def observation_draws(trace: Trace) -> list[Expr]:
     out: list[Expr] = []
     for site in trace.observations.values():
         with attributed(trace.locations, site.distribution.location):
-            sample = array(site.distribution.sample(Draws(site.name))).ravel()
+            sample = drawn(site).ravel()
         by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
         out += [by_symbol[s] for s in site.components]
     return out

@@ -8,7 +8,6 @@ Numba from the very same text.
 
 from __future__ import annotations
 
-import inspect
 import threading
 from collections.abc import Callable
 from types import ModuleType
@@ -17,7 +16,8 @@ from typing import Any
 from numba import config
 
 from ssmppl.codegen import cache
-from ssmppl.codegen.kernels import guide, steering
+from ssmppl.codegen.kernels import backward, backward_pairs, guide, steering
+from ssmppl.codegen.module import Section
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.entries import entry
 from ssmppl.codegen.native.translate import Untranslatable
@@ -29,11 +29,11 @@ HELPERS: dict[str, Any] = {
     for home, names in (
         (guide, ("look_at", "most_likely")),
         (steering, steering.SPECIALISED),
+        (backward, ("backward_weights",)),
+        (backward_pairs, ("continuation",)),
     )
     for name in names
 }
-# Arguments of a filter that only its compiled variant knows: what is not None needs Numba's.
-VARIANTS = ("scheme", "moments")
 
 
 class Loaded:
@@ -59,31 +59,32 @@ class Loaded:
                 self._made[name] = self._algorithm(name)
             return self._made[name]
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._out.algorithms
+
+    def sizes(self, name: str) -> tuple[int, ...]:
+        """An algorithm's sizes, as of the kernel `particle_filter`."""
+        return self._out.algorithms[name].sizes
+
     def _algorithm(self, name: str) -> Callable[..., Any]:
         algorithm, numba_made = self._out.algorithms[name], getattr(self.module, name)
         if config.DISABLE_JIT:  # type: ignore[attr-defined]
             return numba_made
-        section = algorithm.section
         helpers = tuple((HELPERS[n], n) for n in algorithm.bound.values() if n in HELPERS)
+        aside = self._out.algorithms["predict"] if "predict" in algorithm.bound else None
         try:
-            found = addresses(f"{self._name}_{section.suffix}", self._out.texts[id(section)])
-            places = {r: found[section.name(r)] for r in section.roles}
-            run = entry(algorithm, places, helpers)
+            return entry(
+                algorithm, self._places(algorithm.section), helpers,
+                (aside, self._places(aside.section)) if aside else None,
+            )  # fmt: skip
         except Untranslatable as reason:
             self.why[name] = reason.found
             return numba_made
-        if "predict" not in algorithm.bound:
-            return run
-        given = inspect.signature(getattr(algorithm.function, "py_func", algorithm.function))
-        names = list(given.parameters)
-        own = [names.index(v) - names.index("theta") for v in VARIANTS if v in names]
 
-        def call(*args: Any) -> Any:
-            """The filter; with moments or another scheme by Numba's variant."""
-            plain = all(args[i] is None for i in own)
-            return (run if plain else numba_made)(*args)
-
-        return call
+    def _places(self, section: Section) -> dict[str, int]:
+        """Addresses of a section's functions, by role."""
+        found = addresses(f"{self._name}_{section.suffix}", self._out.texts[id(section)])
+        return {r: found[section.name(r)] for r in section.roles}
 
 
 def load(out: ModuleText, name: str, lines: list[str]) -> Loaded:

@@ -22,6 +22,7 @@ from ssmppl.analysis.moves import Proposal, bootstrap
 from ssmppl.analysis.proposals import derive
 from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.analysis.twisted import twisted
+from ssmppl.codegen.device import DeviceFilter, compile_device
 from ssmppl.codegen.kernels.alive_filter import alive_filter
 from ssmppl.codegen.kernels.backward import backward_exact, backward_weights
 from ssmppl.codegen.kernels.backward_pairs import (
@@ -29,6 +30,7 @@ from ssmppl.codegen.kernels.backward_pairs import (
     backward_rejection,
     continuation,
 )
+from ssmppl.codegen.kernels.blocks import move_blocks
 from ssmppl.codegen.kernels.conditional_smc import conditional_smc, filtered_path
 from ssmppl.codegen.kernels.particle_filter import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
@@ -54,8 +56,6 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.trace import Trace
 
-SELDOM = ("simulate", "simulate_on", "observe_states")
-
 
 @dataclass
 class Program:
@@ -70,6 +70,8 @@ class Program:
     text: str
     module: ModuleType = field(repr=False)
     loaded: Loaded = field(repr=False)
+    _entries: dict[str, Callable[..., Any]] = field(default_factory=dict, repr=False)
+    _on_device: dict[tuple[str, int], DeviceFilter] = field(default_factory=dict, repr=False)
 
     def __reduce__(self):  # another process generates the module again, or finds it in its cache
         return compile_trace, (self.trace, self.missing)
@@ -88,6 +90,20 @@ class Program:
     def tempered(self) -> TemperedFilter | NotApplicable:
         """The tempered filter, likewise."""
         return compile_tempered(self.trace, self.missing)
+
+    def apart(self, proposal: str) -> bool:
+        """Whether particles of this proposal move without looking ahead at each other, as in
+        blocks and on a device."""
+        return f"move_blocks_{proposal}" in self.loaded
+
+    def on_device(self, proposal: str, tile: int) -> DeviceFilter:
+        """The filter of one proposal for a CUDA device, with blocks of so many threads."""
+        key = proposal, tile
+        if key not in self._on_device:
+            found = self.proposals[proposal]
+            assert isinstance(found, Proposal), found
+            self._on_device[key] = compile_device(self.trace, found, tile)
+        return self._on_device[key]
 
     def proposal(self, name: str) -> Proposal | NotApplicable | None:
         """What was derived under this name, or why nothing was; None where no proposal has it."""
@@ -121,6 +137,11 @@ class Program:
         ------
         ArgumentError : it belongs to a proposal that could not be derived; gives the reason.
         """
+        if name not in self._entries:
+            self._entries[name] = self._entry(name)
+        return self._entries[name]
+
+    def _entry(self, name: str) -> Callable[..., Any]:
         if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
             return self.twisted.entry(name.removesuffix("_twisted"))
         if name.endswith("_tempered") and isinstance(self.tempered, TemperedFilter):
@@ -128,8 +149,6 @@ class Program:
         if name.endswith(tuple(f"_{own}" for own in MARGINAL)):
             if isinstance(self.marginal, MarginalFilter):
                 return self.marginal.entry(name)
-        if name in SELDOM:  # many a model is simulated a few times only
-            return getattr(self.loaded, name)
         if not hasattr(self.module, name):
             for proposal, found in self.proposals.items():
                 if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
@@ -137,7 +156,7 @@ class Program:
                         f"particles cannot move by the proposal {proposal!r}: {found}",
                         fix="use an exact method, or another proposal",
                     )
-        return getattr(self.module, name)
+        return getattr(self.loaded, name)
 
 
 # The last programs; each keeps its trace, and with it the trace's id, in use.
@@ -194,6 +213,8 @@ def _write(
         own = {"ahead": ahead, "predict": "predict"}
         out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
         out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
+        if proposal.look_ahead is None:
+            out.algorithm(move_blocks, section.name("move_blocks"), section, "entry")
         own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
         own["eliminated"] = "0"
         out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)

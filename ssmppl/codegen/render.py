@@ -236,7 +236,7 @@ def number_text(value: float) -> str:
 
 def comment(node: Expr, width: int = 60) -> str:
     """The expression in the user's words, cut to a margin comment."""
-    text = to_text(node)
+    text = to_text(node, longest=4 * width)
     return text if len(text) <= width else text[: width - 3] + "..."
 
 

@@ -16,7 +16,8 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.moves import Proposal, bootstrap
 from ssmppl.analysis.tempered import Tempered, tempered
 from ssmppl.codegen import kits
-from ssmppl.codegen.kernels.conditional_smc import ancestral_path, draw_index
+from ssmppl.codegen.kernels.conditional_smc import draw_index
+from ssmppl.codegen.kernels.genealogy import ancestral_path
 from ssmppl.codegen.kernels.prediction import predict_step
 from ssmppl.codegen.kernels.random import uniform
 from ssmppl.codegen.kernels.tempered_filter import tempered_filter

@@ -286,7 +286,8 @@ import numpy as np
 @once
 def backward_passes() -> ModuleType:
     """The kernels that know no model, compiled once for all."""
-    made = [specialise(k, k.__name__, {}) for k in (guide_back.look_back, guide_back.write_guide)]
+    kernels = guide_back.look_back, guide_back.look_back_scalar, guide_back.write_guide
+    made = [specialise(k, k.__name__, {}) for k in kernels]
     names = {n: home for m in made for n, home in m.imports.items() if n != "exact"}
     lines = [f"from {home} import {n}" for n, home in sorted(names.items())]
     lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]

@@ -136,6 +136,7 @@ def unpack(sites: Iterable[Site], packed: np.ndarray) -> dict[str, np.ndarray]:
     for site in sites:
         for symbol in site.components:
             position[symbol] = len(position)
+    on_disk = isinstance(packed, np.memmap)
     packed = np.asarray(packed)
     if packed.ndim == 0 or packed.shape[-1] != len(position):
         raise ArgumentError(
@@ -146,7 +147,10 @@ def unpack(sites: Iterable[Site], packed: np.ndarray) -> dict[str, np.ndarray]:
     out = {}
     for site in sites:
         columns = np.array([position[s] for s in site.value.ravel()], dtype=np.intp)
-        out[site.name] = packed[..., columns].reshape(packed.shape[:-1] + site.shape)
+        taken: slice | np.ndarray = columns
+        if on_disk and np.array_equal(columns, np.arange(len(columns)) + columns[0]):
+            taken = slice(int(columns[0]), int(columns[0]) + len(columns))  # stays there
+        out[site.name] = packed[..., taken].reshape(packed.shape[:-1] + site.shape)
     return out
 
 

@@ -232,7 +232,9 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
         )
     if labels.dtype.kind == "O":
         numbers = as_numbers(labels)
-        labels = labels.astype(str) if isinstance(numbers, Fault) else numbers
+        if isinstance(numbers, Fault):
+            numbers = np.array([str(v) for v in labels], dtype=str)  # NumPy takes tuples for arrays
+        labels = numbers
     ordered = labels.dtype.kind in "iufmM"
     if labels.dtype.kind in "fmM":
         absent = ~np.isfinite(labels)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+
 from ssmppl.expressions.graph import topological
 from ssmppl.expressions.node import MATRIX_OPS, Expr, behaviour
 
 _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "pow": ("**", 4)}
 _INFIX |= {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "mod": ("%", 2)}
+LONGEST = 10_000
 
 
 def symbol_text(node: Expr) -> str:
@@ -38,8 +41,12 @@ def _matrix_name(node: Expr) -> str | None:
     return None
 
 
-def to_text(root: Expr) -> str:
-    """The expression as a person writes it."""
+def to_text(root: Expr, longest: int = LONGEST) -> str:
+    """The expression as a person writes it.
+
+    Written out, an expression that shares its parts can be exponentially longer than its graph:
+    what has more than `longest` characters is cut, with a mark that differs where the rest does.
+    """
     if root.op == "symbol":
         return symbol_text(root)
     done: dict[Expr, tuple[str, int]] = {}
@@ -68,6 +75,10 @@ def to_text(root: Expr) -> str:
         else:
             name = node.data[0] if node.op == "random" else node.op
             done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)
+        text, level = done[node]
+        if len(text) > longest:
+            mark = hashlib.sha256(text.encode()).hexdigest()[:8]
+            done[node] = (f"{text[:longest]}...{mark}", level)
     return done[root][0]
 
 

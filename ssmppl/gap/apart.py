@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from ssmppl.gap.classes import (
 )
 from ssmppl.gap.efficient import Null, efficient
 from ssmppl.gap.refit import Refit
-from ssmppl.gap.screen import Screen
+from ssmppl.gap.screen import Question, Screen
 from ssmppl.inference.particles.filtering import random_state
 
 SETS = 25  # simulated under each input
@@ -90,22 +91,8 @@ def separating(
     question, columns = screen.question, np.array(members, dtype=int)
     inputs = simple_inputs(screen.experiments)
     whole = question.theta(screen.theta)
-    own = whole[: len(question.columns.base.parameter_symbols)]
     names = list(inputs)
-
-    def one(k: int) -> Numbers:
-        number, which = divmod(k, len(names))
-        stream = random_state(seed, which, number)
-        try:
-            data = question.simulator.sets(inputs[names[which]], own, stream)
-            passes = question.smoother.run(data, whole, stream)
-        except SamplingError:
-            return {}
-        if not all(np.all(np.isfinite(p.rows)) for p in passes):
-            return {}
-        found = question.statistics(data, passes, stream)
-        return {"columns": found.columns[columns], "nuisance": found.nuisance}
-
+    one = partial(_tried, question, list(inputs.values()), whole, columns, seed)
     results = kept.each("trying inputs", SETS * len(names), one)
     covariances = {}
     for which, name in enumerate(names):
@@ -128,6 +115,25 @@ def separating(
         screen.found.sided[columns],
     )  # fmt: skip
     return best.input if best.told_apart else ""
+
+
+def _tried(
+    question: Question, inputs: Sequence[Sequence[Experiment]], theta: np.ndarray,
+    columns: np.ndarray, seed: np.random.SeedSequence, k: int,
+) -> Numbers:  # fmt: skip
+    """The scores of a set that is simulated under one of the inputs; empty where there are none."""
+    number, which = divmod(k, len(inputs))
+    stream = random_state(seed, which, number)
+    own = theta[: len(question.columns.base.parameter_symbols)]
+    try:
+        data = question.simulator.sets(inputs[which], own, stream)
+        passes = question.smoother.run(data, theta, stream)
+    except SamplingError:
+        return {}
+    if not all(np.all(np.isfinite(p.rows)) for p in passes):
+        return {}
+    found = question.statistics(data, passes, stream)
+    return {"columns": found.columns[columns], "nuisance": found.nuisance}
 
 
 def simple_inputs(experiments: Sequence[Experiment]) -> dict[str, list[Experiment]]:

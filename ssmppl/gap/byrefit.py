@@ -11,6 +11,7 @@ stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrik
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -57,10 +58,7 @@ def refit_p(
     base : the model's fit to the screen's experiments.
     """
     gain, beyond, done = best_of_tried(screen, refits), 0, 0
-
-    def one(k: int) -> Numbers:
-        return {"gain": np.asarray(_gain(workshop, base, screen, random_state(seed, k), seed, k))}
-
+    one = partial(_one, workshop, base, screen, seed)
     for last in range(CHUNK, SETS + CHUNK, CHUNK):
         found = kept.each("refitting simulated data", min(last, SETS), one)
         gains = np.array([float(f["gain"]) for f in found])
@@ -69,6 +67,12 @@ def refit_p(
         if (beyond + 1.0) / (SETS + 1.0) > alpha:
             break
     return (beyond + 1.0) / (done + 1.0)
+
+
+def _one(
+    workshop: Workshop, base: Fit, screen: Screen, seed: np.random.SeedSequence, k: int
+) -> Numbers:
+    return {"gain": np.asarray(_gain(workshop, base, screen, random_state(seed, k), seed, k))}
 
 
 def _gain(

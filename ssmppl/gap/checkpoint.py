@@ -7,33 +7,37 @@ computed from: no code, nothing pickled.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.errors import ArgumentError
-from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import Expr, topological
 from ssmppl.gap.effect import Effect
+from ssmppl.inference.checkpoints.archive import no_checkpoint, read, unwritable, write
+from ssmppl.inference.checkpoints.origin import (
+    Origin,
+    data_digest,
+    digest,
+    model_digest,
+    origin_of,
+    sources_digest,
+    text_of,
+)
 from ssmppl.inference.runner import run_tasks
-from ssmppl.language.primitive import Primitive
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.trace import Trace
 
 SECONDS = 5.0  # between two writings, at least
 SHARE = 0.05  # of the time that may go into writing
 HEADER = "made from"
+WHAT = "a diagnosis"
+FOLDERS = ("expressions", "language", "data", "analysis", "codegen", "inference", "gap")
 
 Numbers = dict[str, np.ndarray]
 
@@ -54,7 +58,7 @@ class Checkpoint:
         self, path: str | os.PathLike[str] | None, made_from: Mapping[str, str],
         executor: Executor | None = None, progress: bool = False,
     ):  # fmt: skip
-        self.made_from = dict(made_from)
+        self.made_from = Origin(dict(made_from))
         self.executor, self.progress = executor, progress
         self.prefix = ""
         self.file = None if path is None else _file(Path(path), made_from.get("mode", "stages"))
@@ -107,18 +111,19 @@ class Checkpoint:
     ) -> list[Numbers]:
         """The numbers of task(0), ..., task(count - 1), those left out that are there.
 
-        At Ctrl-C the tasks that are done are kept, and KeyboardInterrupt goes on.
+        A task may run in another process: a function of a module, or a `partial` of one. At Ctrl-C
+        the tasks that are done are kept, and KeyboardInterrupt goes on.
         """
         todo = [k for k in range(count) if f"{stage}/{k}" not in self]
 
-        def one(k: int) -> None:
-            self.put(f"{stage}/{k}", task(k))
+        def take(i: int, numbers: Mapping[str, Any]) -> None:
+            self.put(f"{stage}/{todo[i]}", numbers)
 
         try:
             if todo:
                 run_tasks(
-                    one, todo, executor=self.executor, progress=self.progress,
-                    title=self.prefix + stage,
+                    task, todo, executor=self.executor, progress=self.progress,
+                    title=self.prefix + stage, take=take,
                 )  # fmt: skip
         finally:
             self.flush()
@@ -130,42 +135,27 @@ class Checkpoint:
             begin = time.monotonic()
             members = {f"{name}|{field}": v for name, numbers in self._done.items()
                        for field, v in numbers.items()}  # fmt: skip
-            members[HEADER] = np.array(json.dumps(self.made_from))
-            beside = self.file.with_name(f"{self.file.name}.{os.getpid()}.part")
+            members[HEADER] = np.array(self.made_from.as_text())
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                with open(beside, "wb") as f:
-                    np.savez(f, **members)  # type: ignore[arg-type]
-                os.replace(beside, self.file)
+                write(self.file, members.items())
             except OSError as error:
-                raise ArgumentError(
-                    f"the checkpoint {self.file} cannot be written: {error.strerror or error}",
-                    fix="give another path, or checkpoint=None",
-                ) from error
+                raise unwritable(self.file, error) from error
             self._written = time.monotonic()
             self._cost = self._written - begin
         self._new = False
 
     def _read(self, file: Path) -> dict[str, Numbers]:
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                found = {name: archive[name] for name in archive.files}
-            made_from = json.loads(str(found.pop(HEADER)))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise ArgumentError(
-                f"{file} is no checkpoint of a diagnosis",
-                fix="give the path of one, or of a file or folder that does not exist yet",
-            ) from error
-        other = [k for k, v in self.made_from.items() if made_from.get(k) != v]
-        if other:
-            raise ArgumentError(
-                f"the checkpoint {file} was made with {_listed(other)}",
-                fix="give another path, or delete it to start anew",
-            )
+        found = read(file, WHAT)
         out: dict[str, Numbers] = {}
-        for name, values in found.items():
-            stage, field = name.rsplit("|", 1)
-            out.setdefault(stage, {})[field] = values
+        try:
+            was = origin_of(str(found.pop(HEADER)))
+            for name, values in found.items():
+                stage, field = name.rsplit("|", 1)
+                out.setdefault(stage, {})[field] = values
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            raise no_checkpoint(file, WHAT, "it holds something else") from error
+        self.made_from.check(file, was)
         return out
 
 
@@ -195,12 +185,6 @@ def _file(path: Path, mode: str) -> Path:
     return path / f"{mode}.npz" if folder else path
 
 
-def _listed(other: Sequence[str]) -> str:
-    plural = ("settings", "data")
-    words = [f"{'other' if k in plural else 'another'} {k}" for k in other]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
 # -- what a diagnosis is computed from
 def digests(
     trace: Trace, experiments: Sequence[Experiment], effects: Sequence[Effect], mode: str,
@@ -209,63 +193,12 @@ def digests(
     """By what they are of: the mode itself, digests of the others."""
     return {
         "mode": mode,
-        "model": _digest(_model(trace)),
-        "data": _digest(*(_data(e) for e in experiments)),
-        "set of effects": _digest(*(_effect(e) for e in effects)),
-        "settings": _digest(*(f"{k}={_value(v)}" for k, v in sorted(settings.items()))),
-        "version of this package": _code(),
+        "model": model_digest(trace),
+        "data": data_digest(experiments),
+        "set of effects": digest(*(_effect(e) for e in effects)),
+        "settings": digest(*(f"{k}={text_of(v)}" for k, v in sorted(settings.items()))),
+        "version of this package": sources_digest(*FOLDERS),
     }
-
-
-def _digest(*parts: str) -> str:
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:20]
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{k}: {_value(v)}" for k, v in sorted(value.items()))
-    return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)
-
-
-def _data(e: Experiment) -> str:
-    own = hashlib.sha256()
-    for values in (e.y, e.seen, e.u):
-        own.update(repr(values.shape).encode())
-        own.update(np.ascontiguousarray(values).tobytes())
-    own.update(repr(None if e.time is None else [str(t) for t in e.time]).encode())
-    return own.hexdigest()
-
-
-def _model(trace: Trace) -> str:
-    """Laws and expressions, without where they were written."""
-    lines = [trace.name]
-    roots: list[Expr] = []
-    for role in ("parameters", "initial", "transition", "observations", "proposal"):
-        for name, site in getattr(trace, role).items():
-            lines.append(f"{role} {name} {site.shape} {_law(site.distribution)}")
-            roots += _roots(site)
-    number: dict[Expr, int] = {}
-    for e in topological(roots):
-        number[e] = len(number)
-        data = e.data.name if isinstance(e.data, Primitive) else repr(e.data)
-        lines.append(f"{e.op} {data} {[number[a] for a in e.args]}")
-    lines.append(repr([number[e] for e in roots]))
-    return "\n".join(lines)
-
-
-def _law(distribution: Any) -> str:
-    base = getattr(distribution, "base", None)
-    return f"{type(distribution).__name__}{f' of {_law(base)}' if base is not None else ''}"
-
-
-def _roots(site: Site) -> list[Expr]:
-    out: list[Expr] = list(site.value.ravel())
-    law: Any = site.distribution
-    while law is not None:
-        for values in law.parameters.values():
-            out += list(array(values).ravel())
-        law = getattr(law, "base", None)
-    return out
 
 
 def _effect(e: Effect) -> str:
@@ -275,12 +208,3 @@ def _effect(e: Effect) -> str:
     declared = [e.name, e.form, e.kind, e.on, e.lower, e.upper, dict(e.shapes), dict(e.given),
                 dict(e.states), e.profile, e.process]  # fmt: skip
     return f"{declared!r} {code.co_code.hex()} {code.co_names} {plain!r}"
-
-
-@cache
-def _code() -> str:
-    """Of the sources that numbers come from."""
-    package = Path(__file__).parents[1]
-    folders = ("expressions", "language", "data", "analysis", "codegen", "inference", "gap")
-    return _digest(*(f.read_text(encoding="utf-8") for folder in folders
-                     for f in sorted((package / folder).rglob("*.py"))))  # fmt: skip

@@ -72,7 +72,8 @@ def diagnose(
     fixed : values of known parameters.
     particles : of the particle filters; None: 500 in fast mode, 1000 in full mode, 100
         where the twisted proposal applies.
-    executor : any `concurrent.futures.Executor` that runs in this process; None: threads.
+    executor : any `concurrent.futures.Executor`, over which simulated sets and refits are shared
+        out; None: threads.
     checkpoint : a file, or a folder, that keeps what is done: the same call again goes on from
         there and gives the same report. None: nothing is kept.
     progress : whether to show the stages and the time that they will take, on stderr.

@@ -53,7 +53,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -62,6 +61,7 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.gap.declared import check
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.model import location_of
+from ssmppl.language.packing import holder_of
 
 _MISSING: Any = None
 
@@ -193,7 +193,7 @@ class Effect:
         """By name where a module holds it in place of its function, as decorated ones are."""
         fields = {k: getattr(self, k) for k in self.__dataclass_fields__}
         module, name = self.function.__module__, self.function.__qualname__
-        holder = getattr(sys.modules.get(module), name, None)
+        holder = holder_of(self.function)
         if holder is self:
             return _by_name, (module, name)
         if isinstance(holder, Effect) and holder.function is self.function:  # renamed

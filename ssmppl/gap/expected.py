@@ -8,6 +8,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
+from ssmppl.inference.executors import workers_of
+
 REFITS = 24  # of single effects, their shapes, pairs and the reference, about
 FIT_PASSES = 36  # over the data in a fit, about
 SCREENS = 2.0  # as long as the first one that follow it: for further effects, under other inputs
@@ -39,7 +41,7 @@ def seconds(found: Timed, sets: int, mode: str, folds: int, executor: Executor |
 
     sets : simulated in the screen. folds : blocks that are left out in turn, 0 for three parts.
     """
-    workers = getattr(executor, "_max_workers", None) or _cores()
+    workers = workers_of(executor) or _cores()
     screen = sets * found.screen_pass / workers
     if mode == "fast":
         return screen

@@ -6,6 +6,7 @@ import re
 import textwrap
 from typing import TYPE_CHECKING
 
+from ssmppl import markup
 from ssmppl.gap.naming import class_letters, leaders, row_label, rows, sentence
 from ssmppl.gap.numerals import DASH, is_number, number, p_text, with_error
 from ssmppl.gap.words import (
@@ -22,7 +23,7 @@ from ssmppl.gap.words import (
 if TYPE_CHECKING:
     from ssmppl.gap.report import GapReport
 
-__all__ = ["cause_rows", "report_text"]
+__all__ = ["cause_rows", "report_html", "report_text"]
 
 PAGE = 100  # columns
 SHOWN_CAUSES = 8
@@ -78,15 +79,49 @@ def report_text(report: GapReport) -> str:
             lines.append("Effects with the same letter cannot be told apart by these data.")
         for term in ("gain", "closable gap", "p")[:: 1 if len(report.closed) else 2]:
             lines += wrapped(f"{term}: {GLOSSARY[term]}.")
-    for name, found in (
+    for name, found in _rest(report):
+        lines += ["", name]
+        for item in found:
+            lines += wrapped(item, "- ", "  ")
+    return "\n".join(lines)
+
+
+def report_html(report: GapReport) -> str:
+    """What `report_text` says, for a notebook."""
+    parts = [markup.heading(report.title or "Diagnosis"), markup.paragraph(headline(report))]
+    answers = [
+        (markup.text(name), markup.text(" ".join(sentences)))
+        for name, sentences in (
+            ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
+            ("How sure", how_sure(report)),
+        )
+        if sentences
+    ]  # fmt: skip
+    parts.append(markup.table(answers, left=(0, 1)))
+    head, *causes = cause_rows(report)
+    if causes:
+        keep = [i for i in range(len(head)) if any(row[i] for row in causes)]
+        cells = [[markup.text(row[i].strip()) for i in keep] for row in causes]
+        left = [k for k, i in enumerate(keep) if i < 2]
+        parts.append(markup.table(cells, [head[i] for i in keep], left))
+        if any("*" in row[3] for row in causes):
+            parts.append(markup.paragraph("* predicted by the screen, not refitted"))
+        if class_letters(report):
+            told = "Effects with the same letter cannot be told apart by these data."
+            parts.append(markup.paragraph(told))
+    for name, found in _rest(report):
+        items = "".join(f"<li>{markup.text(item)}</li>" for item in found)
+        parts.append(markup.folded(f"{name} ({len(found)})", f"<ul>{items}</ul>"))
+    return "".join(parts)
+
+
+def _rest(report: GapReport) -> list[tuple[str, list[str]]]:
+    """What could not be told, what would tell, and what has to be known."""
+    found = [
         ("Could not be told", untold(report)), ("What next", next_steps(report)),
         ("Notes", [sentence(n) for n in report.notes]),
-    ):  # fmt: skip
-        if found:
-            lines += ["", name]
-            for item in found:
-                lines += wrapped(item, "- ", "  ")
-    return "\n".join(lines)
+    ]  # fmt: skip
+    return [(name, items) for name, items in found if items]
 
 
 def wrapped(text: str, first: str = "", rest: str = "") -> list[str]:

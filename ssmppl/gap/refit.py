@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -267,13 +268,7 @@ def refit_all(
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
-    def one(k: int) -> Numbers:
-        own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-        found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh)
-        if isinstance(found, NotApplicable):
-            return {"reason": np.array(found.reason)}
-        return found.fit.numbers
-
+    one = partial(_one, workshop, base, screen, list(sets), tuple(train), seed, added, afresh)
     done, reasons = [], []
     results = kept.each(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
@@ -291,6 +286,19 @@ def refit_all(
         done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))
     done.sort(key=lambda r: -r.merit)
     return done, reasons
+
+
+def _one(
+    workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+    train: Sequence[Experiment], seed: np.random.SeedSequence,
+    added: Sequence[tuple[Candidate, ...]], afresh: bool, k: int,
+) -> Numbers:  # fmt: skip
+    """The numbers of one refit, or the reason why there are none."""
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
+    found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh)
+    if isinstance(found, NotApplicable):
+        return {"reason": np.array(found.reason)}
+    return found.fit.numbers
 
 
 def _shaped(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.gap.printed import report_text
+from ssmppl.gap.printed import report_html, report_text
 from ssmppl.language.model import Model
 
 if TYPE_CHECKING:
@@ -167,6 +167,9 @@ class GapReport:
         return report_text(self)
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return report_html(self)
 
     def plot(self) -> Any:
         """Residual map, ranked effects, missing term and free run, as a Matplotlib Figure."""

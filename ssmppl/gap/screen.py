@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -259,23 +259,7 @@ def ask(
     """
     smoother, whole = question.smoother, question.theta(theta)
     _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
-    given = whole[: len(question.columns.base.parameter_symbols)]
-
-    def one(number: int) -> Numbers:
-        stream = random_state(seed, number)
-        data = list(experiments)
-        try:
-            if number >= OWN_RUNS:
-                data = question.simulator.sets(experiments, given, stream)
-            passes = smoother.run(data, whole, stream, ahead=True)
-        except SamplingError:
-            if number < OWN_RUNS:
-                raise
-            return {}
-        if not all(np.all(np.isfinite(p.rows)) for p in passes):
-            return {}
-        return dict(vars(question.statistics(data, passes, stream)))
-
+    one = partial(_one_set, question, tuple(experiments), whole, seed)
     results = kept.each(stage, OWN_RUNS + sets, one)
     own = [r for r in results[:OWN_RUNS] if r]
     null = [r for r in results[OWN_RUNS:] if r]
@@ -303,6 +287,28 @@ def ask(
     return Screen(
         question, theta, observed, simulated, found, family, law, usual, tuple(experiments)
     )
+
+
+def _one_set(
+    question: Question, experiments: Sequence[Experiment], theta: np.ndarray,
+    seed: np.random.SeedSequence, number: int,
+) -> Numbers:  # fmt: skip
+    """The statistics of the data (the first `OWN_RUNS`) or of a simulated set; empty where it did
+    not go through. theta : of the columns."""
+    smoother, stream = question.smoother, random_state(seed, number)
+    data = list(experiments)
+    try:
+        if number >= OWN_RUNS:
+            own = theta[: len(question.columns.base.parameter_symbols)]
+            data = question.simulator.sets(experiments, own, stream)
+        passes = smoother.run(data, theta, stream, ahead=True)
+    except SamplingError:
+        if number < OWN_RUNS:
+            raise
+        return {}
+    if not all(np.all(np.isfinite(p.rows)) for p in passes):
+        return {}
+    return dict(vars(question.statistics(data, passes, stream)))
 
 
 def compared(law: Null, usual: np.ndarray, seen: Statistics) -> Efficient:

@@ -9,6 +9,7 @@ bounds that the effect declares.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -62,10 +63,7 @@ def shaped_all(
         if r.merit >= least and any(shape_bounds(c, scales) for c in r.candidates)
     ][:SHAPED]  # fmt: skip
 
-    def one(k: int) -> Numbers:
-        own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, k))
-        return _shaped(workshop, scales, out[tried[k]], train, own)
-
+    one = partial(_one, workshop, scales, [out[i] for i in tried], tuple(train), seed)
     for i, numbers in zip(tried, kept.each(stage, len(tried), one), strict=True):
         if "shapes" in numbers:
             old, shapes = out[i], numbers["shapes"]
@@ -77,6 +75,14 @@ def shaped_all(
             if gain - cost > old.merit:
                 out[i] = Refit(old.index, made, fitter, fit, gain, cost)
     return sorted(out, key=lambda r: -r.merit)
+
+
+def _one(
+    workshop: Workshop, scales: Scales, refits: Sequence[Refit], train: Sequence[Experiment],
+    seed: np.random.SeedSequence, k: int,
+) -> Numbers:  # fmt: skip
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, k))
+    return _shaped(workshop, scales, refits[k], train, own)
 
 
 def _shaped(

@@ -31,6 +31,9 @@ class Workshop:
         self.trace, self.missing, self.fixed, self.settings = trace, missing, dict(fixed), settings
         self._made: dict[tuple[tuple[str, str], ...], Fitter] = {}
 
+    def __getstate__(self) -> dict:  # another process makes what it needs
+        return {**self.__dict__, "_made": {}}
+
     def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         """The fitter of the model with these effects; shapes are fixed parameters, so that the
         generated code is the same for all data."""

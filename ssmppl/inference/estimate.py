@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl import markup
 from ssmppl.data import unpack_parameters
 from ssmppl.language.trace import Trace
 from ssmppl.results import to_dataset
@@ -34,7 +35,9 @@ class Estimate:
     log_likelihood : at the estimate; with particles an estimate, whose standard error is
         `attrs["log_likelihood_error"]`.
     iterates : Dataset with dim `iteration`, the way to the estimate; of `IF2` with dim `start` too,
-        and with `perturbed_log_likelihood`, what the swarm's particle filter made of each pass.
+        and with `perturbed_log_likelihood`, what the swarm's particle filter made of each pass. Of
+        exact methods with `objective`, the log-likelihood, with the log prior density where the
+        posterior was maximised.
     attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random
         numbers were used, `monte_carlo_errors`: the estimate's own standard errors by component.
     """
@@ -47,11 +50,33 @@ class Estimate:
     attrs: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        lines = [f"{self.attrs.get('model', '')}: maximum {self.attrs.get('objective', '')} by "
-                 f"{self.attrs.get('method', '')}"]  # fmt: skip
+        lines, rows = [*self._head(), ""], self._rows()
+        widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
+        for row in rows:
+            cells = [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
+            lines.append("  ".join([row[0].ljust(widths[0]), *cells]).rstrip())
+        return "\n".join(lines + [f"\nNote: {note}" for note in self.notes])
+
+    def _repr_html_(self) -> str:
+        title, likelihood = self._head()
+        head, *rows = self._rows()
+        cells = [(markup.code(row[0]), *map(markup.text, row[1:])) for row in rows]
+        notes = "".join(markup.paragraph(f"Note: {note}") for note in self.notes)
+        parts = markup.heading(title), markup.paragraph(likelihood), markup.table(cells, head)
+        return "".join(parts) + notes
+
+    def _head(self) -> tuple[str, str]:
+        """What was maximised and how, and the log-likelihood."""
+        title = (
+            f"{self.attrs.get('model', '')}: maximum {self.attrs.get('objective', '')} by "
+            f"{self.attrs.get('method', '')}"
+        )
         error = self.attrs.get("log_likelihood_error")
         spread = f" (Monte Carlo error {error:.2g})" if error else ""
-        lines += [f"log-likelihood {self.log_likelihood:.6f}{spread}", ""]
+        return title, f"log-likelihood {self.log_likelihood:.6f}{spread}"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        """The table as text, its head first."""
         shown = self.table()
         rows = [("", *(str(c).replace("_", " ") for c in shown.columns))]
         for label, cells in shown.iterrows():
@@ -60,11 +85,7 @@ class Estimate:
             if errors[0] == 0.0:
                 known[0] = "fixed"
             rows.append((str(label), f"{value:.6g}", *known))
-        widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
-        for row in rows:
-            cells = [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
-            lines.append("  ".join([row[0].ljust(widths[0]), *cells]).rstrip())
-        return "\n".join(lines + [f"\nNote: {note}" for note in self.notes])
+        return rows
 
     def table(self) -> pd.DataFrame:
         """One row for each component: estimate, standard error, Monte Carlo error if there is one.

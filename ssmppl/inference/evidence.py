@@ -48,6 +48,7 @@ from ssmppl.language.transforms import unconstrain
 DEGREES = 7.0  # of freedom of the law bridged to: tails heavier than a posterior's
 TASKS = 16
 TARGET_SD = 1.0
+FEW = 20  # draws of a chain that was interrupted, half of which fit the law bridged to
 PARAMETERS = 500  # particles of SMC^2
 REPEATS = 200  # estimates of the likelihood where there is no parameter to integrate out
 
@@ -56,9 +57,13 @@ REPEATS = 200  # estimates of the likelihood where there is no parameter to inte
 class Evidence:
     """log p(y) of a model.
 
-    log_evidence : the estimate. standard_error : its Monte Carlo standard error.
+    Parameters
+    ----------
+    log_evidence : the estimate.
+    standard_error : its Monte Carlo standard error.
     report : how it was made: method, particles, draws, and the estimate by importance sampling
-        from the same draws, which is a check on the other.
+        from the same draws, which is a check on the other; and whether Ctrl-C ended the sampling,
+        so that fewer draws were used.
     """
 
     log_evidence: float
@@ -128,7 +133,10 @@ def evidence(
         model, data, chosen, draws=draws, warmup=warmup, chains=chains, start=start, fixed=fixed,
         states=False, seed=seed, executor=executor, progress=progress,
     )  # fmt: skip
+    interrupted = bool(result["posterior"].attrs["interrupted"])
     z, own = _posterior(space, result)
+    if interrupted and z.shape[1] < FEW:
+        raise KeyboardInterrupt(f"interrupted after {z.shape[1]} draws of each chain: too few")
     half = z.shape[1] // 2
     law = _Student.fitted(z[:, :half].reshape(-1, z.shape[-1]))
     own_ratio = own[:, half:] - law.log_density(z[:, half:])
@@ -145,7 +153,10 @@ def evidence(
     known = _log_prior_of_fixed(problem, held)
     return Evidence(
         found.log_constant - known, found.standard_error,
-        _report(chosen, own_ratio, replace(check, log_constant=check.log_constant - known)),
+        {
+            **_report(chosen, own_ratio, replace(check, log_constant=check.log_constant - known)),
+            "interrupted": interrupted,
+        },
     )  # fmt: skip
 
 

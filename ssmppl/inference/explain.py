@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import html
 import textwrap
 from dataclasses import dataclass
 from typing import Any
 
+from ssmppl import markup
 from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linear
 from ssmppl.analysis.conjugacy import Update, derive_updates
 from ssmppl.analysis.density import Missing
@@ -182,14 +182,10 @@ class Plan:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        parts = [f"<h4>{html.escape(self.trace.name)}</h4>"]
+        parts = [markup.heading(self.trace.name)]
         for title, rows in self.sections():
-            cells = "".join(
-                f"<tr><td style='text-align:left;vertical-align:top'><code>{html.escape(a)}</code>"
-                f"</td><td style='text-align:left;white-space:pre-wrap'>{html.escape(b)}</td></tr>"
-                for a, b in rows
-            )
-            parts.append(f"<b>{html.escape(title)}</b><table>{cells}</table>")
+            cells = [(markup.code(what), markup.text(how)) for what, how in rows]
+            parts.append(f"<b>{markup.text(title)}</b>{markup.table(cells, left=(0, 1))}")
         return "".join(parts)
 
 

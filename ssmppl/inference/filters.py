@@ -12,6 +12,7 @@ import numpy as np
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.models import EXACT
+from ssmppl.inference.labels import observes, with_data
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterRun,
@@ -46,10 +47,15 @@ def particle_filter(
     ess_threshold: float = 1.0,
     rescue: int = 0,
     quantiles: tuple[float, ...] = LEVELS,
+    history: bool = False,
     seed: int | None = None,
     executor: Executor | None = None,
 ) -> xr.Dataset | list[xr.Dataset]:
     """Run the particle filter and tell what it found; arguments as in `log_likelihood`.
+
+    history : whether the result holds every particle with its weight and its ancestor, which
+        `plot_ancestry` draws: T N (D + 2) numbers for each of the repeats. "auto" then leaves the
+        Rao-Blackwellised proposals out.
 
     With proposal="twisted" the particles know what comes later: their sum of log-likelihood
     increments is worth most, while few of them tell the moments at single rows. "auto" leaves it
@@ -69,7 +75,11 @@ def particle_filter(
         * ``y_pit``: P(Y_t <= y_t given y_1:t-1), randomised for discrete channels; NaN where
           missing or undefined;
         * ``ess``: effective sample size (Kong, Liu and Wong 1994);
-        * ``log_likelihood_increment``: log p(y_t given y_1:t-1).
+        * ``log_likelihood_increment``: log p(y_t given y_1:t-1);
+        * ``y_observed``, and ``u_input`` of inputs u: the data, (time, ...);
+        * with `history`: ``x_particles`` (draw, time, ..., particle), ``particle_weight`` and
+          ``particle_ancestor`` (draw, time, particle), the index from 0 of the particle of the row
+          before that each one comes from; of the first row its own.
 
     Raises
     ------
@@ -80,7 +90,12 @@ def particle_filter(
     theta = check_parameters(problem.trace, parameters)
     check_count("repeats", repeats, 1)
     if proposal == "auto":
-        proposal = choose(problem, theta, exact=False, integrate=True).name
+        proposal = choose(problem, theta, exact=False, integrate=not history).name
+    if history and is_marginal(proposal):
+        raise ArgumentError(
+            f'history=True with proposal="{proposal}", whose particles are of some states only',
+            fix='use proposal="auto", which then takes one with particles of all states',
+        )
     settings = settle(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, integrate=True
     )
@@ -93,7 +108,7 @@ def particle_filter(
     levels = quantile_levels(quantiles)
     root = seed_sequence(seed)
 
-    task = partial(_one_run, problem, theta, settings, levels, root)
+    task = partial(_one_run, problem, theta, settings, levels, root, history)
     runs = run_tasks(task, list(range(repeats)), executor=executor)
     attrs = {
         "model": problem.trace.name, "particles": particles, "proposal": settings.proposal,
@@ -109,10 +124,10 @@ def particle_filter(
 
 def _one_run(
     problem: Problem, theta: np.ndarray, settings: FilterSettings, levels: np.ndarray,
-    root: np.random.SeedSequence, repeat: int,
+    root: np.random.SeedSequence, history: bool, repeat: int,
 ) -> list[FilterRun]:  # fmt: skip
     """One run over every experiment; a function that another process can be sent."""
-    run = marginal_run if is_marginal(settings.proposal) else full_run
+    run = marginal_run if is_marginal(settings.proposal) else partial(full_run, history=history)
     return [
         run(problem, e, theta, settings, random_state(root, repeat, i), levels)
         for i, e in enumerate(problem.experiments)
@@ -149,7 +164,18 @@ def filter_dataset(
     variables |= _predictions(problem, experiment, prediction, root)
     variables["ess"] = np.stack([r.ess for r in runs])
     variables["log_likelihood_increment"] = np.stack([r.log_increments for r in runs])
-    return to_dataset(variables, time=experiment.time, dims=dims, coords=coords, attrs=attrs)
+    histories = [r.history for r in runs if r.history is not None]
+    if histories:
+        particles, weights, ancestors = (np.stack(h) for h in zip(*histories, strict=True))
+        for name, values in unpack_states(trace, np.moveaxis(particles, 3, 0)).items():
+            variables[f"{name}_particles"] = np.moveaxis(values, 0, -1)
+            own = [f"{name}_dim_{i}" for i in range(values.ndim - 3)]
+            dims[f"{name}_particles"] = ["time", *own, "particle"]
+        variables |= {"particle_weight": weights, "particle_ancestor": ancestors}
+        dims |= {n: ["time", "particle"] for n in ("particle_weight", "particle_ancestor")}
+    attrs = {**attrs, "observes": observes(trace)}
+    out = to_dataset(variables, time=experiment.time, dims=dims, coords=coords, attrs=attrs)
+    return with_data(out, experiment)
 
 
 def _predictions(

@@ -12,6 +12,7 @@ from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
+from ssmppl.inference.labels import observes
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.posterior_draws import group, parameters_of, posterior_of, states_of
 from ssmppl.inference.simulation import check_finite, feeds_back
@@ -83,7 +84,13 @@ def forecast(
         over_time | unpack_parameters(traced, theta),
         over_time=set(over_time),
         time=labels if labels is not None else after(posterior[axis].values, steps),
-        attrs={"model": traced.name, "seed": str(root.entropy), "after": int(rows)},
+        attrs={
+            "model": traced.name,
+            "seed": str(root.entropy),
+            "after": int(rows),
+            "experiment": experiment or 1,
+            "observes": observes(traced),
+        },
     )
 
 

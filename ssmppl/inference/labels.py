@@ -6,12 +6,46 @@ lengths differ.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.expressions.arrays import array
+from ssmppl.language.trace import Trace
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def with_data(result: xr.Dataset, experiment: Experiment) -> xr.Dataset:
+    """`result` and the data that it is about, (time, ...): `y_observed`, `u_input`."""
+    data = {f"{n}_observed": v for n, v in experiment.observed.items()}
+    data |= {f"{n}_input": v for n, v in experiment.inputs.items()}
+    dims = {n: ("time", *(f"{n}_dim_{k}" for k in range(v.ndim - 1))) for n, v in data.items()}
+    return result.assign({n: (dims[n], v) for n, v in data.items()})
+
+
+def observes(trace: Trace) -> dict[str, str]:
+    """Components of the observation whose mean, or location, is a component of the state itself:
+    `y[0]` to `x`.
+
+    These are in the same units, so that one can be drawn over the other.
+    """
+    states = set(trace.state_symbols)
+    found: dict[str, str] = {}
+    for site in trace.observations.values():
+        d, symbols = site.distribution, site.value.view(np.ndarray).ravel()
+        centres = [d.parameters[n] for n in ("loc",) if n in d.parameters]
+        with contextlib.suppress(AttributeError):  # no moments
+            centres.append(d.mean())
+        for centre in centres:
+            values = np.broadcast_to(array(centre).view(np.ndarray), site.shape).ravel()
+            pairs = zip(symbols, values, strict=True)
+            found |= {repr(y): repr(x) for y, x in pairs if x in states}
+    return found
 
 
 class Labels:

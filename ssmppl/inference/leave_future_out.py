@@ -95,6 +95,7 @@ def leave_future_out(
     Raises
     ------
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    KeyboardInterrupt : Ctrl-C, while it samples too; nothing is kept.
     """
     problem = pose(model, data)
     if len(problem.experiments) > 1:
@@ -128,6 +129,8 @@ def leave_future_out(
         if fresh:
             idata = sample(model, _until(whole, t), seed=_number(seeds, refits), **settings)
             posterior = posterior_of(idata)
+            if posterior.attrs["interrupted"]:  # a part of its draws, where nobody asked for it
+                raise KeyboardInterrupt
             theta, efficiency = parameters_of(problem.trace, posterior), _efficiency(posterior)
             stream = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 2, refits))
             increments = _increments(problem, theta, particles, stream, executor)

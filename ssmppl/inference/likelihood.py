@@ -22,6 +22,7 @@ from ssmppl.inference.particles.filtering import (
     filter_settings,
     seed_sequence,
 )
+from ssmppl.inference.particles.on_device import check_device
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import run_tasks
@@ -43,6 +44,7 @@ def log_likelihood(
     rescue: int = 0,
     seed: int | None = None,
     executor: Executor | None = None,
+    device: str = "cpu",
 ) -> np.ndarray:
     """Estimates of log p(y | parameters).
 
@@ -75,7 +77,12 @@ def log_likelihood(
         unbiased, whatever the limit; -inf where none is alive at the limit. With it ancestors are
         drawn independently at every row. Exact likelihoods need none.
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.
-    executor : any `concurrent.futures.Executor`; None: threads.
+    executor : any `concurrent.futures.Executor`; None: threads. From 524,288 particles on, a filter
+        of "bootstrap", "guided" or "user" also shares its own particles out among all cores.
+    device : "cpu", or "cuda": on an NVIDIA GPU, meant for 100,000 particles and more, with
+        systematic resampling at every row and proposals that do not look ahead ("bootstrap",
+        "guided", "user"; "auto" is the better of them, or exact). Its random numbers, and so its
+        estimates, are other ones than the processor's. Needs `pip install 'ssmppl[cuda]'`.
 
     Returns
     -------
@@ -92,13 +99,14 @@ def log_likelihood(
     check_count("repeats", repeats, 1)
     settings = settle(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, whole=True,
-        integrate=True,
+        integrate=True, device=device,
     )  # fmt: skip
     if settings.proposal in EXACT:
         exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
         return np.full(repeats, exact)
     task = estimates_task(problem, theta, settings, seed_sequence(seed))
-    pieces = [r for r in np.array_split(np.arange(repeats), min(TASKS, repeats)) if len(r)]
+    tasks = min(TASKS if device == "cpu" else 1, repeats)  # a device has one queue
+    pieces = [r for r in np.array_split(np.arange(repeats), tasks) if len(r)]
     ranges = [range(int(p[0]), int(p[-1]) + 1) for p in pieces]
     return np.concatenate(run_tasks(task, ranges, executor=executor))
 
@@ -114,12 +122,15 @@ def settle(
     *,
     whole: bool = False,
     integrate: bool = False,
+    device: str = "cpu",
 ) -> FilterSettings:
     """The settings of a call with "auto" resolved, checked against what could be derived.
 
     whole, integrate : as in `choose`.
     """
     settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
+    if device != "cpu":
+        return _on_device(problem, theta, settings, resampling, device)
     if proposal == "auto":
         fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
         flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
@@ -137,3 +148,20 @@ def settle(
     else:
         problem.proposal(proposal, integrate)
     return settings
+
+
+def _on_device(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, resampling: str, device: str
+) -> FilterSettings:
+    """The settings for a device other than the processor; exact likelihoods need none."""
+    if device != "cuda":
+        raise ArgumentError(f"device={device!r} is unknown", fix="use 'cpu' or 'cuda'")
+    name = settings.proposal
+    if name == "auto":
+        name = choose(problem, theta, look_ahead=False).name
+    if name not in EXACT:
+        check_device(
+            problem, name, resampling=(resampling, "systematic"),
+            ess_threshold=(settings.ess_threshold, 1.0), rescue=(settings.rescue, 0),
+        )  # fmt: skip
+    return replace(settings, proposal=name, device=device)

@@ -17,7 +17,7 @@ from ssmppl.data import (
     unpack_states,
 )
 from ssmppl.errors import ArgumentError, ModelError
-from ssmppl.inference.labels import Labels
+from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
 from ssmppl.inference.posterior_draws import parameters_of, posterior_of, states_of
 from ssmppl.inference.prior import draw_prior
@@ -76,7 +76,9 @@ def predict(
     experiments = bind(traced, data, need_observations=False, steps=steps)
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     labels = Labels(experiments)
-    attrs: dict[str, Any] = {"model": traced.name, "seed": str(root.entropy)}
+    attrs: dict[str, Any] = {
+        "model": traced.name, "seed": str(root.entropy), "observes": observes(traced),
+    }  # fmt: skip
     if idata is None:
         return _from_prior(traced, program, experiments, labels, draws, root, attrs)
     posterior = posterior_of(idata)

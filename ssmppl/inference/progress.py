@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from types import TracebackType
@@ -25,19 +26,26 @@ class Progress:
     total : number of steps in all, over all chains.
     title : what is being done.
     shown : False shows nothing.
+    before : steps done in an earlier call, which tell nothing of the speed of this one.
     """
 
-    def __init__(self, total: int, title: str, shown: bool = True):
+    def __init__(self, total: int, title: str, shown: bool = True, before: int = 0):
         self.total = total
         self.title = title
-        self.done = 0
+        self.done = self.before = before
         self._started = self._last_line = time.monotonic()
-        self._next_share = SPARSE_SHARE
+        self._next_share = before / max(total, 1) + SPARSE_SHARE
         self._lines = shown and not sys.stderr.isatty()
         self._bar = None
         if shown and not self._lines:
             self._bar = tqdm(
-                total=total, desc=title, bar_format=BAR, file=sys.stderr, dynamic_ncols=True
+                total=total,
+                initial=before,
+                desc=title,
+                bar_format=BAR,
+                colour=_colour(),
+                file=sys.stderr,
+                dynamic_ncols=True,
             )
 
     def __enter__(self) -> Progress:
@@ -68,12 +76,18 @@ class Progress:
         if not finished and (early or now - self._last_line < SPARSE_SECONDS):
             return
         elapsed = now - self._started
-        left = elapsed * (self.total - self.done) / self.done
+        left = elapsed * (self.total - self.done) / (self.done - self.before)
         clock = f"{_clock(elapsed)}<{_clock(left)}" if not finished else _clock(elapsed)
         parts = [f"{100 * self.done // self.total}%", f"{self.done}/{self.total}", f"[{clock}]"]
         print(f"{self.title}:", *parts, note, file=sys.stderr, flush=True)
         self._last_line = now
         self._next_share = self.done / self.total + SPARSE_SHARE
+
+
+def _colour() -> str | None:
+    """Of the bar; none where NO_COLOR is set, or the terminal has none."""
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
+    return None if plain else "cyan"
 
 
 def _clock(seconds: float) -> str:

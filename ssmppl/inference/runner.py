@@ -10,33 +10,42 @@ interrupt obeyed, at the borders of blocks.
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass, field, replace
-from types import FrameType
-from typing import Any, Generic, TypeVar
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from ssmppl.errors import ExecutorError
+from ssmppl.inference.executors import (
+    Absent,
+    Sent,
+    error_of,
+    give_up,
+    lost_worker,
+    threads_unless,
+)
+from ssmppl.inference.interrupts import interrupt_flag
 from ssmppl.inference.progress import Progress
+from ssmppl.inference.tasks import POLL_SECONDS, run_tasks
 
-__all__ = ["Block", "ChainDraws", "run_chains", "run_tasks", "stack"]
+__all__ = ["Block", "ChainDraws", "Keep", "Standing", "run_chains", "run_tasks", "stack"]
 
 State = TypeVar("State")
-Argument = TypeVar("Argument")
-Result = TypeVar("Result")
 
 Arrays = Mapping[str, np.ndarray]
 
-# Seconds that a block should take, how fast its size may grow, and seconds between looks at Ctrl-C.
+# Seconds that a block should take, at least so many times what it costs to send it (up to a limit),
+# and how fast its size may grow.
 BLOCK_SECONDS = 0.3
+LONGEST_SECONDS = 5.0
+TIMES_SENDING = 20
 GROWTH = 4
-POLL_SECONDS = 0.1
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,7 @@ class ChainDraws(Generic[State]):
     state : where the chain stands; running on from it continues the chain. After an interrupt
         that is possibly later than the last of `draws`.
     interrupted : whether the run was stopped before its end.
+    lost : the error of the executor that stopped it, if one did.
     """
 
     draws: dict[str, np.ndarray]
@@ -71,6 +81,37 @@ class ChainDraws(Generic[State]):
     warmup_stats: dict[str, np.ndarray]
     state: State
     interrupted: bool = False
+    lost: ExecutorError | None = None
+
+
+@dataclass(frozen=True)
+class Standing(Generic[State]):
+    """How far a chain has come.
+
+    Parameters
+    ----------
+    state : where it goes on from.
+    done : draws made, those of the warmup included.
+    blocks : what was drawn after warmup, in order.
+    """
+
+    state: State
+    done: int = 0
+    blocks: tuple[Block, ...] = ()
+
+
+class Keep(Protocol):
+    """What keeps chains beyond the life of a process."""
+
+    def standings(self) -> Sequence[Standing[Any]] | None:
+        """How far the chains have come in an earlier process; None: they have not begun."""
+
+    def due(self, chains: Sequence[Standing[Any]]) -> bool:
+        """Whether it is time to keep them again."""
+
+    def keep(self, chains: Sequence[Standing[Any]], last: bool) -> Sequence[Standing[Any]]:
+        """Keep them as they stand. Returns them with the draws that need to be in memory, after
+        the last time with all."""
 
 
 Describe = Callable[[Sequence[Arrays]], str]
@@ -94,6 +135,7 @@ def run_chains(
     keep_warmup_stats: bool = False,
     describe: Describe = describe_acceptance,
     title: str = "sampling",
+    keep: Keep | None = None,
 ) -> list[ChainDraws[State]]:
     """Run a chain from each of `states`: `warmup` draws that are dropped, then `draws` more.
 
@@ -103,6 +145,8 @@ def run_chains(
     Ctrl-C stops all chains at the next border of blocks, and what was drawn is returned: the
     chains, cut to the length of the shortest, with `interrupted` set. Before every chain has a
     draw there is nothing to return, and KeyboardInterrupt is raised, as on a second Ctrl-C.
+    Likewise where the executor fails, as a pool of processes does when one of them is killed: with
+    the error as a warning, or raised where there is nothing to return.
 
     An error in a chain stops the others and is raised as it is, with a note saying which chain.
 
@@ -110,7 +154,8 @@ def run_chains(
     ----------
     step_block
         Makes a block of just n draws; may not change the state that it is given. With executors
-        over processes it is a function at the top of a module, or a `functools.partial` of one.
+        over processes it is a function at the top of a module, or a `functools.partial` of one,
+        and sent to each worker once.
     states
         Where the chains start, each with a random state of its own.
     executor
@@ -119,52 +164,36 @@ def run_chains(
         Draws in a block; None adapts to a fraction of a second.
     describe
         From the statistics of the last block of each chain, a few words for the progress line.
+    keep
+        Keeps the chains now and then, at Ctrl-C, at an error and at the end. Where it has them
+        from an earlier call, they go on from there, and `states` are not used.
     """
     run = _Run(step_block, list(states), draws, warmup, block, keep_warmup_stats)
+    if keep is not None:
+        run.go_on(keep.standings())
     total = len(run.chains) * (warmup + draws)
+    before = sum(min(chain.done, warmup + draws) for chain in run.chains)
+
+    def report(n: int) -> None:
+        bar.advance(n, run.note(describe))
+        if keep is not None and keep.due(run.standings()):
+            run.go_on(keep.keep(run.standings(), last=False))
+
     with (
-        _threads_unless(executor, len(run.chains)) as pool,
-        Progress(total, title, shown=progress) as bar,
-        _interrupt_flag() as stop,
+        threads_unless(executor, len(run.chains)) as pool,
+        Progress(total, title, shown=progress, before=before) as bar,
+        interrupt_flag() as stop,
     ):
-        run.to_the_end(pool, stop, lambda n: bar.advance(n, run.note(describe)))
-        run.drain()
-    return run.result()
-
-
-def run_tasks(
-    task: Callable[[Argument], Result],
-    arguments: Sequence[Argument],
-    *,
-    executor: Executor | None = None,
-    progress: bool = False,
-    title: str = "running",
-) -> list[Result]:
-    """`task(argument)` for each of `arguments`, in their order, over an executor.
-
-    The first error is raised as it is, with a note saying which task; the others are given up.
-    """
-    with (
-        _threads_unless(executor, len(arguments)) as pool,
-        Progress(len(arguments), title, shown=progress) as bar,
-        _interrupt_flag() as stop,
-    ):
-        futures = [pool.submit(task, argument) for argument in arguments]
-        numbers = {future: i for i, future in enumerate(futures)}
-        waiting = set(futures)
         try:
-            while waiting:
-                done, waiting = wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
-                if stop.is_set():
-                    raise KeyboardInterrupt
-                for future in done:
-                    if (error := future.exception()) is not None:
-                        error.add_note(f"in task {numbers[future] + 1} of {len(futures)}")
-                        raise error
-                bar.advance(len(done))
+            run.to_the_end(pool, stop, report)
+            run.drain()
+        except Exception:
+            run.drain()
+            raise
         finally:
-            _give_up(waiting)
-        return [future.result() for future in futures]
+            if keep is not None:
+                run.go_on(keep.keep(run.standings(), last=True))
+    return run.result()
 
 
 def stack(chains: Sequence[ChainDraws[Any]]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -186,8 +215,10 @@ class _Chain(Generic[State]):
     blocks: tuple[Block, ...] = ()
     warmup_stats: tuple[Arrays, ...] = ()
     recent: Arrays = field(default_factory=dict)
-    running: Future[tuple[State, Block, float]] | None = None
+    running: Future[tuple[State, Block, float] | Absent] | None = None
     asked: int = 0
+    submitted: float = 0.0
+    known: bool = False  # to the worker that had it last
 
 
 class _Run(Generic[State]):
@@ -202,7 +233,9 @@ class _Run(Generic[State]):
         block: int | None,
         keep_warmup_stats: bool,
     ):
-        self.step_block = step_block
+        self.sent = Sent(partial(_timed, step_block))
+        self.lost: ExecutorError | None = None
+        self.sending = np.inf  # seconds that it takes to hand a block over and back, at least
         self.chains: list[_Chain[State]] = [_Chain(state, size=block or 1) for state in states]
         self.draws, self.warmup, self.block = draws, warmup, block
         self.keep_warmup_stats = keep_warmup_stats
@@ -217,21 +250,33 @@ class _Run(Generic[State]):
             while (running := self._running()) and not stop.is_set():
                 done, _ = wait(running, POLL_SECONDS, FIRST_COMPLETED)
                 for future in done:
-                    if isinstance(future.exception(), KeyboardInterrupt):
+                    if isinstance(error_of(future), KeyboardInterrupt):
                         stop.set()  # a worker process got the signal too, and first
                         break
                     number = running[future]
                     report(self._collect(number))
                     self._submit(pool, number)
-        except Exception:
-            _give_up(self._running())
-            if not stop.is_set():  # else it is the interrupt that broke a pool of processes
+        except Exception as error:
+            give_up(self._running())
+            if stop.is_set():  # it is the interrupt that broke a pool of processes
+                return
+            self.lost = lost_worker(error)
+            if self.lost is None:
                 raise
+
+    def go_on(self, standings: Sequence[Standing[State]] | None) -> None:
+        """Put the chains where they stood."""
+        for i, s in enumerate(standings or ()):
+            self.chains[i] = replace(self.chains[i], state=s.state, done=s.done, blocks=s.blocks)
+
+    def standings(self) -> list[Standing[State]]:
+        """How far each has come."""
+        return [Standing(c.state, c.done, c.blocks) for c in self.chains]
 
     def drain(self) -> None:
         """After an interrupt: wait for the blocks that run, and keep those that came to an end."""
         running = self._running()
-        _give_up(running)
+        give_up(running)
         for future, number in running.items():
             # A signal reaches the workers of a process pool too: their blocks are lost, no more.
             if not future.cancelled() and future.exception() is None:
@@ -246,9 +291,15 @@ class _Run(Generic[State]):
     def result(self) -> list[ChainDraws[State]]:
         """The draws of all chains, of equal length."""
         kept = min((max(chain.done - self.warmup, 0) for chain in self.chains), default=0)
+        kept = min(kept, self.draws)  # an earlier call may have drawn more
         interrupted = any(chain.done < self.warmup + self.draws for chain in self.chains)
         if interrupted and kept == 0:
-            raise KeyboardInterrupt("interrupted before every chain had a draw")
+            raise self.lost or KeyboardInterrupt("interrupted before every chain had a draw")
+        if self.lost is not None:
+            warnings.warn(
+                f"{kept} of {self.draws} draws of each chain are returned: {self.lost}",
+                stacklevel=4,
+            )
         return [
             ChainDraws(
                 draws=_join([block.draws for block in chain.blocks], kept),
@@ -256,11 +307,12 @@ class _Run(Generic[State]):
                 warmup_stats=_join(chain.warmup_stats),
                 state=chain.state,
                 interrupted=interrupted,
+                lost=self.lost,
             )
             for chain in self.chains
         ]
 
-    def _running(self) -> dict[Future[tuple[State, Block, float]], int]:
+    def _running(self) -> dict[Future[tuple[State, Block, float] | Absent], int]:
         """Blocks under way, and whose they are."""
         return {chain.running: i for i, chain in enumerate(self.chains) if chain.running}
 
@@ -269,21 +321,27 @@ class _Run(Generic[State]):
         border = self.warmup if chain.done < self.warmup else self.warmup + self.draws
         n = min(chain.size, border - chain.done)
         if n > 0:
-            future = pool.submit(_timed, self.step_block, chain.state, n)
-            self.chains[number] = replace(chain, running=future, asked=n)
+            future = pool.submit(self.sent.task(whole=not chain.known), chain.state, n)
+            now = time.perf_counter()
+            self.chains[number] = replace(chain, running=future, asked=n, submitted=now)
 
     def _collect(self, number: int) -> int:
         """Take the finished block of a chain into it; returns its number of draws."""
         chain = self.chains[number]
         assert chain.running is not None
         try:
-            state, block, seconds = chain.running.result()
+            answer = chain.running.result()
         except Exception as error:
             error.add_note(
                 f"in chain {number + 1} of {len(self.chains)}, after {chain.done} of "
                 f"{self.warmup} + {self.draws} draws (warmup + kept)"
             )
             raise
+        if isinstance(answer, Absent):  # a worker that is new to this chain
+            self.chains[number] = replace(chain, running=None, known=False)
+            return 0
+        state, block, seconds = answer
+        self.sending = min(self.sending, time.perf_counter() - chain.submitted - seconds)
         n, kept = chain.asked, chain.done >= self.warmup
         warmup_stats = chain.warmup_stats
         if self.keep_warmup_stats and not kept:
@@ -291,10 +349,11 @@ class _Run(Generic[State]):
         self.chains[number] = _Chain(
             state=state,
             done=chain.done + n,
-            size=self.block or _fitting_size(n, seconds),
+            size=self.block or _fitting_size(n, seconds, self.sending),
             blocks=(*chain.blocks, block) if kept else (),
             warmup_stats=warmup_stats,
             recent=block.stats,
+            known=True,
         )
         return n
 
@@ -307,61 +366,15 @@ def _timed(
     return state, block, time.perf_counter() - started
 
 
-def _fitting_size(n: int, seconds: float) -> int:
+def _fitting_size(n: int, seconds: float, sending: float) -> int:
     """Draws that fill a block, when n took so many seconds (compilation, possibly, included)."""
-    return max(1, min(round(BLOCK_SECONDS * n / max(seconds, 1e-9)), GROWTH * n))
+    fill = max(BLOCK_SECONDS, min(TIMES_SENDING * sending, LONGEST_SECONDS))
+    return max(1, min(round(fill * n / max(seconds, 1e-9)), GROWTH * n))
 
 
 def _join(parts: Sequence[Arrays], length: int | None = None) -> dict[str, np.ndarray]:
     if not parts:
         return {}
+    if length is not None and len(next(iter(parts[0].values()))) >= length:
+        return {name: values[:length] for name, values in parts[0].items()}  # not read from disk
     return {name: np.concatenate([part[name] for part in parts])[:length] for name in parts[0]}
-
-
-def _give_up(futures: Collection[Future[Any]]) -> None:
-    """Cancel what has not begun, and wait for what has."""
-    for future in futures:
-        future.cancel()
-    wait(futures)
-
-
-@contextmanager
-def _threads_unless(executor: Executor | None, tasks: int) -> Iterator[Executor]:
-    if executor is not None:
-        yield executor
-        return
-    with ThreadPoolExecutor(max_workers=max(1, min(tasks, _cpu_count()))) as threads:
-        yield threads
-
-
-def _cpu_count() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@contextmanager
-def _interrupt_flag() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, in place of an exception at an arbitrary line.
-
-    Inside of `concurrent.futures` such an exception can leave a lock taken for good. A second
-    Ctrl-C does what the first would have done. Signals belong to the main thread: in others, and
-    where somebody has turned them off, the event is never set.
-    """
-    stop = threading.Event()
-    earlier = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(earlier):
-        yield stop
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            earlier(number, frame)
-        stop.set()
-
-    signal.signal(signal.SIGINT, handle)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, earlier)

@@ -2,27 +2,43 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
+from ssmppl.inference.chains import (
+    elimination,
+    gibbs,
+    interweaving,
+    langevin,
+    metropolis,
+    pgas,
+    pmmh,
+    smc2,
+    walk,
+)
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.chains.update_rates import told
+from ssmppl.inference.checkpoints.chains import ChainFile
+from ssmppl.inference.checkpoints.codec import Codec
+from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
 from ssmppl.inference.exact.models import exact_model, kind_of
-from ssmppl.inference.labels import Labels
+from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.particles import pilot, proposal_choice
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import ChainDraws, run_chains, stack
+from ssmppl.inference.runner import Block, ChainDraws, run_chains, stack
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import transforms
 from ssmppl.results import to_inference_data
@@ -33,6 +49,15 @@ PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
     PMMH: pmmh.prepare,
     PGAS: pgas.prepare,
 }
+
+# What the states of chains are made of, and what is found before they begin.
+STATES = Codec(
+    [
+        walk.WalkState, walk.Point, walk.Run, langevin.Local, pgas.PGASState, gibbs.GibbsState,
+        interweaving.Tuning, elimination.Learned, smc2.State, smc2.Particles,
+        pilot.Pilot, pilot.Tuning, proposal_choice.Choice,
+    ]
+)  # fmt: skip
 
 
 def sample(
@@ -50,6 +75,7 @@ def sample(
     seed: int | None = None,
     executor: Executor | None = None,
     progress: bool = True,
+    checkpoint: str | os.PathLike[str] | None = None,
 ) -> Any:
     """Draw from p(theta, x_{1:T} | y_{1:T}).
 
@@ -74,6 +100,15 @@ def sample(
     seed : the same seed gives the same draws, whatever the executor.
     executor : any `concurrent.futures.Executor`; None: a thread for each chain, up to the cores.
     progress : whether to show a progress bar, on stderr.
+    checkpoint : a file that keeps where the chains stand and what they drew, written every half
+        minute, at Ctrl-C, at an error and at the end. After a kill or a power cut the same call
+        goes on from it and returns the draws that it would have returned, bit for bit; without a
+        seed it takes up that of the file. Once all is drawn, it returns that at once. The same call
+        with more `draws` (of `SMC2`: up to its `parameters`) goes on to those of one longer run;
+        with fewer it returns the first of them. All else has to be as it was: model, data, method
+        and settings, versions of this package, Python, NumPy, SciPy and Numba. Draws that exceed
+        128 MB go to a folder beside it, `<checkpoint>.draws`, and variables of the result that do
+        are read from there when they are looked at. Reading a checkpoint executes nothing.
 
     Returns
     -------
@@ -95,7 +130,10 @@ def sample(
 
     Raises
     ------
-    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix. A
+        checkpoint that is damaged or of another call is refused, and left as it is. One that cannot
+        be written (a disk that is full) is an error before anything is drawn; later it is a
+        warning, and sampling goes on.
     """
     began = time.perf_counter()
     for name, value, least in (("draws", draws, 1), ("warmup", warmup, 0), ("chains", chains, 1),
@@ -111,21 +149,21 @@ def sample(
         raise ArgumentError(
             f"method={method!r} is no method of sampling", fix=f"use {names} or None"
         )
-    root = seed_sequence(seed)
-    space = space_of(problem, held, near)
-    setup = Setup(problem, space, held, chains, warmup, thin, root, states)
-    report: dict[str, Any]
     if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
-        result, report = smc2.drawn(setup, chosen, draws, executor, progress)
         states, warmup, thin = False, 0, 1
+        chosen = smc2.settled(chosen, draws)
+    root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
+    if checkpoint is not None:
+        origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
+        kept = ChainFile(checkpoint, origin, seed, root, STATES, draws)
+        root = kept.root
+    setup = Setup(problem, space, held, chains, warmup, thin, root, states, kept)
+    report: dict[str, Any]
+    if isinstance(chosen, SMC2):
+        result, report = smc2.drawn(setup, chosen, draws, executor, progress)
     else:
         assert prepare is not None
-        sampler = prepare(setup, chosen)
-        result = run_chains(
-            sampler.step_block, sampler.states, draws, warmup, executor=executor,
-            progress=progress, title=type(chosen).__name__,
-        )  # fmt: skip
-        report = sampler.report
+        result, report = _drawn(setup, prepare, chosen, draws, executor, progress, kept)
     attrs = {
         "model": problem.trace.name,
         "method": type(chosen).__name__,
@@ -133,12 +171,51 @@ def sample(
         **({"method_reason": reason} if reason else {}),
         **report,
         "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
+        "observes": observes(problem.trace),
         "interrupted": any(c.interrupted for c in result),
-        "seconds": time.perf_counter() - began,
+        "seconds": time.perf_counter() - began if kept is None else kept.seconds,
     }  # fmt: skip
     if isinstance(chosen, PGAS):
         attrs |= told(problem, result)
-    return _to_arviz(problem, result, held, states, attrs)
+    whole = stack(result) if kept is None else kept.stack(result)
+    return _to_arviz(problem, whole, held, states, attrs)
+
+
+def _drawn(
+    setup: Setup, prepare: Callable[[Setup, Any], Sampler], method: Method, draws: int,
+    executor: Executor | None, progress: bool, kept: ChainFile | None,
+) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:  # fmt: skip
+    """The chains of a method, and what it has to report."""
+    if kept is None or kept.report is None or not kept.finished(setup.warmup + draws):
+        sampler = prepare(setup, method)
+        if kept is not None:
+            kept.report = sampler.report
+    else:  # nothing is left to draw, and nothing needs to be compiled for it
+        sampler = Sampler(_finished, [None] * setup.chains, kept.report)
+    result = run_chains(
+        sampler.step_block, sampler.states, draws, setup.warmup, executor=executor,
+        progress=progress, title=type(method).__name__, keep=kept,
+    )  # fmt: skip
+    return result, sampler.report
+
+
+def _finished(state: Any, n: int) -> tuple[Any, Block]:
+    raise AssertionError("a finished chain draws no more")
+
+
+def _origin(
+    problem: Problem, method: Method, held: Mapping[str, np.ndarray],
+    near: Mapping[str, np.ndarray], chains: int, warmup: int, thin: int, states: bool,
+) -> Origin:  # fmt: skip
+    """All that the draws depend on, but for the seed and their number."""
+    own = ", ".join(f"{f.name}={text_of(getattr(method, f.name))}" for f in fields(method))
+    plain = {
+        "method": f"{type(method).__name__}({own})", "chains=": str(chains),
+        "warmup=": str(warmup), "thin=": str(thin), "states=": str(states),
+        "fixed=": f"{{{text_of(held)}}}", "start=": f"{{{text_of(near)}}}",
+    }  # fmt: skip
+    digests = {"model": model_digest(problem.trace), "data": data_digest(problem.experiments)}
+    return Origin(digests, plain | versions())
 
 
 def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
@@ -151,10 +228,10 @@ def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]
 
 
 def _to_arviz(
-    problem: Problem, result: list[ChainDraws[Any]], held: dict[str, np.ndarray], states: bool,
-    attrs: dict[str, Any],
+    problem: Problem, whole: tuple[dict[str, np.ndarray], dict[str, np.ndarray]],
+    held: dict[str, np.ndarray], states: bool, attrs: dict[str, Any],
 ) -> Any:  # fmt: skip
-    drawn, stats = stack(result)
+    drawn, stats = whole
     trace = problem.trace
     posterior = {n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held}
     labels = Labels(problem.experiments)

@@ -114,6 +114,13 @@ def score(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, fixed)
     held = check_values(problem.trace, fixed, argument="fixed")
+    free = free_components(problem.trace, held)
+    if not np.any(free):
+        raise ArgumentError(
+            "there is no parameter in which to differentiate: "
+            + ("all of them are fixed" if problem.trace.parameters else "the model has none"),
+            fix="leave out fixed=, or use ssm.log_likelihood",
+        )
     check_count("repeats", repeats, 2)
     check_count("trajectories", trajectories, 1)
     settings = settle(problem, theta, particles, proposal)
@@ -121,7 +128,7 @@ def score(
     attrs: dict[str, Any] = {"model": problem.trace.name, "fixed": dict(fixed or {})}
     form = exact_model(problem.trace)
     if settings.proposal in EXACT and not isinstance(form, NotApplicable):
-        exact = exact_score(form, problem.experiments, free_components(problem.trace, held), theta)
+        exact = exact_score(form, problem.experiments, free, theta)
         found = _exact(exact, theta)
         by = "the sensitivities of the Kalman filter"
         if settings.proposal == "forward":

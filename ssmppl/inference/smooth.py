@@ -18,6 +18,7 @@ from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.exact.models import EXACT, exact_model, kind_of
 from ssmppl.inference.filters import LEVELS, quantile_levels
+from ssmppl.inference.labels import observes, with_data
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS
@@ -108,6 +109,7 @@ def smooth(
         ``covariance`` of all stacked components, but given all of the data; and
         ``covariance_previous``, that of x_t (`state`) with x_{t-1} (`state_`), NaN in the first
         row. For FixedLag also `distinct`, the ancestors that are left.
+        Both: the data, ``y_observed`` of channels y and ``u_input`` of inputs u, (time, ...).
         Attributes name method, settings, seed and the log-likelihood (exact, or the filter's
         estimate).
 
@@ -357,6 +359,7 @@ def _dataset(
             coords["quantile"] = call.levels
     out = to_dataset(
         variables, sample_dim=sample_dim, time=experiment.time, dims=dims, coords=coords,
-        attrs={**attrs, **found.attrs},
+        attrs={**attrs, **found.attrs, "observes": observes(trace)},
     )  # fmt: skip
-    return out.assign({k: ("time", v) for k, v in (found.over_time or {}).items()})
+    out = out.assign({k: ("time", v) for k, v in (found.over_time or {}).items()})
+    return with_data(out, experiment)

@@ -44,7 +44,10 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
         first = function(*bound.args, **bound.kwargs)
         again = function(*bound.args, **bound.kwargs)
     except SSMError as error:
-        raise _at_users_line(error, function) from error
+        told = _at_users_line(error, function)
+        if told is error:  # not its own cause: what packs errors follows causes to their end
+            raise
+        raise told from error
     except Exception as error:
         raise _wrapped(error, function, role, arguments, known) from error
     if not _same(first, again):

@@ -49,6 +49,10 @@ class Normal(Distribution):
         self._set(**{"mean_": mean, self.spread: value})
         self._require(self.spread, 0.0)
 
+    def in_range(self) -> ExprArray | None:
+        # the square root of a negative variance or precision is no number without being asked
+        return super().in_range() if self.spread == "sd" else None
+
     def mean(self):
         return self.mean_
 

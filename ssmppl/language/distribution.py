@@ -22,6 +22,7 @@ from ssmppl.language.draws import Draws
 
 INFINITY = math.inf
 LOG_2 = math.log(2.0)
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class Distribution:
     proper = True
     by_name = "spread"  # what the keyword-only arguments are called in messages
     parameters: dict[str, ExprArray]
+    ranges: dict[str, tuple[float, float, bool]]  # by parameter: low, high, without the ends
     shape: tuple[int, ...]
     location: Location
 
@@ -97,10 +99,11 @@ class Distribution:
             arrays = {n: array(np.broadcast_to(a.view(np.ndarray), shape))
                       for n, a in arrays.items()}  # fmt: skip
             self.shape = shape
-        self.parameters = arrays
+        self.parameters, self.ranges = arrays, {}
 
     def _require(self, name: str, low: float, high: float = INFINITY, strict: bool = True) -> None:
-        """Refuse numbers out of range; symbols are checked when they have values."""
+        """Refuse numbers out of range; symbols are checked where they have values (`in_range`)."""
+        self.ranges[name] = low, high, strict
         for e in self.parameters[name].ravel():
             if e.op != "const":
                 continue
@@ -113,6 +116,28 @@ class Distribution:
                     fix=f"give a {_plain_name(name)} inside that range",
                     where=self.location,
                 )
+
+    def in_range(self) -> ExprArray | None:
+        """Whether the parameters that are no numbers allow a draw: element by element, or () for a
+        joint law; None where nothing has to be asked.
+
+        Ends of the range are let through: a spread of zero is a law at one point, and sums of
+        probabilities miss 0 and 1 by rounding.
+        """
+        inside: ExprArray | None = None
+        for name, (low, high, strict) in self.ranges.items():
+            values = self.parameters[name]
+            if all(e.op == "const" for e in values.ravel()):
+                continue
+            slack = 0.0 if strict else ROUNDING
+            own = [elementwise("le", low - slack, values)]
+            if high < INFINITY:
+                own.append(elementwise("le", values, high + slack))
+            for condition in own:
+                each = list(array(condition).ravel()) if self.joint else [array(condition)]
+                for c in each:
+                    inside = array(c) if inside is None else array(elementwise("and", inside, c))
+        return inside
 
     def __getattr__(self, name: str) -> ExprArray:
         try:

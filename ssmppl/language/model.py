@@ -10,12 +10,15 @@ import dis
 import inspect
 import linecache
 import numbers
+import os
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from types import CodeType, FunctionType
 from typing import Any, TypeVar
 
 import numpy as np
 
+from ssmppl import markup
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.expr import user_location
 
@@ -30,7 +33,8 @@ class Model:
     Parameters
     ----------
     name : shown in results and messages.
-    inputs : names of the measured inputs u_t; a mapping name -> length for vector inputs.
+    inputs : names of the measured inputs u_t; a mapping name -> length where some are vectors, with
+        None for a number.
 
     The decorators `prior`, `initial`, `transition` and `observation` each take a function that
     returns ``{name: distribution}`` and whose arguments name what it depends on: parameters,
@@ -54,7 +58,9 @@ class Model:
     ...     return {"y": ssm.Normal(x, sd=1)}
     """
 
-    def __init__(self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int] = ()):
+    def __init__(
+        self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = ()
+    ):
         self.location = user_location()
         if not isinstance(name, str):
             raise ModelError(
@@ -81,7 +87,7 @@ class Model:
                 raise ModelError(
                     f"input {key!r} of length {length!r}",
                     fix="input names are Python identifiers; the length of a vector input is a "
-                    "positive whole number",
+                    "positive whole number, None stands for a number",
                     where=self.location,
                 )
         if len(dict(pairs)) < len(pairs):
@@ -157,6 +163,39 @@ class Model:
         )  # no tracing in a repr
         inputs = f", inputs={tuple(self.inputs)}" if self.inputs else ""
         return f"<Model {self.name!r}{inputs}: {declared or 'nothing declared'}>"
+
+    def _repr_html_(self) -> str:
+        """What was declared, where, on what each law depends, and the functions as they stand."""
+        rows, texts = [], []
+        for role in ROLES:
+            for function in self.functions[role]:
+                where = location_of(function)
+                place = f"{os.path.basename(where.file)}:{where.line}"
+                names = ", ".join(inspect.signature(function).parameters)
+                needs = markup.code(names) if names else markup.text("nothing")
+                rows.append((markup.text(role), needs, markup.text(place)))
+                texts.append(_source(function))
+        lengths = [n + (f" ({s[0]} numbers)" if s else "") for n, s in self.inputs.items()]
+        if lengths:
+            rows.insert(0, (markup.text("inputs"), markup.code(", ".join(lengths)), ""))
+        if not rows:
+            return markup.heading(self.name) + markup.paragraph("Nothing is declared yet.")
+        head = ("law", "depends on", "declared at")
+        found = markup.heading(self.name) + markup.table(rows, head, left=(0, 1, 2))
+        source = "\n\n".join(t for t in texts if t)
+        style = "text-align:left"
+        if source:
+            inside = f"<pre style='{style}'>{markup.text(source)}</pre>"
+            found += markup.folded("the functions", inside)
+        return found
+
+
+def _source(function: Callable[..., Any]) -> str:
+    """Its text; empty where that is not at hand."""
+    try:
+        return textwrap.dedent(inspect.getsource(plain_function(function))).strip()
+    except (OSError, TypeError):
+        return ""
 
 
 def plain_function(function: Any) -> FunctionType:

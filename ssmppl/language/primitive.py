@@ -1,12 +1,15 @@
 """Opaque functions of numbers that a model may call: `@ssm.primitive`.
 
 A primitive is compiled by Numba and called once per particle. It has no symbolic form, so nothing
-is derived through it: no gradients, no conjugate updates, the bootstrap proposal.
+is derived through it: no gradients, no conjugate updates of what enters it, and no proposal that
+looks at an observation through it. In the mean of a Gaussian transition guided and auxiliary
+proposals are still derived, as they need its value only.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib
 import inspect
 import types
 from collections.abc import Callable
@@ -19,6 +22,7 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array, scalar_or_array
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model import location_of
+from ssmppl.language.packing import holder_of
 
 REGISTRY: dict[str, Callable[..., Any]] = {}  # unique name -> compiled function
 
@@ -51,11 +55,28 @@ class Primitive:
             out[i] = Expr("call", tuple(a[i] for a in arrays), self)
         return scalar_or_array(out)
 
-    def __reduce__(self):  # by the function, which the other process imports
-        return Primitive, (self.function,)
+    def __reduce__(self):  # by name where a module holds it, else by the function
+        if holder_of(self.function) is self:
+            return _by_name, (self.function.__module__, self.function.__qualname__)
+        return _restored, (self.name, self.function)
 
     def __repr__(self) -> str:
         return f"<primitive {self.__name__}>"
+
+
+_made: dict[str, Primitive] = {}
+
+
+def _by_name(module: str, name: str) -> Primitive:
+    found: Primitive = getattr(importlib.import_module(module), name)
+    return found
+
+
+def _restored(name: str, function: Callable[..., float]) -> Primitive:
+    """The primitive of this name, compiled once in each process."""
+    if name not in _made:
+        _made[name] = Primitive(function)
+    return _made[name]
 
 
 def primitive(function: Callable[..., float]) -> Primitive:
@@ -125,11 +146,18 @@ def _compile(function: Callable[..., float], n: int) -> Callable[..., Any]:
     return compiled
 
 
-def _digest(function: Callable[..., float]) -> str:
-    """Changes with the function's code and with the numbers that it takes from outside."""
+def _digest(function: Callable[..., float], within: tuple[Any, ...] = ()) -> str:
+    """Changes with the function's code and with what it takes from outside: numbers, and functions
+    by the same rule; the same in every process. within : functions that it is called from."""
     outside = inspect.getclosurevars(function)
-    values = {**outside.globals, **outside.nonlocals}
-    plain = {k: repr(v) for k, v in values.items() if not isinstance(v, types.ModuleType)}
+    plain = {}
+    for name, value in {**outside.globals, **outside.nonlocals}.items():
+        called = getattr(value, "py_func", value)
+        if inspect.isfunction(called):
+            around = (*within, function)
+            plain[name] = name if called in around else _digest(called, around)
+        elif not isinstance(value, types.ModuleType):
+            plain[name] = repr(value)
     text = repr((_code(function.__code__), sorted(plain.items())))
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 

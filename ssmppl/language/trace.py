@@ -18,7 +18,8 @@ from __future__ import annotations
 import inspect
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from ssmppl.expressions.expr import Expr, recording, symbol
 from ssmppl.language.calling import call, check_outer_names, return_location
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.model import Model, location_of
+from ssmppl.language.packing import Known, digest_of, packed, unpacked
 from ssmppl.language.rules import (
     RESERVED,
     a,
@@ -58,7 +60,7 @@ class Site:
     def shape(self) -> tuple[int, ...]:
         return self.value.shape
 
-    @property
+    @cached_property
     def components(self) -> list[Expr]:
         """The distinct symbols of the value, row by row."""
         return list(dict.fromkeys(self.value.ravel()))
@@ -78,25 +80,42 @@ class Trace:
     locations: dict[Expr, Location]
     functions: dict[str, list[Location]] = field(default_factory=dict)
 
-    @property
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Packed once, and one object in each process that gets it: what was generated for it is
+        found again by its identity."""
+        content = self.__dict__.get("_packed")
+        if content is None:
+            content = packed(tuple(getattr(self, f.name) for f in fields(self)))
+            object.__setattr__(self, "_packed", content)
+        _received.put(digest_of(content), self)
+        return _receive, (content,)
+
+    @cached_property
     def parameter_symbols(self) -> list[Expr]:
         return [s for site in self.parameters.values() for s in site.components]
 
-    @property
+    @cached_property
     def state_symbols(self) -> list[Expr]:
         return [s for site in self.initial.values() for s in site.components]
 
-    @property
+    @cached_property
     def state_prev_symbols(self) -> list[Expr]:
         return [previous(s) for s in self.state_symbols]
 
-    @property
+    @cached_property
     def observation_symbols(self) -> list[Expr]:
         return [s for site in self.observations.values() for s in site.components]
 
-    @property
+    @cached_property
     def input_symbols(self) -> list[Expr]:
         return [s for n, shape in self.inputs.items() for s in symbols("input", n, shape).ravel()]
+
+
+_received: Known[Trace] = Known(most=64)
+
+
+def _receive(content: bytes) -> Trace | None:
+    return _received.get(digest_of(content), lambda: Trace(*unpacked(content)))
 
 
 def previous(s: Expr) -> Expr:

@@ -96,6 +96,10 @@ class Truncated(Distribution):
         lower = _tighter("maximum", base.lower, self.lower)
         return Support(kind, lower, _tighter("minimum", base.upper, self.upper))
 
+    def in_range(self) -> ExprArray | None:
+        # bounds in the wrong order leave quantiles of no probability at all: no number
+        return self.base.in_range()
+
     def _bounds(self) -> tuple[ExprArray, ExprArray]:
         s = self.support()
         return s.lower, s.upper

@@ -18,7 +18,7 @@ from ssmppl.plots.panels import (
     residual_map,
     runs,
 )  # fmt: skip
-from ssmppl.plots.style import RC
+from ssmppl.plots.style import look
 
 __all__ = ["TITLES", "panel_figures", "pictures", "plot"]
 
@@ -39,10 +39,9 @@ MOST_RUNS = 6
 
 def plot(report: GapReport) -> Any:
     """All panels that the report has something for, below each other, as a pyplot figure."""
-    import matplotlib as mpl
     from matplotlib import pyplot
 
-    with mpl.rc_context(RC):
+    with look():
         width = 8.0
         sizes = {name: height for name in TITLES if (height := _height(report, name, width))}
         figure = pyplot.figure(figsize=(width, sum(sizes.values()) or 1.0), layout="constrained")
@@ -61,11 +60,10 @@ def panel_figures(report: GapReport, width: float) -> dict[str, Any]:
 
     The figures belong to no window, and need not be closed.
     """
-    import matplotlib as mpl
     from matplotlib.figure import Figure
 
     found: dict[str, Any] = {}
-    with mpl.rc_context(RC):
+    with look():
         for name in TITLES:
             height = _height(report, name, width)
             if height:

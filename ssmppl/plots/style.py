@@ -6,18 +6,23 @@ hatching say the same again, for print in black and white.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-__all__ = ["AFTER", "BEFORE", "DATA", "FAINT", "INK", "RC", "SIGNED", "bare", "times"]
+__all__ = [
+    "AFTER", "BEFORE", "DATA", "FAINT", "INK", "MAIN", "OTHER", "RC", "SIGNED", "bare", "look",
+    "times",
+]  # fmt: skip
 
 INK = "#222222"
 FAINT = "#8a8a8a"
 DATA = "#333333"
 BEFORE = "#D55E00"  # vermilion, dashed
 AFTER = "#0072B2"  # blue, solid
+MAIN, OTHER = AFTER, BEFORE  # of plots of a result: what it says; what it is compared with
 SIGNED = "RdBu_r"
 
 RC: dict[Any, Any] = {
@@ -39,6 +44,23 @@ RC: dict[Any, Any] = {
     "savefig.facecolor": "white",
     "hatch.linewidth": 0.6,
 }
+
+
+@contextlib.contextmanager
+def look() -> Iterator[None]:
+    """Draw in the look of the project, and leave the user's settings as they were.
+
+    Only the settings of `RC` are put back: the first figure of a notebook loads the backend, which
+    turns the interactive mode on, and `rc_context` would turn it off again, for good.
+    """
+    import matplotlib as mpl
+
+    before = {name: mpl.rcParams[name] for name in RC}
+    mpl.rcParams.update(RC)
+    try:
+        yield
+    finally:
+        mpl.rcParams.update(before)
 
 
 def bare(ax: Any, keep: Iterable[str] = ("left", "bottom")) -> None:

@@ -1,6 +1,8 @@
 """What is written where: data that hold no answer, sealed answers, and a plan that is fixed."""
 
 import io
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -175,6 +177,23 @@ def test_a_run_is_kept_under_its_digest_and_not_made_twice(one_set):
     assert calls == [("heater in a casing", ["u", "outside", "y1", "y2"], "full", 1)]
     run.diagnosed(one_set, method="m2", diagnose=diagnose)
     assert len(calls) == 2
+
+
+def test_the_verb_of_the_package_is_called_unless_another_is_given(one_set):
+    # In a fresh interpreter: `ssm.diagnose` is imported when it is first asked for, and whatever
+    # ran before this test may have asked.
+    script = f"""
+from pathlib import Path
+from bench.gap import records, run
+from ssmppl.gap import diagnose as module
+from tests.bench_gap import made_up
+
+run.SETS, records.CACHE = Path({str(run.SETS)!r}), Path({str(records.CACHE)!r})
+module.diagnose = lambda model, data, **options: made_up.report(causes=[])
+print(run.diagnosed({one_set!r}, mode="fast", method="m").failed)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
 def test_a_failed_run_is_recorded_with_its_reason(one_set):

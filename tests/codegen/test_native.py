@@ -1,66 +1,31 @@
 """Native code does what the text says: every function of the corpus, and the small language."""
 
-import ctypes
 import itertools
-import re
 
 import numpy as np
 import pytest
+from numba.core.errors import TypingError
 
 import ssmppl as ssm
-from ssmppl.analysis.density import Missing
 from ssmppl.codegen import cache
+from ssmppl.codegen.kernels.calls import address_of
+from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.codegen.loading import Loaded
+from ssmppl.codegen.metropolis import numbered_filter, scored_filter
 from ssmppl.codegen.native import build as native_build
 from ssmppl.codegen.native.library import HOMES
-from ssmppl.codegen.native.translate import PLANES, Untranslatable, translate
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
-from tests.codegen.harness import PARTICLES, ROOM, STEPS, Numbers, plain_module
+from tests.codegen.harness import Numbers
 from tests.codegen.models import MODELS, build
+from tests.codegen.native_calls import MATRIX, both_ways, called, sections
 
 pytestmark = pytest.mark.skipif(
     native_build.llvm.llvm_version_info[0] < native_build.OLDEST,
     reason="this LLVM has typed pointers, and Numba compiles everything",
 )
-
-MATRIX = re.compile(r"\b(cholesky|inverse|logdet|det)\(\(")  # what is left to Numba
-
-
-def called(address, names, values):
-    """Call a native function with these arguments."""
-    words = np.zeros(2 * len(names), dtype=np.int64)
-    for k, name in enumerate(names):
-        value = values[name]
-        if isinstance(value, int):
-            words[2 * k] = value
-            continue
-        assert value.flags.c_contiguous
-        words[2 * k] = value.ctypes.data
-        words[2 * k + 1] = value.shape[1 if name in PLANES else 0]
-    ctypes.CFUNCTYPE(None, ctypes.c_void_p)(address)(words.ctypes.data)
-
-
-def arguments(numbers, t, rng):
-    """An array for every argument that a generated function can have."""
-    d = len(numbers.traced.state_symbols)
-    return {
-        "theta": numbers.theta, "c": np.zeros(ROOM), "s": np.zeros(ROOM), "t": t,
-        "y_data": numbers.y, "seen_data": numbers.seen, "u_data": numbers.u,
-        "states": numbers.states[t].copy(), "states_prev": numbers.states[max(t - 1, 0)].copy(),
-        "fits": rng.uniform(0.5, 1.5, (ROOM, PARTICLES)), "log_w": rng.normal(size=PARTICLES),
-        "out": rng.normal(size=(ROOM, PARTICLES)), "noise": rng.normal(size=ROOM),
-        "reference": np.ascontiguousarray(numbers.states[t, :, 2]) if d else np.zeros(0),
-        "normals": rng.normal(size=ROOM * PARTICLES), "uniforms": rng.uniform(size=ROOM),
-        "rng": new_state(np.random.SeedSequence(3)),
-    }  # fmt: skip
-
-
-def copied(values):
-    return {k: v if isinstance(v, int) else v.copy() for k, v in values.items()}
-
 
 CASES = [(name, name != "varves") for name in MODELS]  # with guards for gaps, and once without
 
@@ -69,37 +34,19 @@ CASES = [(name, name != "varves") for name in MODELS]  # with guards for gaps, a
 def test_every_function_of_the_corpus(name, gaps):
     """Native and interpreted functions leave the same numbers in all their arguments."""
     traced = trace(build(name))
-    program = compile_trace(traced, Missing(none=not gaps))
     rng = np.random.default_rng(4)
     numbers = Numbers(traced, rng, gaps)
-    plain, sections = plain_module(program.module), {}
-    for algorithm in program.loaded._out.algorithms.values():
-        sections[algorithm.section.suffix] = algorithm.section
+    plain, parts = sections(traced, gaps)
     done = 0
-    for suffix, section in sections.items():
-        text = program.loaded._out.texts[id(section)]
+    for part, section, text in parts:
         if MATRIX.search(text):
             with pytest.raises(Untranslatable):
-                native_build.addresses(f"{traced.name}_{suffix}", text)
+                native_build.addresses(part, text)
             continue
-        found = native_build.addresses(f"{traced.name}_{suffix}", text)
-        for t in (0, STEPS - 1):
-            values = arguments(numbers, t, rng)
-            order = ["prepare", "step", *(r for r in section.roles if r not in ("prepare", "step"))]
-            for role in order:
-                names = section.roles[role].split(", ")
-                if t == 0 and "states_prev" in names:
-                    continue
-                twin = copied(values)
-                called(found[section.name(role)], names, values)
-                with np.errstate(all="ignore"):
-                    getattr(plain, section.name(role))(*(twin[n] for n in names))
-                for n in set(names) - {"t"}:
-                    np.testing.assert_allclose(
-                        values[n], twin[n], rtol=1e-12, atol=1e-13, err_msg=f"{role} {n} t={t}"
-                    )
-                done += 1
-    assert done or MATRIX.search(program.source())
+        for what, native, interpreted in both_ways(plain, part, section, text, numbers, rng):
+            np.testing.assert_allclose(native, interpreted, rtol=1e-12, atol=1e-13, err_msg=what)
+            done += 1
+    assert done or any(MATRIX.search(text) for *_, text in parts)
 
 
 ODD = [0.0, -0.0, 1.0, -1.0, 0.3, -2.5, 7.0, 1e300, -1e300, np.inf, -np.inf, np.nan]
@@ -199,6 +146,99 @@ def test_a_filter_by_address_is_the_filter():
     native, numba_made = passes(walk())
     for a, b in zip(native, numba_made, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.slow  # half a minute of Numba for the second of the two
+def test_conditional_smc_by_address_is_the_same():
+    """Every proposal's sweep, from the same numbers, and the path that it begins with."""
+    problem = pose(walk(0.9), {"y": np.random.default_rng(3).normal(size=40)})
+    program, e, theta = problem.program, problem.experiments[0], np.zeros(0)
+    assert not program.loaded.why
+    for proposal in ("bootstrap", "guided", "auxiliary"):
+        found = []
+        for module in (program.loaded, program.module):
+            stream = new_state(np.random.SeedSequence(5))
+            path, new = np.empty((e.steps, 1)), np.empty((e.steps, 1))
+            increments, figures = np.empty(e.steps), np.empty(2)
+            begin = getattr(module, f"filtered_path_{proposal}")
+            begin(theta, e.y, e.seen, e.u, 30, stream, path, increments)
+            sweep = getattr(module, f"conditional_smc_{proposal}")
+            for _ in range(20):
+                sweep(theta, e.y, e.seen, e.u, 30, stream, path, new, figures)
+                path, new = new, path
+            found.append((path, increments, figures))
+        for a, b in zip(*found, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)
+
+
+def moments(model):
+    """A guided filter's moments and predictions through both ways of compiling them."""
+    problem = pose(model, {"y": np.random.default_rng(7).normal(size=25)})
+    program, e, out = problem.program, problem.experiments[0], []
+    for module in (program.loaded, program.module):
+        levels, predicted = np.array([0.1, 0.5]), np.empty((25, 4, 1))
+        written = np.empty((25, 1)), np.empty((25, 1, 1)), np.empty((25, 2, 1)), predicted
+        increments, ess = np.empty(25), np.empty(25)
+        stream = new_state(np.random.SeedSequence(2))
+        module.filter_guided(
+            np.zeros(0), e.y, e.seen, e.u, 40, 0, 0.5, stream, increments, ess,
+            (levels, *written), None,
+        )  # fmt: skip
+        out.append((*written, increments, ess))
+    assert not program.loaded.why
+    return out
+
+
+@pytest.mark.slow  # a minute of Numba for the second of the two
+def test_predictions_by_address_are_the_same():
+    for a, b in zip(*moments(walk(0.8)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
+
+
+def test_what_a_new_model_needs_no_numba_for():
+    """Filters with predictions, on given numbers and with a score."""
+    model = ssm.Model("rate")
+
+    @model.prior
+    def prior():
+        return {"r": ssm.Uniform(-0.9, 0.9)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0.0, sd=1.0)}
+
+    @model.transition
+    def transition(x, r):
+        return {"x": ssm.Normal(r * np.sin(x), sd=0.5)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.StudentT(4.0, x, scale=0.3)}
+
+    program = pose(model, {"y": np.zeros(20)}).program
+    program.entry("filter_guided")
+    assert not program.loaded.why
+    proposal = program.proposals["guided"]
+    wanted = tuple(program.trace.parameter_symbols)
+    numbered = numbered_filter(program, proposal)
+    scored = [scored_filter(program, proposal, wanted, second) for second in (False, True)]
+    for made, name in ((numbered, "correlated_path"), *((s, "filter_with_score") for s in scored)):
+        assert getattr(made.module, name) is not getattr(made.module.module, name)
+        assert not made.module.why
+
+
+def test_arrays_with_gaps_have_no_address():
+    """A function called by address reads elements that stand one after the other."""
+
+    @exact
+    def place(array):
+        return address_of(array)
+
+    array = np.zeros((4, 6))
+    assert place(array) == array.ctypes.data
+    assert place(array[2]) == array.ctypes.data + 2 * array.strides[0]
+    with pytest.raises(TypingError, match="gaps between its elements"):
+        place(array[:, ::2])
 
 
 def test_matrices_are_left_to_numba():

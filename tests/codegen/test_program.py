@@ -153,6 +153,41 @@ def test_a_file_where_the_folder_should_be(tmp_path):
     assert tmp_path not in path.parents
 
 
+def _planted(folder, text):
+    """In place of a generated module what somebody else would put there; raises when it is run."""
+    path = folder / f"planted_{cache.digest_of(text)}.py"
+    path.write_text("raise SystemExit('this is not ours')")
+    return path
+
+
+def _opened(folder):
+    folder.chmod(0o777)
+
+
+def _given_away(folder):
+    if os.geteuid() != 0:
+        pytest.skip("only root gives folders away")
+    os.chown(folder, 12345, -1)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [(_opened, "others can write"), (_given_away, "somebody else")]
+)
+def test_a_folder_that_others_write_to_is_not_used(tmp_path, monkeypatch, change, words):
+    monkeypatch.setenv("SSMPPL_CACHE", str(tmp_path))
+    assert cache.cache_folder() == tmp_path / "ssmppl"
+    assert stat.S_IMODE((tmp_path / "ssmppl").stat().st_mode) == 0o700
+    text = f"x = 1  # {words}"  # each case a module of its own
+    path = _planted(tmp_path / "ssmppl", text)
+    change(tmp_path / "ssmppl")
+    with pytest.warns(UserWarning, match=words) as caught:
+        module = cache.load("planted", text)
+    assert "SSMPPL_CACHE" in str(caught[0].message)
+    assert module.x == 1
+    assert tmp_path not in Path(module.__file__).parents
+    assert "not ours" in path.read_text()
+
+
 def test_runs_without_compiling(tmp_path):
     """NUMBA_DISABLE_JIT=1 gives the same numbers, for debugging."""
     script = SCRIPT.replace("stats = run.stats", "class stats: cache_hits = cache_misses = {}")

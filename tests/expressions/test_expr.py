@@ -19,6 +19,7 @@ from ssmppl.expressions.calculus import gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     Expr,
+    apply,
     constant,
     dependent,
     depends_on,
@@ -28,6 +29,7 @@ from ssmppl.expressions.expr import (
     symbols_of,
     topological,
 )
+from ssmppl.expressions.text import to_text
 
 X, Y = symbol("state", "x"), symbol("state", "y")
 V = array([X, Y, 3.0])
@@ -353,3 +355,22 @@ def test_nodes_have_no_attributes_to_set_or_find():
     assert isinstance(X, Expr)
     with pytest.raises(AttributeError):
         X.nothing  # noqa: B018
+
+
+def test_text_of_an_expression_that_shares_its_parts_is_cut():
+    """Written out, these would have some 2^80 characters."""
+
+    def nested(inmost, deep):
+        e = inmost
+        for _ in range(deep):
+            e = apply("sin", e) + apply("cos", e)
+        return e
+
+    x, y = symbol("state", "x"), symbol("state", "y")
+    assert to_text(nested(x, 1)) == "sin(x) + cos(x)"
+    texts = [to_text(nested(start, deep)) for start in (x, y) for deep in (79, 80)]
+    assert len(set(texts)) == 4
+    tails = [to_text(nested(x, 80) * apply("tanh", end)) for end in (x, y)]
+    assert tails[0] != tails[1], "though they begin alike as far as they are written"
+    assert max(map(len, texts)) < 11_000
+    assert to_text(nested(x, 80), longest=50).startswith("sin(sin(sin(")

@@ -9,7 +9,6 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl import cli
-from ssmppl.cli_diagnose import diagnose_command
 from ssmppl.errors import DataError
 from ssmppl.gap.report import tabulate
 from tests.gap.made_up import effect_found
@@ -65,9 +64,7 @@ def calls(tmp_path, monkeypatch):
 
 
 def run(*args, code=0):
-    main = cli.Commands("ssmppl")
-    main.add_command(diagnose_command(cli.Command, cli._data))
-    result = click.testing.CliRunner().invoke(main, ["diagnose", *map(str, args)])
+    result = click.testing.CliRunner().invoke(cli.main, ["diagnose", *map(str, args)])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert result.exit_code == code, result.output
@@ -85,7 +82,7 @@ def test_everything_given_is_handed_on(calls, tmp_path):
     checkpoint = keywords.pop("checkpoint")
     assert checkpoint.resolve().parent == tmp_path / "out"
     assert keywords == {"mode": "fast", "alpha": 0.01, "fixed": {"q": 0.5, "r": 1.0},
-                        "particles": 500, "seed": 7}  # fmt: skip
+                        "particles": 500, "progress": True, "seed": 7}  # fmt: skip
 
 
 def test_the_words_are_printed_and_the_folder_is_written(calls, tmp_path):
@@ -107,8 +104,8 @@ def test_several_files_are_several_experiments(calls):
 
 def test_an_interrupt_says_that_the_report_is_not_whole(calls, monkeypatch, tmp_path):
     monkeypatch.setattr(ssm, "diagnose", lambda *a, **k: light(interrupted=True), raising=False)
-    done = run("walk.py", "series.csv")
-    assert "Interrupted" in done.stderr
+    done = run("walk.py", "series.csv", code=130)
+    assert "the stages done so far tell. series_report/stages holds them" in done.stderr
     assert "goes on from the stages done" in (tmp_path / "series_report/report.txt").read_text(
         encoding="utf-8"
     )
@@ -117,7 +114,7 @@ def test_an_interrupt_says_that_the_report_is_not_whole(calls, monkeypatch, tmp_
 @pytest.mark.parametrize(
     ("args", "code", "said"),
     [
-        (["walk.py"], 2, "DATA.csv"),
+        (["walk.py"], 2, "DATA"),
         (["walk.py", "none.csv"], 2, "none.csv"),
         (["nowhere.py", "series.csv"], 1, "nowhere.py does not exist"),
         (["walk.py", "series.csv", "--effects", " ,"], 1, "names no effect"),

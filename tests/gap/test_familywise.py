@@ -129,7 +129,7 @@ def test_false_alarms():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["normal", "t5", "squares"])
-@pytest.mark.parametrize("sets", [150, 300])
+@pytest.mark.parametrize("sets", [pytest.param(150, marks=pytest.mark.exhaustive), 300])
 def test_false_alarms_of_other_laws(law, sets):
     p, _ = family_p(rng_of("level", law, sets), sets, law, 1000)
     assert_level(p, 0.05, 1000)

@@ -63,7 +63,7 @@ def test_level_of_one_group(size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("heavy", [False, True])
+@pytest.mark.parametrize("heavy", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 def test_level_over_groups(heavy):
     rng, together, alone, each = rng_of("many", heavy), [], [], []
     world = World(rng, [12, 12, 6, 12, 8], heavy)

@@ -91,7 +91,7 @@ def test_filtering_agrees_with_particles(name):
     )
     checked = 0
     for variable in particles.data_vars:
-        if variable == "ess" or variable.endswith(("quantile", "_pit")):
+        if variable == "ess" or variable.endswith(("quantile", "_pit", "_observed")):
             continue
         runs = particles[variable].values
         error = runs.std(axis=0, ddof=1) / np.sqrt(len(runs))

@@ -192,6 +192,7 @@ def test_refuses_other_models():
         kalman_log_likelihood(traced, [experiment], np.zeros(0))
 
 
+@pytest.mark.slow
 def test_compiled_once_for_all_processes(tmp_path):
     code = (
         "import numpy as np\n"

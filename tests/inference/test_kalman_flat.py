@@ -118,6 +118,7 @@ def trend():
     return model
 
 
+@pytest.mark.slow
 def test_several_flat_components_and_experiments():
     """Score, information and draws of a model with inputs, gaps and a Dirac component."""
     traced = trace(trend())

@@ -60,6 +60,8 @@ def test_the_same_seed_gives_the_same_numbers():
         ({"particles": 10.5}, ["particles=10.5"]),
         ({"repeats": 0}, ["repeats=0"]),
         ({"ess_threshold": 1.5}, ["ess_threshold=1.5", "from 0"]),
+        ({"ess_threshold": None}, ["ess_threshold=None", "from 0"]),
+        ({"ess_threshold": "half"}, ["ess_threshold='half'", "from 0"]),
         ({"seed": "a"}, ["seed='a'"]),
     ],
 )
@@ -129,6 +131,98 @@ def test_nan_for_some_particles_is_an_error_not_a_silent_drop():
     with pytest.raises(ssm.SamplingError, match="nan at t=") as error:
         ssm.simulate(broken, {"s": 1.0}, steps=50, draws=20, seed=1)
     assert __file__ in str(error.value)
+
+
+def out_of_range(law):
+    """A model whose state g has a law with a parameter that leaves its range: x goes below 0."""
+    model = ssm.Model("out of range")
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(1, sd=1), "g": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.Normal(0.5 * x, sd=1), "g": law(x)}
+
+    @model.observation
+    def observation(x, g):
+        return {"y": ssm.Normal(g, sd=1), "z": ssm.Normal(x, sd=1)}
+
+    return model
+
+
+LAWS = [
+    lambda x: ssm.Gamma(2, rate=x), lambda x: ssm.Gamma(x, rate=1), lambda x: ssm.Exponential(x),
+    lambda x: ssm.Exponential(scale=x), lambda x: ssm.Normal(0, sd=x),
+    lambda x: ssm.Normal(0, variance=x), lambda x: ssm.HalfNormal(sd=x),
+    lambda x: ssm.InverseGamma(2, scale=x), lambda x: ssm.Beta(1, x), lambda x: ssm.Poisson(x),
+    lambda x: ssm.Binomial(5, x), lambda x: ssm.Bernoulli(x), lambda x: ssm.LogNormal(0, sd=x),
+    lambda x: ssm.StudentT(4, 0, scale=x), lambda x: ssm.Laplace(0, scale=x),
+    lambda x: ssm.NegativeBinomial(x, dispersion=2),
+    lambda x: ssm.Truncated(ssm.Gamma(2, rate=x), upper=3),
+    lambda x: ssm.Truncated(ssm.Normal(0, sd=x), lower=-3, upper=3),
+    lambda x: ssm.Categorical(np.stack([x, 1 - x])),
+    lambda x: ssm.Normal(0, sd=np.where(x < 0, -1.0, 1.0)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: repr(law(1.0 * 0.5)))
+def test_nothing_is_drawn_from_a_law_out_of_its_range(law):
+    """Neither by the simulator, nor silently by a filter that asks for no density of the states."""
+    model = out_of_range(law)
+    with pytest.raises(ssm.SamplingError, match=r"'?g'? is nan at t=") as error:
+        ssm.simulate(model, steps=30, draws=5, seed=1)
+    assert __file__ in str(error.value)
+    data = {"y": np.full(30, 0.5), "z": np.zeros(30)}
+    with pytest.raises(ssm.SamplingError, match="nan at t="):
+        ssm.log_likelihood(model, data, {}, particles=200, proposal="bootstrap", seed=1)
+
+
+def test_no_observation_is_simulated_by_a_law_out_of_its_range():
+    model = ssm.Model("observed")
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(-1, sd=0.1)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.Normal(x, sd=0.1)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Exponential(rate=x)}
+
+    with pytest.raises(ssm.SamplingError, match="y is nan at t=1 of draw 1") as error:
+        ssm.simulate(model, steps=3, seed=1)
+    assert __file__ in str(error.value)
+
+
+def test_laws_at_the_end_of_their_range_are_drawn_from():
+    """A spread of zero is one point; probabilities miss 0 and 1 by rounding."""
+    model = ssm.Model("ends")
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1), "k": ssm.Bernoulli(0.5)}
+
+    @model.transition
+    def transition(x, k, t):
+        return {
+            "x": ssm.Normal(x, sd=np.where(t > 3, 0.0, 1.0)),
+            "k": ssm.Bernoulli((0.1 + 0.2) * k / 0.3),
+        }
+
+    @model.observation
+    def observation(x, k):
+        return {"y": ssm.Normal(x + k, sd=1)}
+
+    drawn = ssm.simulate(model, steps=8, draws=20, seed=1)
+    assert np.ptp(drawn["x"].values[:, 3:], axis=1).max() == 0.0
+    assert set(np.unique(drawn["k"])) == {0.0, 1.0}
+    found = ssm.log_likelihood(model, {"y": np.zeros(8)}, {}, proposal="bootstrap", seed=1)
+    assert np.isfinite(found)
 
 
 def test_simulate_shapes_and_prior_draws():

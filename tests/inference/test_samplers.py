@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import pickle
 
+import arviz as az
 import numpy as np
 import pytest
+import scipy.stats as st
 
 import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import chart, coordinates
@@ -247,3 +249,51 @@ def test_fitted_covariance_is_that_of_a_gaussian():
 def test_states_cross_process_borders():
     for method in VARIANTS[-2:]:
         assert pickle.loads(pickle.dumps(method)) == method
+
+
+idle = ssm.Model("idle")
+
+
+@idle.prior
+def idle_prior():
+    return {"p": ssm.Uniform(0, 1), "q": ssm.Gamma(3, rate=2), "m": ssm.Normal(1, sd=2)}
+
+
+@idle.initial
+def idle_initial():
+    return {"x": ssm.Normal(0, sd=1)}
+
+
+@idle.transition
+def idle_transition(x):
+    return {"x": ssm.Normal(0.5 * x, sd=1)}
+
+
+@idle.observation
+def idle_observation(x):
+    return {"y": ssm.Normal(x, sd=1)}
+
+
+@pytest.mark.parametrize(
+    ("method", "draws"),
+    [
+        (ssm.Gibbs(), 150),  # independent draws
+        (ssm.PGAS(particles=5, proposal="bootstrap"), 150),
+        (ssm.PMMH(particles=50, proposal="bootstrap"), 1500),
+        (ssm.MetropolisHastings(), 1500),
+    ],
+    ids=["Gibbs", "PGAS", "PMMH", "MetropolisHastings"],
+)
+def test_parameters_that_nothing_depends_on_keep_their_prior(method, draws):
+    """Kolmogorov and Smirnov's distance from the prior, with as many draws as are independent."""
+    idata = ssm.sample(
+        idle, {"y": np.array([0.3, -1.0, 0.8])}, method, draws=draws, warmup=draws // 3, chains=2,
+        seed=4, states=False, progress=False,
+    )  # fmt: skip
+    laws = {"p": st.uniform(), "q": st.gamma(3, scale=0.5), "m": st.norm(1, 2)}
+    for name, law in laws.items():
+        draws = idata["posterior"][name].values
+        size = min(float(az.ess(draws)), draws.size)
+        distance = st.kstest(draws.ravel(), law.cdf).statistic
+        assert size > 100
+        assert st.kstwobign.sf(distance * np.sqrt(size)) > 1e-3, (name, distance, size)

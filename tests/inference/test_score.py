@@ -137,6 +137,7 @@ def test_weighted_runs_have_the_smoothed_mean():
 def test_uneven_weights_are_not_used():
     assert np.allclose(run_weights(np.array([0.0, -50.0, -60.0, -55.0])), 0.25)
     assert np.ptp(run_weights(np.array([0.0, -0.5, -0.2, -1.0]))) > 0
+    assert np.allclose(run_weights(np.array([0.0, -800.0])), 0.5), "one run alone"
 
 
 def test_vectors_matrices_and_names():
@@ -191,6 +192,7 @@ def test_an_opaque_matrix_of_a_linear_model_is_differenced_and_says_so():
         ({"parameters": {"phi": 2.0, "tau": 1.0}}, "phi"),
         ({"parameters": {"phi": 0.9}}, "no value is given"),
         ({"repeats": 1}, "repeats=1"),
+        ({"fixed": {"phi": 0.9, "tau": 20.0}, "parameters": {}}, "all of them are fixed"),
         ({"kernel": "fast", "particles": 20}, "kernel='fast'"),
         ({"proposal": "kalman"}, "linear Gaussian"),
     ],

@@ -419,6 +419,7 @@ def ring():
     return ring, y, DenseGaussian(y, **ring_matrices())
 
 
+@pytest.mark.slow
 def test_twenty_noises(ring):
     """More than can be written out, in a moderate dimension; the guide is exact here, so that the
     variance is little, where the transition's is hopeless."""

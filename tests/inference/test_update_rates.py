@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.chains.update_rates import gelman_rubin, random_components, told
+from ssmppl.inference.chains import update_rates
+from ssmppl.inference.chains.update_rates import movement, random_components, told
 from ssmppl.inference.problem import pose
 from ssmppl.inference.runner import ChainDraws
 from ssmppl.inference.sample import _chosen
@@ -128,7 +129,23 @@ def test_r_hat_of_still_and_of_moving_chains():
     paths = rng.normal(size=(3, 200, 1, 3))
     paths[:, :, 0, 1] = 1.0
     paths[:, :, 0, 2] = np.arange(3)[:, None]
-    found = gelman_rubin(paths)[0]
+    found = movement(paths)[2][0]
     assert 1.0 <= found[0] < 1.05
     assert found[1] == 1.0
     assert found[2] == np.inf
+
+
+@pytest.mark.parametrize("size", [1, 1000, 5000])
+def test_draws_that_are_read_in_pieces_count_as_whole_ones(monkeypatch, size):
+    rng = np.random.default_rng(4)
+    paths = np.floor(rng.normal(size=(3, 101, 4, 2)) * 2.0)
+    paths[:, :, 1], paths[1:, :60, 2] = 3.1, 7.0
+    monkeypatch.setattr(update_rates, "PIECE", size)
+    rate, ever, apart = movement(paths)
+    np.testing.assert_array_equal(rate, np.mean(paths[:, 1:] != paths[:, :-1], axis=(0, 1)))
+    np.testing.assert_array_equal(ever, (paths != paths[:1, :1]).any(axis=(0, 1)))
+    within, between = paths.var(axis=1, ddof=1).mean(axis=0), paths.mean(axis=1).var(axis=0, ddof=1)
+    moved = ever & (between > 0)
+    assert moved.sum() == 6
+    np.testing.assert_allclose(apart[moved], np.sqrt(1 + between / within)[moved], rtol=1e-12)
+    np.testing.assert_array_equal(apart[1], 1.0)

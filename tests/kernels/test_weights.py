@@ -1,9 +1,23 @@
 """Normalised weights: against NumPy, and every status."""
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK, largest, normalise
+from ssmppl.codegen.kernels import weights
+from ssmppl.codegen.kernels.weights import (
+    ALL_ZERO,
+    INFINITE,
+    NAN,
+    OK,
+    STRETCH,
+    draw_relative,
+    largest,
+    normalise,
+    relative_weights,
+)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 64, 1001])
@@ -51,3 +65,86 @@ def test_no_particle_left_and_infinite_weight(n):
     assert normalise(log_w, np.empty(n)) == (-np.inf, 0.0, ALL_ZERO)
     log_w[n // 2] = np.inf
     assert normalise(log_w, np.empty(n))[2] == INFINITE
+
+
+@pytest.mark.parametrize("n", [1, 5, STRETCH, STRETCH + 1, 3 * STRETCH, 500])
+def test_the_index_is_the_first_whose_sum_exceeds_the_point(n):
+    """Whole-number weights, a third of them zero: sums in any order are the same."""
+    rng = np.random.default_rng(n)
+    whole = rng.integers(0, 9, n) * (rng.random(n) < 0.7)
+    whole[n // 2] += 1
+    total = float(whole.sum())
+    sums = np.cumsum(whole)
+    for u in (np.arange(2 * whole.sum()) + 0.5) / (2 * whole.sum()):
+        expected = np.searchsorted(sums, u * total, side="right")
+        assert draw_relative(whole.astype(float), total, u) == expected
+
+
+@pytest.mark.parametrize("n", [3, STRETCH, 2 * STRETCH, 70])
+@pytest.mark.parametrize("where", ["first", "last", "middle"])
+def test_rounding_leads_to_no_weight_of_zero(n, where):
+    """A sum taken in another order may lie above all that is found on the way."""
+    w = np.zeros(n)
+    place = {"first": 0, "last": n - 1, "middle": n // 2}[where]
+    w[place] = 1.0
+    for total in (1.0, 1.0 + 1e-12):
+        for u in (1e-300, 0.5, 1.0 - 1e-16):
+            assert draw_relative(w, total, u) == place
+
+
+def test_relative_weights_and_their_statuses():
+    log_w = np.random.default_rng(1).normal(size=101) * 30
+    log_w[::7] = -np.inf
+    w = np.empty(101)
+    total, status = relative_weights(log_w, w)
+    assert status == OK
+    np.testing.assert_allclose(w, np.exp(log_w - log_w.max()), rtol=1e-13)
+    assert total == pytest.approx(w.sum(), rel=1e-14)
+    for bad, code in ((np.nan, NAN), (-np.nan, NAN), (np.inf, INFINITE)):
+        log_w[50] = bad
+        assert relative_weights(log_w, w)[1] == code
+    assert relative_weights(np.full(9, -np.inf), np.empty(9))[1] == ALL_ZERO
+
+
+def _at(buffer, byte, size):
+    return buffer[byte : byte + 8 * size].view(np.float64)
+
+
+@pytest.mark.parametrize("n", [3, 10, 15, 31, 40])
+def test_the_last_digit_does_not_depend_on_where_arrays_lie(n):
+    """Short arrays at all distances from each other, before and behind."""
+    log_w = np.random.default_rng(n).normal(size=n)
+    found = set()
+    buffer = np.zeros(4096, dtype=np.uint8)
+    for apart in range(8 * n, 8 * n + 400, 8):
+        for first, second in ((512, 512 + apart), (512 + apart, 512)):
+            given, w = _at(buffer, first, n), _at(buffer, second, n)
+            given[:] = log_w
+            normalised = (*weights.normalise(given, w), w.tobytes())
+            given[:] = log_w
+            found.add((normalised, weights.relative_weights(given, w), w.tobytes()))
+    assert len(found) == 1
+
+
+def test_loops_that_add_up_store_nothing():
+    """In kernels whose sums may be reordered: see the head of `kernels/weights.py`."""
+    folder = Path(weights.__file__).parent
+    for file in sorted(folder.glob("*.py")):
+        for function in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not isinstance(function, ast.FunctionDef):
+                continue
+            if "kernel" not in [ast.unparse(d) for d in function.decorator_list]:
+                continue
+            for loop in (n for n in ast.walk(function) if isinstance(n, ast.For)):
+                if any(isinstance(n, ast.For) for b in loop.body for n in ast.walk(b)):
+                    continue
+                inside = [n for b in loop.body for n in ast.walk(b)]
+                sums = [
+                    n for n in inside if isinstance(n, ast.AugAssign)
+                    and isinstance(n.target, ast.Name)
+                ]  # fmt: skip
+                stores = [
+                    n for n in inside if isinstance(n, ast.Subscript)
+                    and isinstance(n.ctx, ast.Store)
+                ]  # fmt: skip
+                assert not (sums and stores), f"{file.name}, line {loop.lineno}"

@@ -3,6 +3,7 @@
 import inspect
 import math
 
+import numba
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ import ssmppl as ssm
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
+from ssmppl.language.primitive import _digest
 from ssmppl.language.trace import trace
 
 LEVEL = 0.25
@@ -122,3 +124,20 @@ def test_wrong_number_of_arguments_in_a_law_names_the_place():
         trace(model)
     assert "test_primitive.py" in str(error.value)
     assert inspect.getsource(friction.function).splitlines()[1].strip() in str(error.value)
+
+
+def test_a_name_follows_called_functions_and_not_their_addresses():
+    """A name with an address in it would be new in every process: nothing cached, no checkpoint."""
+
+    def make(power):
+        def cube(v):
+            return v**power if v > 0 else cube(-v)
+
+        compiled = numba.njit(cube)
+
+        def friction(v):
+            return cube(v) * 2.0 + compiled(v)
+
+        return friction
+
+    assert _digest(make(3)) == _digest(make(3)) != _digest(make(2))

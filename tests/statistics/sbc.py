@@ -35,13 +35,14 @@ TABLE = Path(__file__).parents[2] / "docs" / "figures" / "calibration.csv"
 
 @dataclass(frozen=True)
 class Study:
-    """A model, how it is sampled, and what is ranked: its parameters, and a state half-way.
+    """A model, how it is sampled, and what is ranked: its parameters, and a state half-way (not by
+    SMC2, which keeps none).
 
     An entry of a vector or matrix is ranked by its name: "Q[0, 1]".
     """
 
     model: str
-    method: ssm.PMMH | ssm.PGAS | ssm.Gibbs | ssm.MetropolisHastings
+    method: ssm.PMMH | ssm.PGAS | ssm.Gibbs | ssm.MetropolisHastings | ssm.SMC2
     parameters: tuple[str, ...]
     state: str
 
@@ -60,6 +61,8 @@ class Study:
 
     @property
     def ranked(self) -> tuple[str, ...]:
+        if isinstance(self.method, ssm.SMC2):
+            return self.parameters
         return (*self.parameters, f"{self.state}[{STEPS // 2}]")
 
 
@@ -82,6 +85,7 @@ METHODS = (
     ssm.PGAS(particles=20, interweave=True),
     ssm.PGAS(particles=20, eliminate=True),
     ssm.PMMH(particles=100),
+    ssm.SMC2(parameters=4 * KEPT, particles=50),
 )
 EXACT = (ssm.Gibbs(interweave=False), ssm.Gibbs(interweave=True), ssm.MetropolisHastings())
 MISSING = {"vector_ar", "vector_ar_apart"}  # of their data, some steps and single entries
@@ -120,8 +124,9 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     middle = STEPS // 2
     known = [entry(truth, p)[0] for p in study.parameters]
     drawn = [entry(posterior, p) for p in study.parameters]
-    known.append(truth[study.state].values[0, middle].ravel()[0])
-    drawn.append(posterior[study.state].values[0, :, middle].reshape(draws, -1)[:, 0])
+    if len(study.ranked) > len(known):
+        known.append(truth[study.state].values[0, middle].ravel()[0])
+        drawn.append(posterior[study.state].values[0, :, middle].reshape(draws, -1)[:, 0])
     return np.array(known, dtype=float), np.array(drawn, dtype=float)
 
 
@@ -152,8 +157,11 @@ def calibrate(study: Study, replications: int, pilots: int = 8) -> tuple[np.ndar
     """Ranks (replications, quantities), and the thinning.
 
     Thinning is by the worst quantity of the second worst pilot data set: the few data sets whose
-    chains mix worse leave their ranks a little too far out.
+    chains mix worse leave their ranks a little too far out. SMC2, whose draws are no chain, keeps
+    a quarter of its particles instead, so that few of those ranked have an ancestor in common.
     """
+    if isinstance(study.method, ssm.SMC2):
+        return np.array([rank(study, i, 1) for i in range(replications)]), 1
     worst = np.sort([iterations_per_draw(study, i).max() for i in range(pilots)])
     thin = max(1, int(np.ceil(worst[-2])))
     return np.array([rank(study, i, thin) for i in range(replications)]), thin

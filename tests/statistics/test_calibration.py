@@ -29,6 +29,7 @@ def test_statistic_knows_uniform_from_not():
 LONG = [
     n for n, s in STUDIES.items()
     if s.model in BLOCKS or "interweaved" in s.label or "eliminated" in s.label
+    or n == "two_states PMMH"
 ]  # fmt: skip
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
 

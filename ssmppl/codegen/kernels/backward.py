@@ -20,11 +20,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.codegen.kernels.conditional_smc import draw_index
 from ssmppl.codegen.kernels.flags import exact, kernel
 from ssmppl.codegen.kernels.particle_filter import add, take_log
 from ssmppl.codegen.kernels.random import uniform
-from ssmppl.codegen.kernels.weights import OK, normalise
+from ssmppl.codegen.kernels.weights import OK, draw_relative, relative_weights
 
 
 @exact
@@ -141,6 +140,7 @@ def backward_exact(
         take_log(weights[t], log_w)
         following[:] = index
         order = np.argsort(following)
+        total = 0.0
         for r in range(n_paths):
             m = order[r]
             if r == 0 or horizon != 0 or following[m] != following[order[r - 1]]:
@@ -148,10 +148,10 @@ def backward_exact(
                     theta, c, s, s_later, y, seen, u, t, history[t], log_w, paths, m, reference,
                     joined, joined_next, part, log_v,
                 )  # fmt: skip
-                _, _, status = normalise(log_v, p)
+                total, status = relative_weights(log_v, p)
                 if status != OK:
                     return status, t
-            index[m] = draw_index(p, uniform(rng))
+            index[m] = draw_relative(p, total, uniform(rng))
         take(history[t], index, paths[t])
     if horizon != 0:
         for t in range(1, n_steps):

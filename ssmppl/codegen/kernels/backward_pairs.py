@@ -21,11 +21,10 @@ import math
 import numpy as np
 
 from ssmppl.codegen.kernels.backward import draw_last, draw_tabulated, tabulate, take
-from ssmppl.codegen.kernels.conditional_smc import draw_index
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import add, copy, take_log
 from ssmppl.codegen.kernels.random import uniform
-from ssmppl.codegen.kernels.weights import NAN, OK, normalise
+from ssmppl.codegen.kernels.weights import NAN, OK, draw_relative, relative_weights
 
 ABOVE_BOUND = 4
 """A density above what was derived as its bound."""
@@ -171,6 +170,7 @@ def backward_rejection(
             proposed[r] = later[waiting[r]]
         order = np.argsort(proposed[:left])
         take_log(weights[t], log_w)
+        total = 0.0
         for q in range(left):
             r = order[q]
             if q == 0 or proposed[r] != proposed[order[q - 1]]:  # else the weights are the same
@@ -178,9 +178,9 @@ def backward_rejection(
                     reference[k] = following[k, r]
                 weigh_following(theta, c, s, history[t], reference, log_v)
                 add(log_v, log_w)
-                _, _, status = normalise(log_v, p)
+                total, status = relative_weights(log_v, p)
                 if status != OK:
                     return status, t
-            index[waiting[r]] = draw_index(p, uniform(rng))
+            index[waiting[r]] = draw_relative(p, total, uniform(rng))
         take(history[t], index, paths[t])
     return OK, n_steps

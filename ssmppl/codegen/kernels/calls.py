@@ -6,16 +6,18 @@ length of its last axis, or a whole number; see `native/translate.py`.
 
 from __future__ import annotations
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 
 @intrinsic
 def address_of(typing, array):
-    """Address of an array's first element."""
+    """Address of an array's first element; its rows have to stand one after the other."""
+    if array.layout != "C":
+        raise TypingError(f"{array} has gaps between its elements: hand over a contiguous one")
 
     def generate(context, builder, signature, arguments):
         data = cgutils.create_struct_proxy(signature.args[0])(
@@ -28,21 +30,17 @@ def address_of(typing, array):
 
 @intrinsic
 def invoke(typing, address, words):
-    """Call the function at `address` with the address of `words`, an array of int64."""
+    """Call the function at `address` with the address of `words`, a tuple of int64.
+
+    The tuple lies on the stack: an array for it would cost more than a pass over few particles.
+    """
 
     def generate(context, builder, signature, arguments):
-        data = cgutils.create_struct_proxy(signature.args[1])(
-            context, builder, value=arguments[1]
-        ).data
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64).as_pointer()])
-        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), [data])
+        where = cgutils.alloca_once_value(builder, arguments[1])
+        pointer = ir.IntType(64).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [pointer])
+        function = builder.inttoptr(arguments[0], kind.as_pointer())
+        builder.call(function, [builder.bitcast(where, pointer)])
         return context.get_dummy_value()
 
     return types.void(address, words), generate
-
-
-def no_prediction(theta, y, seen, u, t, x, w, rng, out):
-    """Stands where a filter makes no predictions, and is never called."""
-
-
-WORD = np.int64

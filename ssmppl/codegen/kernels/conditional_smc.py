@@ -30,6 +30,7 @@ import math
 import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
+from ssmppl.codegen.kernels.genealogy import DENSE, open_genealogy, recall, remember
 from ssmppl.codegen.kernels.particle_filter import (
     NO_LOOK_AHEAD,
     add,
@@ -38,7 +39,6 @@ from ssmppl.codegen.kernels.particle_filter import (
     gather,
     look_ahead_weights,
     second_stage,
-    take_log,
 )
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform, uniform
 from ssmppl.codegen.kernels.resampling import (
@@ -46,7 +46,14 @@ from ssmppl.codegen.kernels.resampling import (
     conditional_systematic,
     systematic,
 )
-from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise
+from ssmppl.codegen.kernels.weights import (
+    ALL_ZERO,
+    NAN,
+    OK,
+    draw_relative,
+    normalise,
+    relative_weights,
+)
 
 
 @exact
@@ -63,18 +70,6 @@ def draw_index(w, u):
 
 
 @exact
-def ancestral_path(history, ancestry, k, path):
-    """Write the path (T, D) that ends in particle k of the last step."""
-    n_steps, d = path.shape
-    for back in range(n_steps):
-        t = n_steps - 1 - back
-        for m in range(d):
-            path[t, m] = history[t, m, k]
-        if t > 0:
-            k = ancestry[t, k]
-
-
-@exact
 def conditional_smc(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh,
     connect, weigh_connected, weigh_observed, weigh_future, sizes, ahead, horizon, eliminated,
@@ -88,8 +83,10 @@ def conditional_smc(
     """
     n_steps, n, d = y.shape[0], particles, reference.shape[1]
     c, s, s_later = np.empty(sizes[0]), np.empty(sizes[1]), np.empty(sizes[1])
-    history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
-    x_prev, joined, joined_next = np.empty((d, n)), np.empty((d, n)), np.empty((d, n))
+    genealogy = open_genealogy(n_steps, d, n, DENSE)
+    x, x_before, x_prev = np.empty((d, n)), np.empty((d, n)), np.empty((d, n))
+    joined, joined_next = np.empty((d, n)), np.empty((d, n))
+    before, own = np.empty((d, 1)), np.empty((d, 1))
     fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     log_v, log_base, part = np.empty(n), np.empty(n), np.empty(n)
@@ -99,7 +96,7 @@ def conditional_smc(
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
-        x = history[t]
+        x, x_before = x_before, x
         if t == 0:
             fill_normal(rng, normals)
             if sizes[4] > 0:
@@ -109,11 +106,10 @@ def conditional_smc(
                 x[k, last] = reference[0, k]
             weigh_initial(theta, c, s, x, log_v)
         else:
-            x_before = history[t - 1]
             # the ancestor of the reference
             keep = last
             if horizon >= 0:
-                take_log(w, log_base)
+                log_base, log_v = log_v, log_base
                 connect(theta, c, s, x_before, reference[t], joined)
                 weigh_connected(theta, c, s, x_before, joined, log_v)
                 add(log_v, log_base)
@@ -131,10 +127,10 @@ def conditional_smc(
                 if eliminated:
                     weigh_future(theta, c, s, x_before, joined, part)
                     add(log_v, part)
-                _, _, status = normalise(log_v, p)
+                total, status = relative_weights(log_v, p)
                 if status != OK:
                     return status, t
-                keep = draw_index(p, uniform(rng))
+                keep = draw_relative(p, total, uniform(rng))
             # all others, given that one
             if ahead != NO_LOOK_AHEAD:
                 if sizes[5] > 0:
@@ -156,14 +152,16 @@ def conditional_smc(
             if sizes[4] > 0:
                 fill_uniform(rng, uniforms)
             draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
-            connect(theta, c, s, x_prev, reference[t], joined)
             for k in range(d):
-                x[k, last] = joined[k, last]
+                before[k, 0] = x_prev[k, last]
+            connect(theta, c, s, before, reference[t], own)
+            for k in range(d):
+                x[k, last] = own[k, 0]
             weigh(theta, c, s, x_prev, fits, x, log_v)
             if ahead != NO_LOOK_AHEAD:
                 second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
-            copy(ancestors, ancestry[t])
+        genealogy = remember(genealogy, t, x, ancestors)
         _, ess, status = normalise(log_v, w)
         if status == NAN and not any_finite(log_v):
             status = ALL_ZERO
@@ -173,8 +171,8 @@ def conditional_smc(
     if paths is not None:
         copy(w, weights)
         for i in range(n):
-            ancestral_path(history, ancestry, i, paths[i])
-    ancestral_path(history, ancestry, draw_index(w, uniform(rng)), trajectory)
+            recall(genealogy, i, paths[i])
+    recall(genealogy, draw_index(w, uniform(rng)), trajectory)
     changed = 0
     for t in range(n_steps):
         different = False
@@ -198,8 +196,8 @@ def filtered_path(
     """
     n_steps, n, d = y.shape[0], particles, trajectory.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
-    history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
-    x_prev = np.empty((d, n))
+    genealogy = open_genealogy(n_steps, d, n, DENSE)
+    x, x_before, x_prev = np.empty((d, n)), np.empty((d, n)), np.empty((d, n))
     fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     log_v, log_base, part = np.empty(n), np.empty(n), np.empty(n)
@@ -209,24 +207,23 @@ def filtered_path(
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
-        x = history[t]
+        x, x_before = x_before, x
         if t > 0:
             copy(w, p)
             if ahead != NO_LOOK_AHEAD:
                 if sizes[5] > 0:
-                    fit(theta, c, s, history[t - 1], fits_prev)
-                look_ahead(theta, c, s, history[t - 1], fits_prev, log_v)
+                    fit(theta, c, s, x_before, fits_prev)
+                look_ahead(theta, c, s, x_before, fits_prev, log_v)
                 _, status = look_ahead_weights(log_v, w, log_base, ahead, p)
                 if status != OK:
                     return status, t, -np.inf
             systematic(rng, p, ancestors)
-            gather(history[t - 1], ancestors, x_prev)
+            gather(x_before, ancestors, x_prev)
             if sizes[5] > 0:
                 if ahead != NO_LOOK_AHEAD:
                     gather(fits_prev, ancestors, fits)
                 else:
                     fit(theta, c, s, x_prev, fits)
-            copy(ancestors, ancestry[t])
         fill_normal(rng, normals)
         if sizes[4] > 0:
             fill_uniform(rng, uniforms)
@@ -241,11 +238,12 @@ def filtered_path(
                 second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
                 log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
+        genealogy = remember(genealogy, t, x, ancestors)
         log_sum, _, status = normalise(log_v, w)
         if status == NAN and not any_finite(log_v):
             status = ALL_ZERO
         if status != OK:
             return status, t, -np.inf
         log_increment[t] += log_sum - math.log(n)
-    ancestral_path(history, ancestry, draw_index(w, uniform(rng)), trajectory)
+    recall(genealogy, draw_index(w, uniform(rng)), trajectory)
     return OK, n_steps, log_increment.sum()

@@ -59,13 +59,13 @@ def _decorator(**options: Any) -> Callable[[Callable], Any]:
 
     def decorate(function: Callable) -> Any:
         if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-            return _interpreted(function)
+            return interpreted(function)
         return Kernel(function, options)
 
     return decorate
 
 
-def _interpreted(function: Callable) -> Callable:
+def interpreted(function: Callable) -> Callable:
     """`function` in plain Python, for debugging, with the arithmetic of the compiled code.
 
     Unsigned words wrap around and 1/0 is inf: NumPy does that, with a warning, where

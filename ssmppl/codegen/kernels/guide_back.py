@@ -181,6 +181,21 @@ def look_back(x, rest, jacobian, spread, spread_initial, g, h, horizon, a, pull,
 
 
 @exact
+def look_back_scalar(x, rest, jacobian, spread, spread_initial, g, h, a, pull):
+    """`look_back` for one state with one noise, where its matrices are numbers."""
+    a_next, g_next = 0.0, 0.0
+    for t in range(x.shape[0] - 1, -1, -1):
+        a[t, 0, 0] = h[t, 0, 0] + a_next
+        pull[t, 0] = g[t, 0] + g_next
+        size = spread[t, 0, 0] if t > 0 else spread_initial[0, 0]
+        left = 1.0 / (1.0 + size * size * a[t, 0, 0])
+        bar = left * a[t, 0, 0]
+        g_next = jacobian[t, 0, 0] * (left * pull[t, 0] - bar * (rest[t, 0] - x[t, 0]))
+        a_next = jacobian[t, 0, 0] * jacobian[t, 0, 0] * bar
+    return abs(a[0, 0, 0]) < np.inf and abs(pull[0, 0]) < np.inf
+
+
+@exact
 def write_guide(a, pull, x, u, aim, spread_initial, out):
     """out (T, U + G): the inputs, then each row's guide; False where its start is no number.
 

@@ -55,21 +55,6 @@ def linearise(
 
 
 @exact
-def look_back_scalar(x, rest, jacobian, spread, spread_initial, g, h, a, pull):
-    """`guide_back.look_back` for one state with one noise, where its matrices are numbers."""
-    a_next, g_next = 0.0, 0.0
-    for t in range(x.shape[0] - 1, -1, -1):
-        a[t, 0, 0] = h[t, 0, 0] + a_next
-        pull[t, 0] = g[t, 0] + g_next
-        size = spread[t, 0, 0] if t > 0 else spread_initial[0, 0]
-        left = 1.0 / (1.0 + size * size * a[t, 0, 0])
-        bar = left * a[t, 0, 0]
-        g_next = jacobian[t, 0, 0] * (left * pull[t, 0] - bar * (rest[t, 0] - x[t, 0]))
-        a_next = jacobian[t, 0, 0] * jacobian[t, 0, 0] * bar
-    return abs(a[0, 0, 0]) < np.inf and abs(pull[0, 0]) < np.inf
-
-
-@exact
 def noise_law(a, pull, centre, rest, spread, r, factor, mean):
     """C (R, R) and the mean (R,) of the noise given x_{t-1}; sum log C_kk, nan where there is none.
 

@@ -13,6 +13,10 @@ make an array lower triangular (Kailath, Sayed and Hassibi 2000, "Linear estimat
 so no covariance is ever subtracted from another and none loses its positive semidefiniteness;
 Q and P may be singular. A missing component drops its row from C and from R^1/2.
 
+Where A, Q, C and R do not depend on time, covariances settle (Anderson and Moore 1979, "Optimal
+filtering", chapter 4). From the step on at which the root moves by rounding errors only, the arrays
+are kept and the means go on alone, until a row misses other components than the one before.
+
 Everything that the entry point calls is in this file, because Numba's disk cache notices edits of
 the entry point's own file only.
 
@@ -34,6 +38,8 @@ LOG_2PI = math.log(2.0 * math.pi)
 # Of a covariance's entries: pivots below this share are zero, and what they leave may be as large
 # as that one.
 PIVOT, REST = 1e-14, 1e-10
+# A root that moved by no more, as a share of its rows, has settled: rounding alone moves it so.
+SETTLED = 16 * 2.0**-52
 
 entry = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -84,6 +90,21 @@ def square_root(covariance, root):
 
 
 @exact
+def product(x, y):
+    """x'y in four sums that need not wait for each other, always in the same order."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    quarters = x.size // 4
+    for q in range(quarters):
+        a += x[4 * q] * y[4 * q]
+        b += x[4 * q + 1] * y[4 * q + 1]
+        c += x[4 * q + 2] * y[4 * q + 2]
+        d += x[4 * q + 3] * y[4 * q + 3]
+    for k in range(4 * quarters, x.size):
+        a += x[k] * y[k]
+    return (a + b) + (c + d)
+
+
+@exact
 def triangularise(a):
     """Make a (n, m), m >= n, lower triangular in place, a a' kept: Householder reflections."""
     reflect(a, a.shape[0])
@@ -95,38 +116,36 @@ def reflect(a, pivots):
 
     Rows of a unit matrix below the pivots hold the orthogonal transformation afterwards.
     """
-    n, m = a.shape
+    n = a.shape[0]
     for i in range(pivots):
-        norm = 0.0
-        for k in range(i, m):
-            norm += a[i, k] * a[i, k]
-        norm = math.sqrt(norm)
+        v = a[i, i:]
+        norm = math.sqrt(product(v, v))
         if norm == 0.0:
             continue
-        diagonal = -norm if a[i, i] > 0.0 else norm
-        a[i, i] -= diagonal  # row i now holds the vector v of the reflection 1 - 2 v v' / v'v
-        scale = -1.0 / (diagonal * a[i, i])
-        for row in range(i + 1, n):
-            product = 0.0
-            for k in range(i, m):
-                product += a[row, k] * a[i, k]
-            product *= scale
-            for k in range(i, m):
-                a[row, k] -= product * a[i, k]
-        a[i, i] = diagonal
-        for k in range(i + 1, m):
-            a[i, k] = 0.0
+        diagonal = -norm if v[0] > 0.0 else norm
+        v[0] -= diagonal  # row i now holds the vector v of the reflection 1 - 2 v v' / v'v
+        scale = -1.0 / (diagonal * v[0])
+        for j in range(i + 1, n):
+            row = a[j, i:]
+            factor = scale * product(row, v)
+            for k in range(row.size):
+                row[k] -= factor * v[k]
+        v[0] = diagonal
+        for k in range(1, v.size):
+            v[k] = 0.0
 
 
 @exact
 def multiply(a, b, out):
     """out = a b."""
     for i in range(a.shape[0]):
+        row = out[i]
         for j in range(b.shape[1]):
-            total = 0.0
-            for k in range(a.shape[1]):
-                total += a[i, k] * b[k, j]
-            out[i, j] = total
+            row[j] = 0.0
+        for k in range(a.shape[1]):
+            factor, other = a[i, k], b[k]
+            for j in range(b.shape[1]):
+                row[j] += factor * other[j]
 
 
 @exact
@@ -158,10 +177,9 @@ def at(t, n):
 
 
 @exact
-def predict(a, b, q_root, mean, root, array):
-    """mean, root <- those of a x + b + N(0, q_root q_root')."""
-    n = mean.size
-    affine_map(a, mean.copy(), b, mean)
+def predict(a, q_root, root, array):
+    """root <- that of a x + N(0, q_root q_root'); array (D, 2 D) is scratch."""
+    n = root.shape[0]
     multiply(a, root, array[:, :n])
     array[:, n:] = q_root
     triangularise(array)
@@ -169,35 +187,74 @@ def predict(a, b, q_root, mean, root, array):
 
 
 @exact
-def update(residual, seen, r_root, c_root, mean, root, z):
-    """mean, root <- those given the seen components of y; (log density, smallest |S^1/2_ii|).
+def join(seen, r_root, c_root, root, array):
+    """Fill and transform the array of an update; returns k, how many components were measured.
 
-    residual : (K,) y less its prediction. c_root : (K, D) C L. z : (K,) scratch.
+    array (K + D, K + D): rows 0 to k hold S^1/2, rows k to k + D the gain's K and the new root,
+    in columns 0 to k and k to k + D.
     """
-    n, k_all = mean.size, residual.size
+    n, k_all = root.shape[0], r_root.shape[0]
+    array[:] = 0.0
     k = 0
-    array = np.zeros((k_all + n, k_all + n))
     for j in range(k_all):
         if seen[j] != 0.0:
             array[k, :k_all] = r_root[j]
             array[k, k_all:] = c_root[j]
-            z[k] = residual[j]
             k += 1
     array[k : k + n, k_all:] = root
-    array = array[: k + n]
-    triangularise(array)
+    triangularise(array[: k + n])
+    return k
+
+
+@exact
+def learn(array, k, residual, seen, mean, z):
+    """mean <- that given the seen components of y; (log density, smallest |S^1/2_ii|).
+
+    array, k : of `join`. residual : (K,) y less its prediction. z : (K,) scratch.
+    """
     log_density, least = -0.5 * k * LOG_2PI, np.inf
-    for i in range(k):  # z = S^-1/2 residual
-        for j in range(i):
-            z[i] -= array[i, j] * z[j]
-        z[i] /= array[i, i]
-        least = min(least, abs(array[i, i]))
-        log_density -= math.log(abs(array[i, i])) + 0.5 * z[i] * z[i]
-    for i in range(n):
+    i = 0
+    for row in range(seen.size):  # z = S^-1/2 residual
+        if seen[row] != 0.0:
+            z[i] = residual[row]
+            for j in range(i):
+                z[i] -= array[i, j] * z[j]
+            z[i] /= array[i, i]
+            least = min(least, abs(array[i, i]))
+            log_density -= math.log(abs(array[i, i])) + 0.5 * z[i] * z[i]
+            i += 1
+    for i in range(mean.size):
         for j in range(k):
             mean[i] += array[k + i, j] * z[j]
-    root[:] = array[k:, k : k + n]
     return log_density, least
+
+
+@exact
+def moved(root, last):
+    """How far a triangular root is from the last one, in units of its rows; last <- root.
+
+    The signs of columns do not matter: last holds the root with a diagonal that is not negative.
+    """
+    most = 0.0
+    for i in range(root.shape[0]):
+        squares, change = 0.0, 0.0
+        for j in range(i + 1):
+            entry = root[i, j] if root[j, j] >= 0.0 else -root[i, j]
+            squares += entry * entry
+            change = max(change, abs(entry - last[i, j]))
+            last[i, j] = entry
+        if change > 0.0:
+            most = max(most, change / math.sqrt(squares))
+    return most
+
+
+@exact
+def same(a, b):
+    """Whether two vectors are equal."""
+    for i in range(a.size):
+        if a[i] != b[i]:
+            return False
+    return True
 
 
 @entry
@@ -214,32 +271,50 @@ def kalman_filter(
     y_{1:t-1}, and those of all components of y_t given y_{1:t-1}: written where their first axis
     is not empty.
     """
-    n_steps, n, k = y.shape[0], m.size, y.shape[1]
+    n_steps, n, k_all = y.shape[0], m.size, y.shape[1]
     moments = mean.shape[0] > 0
-    x, root, q_root, r_root = m.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((k, k))
-    c_root, both = np.empty((k, n)), np.empty((n, 2 * n))
-    predicted, residual, z = np.empty(k), np.empty(k), np.empty(k)
+    constant = A.shape[0] == 1 and Q.shape[0] == 1 and C.shape[0] == 1 and R.shape[0] == 1
+    settled, k = False, 0
+    x, root, q_root, r_root = m.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((k_all, k_all))
+    c_root, both, array = (
+        np.empty((k_all, n)),
+        np.empty((n, 2 * n)),
+        np.empty((k_all + n, k_all + n)),
+    )
+    last, before, predicted = np.zeros((n, n)), np.empty(n), np.empty(k_all)
+    residual, z = np.empty(k_all), np.empty(k_all)
     log_increment[:] = -np.inf
     if not square_root(P, root):
         return NOT_COVARIANCE, 0
     for t in range(n_steps):
+        alike = constant and t > 1 and same(seen[t], seen[t - 1])
+        settled = settled and alike
         if t > 0:
-            if (t == 1 or Q.shape[0] > 1) and not square_root(Q[at(t, Q.shape[0])], q_root):
+            before[:] = x
+            affine_map(A[at(t, A.shape[0])], before, b[at(t, b.shape[0])], x)
+        if not settled:
+            if t > 0:
+                if (t == 1 or Q.shape[0] > 1) and not square_root(Q[at(t, Q.shape[0])], q_root):
+                    return NOT_COVARIANCE, t
+                predict(A[at(t, A.shape[0])], q_root, root, both)
+            if (t == 0 or R.shape[0] > 1) and not square_root(R[at(t, R.shape[0])], r_root):
                 return NOT_COVARIANCE, t
-            predict(A[at(t, A.shape[0])], b[at(t, b.shape[0])], q_root, x, root, both)
-        if (t == 0 or R.shape[0] > 1) and not square_root(R[at(t, R.shape[0])], r_root):
-            return NOT_COVARIANCE, t
-        multiply(C[at(t, C.shape[0])], root, c_root)
+            multiply(C[at(t, C.shape[0])], root, c_root)
         affine_map(C[at(t, C.shape[0])], x, d[at(t, d.shape[0])], predicted)
         if moments:
-            mean_predicted[t] = x
-            square(root, covariance_predicted[t])
-            observation_mean[t] = predicted
-            square(c_root, observation_covariance[t])
-            observation_covariance[t] += R[at(t, R.shape[0])]
-        for j in range(k):
+            mean_predicted[t], observation_mean[t] = x, predicted
+            if settled:
+                covariance_predicted[t] = covariance_predicted[t - 1]
+                observation_covariance[t] = observation_covariance[t - 1]
+            else:
+                square(root, covariance_predicted[t])
+                square(c_root, observation_covariance[t])
+                observation_covariance[t] += R[at(t, R.shape[0])]
+        for j in range(k_all):
             residual[j] = y[t, j] - predicted[j]
-        increment, least = update(residual, seen[t], r_root, c_root, x, root, z)
+        if not settled:
+            k = join(seen[t], r_root, c_root, root, array)
+        increment, least = learn(array, k, residual, seen[t], x, z)
         if least == 0.0:
             return SINGULAR, t
         if not abs(increment) < np.inf:
@@ -247,5 +322,13 @@ def kalman_filter(
         log_increment[t] = increment
         if moments:
             mean[t] = x
+        if settled:
+            if moments:
+                covariance[t] = covariance[t - 1]
+            continue
+        root[:] = array[k : k + n, k : k + n]
+        if moments:
             square(root, covariance[t])
+        if constant:
+            settled = moved(root, last) <= SETTLED and alike
     return OK, n_steps

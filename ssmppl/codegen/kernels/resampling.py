@@ -59,7 +59,7 @@ def _place(ancestors, p, q, j):
 
 
 @exact
-def _last_positive(w):
+def last_positive(w):
     """Index of the last particle with a positive weight."""
     for i in range(w.size):
         j = w.size - 1 - i
@@ -69,14 +69,14 @@ def _last_positive(w):
 
 
 @exact
-def _fill(ancestors, p, end, j):
+def fill_slots(ancestors, p, end, j):
     """Make j the ancestor of the slots p, ..., end - 1."""
     for m in range(np.int64(p), end):
         ancestors[m] = j
 
 
 @exact
-def _sweep(w, begin, end, scale, limit, s, p, ancestors):
+def sweep(w, begin, end, scale, limit, s, p, ancestors):
     """Place the particles begin, ..., end - 1: after j, int(s + scale (w_begin + .. + w_j)) slots
     are full, at most `limit` of them.  Returns the new (s, p).
 
@@ -117,9 +117,9 @@ def systematic(state, w, ancestors):
     """The points u, 1 + u, ..., M - 1 + u on the axis of M (w_1 + ... + w_j)."""
     m = ancestors.size - PADDING
     # k + u < s exactly if k < s - u: the number of such k is int(s + 1 - u).
-    _, p = _sweep(w, 0, w.size, float(m), m, 1.0 - uniform(state), np.uint64(0), ancestors)
+    _, p = sweep(w, 0, w.size, float(m), m, 1.0 - uniform(state), np.uint64(0), ancestors)
     if p < m:
-        _fill(ancestors, p, m, _last_positive(w))
+        fill_slots(ancestors, p, m, last_positive(w))
 
 
 @exact
@@ -138,7 +138,7 @@ def stratified(state, w, ancestors):
         p = q
     state[2] = start + np.uint64(m)
     if p < m:
-        _fill(ancestors, p, m, _last_positive(w))
+        fill_slots(ancestors, p, m, last_positive(w))
 
 
 @precise
@@ -208,10 +208,10 @@ def _merge(state, w, scale, draws, total, ancestors):
             left -= 1
             q += 1
         q = min(q, m)
-        _fill(ancestors, p, q, j)
+        fill_slots(ancestors, p, q, j)
         p = q
     if p < m:
-        _fill(ancestors, p, m, _last_positive(w))
+        fill_slots(ancestors, p, m, last_positive(w))
 
 
 @exact
@@ -230,10 +230,10 @@ def conditional_systematic(state, w, keep, ancestors):
     limit = n - 1
     s = uniform(state) * (scale * w[keep])
     p = _floor_below(s, limit)
-    _fill(ancestors, 0, np.int64(p), keep)
-    s, p = _sweep(w, keep + 1, n, scale, limit, s, p, ancestors)
-    s, p = _sweep(w, 0, keep, scale, limit, s, p, ancestors)
-    _fill(ancestors, p, n, keep)
+    fill_slots(ancestors, 0, np.int64(p), keep)
+    s, p = sweep(w, keep + 1, n, scale, limit, s, p, ancestors)
+    s, p = sweep(w, 0, keep, scale, limit, s, p, ancestors)
+    fill_slots(ancestors, p, n, keep)
 
 
 @exact

@@ -1,8 +1,12 @@
-"""Normalised importance weights, their sum and their effective size.
+"""Normalised importance weights, their sum and their effective size; an index drawn by weights.
 
 The sum is taken after subtracting the maximum (log-sum-exp); the effective sample size is
-(sum W)^2 / sum W^2, A. Kong, J. S. Liu and W. H. Wong, *JASA* 89 (1994).  Two passes, both of
-which vectorise, and one to scale; nothing is allocated.
+(sum W)^2 / sum W^2, A. Kong, J. S. Liu and W. H. Wong, *JASA* 89 (1994).  Passes that vectorise;
+nothing is allocated.
+
+A loop that adds up stores nothing.  Before a loop that does both the compiler compares the
+addresses of its arrays, and takes the scalar one if they are close: the order of the sum, and with
+it the last digit, would depend on where short arrays happen to lie.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.elementary import bits_float, exp, float_bits
 from ssmppl.codegen.kernels.elementary import log as _log
-from ssmppl.codegen.kernels.flags import kernel, precise
+from ssmppl.codegen.kernels.flags import exact, kernel, precise
 
 OK = 0
 ALL_ZERO = 1
@@ -21,6 +25,7 @@ NAN = 2
 INFINITE = 3
 """Some log-weight is +inf, and none is NaN."""
 
+STRETCH = 32
 _INF = np.inf
 _NON_SIGN = np.int64(0x7FFFFFFFFFFFFFFF)
 
@@ -71,13 +76,13 @@ def normalise(log_w, w):
         if status == ALL_ZERO:
             return -_INF, 0.0, status
         return np.nan, np.nan, status
+    for i in range(n):
+        w[i] = exp(log_w[i] - top)
     total = 0.0
     squares = 0.0
     for i in range(n):
-        value = exp(log_w[i] - top)
-        w[i] = value
-        total += value
-        squares += value * value
+        total += w[i]
+        squares += w[i] * w[i]
     # A NaN that the maximum passed over shows in the sum.
     if total != total:
         return np.nan, np.nan, NAN
@@ -85,3 +90,59 @@ def normalise(log_w, w):
     for i in range(n):
         w[i] *= scale
     return top + _log(total), total * total / squares, OK
+
+
+@kernel
+def sum_of(w):
+    """w_1 + ... + w_n."""
+    total = 0.0
+    for i in range(w.size):
+        total += w[i]
+    return total
+
+
+@kernel
+def _exponentials(log_w, top, w):
+    """w = exp(log_w - top); their sum."""
+    for i in range(log_w.size):
+        w[i] = exp(log_w[i] - top)
+    return sum_of(w)
+
+
+@exact
+def relative_weights(log_w, w):
+    """w = exp(log_w - max); (their sum, status)."""
+    top = largest(log_w)
+    if not (-_INF < top < _INF):
+        return np.nan, _fault(log_w)
+    total = _exponentials(log_w, top, w)
+    return total, OK if total == total else NAN
+
+
+@exact
+def draw_relative(w, total, u):
+    """Index j with probability w[j] / total, from one uniform; never one of weight zero.
+
+    w : (N,), total : their sum, in whatever order it was taken. The weights are passed through by
+    stretches first, because adding them up one by one is what takes longest.
+    """
+    n, begin, point = w.size, 0, u * total
+    while begin + STRETCH < n:
+        own = sum_of(w[begin : begin + STRETCH])
+        if own > point:
+            break
+        point -= own
+        begin += STRETCH
+    part = w[begin : min(begin + STRETCH, n)]
+    last = -1
+    for j in range(part.size):
+        if part[j] > 0.0:
+            last = j
+            point -= part[j]
+            if point < 0.0:
+                return begin + j
+    if last < 0:  # rounding has passed all weights
+        while w[begin] == 0.0:
+            begin -= 1
+        return begin
+    return begin + last

@@ -2,11 +2,13 @@
 
 The text of a kernel is specialised as in a generated module, only that its parameters for the
 model's functions stand for small functions here, which call by address. The addresses travel with
-theta, which no kernel looks into: in place of the array a pair (addresses, theta).
+theta, which no kernel looks into: in place of the array a pair (addresses, theta), and where
+predictions are made the sizes of their section third.
 """
 
 from __future__ import annotations
 
+import ast
 import inspect
 from collections.abc import Callable, Mapping
 from functools import cache as once
@@ -16,6 +18,7 @@ import numpy as np
 
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels import particle_filter
+from ssmppl.codegen.kernels.prediction import predict_step
 from ssmppl.codegen.native.translate import PLANES, WHOLE
 from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.text import Algorithm
@@ -36,29 +39,40 @@ entry = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 '''
 
-TEXTS = ("flat", "varies")  # parameters that decide what is compiled
-NUMBERS = ("ahead", "horizon", "eliminated")  # parameters that are handed over when it runs
+TEXTS = ("flat", "varies", "steered", "second")  # parameters that decide what is compiled
+# What need not be compiled where there is none of it: a filter's first call waits for less.
+LEFT_OUT = {"ahead": "NO_LOOK_AHEAD"}
+NUMBERS = ("ahead", "horizon", "eliminated", "noises")  # those that are handed over when it runs
 # The functions that a model may lack; they are never called then.
 OPTIONAL: Mapping[str, str] = {
     "fit": "theta, c, s, states_prev, fits",
     "look_ahead": "theta, c, s, states_prev, fits, log_w",
     "weigh_future": "theta, c, s, states_prev, states, log_w",
+    "linear_initial": "theta, c, s, states, out",
+    "linear": "theta, c, s, states_prev, states, out",
+    "hessian_initial": "theta, c, s, states, out",
+    "hessian": "theta, c, s, states_prev, states, out",
 }
+Roles = tuple[tuple[str, str], ...]  # of some of a section's functions, with their arguments
 
 
 def by_address(
     function: Callable[..., Any], roles: Mapping[str, str], helpers: tuple[Any, ...] = (),
-    fixed: tuple[tuple[str, str], ...] = (),
-) -> tuple[Callable[..., Any], tuple[str, ...]]:  # fmt: skip
-    """The kernel with its functions called by address, and the order of the addresses.
+    fixed: tuple[tuple[str, str], ...] = (), aside: Mapping[str, str] | None = None,
+) -> tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]:  # fmt: skip
+    """The kernel with its functions called by address; the order of the addresses, its own first,
+    then those of predictions.
 
     roles : a model's functions, and the arguments of each. helpers : (kernel, name) of specialised
-    functions that the kernel calls. fixed : parameters that stand for text.
+    functions that the kernel calls. fixed : parameters that stand for text. aside : the functions
+    of the section that makes predictions, for a kernel with a parameter `predict`.
     """
     taken = {p for f in (function, *(h for h, _ in helpers)) for p in _parameters(f)}
     known = {**OPTIONAL, **roles}
-    order = tuple(sorted(r for r in known if r in taken))
-    return _made(function, order, tuple(known[r] for r in order), helpers, fixed), order
+    own = tuple((r, known[r]) for r in sorted(known) if r in taken)
+    beside = {r: aside[r] for r in sorted(aside) if r in _parameters(predict_step)} if aside else {}
+    made = _made(function, own, tuple(beside.items()), helpers, fixed)
+    return made, tuple(r for r, _ in own), tuple(beside)
 
 
 def _parameters(function: Callable[..., Any]) -> Mapping[str, Any]:
@@ -67,27 +81,25 @@ def _parameters(function: Callable[..., Any]) -> Mapping[str, Any]:
 
 @once
 def _made(
-    function: Callable[..., Any], order: tuple[str, ...], arguments: tuple[str, ...],
-    helpers: tuple[Any, ...], fixed: tuple[tuple[str, str], ...],
+    function: Callable[..., Any], own: Roles, beside: Roles, helpers: tuple[Any, ...],
+    fixed: tuple[tuple[str, str], ...],
 ) -> Callable[..., Any]:  # fmt: skip
     name = getattr(function, "py_func", function).__name__
-    bound = {role: f"call_{role}" for role in order}
-    own = {helper: helper for _, helper in helpers}
-    bound |= dict(fixed)
-    if "predict" in _parameters(function):
-        own["predict"] = "no_prediction"
-    made = [_specialised(f, n, bound | own) for f, n in (*helpers, (function, name))]
-    imports = {n: home for m in made for n, home in m.imports.items() if n not in own}
-    imports.pop("exact", None)
+    bound = {role: f"call_{role}" for role, _ in own}
+    bound |= {helper: helper for _, helper in helpers} | dict(fixed)
+    called = [(f"call_{role}", arguments) for role, arguments in own]
+    made = []
+    if beside:
+        apart = {role: f"call_predict_{role}" for role, _ in beside} | {"sizes": "theta[2]"}
+        called += [(apart[role], arguments) for role, arguments in beside]
+        made.append(specialise(predict_step, "predict", apart))
+        bound["predict"] = "predict"
+    made += [_specialised(f, n, bound) for f, n in (*helpers, (function, name))]
+    here = {"exact", "predict", *(helper for _, helper in helpers)}
+    imports = {n: home for m in made for n, home in m.imports.items() if n not in here}
     lines = [f"from {home} import {n}" for n, home in sorted(imports.items())]
-    if "predict" in own:
-        lines.append("from ssmppl.codegen.kernels.calls import no_prediction as _nothing")
     text = HEAD.format(name=name, imports="\n".join(lines))
-    if "predict" in own:
-        text += "no_prediction = exact(_nothing)\n\n\n"
-    text += "\n\n".join(
-        _caller(k, *pair) for k, pair in enumerate(zip(order, arguments, strict=True))
-    )
+    text += "\n\n".join(_caller(k, *pair) for k, pair in enumerate(called))
     texts = [m.text for m in made]
     texts[-1] = texts[-1].replace("@exact", "@entry", 1)
     return getattr(cache.load(f"{name}_by_address", text + "\n\n" + "\n\n".join(texts)), name)
@@ -98,42 +110,52 @@ def _specialised(function: Callable[..., Any], name: str, bound: Mapping[str, st
     return specialise(function, name, {k: v for k, v in bound.items() if k in parameters})
 
 
-def _caller(k: int, role: str, arguments: str) -> str:
-    """A function with a role's arguments that calls the k-th address."""
-    names = arguments.split(", ")
-    lines = [
-        f"@exact\ndef call_{role}({arguments}):",
-        f"    words = np.empty({2 * len(names)}, dtype=np.int64)",
-    ]
-    for j, name in enumerate(names):
-        array = "theta[1]" if name == "theta" else name
-        if name in WHOLE:
-            lines.append(f"    words[{2 * j}] = {name}")
-            continue
-        axis = 1 if name in PLANES else 0
-        lines.append(f"    words[{2 * j}] = address_of({array})")
-        lines.append(f"    words[{2 * j + 1}] = {array}.shape[{axis}]")
-    return "\n".join([*lines, f"    invoke(theta[0][{k}], words)"]) + "\n"
+def _caller(k: int, name: str, arguments: str) -> str:
+    """A function with these arguments that calls the k-th address."""
+    words = []
+    for given in arguments.split(", "):
+        array = "theta[1]" if given == "theta" else given
+        if given in WHOLE:
+            words += [f"np.int64({given})", "np.int64(0)"]
+        else:
+            words += [f"address_of({array})", f"{array}.shape[{1 if given in PLANES else 0}]"]
+    body = f"    invoke(theta[0][{k}], ({', '.join(words)}))"
+    return f"@exact\ndef {name}({arguments}):\n{body}\n"
 
 
-def entry(algorithm: Algorithm, places: Mapping[str, int], helpers: tuple[Any, ...] = ()) -> Any:
+def entry(
+    algorithm: Algorithm, places: Mapping[str, int], helpers: tuple[Any, ...] = (),
+    aside: tuple[Algorithm, Mapping[str, int]] | None = None,
+) -> Any:  # fmt: skip
     """An algorithm for one model: `entry(theta, ...)`, as in the model's generated module.
 
     places : address of each of the section's functions, by role. helpers : as in `by_address`.
+    aside : the algorithm that makes predictions, and the addresses of its section's functions.
     """
     section, bound = algorithm.section, algorithm.bound
     named = {name for _, name in helpers}
-    fixed = tuple((n, text) for n, text in bound.items() if n in TEXTS or text in named)
-    run, order = by_address(algorithm.function, section.roles, helpers, fixed)
-    codes = np.array([places.get(r, 0) for r in order], dtype=np.int64)
+    of_helpers = {p for h, _ in helpers for p in _parameters(h)}
+    fixed = tuple(
+        (n, text) for n, text in bound.items()
+        if n in TEXTS or text in (*named, LEFT_OUT.get(n)) or (n in NUMBERS and n in of_helpers)
+    )  # fmt: skip
+    predicted = aside[0].section.roles if aside else None
+    run, own, beside = by_address(algorithm.function, section.roles, helpers, fixed, predicted)
+    found = [places.get(r, 0) for r in own]
+    more: tuple[Any, ...] = ()
+    if aside:
+        found += [aside[1][r] for r in beside]
+        more = (aside[0].sizes,)
+    codes = np.array(found, dtype=np.int64)
     values: dict[str, Any] = {"sizes": algorithm.sizes}
     for n in NUMBERS:
-        if n in bound:  # by the name of a constant, or by itself
-            text = bound[n]
-            values[n] = vars(particle_filter)[text] if text.isidentifier() else int(text)
+        if n in bound and n not in of_helpers and n not in dict(fixed):
+            text = bound[n]  # the name of a constant, or a number
+            constant = text.isidentifier()
+            values[n] = vars(particle_filter)[text] if constant else ast.literal_eval(text)
     constants = [values[p] for p in _parameters(algorithm.function) if p in values]
 
     def call(theta: Any, *rest: Any) -> Any:
-        return run(*constants, (codes, theta), *rest)
+        return run(*constants, (codes, theta, *more), *rest)
 
     return call

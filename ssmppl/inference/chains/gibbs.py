@@ -58,13 +58,14 @@ def prepare(setup: Setup, method: Gibbs) -> Sampler:
     model = needed_model(problem, "Gibbs")
     kind = filter_of(model)
     if space.where.size:
-        pilot = find_mode(space, setup.root, kind)
+        pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     further, interweaved = interweaving(setup, method.interweave, pilot, model)
     steps = GibbsSteps(problem, plan_updates(problem, setup.held), further)
+    starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
-    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, kind)):
+    for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         theta = space.parameters(z)[0] if len(z) else space.theta
         tuning = further.begin() if further is not None else None

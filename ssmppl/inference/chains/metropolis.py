@@ -75,7 +75,7 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
     exact = needed_model(problem, "MetropolisHastings")
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
-    pilot = find_mode(space, setup.root, kind)
+    pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     factor = walk_factor(setup, method, where, pilot, kind)
     d = len(where)
     target = method.target_acceptance or (0.44 if d <= 1 else 0.35 if d == 2 else 0.234)
@@ -83,8 +83,9 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
         where, ExactLikelihood(problem, setup.states), RandomWalk(), setup.warmup,
         setup.warmup if adapts(method) else 0, target, setup.thin,
     )  # fmt: skip
+    starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
-    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, kind)):
+    for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         states.append(start_chain(kernel, where.at(z), factor, generator, stream))
     report = {

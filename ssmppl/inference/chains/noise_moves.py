@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
 
 from ssmppl.analysis.noises import Noises
 from ssmppl.codegen.interweaving import compile_noises
+from ssmppl.codegen.loading import Loaded
 from ssmppl.codegen.twisted import TwistedFilter, backward_passes
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
@@ -58,7 +58,7 @@ class NoiseMove:
         self.__dict__.update(state)
 
     @cached_property
-    def module(self) -> ModuleType:
+    def module(self) -> Loaded:
         return compile_noises(self.problem.trace, self.found, self.steered)
 
     @cached_property
@@ -125,8 +125,8 @@ class NoiseMove:
         if looking and not self.data_told_by:
             self.looks[i] = g, h
         a, pull = np.empty((steps, d, d)), np.empty((steps, d))
-        if hasattr(self.module, "look_back_scalar"):
-            fine = self.module.look_back_scalar(x, *derivatives, g, h, a, pull)
+        if d == r == r_initial == 1:
+            fine = backward_passes().look_back_scalar(x, *derivatives, g, h, a, pull)
         else:
             widest = max(r, r_initial)
             rest = np.empty((steps, widest)), np.empty((steps, widest, d))

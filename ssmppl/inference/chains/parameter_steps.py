@@ -114,7 +114,7 @@ def _totals(
 ) -> np.ndarray:
     """The statistics C_i of update k: the prior once, the rest summed over experiments."""
     update = steps.updates[k]
-    if update.needs_log_joint:
+    if update.needs_log_joint or not update.functions:
         return np.empty(0)
     total, part = np.zeros(len(update.functions)), np.empty(len(update.functions))
     run = getattr(steps.module, statistics_name(update))

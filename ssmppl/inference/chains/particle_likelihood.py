@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ssmppl.codegen.kernels.conditional_smc import ancestral_path, draw_index
+from ssmppl.codegen.kernels.conditional_smc import draw_index
+from ssmppl.codegen.kernels.genealogy import ancestral_path
 from ssmppl.codegen.kernels.random import fill_normal, uniform
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
 from ssmppl.codegen.metropolis import (

@@ -52,7 +52,7 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
     settings = FilterSettings(int(particles), proposal)
     asked(problem, method.interweave, None)  # refused before anything is compiled
     if space.where.size:
-        pilot = find_mode(space, setup.root)
+        pilot = setup.once("pilot", lambda: find_mode(space, setup.root))
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     further, interweaved = interweaving(setup, method.interweave, pilot)
@@ -65,8 +65,11 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
         gone = set(eliminated.components)
         updates = tuple(u for u in updates if not gone.issuperset(u.components))
     sweeper = Sweeper(problem, updates, settings, further, without)
+    starts = setup.once(
+        "starts", lambda: dispersed(space, pilot, setup.chains, setup.root, "bootstrap")
+    )
     states = []
-    for chain, z in enumerate(dispersed(space, pilot, setup.chains, setup.root, "bootstrap")):
+    for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
         states.append(start_chain(sweeper, theta, generator, stream))

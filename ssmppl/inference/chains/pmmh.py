@@ -71,20 +71,23 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     where = coordinates(space, method.scale, method.transform)
     if method.covariance is not None:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
-    pilot = find_mode(space, setup.root, rescue=method.rescue)
+    pilot = setup.once("pilot", lambda: find_mode(space, setup.root, rescue=method.rescue))
     theta, _ = space.parameters(pilot.z)
     plain = method.order == 0 and not method.correlation  # others know no guide
     choice = None
     if method.proposal == "auto":
         temper = plain and not method.rescue
-        choice = choose(
-            problem, theta, exact=False, whole=plain, integrate=plain, temper=temper
-        )  # fmt: skip
+        choice = setup.once(
+            "proposal",
+            lambda: choose(
+                problem, theta, exact=False, whole=plain, integrate=plain, temper=temper
+            ),
+        )
     proposal = choice.name if choice else method.proposal
     problem.proposal(proposal, integrate=plain)
     particles, tuned = method.particles, None
     if particles is None:
-        tuned = _tuned(setup, method, theta, proposal)
+        tuned = setup.once("tuning", lambda: _tuned(setup, method, theta, proposal))
         particles = tuned.particles
     settings = FilterSettings(int(particles), proposal, rescue=int(method.rescue))
     d = len(where)
@@ -103,7 +106,10 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
         setup.warmup if adapts(method) else 0, method.target_acceptance or usual, setup.thin,
     )  # fmt: skip
     states = []
-    starts = dispersed(space, pilot, setup.chains, setup.root, "bootstrap", method.rescue)
+    starts = setup.once(
+        "starts",
+        lambda: dispersed(space, pilot, setup.chains, setup.root, "bootstrap", method.rescue),
+    )
     for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         states.append(start_chain(kernel, where.at(z), tuning, generator, stream))
@@ -209,7 +215,9 @@ def walk_factor(
     if method.covariance is not None:
         return given_factor(method.covariance, len(where))
     rescue = method.rescue if isinstance(method, PMMH) else 0
-    covariance = pilot_covariance(setup, where, pilot, proposal, rescue)
+    covariance = setup.once(
+        "covariance", lambda: pilot_covariance(setup, where, pilot, proposal, rescue)
+    )
     return np.linalg.cholesky(covariance) * STRETCH / np.sqrt(max(len(where), 1))
 
 

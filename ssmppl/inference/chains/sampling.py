@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,16 @@ from ssmppl.data import unpack_parameters
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import Block
+from ssmppl.inference.runner import Block, Keep
+
+Result = TypeVar("Result")
+
+
+class Memory(Keep, Protocol):
+    """Outlives the process: `ChainFile`."""
+
+    def once(self, name: str, make: Callable[[], Any]) -> Any:
+        """What `make` gives, or gave in an earlier process."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +34,7 @@ class Setup:
 
     space : the free parameters, at the values near which to begin. held : the fixed ones.
     chains, warmup, thin, states : as in `sample`. root : of all random numbers of the call.
+    memory : what was found before the chains began, by name, and goes on being known.
     """
 
     problem: Problem
@@ -35,6 +45,12 @@ class Setup:
     thin: int
     root: np.random.SeedSequence
     states: bool = True
+    memory: Memory | None = None
+
+    def once(self, name: str, make: Callable[[], Result]) -> Result:
+        """What `make` gives, or gave in the call that this one continues: for what takes long, and
+        for what the kernel of the chains depends on."""
+        return make() if self.memory is None else self.memory.once(name, make)
 
     def streams(self, chain: int) -> tuple[np.random.Generator, np.ndarray]:
         """The random numbers of a chain: for the parameters, and for the kernels."""

@@ -306,10 +306,10 @@ def run_smc2(setup: Setup, method: SMC2, executor: Any, progress: bool) -> Runs:
     rows = sum(e.steps for e in setup.problem.experiments)
     chains: Sequence[ChainDraws[State]] = run_chains(
         partial(rows_block, filters), states, rows, executor=executor, progress=progress,
-        title="SMC2", describe=_describe,
+        title="SMC2", describe=_describe, keep=setup.memory,
     )  # fmt: skip
     if any(c.interrupted for c in chains):
-        raise KeyboardInterrupt("interrupted before all rows were seen")
+        raise chains[0].lost or KeyboardInterrupt("interrupted before all rows were seen")
     kept = [c.state.theta[c.state.generator.permutation(len(c.state.theta))] for c in chains]
     log_evidence = np.array([c.state.log_evidence for c in chains])
     rates = np.concatenate([c.stats["acceptance_rate"] for c in chains])
@@ -330,10 +330,8 @@ def _describe(recent: Sequence[Mapping[str, np.ndarray]]) -> str:
     return f"{max(int(stats['particles'][-1]) for stats in recent)} particles, ESS {share:.2f}"
 
 
-def drawn(
-    setup: Setup, method: SMC2, draws: int, executor: Any, progress: bool
-) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:
-    """The runs as chains of `draws` draws, and what to report.
+def settled(method: SMC2, draws: int) -> SMC2:
+    """With its number of parameters.
 
     Raises
     ------
@@ -346,6 +344,13 @@ def drawn(
             f"draws={draws} from SMC2(parameters={method.parameters})",
             fix=f"give at most {method.parameters} draws, or more parameters=",
         )
+    return method
+
+
+def drawn(
+    setup: Setup, method: SMC2, draws: int, executor: Any, progress: bool
+) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:
+    """The runs of a settled method as chains of `draws` draws, and what to report."""
     found = run_smc2(setup, method, executor, progress)
     chains = [ChainDraws({"theta": theta[:draws]}, {}, {}, None) for theta in found.theta]
     return chains, found.report
@@ -355,7 +360,8 @@ def _proposal(setup: Setup, method: SMC2) -> str:
     """The proposal of the filters, one without look-ahead."""
     name = method.proposal
     if name == "auto":
-        name = choose(setup.problem, setup.space.theta, exact=False).name
+        theta = setup.space.theta
+        name = setup.once("proposal", lambda: choose(setup.problem, theta, exact=False)).name
         name = {"auxiliary": "guided", "twisted": "bootstrap"}.get(name, name)
     if setup.problem.proposal(name).look_ahead is not None or name in ("twisted", "tempered"):
         raise ArgumentError(

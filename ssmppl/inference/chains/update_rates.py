@@ -20,6 +20,7 @@ from ssmppl.language.trace import Site
 
 LOW = 0.02  # share of draws at which a row changes, below which there is a warning
 APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
+PIECE = 2**25  # bytes of draws that are looked at together
 FEWEST = 50  # draws of a chain from which rates are worth a warning
 
 
@@ -32,17 +33,18 @@ def told(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
     """
     least, stuck = 1.0, []
     for i in range(len(problem.experiments)):
-        paths = np.stack([c.draws[f"path_{i}"] for c in result])  # (chains, draws, T, D)
-        if paths.shape[1] < 2:
+        paths = [c.draws[f"path_{i}"] for c in result]  # of each chain (draws, T, D)
+        draws, steps, _ = paths[0].shape
+        if draws < 2:
             return {}
-        free, discrete = random_components(problem, paths.shape[2])
-        rate = np.mean(paths[:, 1:] != paths[:, :-1], axis=(0, 1))  # (T, D)
+        free, discrete = random_components(problem, steps)
+        rate, ever, apart = movement(paths)
         # a continuous one that stands still is never right
-        counted = free & (~discrete | (gelman_rubin(paths) > APART))
-        varied = free & (paths != paths[:1, :1]).any(axis=(0, 1))
+        counted = free & (~discrete | (apart > APART))
+        varied = free & ever
         if (counted | varied).any():
             least = min(least, float(rate[counted | varied].min()))
-        if paths.shape[1] >= FEWEST:
+        if draws >= FEWEST:
             rows = np.flatnonzero((counted & (rate < LOW)).any(axis=1))
             stuck += [(i, int(rows[0]) + 1, int(rows[-1]) + 1, len(rows))] if len(rows) else []
     if not stuck:
@@ -79,13 +81,35 @@ def random_components(problem: Problem, steps: int) -> tuple[np.ndarray, np.ndar
     return free, discrete
 
 
-def gelman_rubin(paths: np.ndarray) -> np.ndarray:
-    """R-hat (T, D) of draws (chains, draws, T, D) (Gelman and Rubin 1992); 1 where nothing ever
-    varied, infinite where chains stand still apart, and for one chain 1."""
-    if len(paths) < 2:
-        return np.ones(paths.shape[2:])
-    within = paths.var(axis=1, ddof=1).mean(axis=0)
-    between = paths.mean(axis=1).var(axis=0, ddof=1)
+def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each chain's draws (draws, T, D), which may lie on disk and are read in pieces: the share
+    of successive draws that differ, whether any differ, and R-hat; (T, D) each."""
+    n, shape = len(paths[0]), paths[0].shape[1:]
+    size = max(1, PIECE // max(1, len(paths) * paths[0][0].nbytes))
+    changed, ever = np.zeros(shape, dtype=int), np.zeros(shape, dtype=bool)
+    mean = square = np.zeros((len(paths), *shape))
+    first, last = paths[0][:1], None
+    for a in range(0, n, size):
+        piece = np.stack([p[a : a + size] for p in paths])
+        changed += (piece[:, 1:] != piece[:, :-1]).sum(axis=(0, 1))
+        if last is not None:
+            changed += (piece[:, 0] != last).sum(axis=0)
+        last = piece[:, -1]
+        ever |= (piece != first).any(axis=(0, 1))
+        new = piece.mean(axis=1)
+        m, off = piece.shape[1], new - mean  # (Chan, Golub and LeVeque 1983)
+        square = square + piece.var(axis=1) * m + off**2 * (a * m / (a + m))
+        mean = mean + off * (m / (a + m))
+    return changed / (len(paths) * (n - 1)), ever, gelman_rubin(mean, square / (n - 1))
+
+
+def gelman_rubin(means: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """R-hat (T, D) of chains by their means and variances (chains, T, D) (Gelman and Rubin 1992);
+    1 where nothing ever varied, infinite where chains stand still apart, and for one chain 1."""
+    if len(means) < 2:
+        return np.ones(means.shape[1:])
+    within = variances.mean(axis=0)
+    between = means.var(axis=0, ddof=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(1.0 + between / within)
     return np.where(between > 0.0, ratio, 1.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.kalman import LOG_2PI, OK
@@ -84,7 +84,7 @@ def start_of(trace: Trace, flat: tuple[int, ...], model: Matrices, experiment: E
                 where=site.distribution.location,
             )
     total = float(increments.sum())
-    root = solve_triangular(factor, np.eye(len(flat)))
+    root = scipy.linalg.solve_triangular(factor, np.eye(len(flat)))
     columns = np.zeros((len(mean), 1 + len(flat)))
     columns[:, :1] = mean
     columns[list(flat), 0] += root @ right

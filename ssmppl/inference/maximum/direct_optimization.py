@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -61,6 +61,7 @@ class ExactClimb:
         self.exact = exact_score(model, self.experiments, free, setup.space.theta)
         self.best, self.best_value = np.empty(0), -np.inf
         self.iterates: list[np.ndarray] = []
+        self.values: list[float] = []
         self.evaluations = 0
 
     def run(self) -> Ascent:
@@ -98,6 +99,7 @@ class ExactClimb:
         return Ascent(
             point.theta, self.model.log_likelihood(self.experiments, point.theta),
             np.array(self.iterates), report, interrupted=interrupted,
+            figures={"objective": np.array(self.values)},
         )  # fmt: skip
 
     def value(self, z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -122,12 +124,9 @@ class ExactClimb:
             value, slope = self.value(z)
             return (-value, -slope) if value > -np.inf else (FAR, slope)
 
-        def remember(z: np.ndarray) -> None:
-            self.iterates.append(self.setup.space.parameters(z)[0].copy())
-
-        remember(start)
-        found: Any = minimize(
-            downhill, start, jac=True, method="L-BFGS-B", callback=remember,
+        self._remember(start)
+        found: Any = scipy.optimize.minimize(
+            downhill, start, jac=True, method="L-BFGS-B", callback=self._remember,
             options={"maxiter": self.method.steps, "ftol": 1e-13, "gtol": 1e-7},
         )  # fmt: skip
         return str(found.message)
@@ -153,8 +152,15 @@ class ExactClimb:
                 if gap < 1e-5:  # a gain below the rounding of the likelihood: the step is right
                     self.best = z + step
                 break
-            self.iterates.append(self.setup.space.parameters(self.best)[0].copy())
+            self._remember(self.best)
         return gap
+
+    def _remember(self, z: np.ndarray) -> None:
+        """z is one of the iterates."""
+        point, theta = self.setup.chart.at(z), self.setup.space.parameters(z)[0].copy()
+        value = self.model.log_likelihood(self.experiments, theta)
+        self.iterates.append(theta)
+        self.values.append(value + point.log_prior if self.setup.with_prior else value)
 
     def _curvature(self, z: np.ndarray) -> np.ndarray:
         return _curvature(self.setup, self.exact, z)

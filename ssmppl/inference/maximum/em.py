@@ -190,7 +190,7 @@ class _Climb:
         self.to_z = Unconstrained(setup.problem.trace, free)
         self.theta = setup.space.parameters(setup.start)[0].copy()
         self.value = self.objective(self.theta)
-        self.iterates = [self.theta]
+        self.iterates, self.values = [self.theta], [self.value]
         self.maps = 0
 
     def objective(self, theta: np.ndarray) -> float:
@@ -227,8 +227,9 @@ class _Climb:
         }
         likelihood = self.model.log_likelihood(self.setup.problem.experiments, self.theta)
         return Ascent(
-            self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted
-        )
+            self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted,
+            figures={"objective": np.array(self.values)},
+        )  # fmt: skip
 
     def _step(self, theta: np.ndarray) -> np.ndarray:
         self.maps += 1
@@ -237,6 +238,7 @@ class _Climb:
     def _take(self, theta: np.ndarray, value: float) -> None:
         self.theta, self.value = theta, value
         self.iterates.append(theta)
+        self.values.append(value)
 
     def _cycle(self) -> float:
         """Two EM steps, and from them an extrapolated one; how far the limit seems to be."""

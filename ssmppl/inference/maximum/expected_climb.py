@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ssmppl.inference.maximum.ascent import Setup
 
@@ -30,7 +30,7 @@ def climbed(
 
     z = setup.space_at(theta)
     before = at(z)[0]
-    found = minimize(
+    found = scipy.optimize.minimize(
         at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
         method="BFGS" if with_slope else "Nelder-Mead",
         options={"gtol": 1e-7} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},

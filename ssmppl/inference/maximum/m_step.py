@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ssmppl.analysis.climber import Unconstrained
 from ssmppl.analysis.expectation import unsuited
@@ -105,7 +105,9 @@ class Maximiser:
                 return np.inf, np.zeros(len(z))
             return -value, -slope
 
-        found = minimize(negative, z, jac=True, method="BFGS", options={"maxiter": BFGS_STEPS})
+        found = scipy.optimize.minimize(
+            negative, z, jac=True, method="BFGS", options={"maxiter": BFGS_STEPS}
+        )
         return self.chart.at(found.x).theta if found.fun <= negative(z)[0] else theta
 
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import eigh
+import scipy
 
 from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.likelihood import settle
@@ -196,7 +196,7 @@ def _preconditioner(b: np.ndarray | None, slope: Slope) -> np.ndarray:
     data's information and the whole of it, in every direction."""
     complete = _positive(slope.complete)
     new = slope.information if b is None else (1.0 - MEMORY) * b + MEMORY * slope.information
-    values, vectors = eigh(0.5 * (new + new.T), complete)
+    values, vectors = scipy.linalg.eigh(0.5 * (new + new.T), complete)
     values = np.clip(values, LEAST_INFORMATION, 1.0)
     back = complete @ vectors
     return (back * values) @ back.T
@@ -213,7 +213,7 @@ def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """(top, Monte Carlo covariance, information, largest error in standard errors), in z."""
     information = np.mean([s.information for s in way.near], axis=0)
     complete = _positive(np.mean([s.complete for s in way.near], axis=0))
-    values, vectors = eigh(0.5 * (information + information.T), complete)
+    values, vectors = scipy.linalg.eigh(0.5 * (information + information.T), complete)
     back = complete @ vectors
     usable = (back * np.maximum(values, LEAST_INFORMATION)) @ back.T
     inverse = np.linalg.inv(usable)

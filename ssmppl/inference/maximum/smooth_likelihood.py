@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.codegen.smooth import compile_smooth_filter
@@ -146,7 +146,7 @@ class SmoothClimb:
             self.iterates.append(self.setup.space.parameters(start + self.unit * v)[0].copy())
 
         remember(np.zeros(len(start)))
-        minimize(
+        scipy.optimize.minimize(
             downhill, np.zeros(len(start)), jac=True, method="L-BFGS-B", callback=remember,
             options={"maxiter": self.method.steps, "ftol": 1e-9, "gtol": 3e-3},
         )  # fmt: skip

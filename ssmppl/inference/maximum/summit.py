@@ -58,7 +58,8 @@ def summit(setup: Setup, method: IF2, ends: np.ndarray) -> Summit:
     values, errors = evaluate(setup, method, ends, 0)
     heights = values + np.array([prior(z) for z in ends])
     best = int(np.argmax(heights))
-    near = heights[best] - heights <= HALF_INTERVAL + 2.0 * np.hypot(errors, errors[best])
+    with np.errstate(invalid="ignore"):  # none is near where all likelihoods are zero
+        near = heights[best] - heights <= HALF_INTERVAL + 2.0 * np.hypot(errors, errors[best])
     z, value, noise, spread, pooled = ends[best], values[best], errors[best], None, False
     if near.sum() > 1:
         spread = np.atleast_2d(np.cov(ends[near].T))

@@ -14,7 +14,9 @@ FEW = 0.01  # of the values that there could be, below which the spread of the d
 
 def distinct(paths: np.ndarray) -> np.ndarray:
     """How many values x_t has among draws (M, T, D): (T,)."""
-    return np.array([len(np.unique(paths[:, t], axis=0)) for t in range(paths.shape[1])])
+    order = np.lexsort(np.moveaxis(paths, 2, 0), axis=0)  # of the draws, at each t
+    ordered = np.take_along_axis(paths, order[:, :, None], axis=0)
+    return 1 + np.sum(np.any(ordered[1:] != ordered[:-1], axis=2), axis=0)
 
 
 def collapse(

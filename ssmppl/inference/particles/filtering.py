@@ -17,6 +17,8 @@ from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED,
 from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
+from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
+from ssmppl.inference.particles.on_device import run_on_device
 from ssmppl.inference.problem import Problem
 
 SCHEMES = {
@@ -35,6 +37,7 @@ class FilterSettings:
     ess_threshold : resample when the effective sample size is below this share of N; 1: always.
     rescue : how many times N particles a row may take until N + 1 have a positive weight, by the
         alive particle filter; 0: N, whatever they weigh.
+    device : "cpu" or "cuda".
     """
 
     particles: int
@@ -42,6 +45,7 @@ class FilterSettings:
     scheme: int = SYSTEMATIC
     ess_threshold: float = 1.0
     rescue: int = 0
+    device: str = "cpu"
 
 
 def filter_settings(
@@ -59,7 +63,8 @@ def filter_settings(
             fix=f"use one of: {listing(str(resampling), SCHEMES)}",
         )
     check_count("particles", particles, 1)
-    if not 0.0 <= ess_threshold <= 1.0:
+    number = isinstance(ess_threshold, (int, float, np.floating, np.integer))
+    if not (number and 0.0 <= ess_threshold <= 1.0):
         raise ArgumentError(
             f"ess_threshold={ess_threshold!r} is no share of the particles",
             fix="give a number from 0 (never resample) to 1 (always)",
@@ -127,12 +132,23 @@ def run_filter(
 
     log_increments, ess : (T,), written. moments, kept : as of the kernel `particle_filter`.
     """
+    if settings.device == "cuda":
+        return run_on_device(
+            problem, theta, settings.proposal, settings.particles, experiment, rng,
+            log_increments, ess,
+        )  # fmt: skip
     data = theta, experiment.y, experiment.seen, experiment.u, settings.particles
     out = log_increments, ess, moments, kept
     if settings.rescue:
         alive = problem.program.entry(f"alive_filter_{settings.proposal}")
         return alive(*data, settings.rescue * settings.particles, rng, *out)
     scheme = None if settings.scheme == SYSTEMATIC and moments is None else settings.scheme
+    plain = settings.scheme == SYSTEMATIC and moments is None and kept is None
+    if plain and settings.particles >= LEAST and problem.program.apart(settings.proposal):
+        return run_in_blocks(
+            problem, theta, settings.proposal, settings.particles, settings.ess_threshold,
+            experiment, rng, log_increments, ess,
+        )  # fmt: skip
     run = problem.program.entry(f"filter_{settings.proposal}")
     return run(*data, scheme, settings.ess_threshold, rng, *out)
 
@@ -190,6 +206,7 @@ class FilterRun:
 
     log_increments, ess : (T,). mean : (T, D). covariance : (T, D, D). quantiles : (T, P, D).
     prediction : (T, 4, K): mean, variance, P(Y <= y) and P(Y < y) of the one-step prediction.
+    history : particles (T, D, N), weights (T, N) and ancestors (T, N), where they were asked for.
     """
 
     log_increments: np.ndarray
@@ -198,6 +215,7 @@ class FilterRun:
     covariance: np.ndarray
     quantiles: np.ndarray
     prediction: np.ndarray
+    history: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 def full_run(
@@ -207,22 +225,29 @@ def full_run(
     settings: FilterSettings,
     rng: np.ndarray,
     probabilities: np.ndarray,
+    history: bool = False,
 ) -> FilterRun:
     """Run the filter and keep its moments, quantiles and predictions.
+
+    history : whether to keep the particles, too, with their weights and ancestors.
 
     Raises
     ------
     SamplingError : all weights vanish, or are NaN; names the step, the user's line, the parameters.
     """
     d, k = len(problem.trace.state_symbols), len(problem.trace.observation_symbols)
-    steps, p = experiment.steps, len(probabilities)
+    steps, p, n = experiment.steps, len(probabilities), settings.particles
+    kept = None
+    if history:
+        ancestors = np.tile(np.arange(n, dtype=np.int32), (steps, 1))  # those of row 0: themselves
+        kept = np.empty((steps, d, n)), np.empty((steps, n)), ancestors
     out = FilterRun(
         np.empty(steps), np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)),
-        np.empty((steps, p, d)), np.empty((steps, 4, k)),
+        np.empty((steps, p, d)), np.empty((steps, 4, k)), kept,
     )  # fmt: skip
     moments = probabilities, out.mean, out.covariance, out.quantiles, out.prediction
     status, t = run_filter(
-        problem, theta, settings, experiment, rng, out.log_increments, out.ess, moments
+        problem, theta, settings, experiment, rng, out.log_increments, out.ess, moments, kept
     )
     if status != OK:
         raise failure(problem, theta, status, t, experiment)

@@ -28,6 +28,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.runner import run_tasks
 
 LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
+LEAST_RUNS = 1.1  # of one run alone nothing is known about products of different ones
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,8 @@ def run_weights(log_z: np.ndarray) -> np.ndarray:
     """(R,) likelihood estimates as weights, or equal ones where those would leave few runs."""
     w = np.exp(log_z - log_z.max())
     w /= w.sum()
-    return w if 1.0 / (w @ w) >= LEAST_SHARE * len(w) else np.full(len(w), 1.0 / len(w))
+    least = max(LEAST_SHARE * len(w), LEAST_RUNS)
+    return w if 1.0 / (w @ w) >= least else np.full(len(w), 1.0 / len(w))
 
 
 def _louis(runs: Sequence[Run], w: np.ndarray) -> np.ndarray:

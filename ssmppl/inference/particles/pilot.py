@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError, SamplingError
@@ -166,7 +166,7 @@ def climb_to_mode(
     size = 1.0
     for _ in range(4):  # restarts, as a simplex may collapse early on a ragged function
         simplex = np.vstack([best, best + size * np.eye(len(z))])
-        found = minimize(
+        found = scipy.optimize.minimize(
             lambda v: min(-log_density(v), 1e300), best, method="Nelder-Mead",
             options={"initial_simplex": simplex, "maxfev": 80 * len(z), "fatol": 0.1,
                      "xatol": 1e-3},

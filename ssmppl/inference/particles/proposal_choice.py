@@ -101,7 +101,7 @@ _choices: dict[tuple, Choice] = {}
 
 def choose(
     problem: Problem, theta: np.ndarray, exact: bool = True, *, whole: bool = False,
-    integrate: bool = False, temper: bool = False,
+    integrate: bool = False, temper: bool = False, look_ahead: bool = True,
 ) -> Choice:  # fmt: skip
     """The exact filter where there is one, the user's proposal where there is one, else the
     winner of a pilot at theta; remembered for each program and data.
@@ -112,6 +112,7 @@ def choose(
     particles are then of the others.
     temper : whether the tempered filter may be chosen, where no better proposal than the transition
         is derived.
+    look_ahead : whether proposals may be chosen whose particles resample by what comes next.
     """
     found = exact_model(problem.trace)
     if exact and not isinstance(found, NotApplicable):
@@ -119,8 +120,9 @@ def choose(
     if "user" in problem.program.proposals:
         return Choice("user", {})
     candidates = {
-        n: p for n, p in problem.program.proposals.items() if not isinstance(p, NotApplicable)
-    }
+        n: p for n, p in problem.program.proposals.items()
+        if isinstance(p, Proposal) and (look_ahead or p.look_ahead is None)
+    }  # fmt: skip
     twisted = {n: candidates.pop(n) for n in ("twisted",) if n in candidates}
     last = twisted if whole else {}
     if temper and "guided" not in candidates:
@@ -133,7 +135,8 @@ def choose(
         }
     if len(candidates) == 1 and not last:
         return Choice("bootstrap", {})
-    key = (problem.program.path, _digest(problem), theta.tobytes(), whole, integrate, temper)
+    flags = whole, integrate, temper, look_ahead
+    key = (problem.program.path, _digest(problem), theta.tobytes(), *flags)
     if key not in _choices:
         _choices[key] = _pilot(problem, theta, candidates, last)
     return _choices[key]

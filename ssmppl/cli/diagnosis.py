@@ -1,0 +1,122 @@
+"""The command `diagnose`: a model file and measurements in, the report and its page out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import ssmppl as ssm
+from ssmppl.cli.group import command
+from ssmppl.cli.options import FIXED, MODEL, NEEDED_DATA, PROGRESS, option, output
+from ssmppl.cli.reading import read_data
+from ssmppl.cli.rendering import answer, records, say, stop_interrupted, wrote
+from ssmppl.errors import ArgumentError
+from ssmppl.modelfile import load_model, parse_assignments
+
+if TYPE_CHECKING:
+    from ssmppl.gap.report import GapReport
+
+__all__ = ["diagnose"]
+
+# Beside the report: the stages that are done, from which an interrupted run goes on.
+CHECKPOINT = "stages"
+
+
+def _names(text: str | None) -> list[str] | None:
+    """a, b as a list; None where the option is not given."""
+    if text is None:
+        return None
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise ArgumentError(
+            "--effects names no effect",
+            fix="name some, separated by commas: --effects 'coulomb friction,quadratic drag'",
+        )
+    return names
+
+
+def _made(folder: Path) -> Path:
+    """The folder, made now: found out before minutes of computing, not after."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ArgumentError(
+            f"the folder {folder} cannot be made: {error.strerror or error}",
+            fix="name another with -o",
+        ) from error
+    return folder
+
+
+@command("diagnose", "Where model and data differ, why, and what it buys.")
+@MODEL
+@NEEDED_DATA
+@option("--mode", type=click.Choice(["full", "fast"]), default="full",
+        help="fast stops after the screen: nothing is fitted again.")  # fmt: skip
+@option("--fast", is_flag=True, show_default=False, help="The same as --mode fast.")
+@FIXED
+@option(
+    "--effects", metavar="NAME,NAME...",
+    help="Try these effects only; names as in ssm.effects.names() [default: all].",
+)  # fmt: skip
+@option("--particles", type=click.IntRange(2), help="Number of particles [default: tuned].")
+@option(
+    "--alpha", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.05,
+    help="Chance of a false alarm, over everything that is tried.",
+)  # fmt: skip
+@option("--seed", type=int, default=1, section="Run", help="Of all random numbers.")
+@option(
+    "--checkpoint", type=click.Path(path_type=Path), metavar="PATH", section="Run",
+    help="Keeps the stages that are done [default: stages/ in the folder of the report].",
+)  # fmt: skip
+@PROGRESS
+@output("the name of the data file, with _report", "Folder for the report.", file=False)
+def diagnose(
+    model: str, data: tuple[Path, ...], output: Path | None, mode: str, fast: bool,
+    fixed: tuple[str, ...], effects: str | None, particles: int | None, alpha: float,
+    seed: int, checkpoint: Path | None, progress: bool,
+) -> None:  # fmt: skip
+    """Where MODEL.py differs from DATA, which effect is missing, how far the gap closes.
+
+    Prints the three answers in words, and writes a folder with the page index.html, tables
+    (CSV), plots (PNG) and the model with what was found added. The page is one file that any
+    browser shows, on a phone too. Inputs are columns of the data; several DATA are several
+    experiments of one system. Ctrl-C ends early: the stages that are done are kept, and the same
+    command goes on from there.
+
+    \b
+        ssmppl diagnose model.py data.csv -o report/
+        ssmppl diagnose model.py data.csv --fast --fixed mass=1.2 length=0.4
+        ssmppl diagnose model.py data.csv --effects 'coulomb friction,quadratic drag'
+    """
+    held, names = parse_assignments(fixed, "--fixed"), _names(effects)
+    loaded, read = load_model(model), read_data(data)
+    folder = _made(output or Path(f"{data[0].stem}_report"))
+    kept = checkpoint or folder / CHECKPOINT
+    try:
+        report: GapReport = ssm.diagnose(
+            loaded, read, names, mode="fast" if fast else mode, alpha=alpha, fixed=held or None,
+            particles=particles, checkpoint=kept, progress=progress, seed=seed,
+        )  # fmt: skip
+    except KeyboardInterrupt:
+        stop_interrupted(f"before there was anything to report. {kept} holds the stages that are "
+                         "done: the same command goes on from there.")  # fmt: skip
+    say(str(report))
+    page = report.save(folder)
+    wrote(page)
+    answer(model=loaded.name, **_told(report), folder=folder, files=[page])
+    if report.interrupted:
+        stop_interrupted(f"this is what the stages done so far tell. {kept} holds them: the same "
+                         "command goes on from there.")  # fmt: skip
+
+
+def _told(report: GapReport) -> dict[str, Any]:
+    """The report by the names of its attributes."""
+    tables = {name: records(table) for name, table in report.tables().items()}
+    return {
+        "verdict": report.verdict, "chosen": report.chosen, "estimates": report.estimates,
+        **tables, "missing": tables.get("missing"), "parts": report.parts, "notes": report.notes,
+        "settings": report.settings, "mode": report.mode, "seconds": report.seconds,
+        "interrupted": report.interrupted,
+    }  # fmt: skip

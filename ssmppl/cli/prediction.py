@@ -1,0 +1,213 @@
+"""Commands about observations that a model expects: predictive draws, forecasts, their scores."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import ssmppl as ssm
+from ssmppl.cli.group import command
+from ssmppl.cli.methods import SAMPLERS, method_of
+from ssmppl.cli.options import (
+    DATA,
+    FIXED,
+    INPUTS,
+    MODEL,
+    POSTERIOR,
+    PROGRESS,
+    SEED,
+    SERIES,
+    SETTINGS,
+    START,
+    MethodName,
+    drawn_seed,
+    option,
+    output,
+)
+from ssmppl.cli.reading import read_data, read_posterior, read_table
+from ssmppl.cli.rendering import (
+    answer,
+    heading,
+    records,
+    say,
+    spread,
+    spread_table,
+    table_text,
+    write,
+    wrote,
+)
+from ssmppl.cli.targets import file_of_model, new_file, target
+from ssmppl.modelfile import load_model, parse_assignments
+from ssmppl.results import wide_table
+
+__all__ = ["forecast", "leave_future_out", "predict"]
+
+
+@command("predict", "Draws of the observations, from prior or posterior.")
+@MODEL
+@DATA
+@option(
+    "--posterior", "--idata", "posterior", metavar="POSTERIOR.nc", section="Model and data",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="File that `ssmppl sample` wrote; without it, draws are from the prior.",
+)  # fmt: skip
+@option("--steps", type=int, section="Model and data", help="Number of rows where there are no "
+        "DATA.")  # fmt: skip
+@option("--draws", type=int, default=1000, section="Run",
+        help="From the prior; of the posterior all its draws are taken.")  # fmt: skip
+@option(
+    "--conditional/--free-run", default=None,
+    help="Of the posterior, whether the states are those of its trajectories, or simulated anew "
+    "from the first on [default: as the trajectories are there or not].",
+)  # fmt: skip
+@SEED
+@output("the name of the posterior, or of the model, with _predictive.nc",
+        "netCDF file for the draws.")  # fmt: skip
+def predict(
+    model: str, data: tuple[Path, ...], posterior: Path | None, steps: int | None, draws: int,
+    conditional: bool | None, seed: int | None, output: Path | None,
+) -> None:  # fmt: skip
+    """Draws of the observations at the rows of DATA, from the prior or the posterior.
+
+    Prints mean, standard deviation and quantiles of what is drawn at each row. Writes the draws to
+    a netCDF file, groups posterior_predictive or prior_predictive, which arviz.from_netcdf reads
+    and arviz.plot_ppc draws.
+
+    \b
+        ssmppl predict model.py data.csv --posterior posterior.nc --seed 1
+        ssmppl predict model.py --steps 100 --draws 500 -o prior.nc
+    """
+    path = target(output, posterior or file_of_model(model), "_predictive.nc", "_2", data)
+    loaded, seed = load_model(model), drawn_seed(seed)
+    idata = read_posterior(posterior) if posterior else None
+    read = read_data(data) if data else None
+    found = ssm.predict(
+        loaded, idata, read, steps=steps, draws=draws, conditional=conditional, seed=seed
+    )
+    group = "posterior_predictive" if posterior else "prior_predictive"
+    drawn = found[group]
+    count = drawn.sizes["chain"] * drawn.sizes["draw"]
+    heading(f"{loaded.name}: {count} draws from the {group.replace('_', ' ')} distribution")
+    experiments = []
+    axes = [str(dim) for dim in drawn.dims if dim == "time" or str(dim).startswith("time_")]
+    for axis in axes:
+        time = drawn[axis].values
+        own = {str(n): v for n, v in drawn.data_vars.items() if axis in v.dims}
+        spreads = spread(own, ("chain", "draw"))
+        say(table_text(spread_table(spreads, time)))
+        experiments.append({"time": time, "observations": spreads})
+    write(found, path)
+    wrote(path)
+    answer(
+        model=loaded.name, group=group, draws=count, experiments=experiments, seed=seed,
+        conditional=bool(drawn.attrs["conditional"]) if "conditional" in drawn.attrs else None,
+        files=[path],
+    )  # fmt: skip
+
+
+@command("forecast", "Draws of the rows after the data.")
+@MODEL
+@POSTERIOR
+@option("--steps", type=int, section="Model and data",
+        help="Number of rows; the inputs, if any, tell it too.")  # fmt: skip
+@INPUTS
+@option("--experiment", type=int, section="Model and data",
+        help="Which one is continued, from 1, where several were sampled.")  # fmt: skip
+@SEED
+@output("the name of the posterior, with _forecast.nc",
+        "File for the draws: .nc, or .csv and .parquet for a row per draw and time.")  # fmt: skip
+def forecast(
+    model: str, posterior: Path, steps: int | None, inputs: Path | None, experiment: int | None,
+    seed: int | None, output: Path | None,
+) -> None:  # fmt: skip
+    """Draws of states and observations after the last row of the data.
+
+    Each draw of POSTERIOR.nc, which `ssmppl sample` wrote with its states, is continued by the laws
+    of MODEL.py. Prints mean, standard deviation and quantiles at each row, and writes the draws to
+    a netCDF file, which xarray.open_dataset reads.
+
+    \b
+        ssmppl forecast model.py posterior.nc --steps 12 --seed 1
+        ssmppl forecast model.py posterior.nc --inputs torque_tomorrow.csv -o tomorrow.csv
+    """
+    given = [posterior, inputs] if inputs else [posterior]
+    path = target(output, posterior, "_forecast.nc", "_2", given)
+    loaded, seed = load_model(model), drawn_seed(seed)
+    found = ssm.forecast(
+        loaded, read_posterior(posterior), steps, read_table(inputs) if inputs else None,
+        experiment=experiment, seed=seed,
+    )  # fmt: skip
+    time = found["time"].values
+    over_time = {str(n): v for n, v in found.data_vars.items() if "time" in v.dims}
+    spreads = spread(over_time, ("draw",))
+    heading(f"{loaded.name}: {found.sizes['draw']} draws of the {len(time)} rows after row "
+            f"{found.attrs['after']}")  # fmt: skip
+    say(table_text(spread_table(spreads, time)))
+    write(found, path, wide_table(found).set_index("time"))
+    wrote(path)
+    answer(model=loaded.name, draws=found.sizes["draw"], after=found.attrs["after"], time=time,
+           variables=spreads, seed=seed, files=[path])  # fmt: skip
+
+
+@command("leave-future-out", "How well each row is predicted from those before it.")
+@MODEL
+@SERIES
+@option("--first", type=int, section="Model and data",
+        help="The first row that is predicted, from 2 [default: after a quarter].")  # fmt: skip
+@option("--method", type=MethodName(SAMPLERS), help="Of `ssmppl sample` [default: chosen by the "
+        "model].")  # fmt: skip
+@SETTINGS
+@option("--draws", type=int, default=500, section="Run", help="Kept draws of a chain.")
+@option("--warmup", type=int, default=500, section="Run", help="Dropped ones before.")
+@option("--chains", type=int, default=4, section="Run", help="Number of chains.")
+@option("--threshold", type=float, default=0.7,
+        help="Pareto shape beyond which the model is sampled anew.")  # fmt: skip
+@option(
+    "--particles",
+    type=int,
+    default=1000,
+    help="Of the filters that give predictive densities, where there is no exact one.",
+)
+@SEED
+@FIXED
+@START
+@PROGRESS
+@output("none", "File for the rows: .csv, .parquet or .nc.")
+def leave_future_out(
+    model: str, data: Path, method: str | None, settings: tuple[str, ...], seed: int | None,
+    fixed: tuple[str, ...], start: tuple[str, ...], output: Path | None, **run: Any,
+) -> None:  # fmt: skip
+    """How well MODEL.py predicts each row of DATA from the rows before it.
+
+    Prints the sum of the log predictive densities, the parameters integrated out, with its standard
+    error, and the rows. Models of the same data are compared by their sums over the same rows.
+    Writes the rows only where -o says where.
+
+    \b
+        ssmppl leave-future-out model.py data.csv --seed 1
+        ssmppl leave-future-out model.py data.csv --first 50 -o scores.csv
+    """
+    path = new_file(output, [data])
+    loaded, seed = load_model(model), drawn_seed(seed)
+    found = ssm.leave_future_out(
+        loaded, read_table(data), method=method_of(SAMPLERS, method, settings), seed=seed,
+        fixed=parse_assignments(fixed, "--fixed"), start=parse_assignments(start, "--start"), **run,
+    )  # fmt: skip
+    attrs, table = found.attrs, found.to_dataframe()
+    rows = int(np.isfinite(found["elpd"].values).sum())
+    heading(
+        f"{loaded.name}: elpd {attrs['elpd']:.4f} (standard error "
+        f"{attrs['standard_error']:.3g}) over {rows} rows, sampled {attrs['refits']} times"
+    )
+    say(table_text(table))
+    if path is not None:
+        write(found, path, table)
+        wrote(path)
+    answer(
+        model=loaded.name, elpd=attrs["elpd"], standard_error=attrs["standard_error"],
+        refits=attrs["refits"], rows=records(table.reset_index()), seed=seed,
+        files=[path] if path else [],
+    )  # fmt: skip

@@ -1,0 +1,250 @@
+"""What results hold, read for drawing: bands over time, the data, and the names of it all.
+
+A result comes in several forms: InferenceData (or a DataTree) of `sample`, a Dataset of draws or of
+moments, or a list of those for several experiments. Here each experiment becomes one `Record`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError, listing
+from ssmppl.inference.posterior_draws import group
+
+__all__ = [
+    "LEVELS",
+    "Record",
+    "bands",
+    "components",
+    "data_of",
+    "group_of",
+    "is_dataset",
+    "is_inference_data",
+    "observed_states",
+    "over_time",
+    "pick",
+    "records",
+    "wrong_kind",
+]
+
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)  # the ends of the bands, and the median
+STATES_FROM = "give what ssm.sample(..., states=True), ssm.smooth or a filter returns"
+
+
+@dataclass(frozen=True)
+class Record:
+    """One experiment as it is drawn (T rows); all names are those of scalars, as `x[0]`.
+
+    name : "experiment 2"; "" where there is one only. mark : what follows its names in groups.
+    time : (T,) labels. states : quantiles (5, T) at `LEVELS`. data, inputs : (T,), NaN if missing.
+    observes : of a component of the data, the state that is its mean.
+    """
+
+    name: str
+    time: np.ndarray
+    states: dict[str, np.ndarray]
+    data: dict[str, np.ndarray] = field(default_factory=dict)
+    inputs: dict[str, np.ndarray] = field(default_factory=dict)
+    observes: dict[str, str] = field(default_factory=dict)
+    mark: str = ""
+
+
+def is_inference_data(result: Any) -> bool:
+    """Whether it has groups: ArviZ's InferenceData, or a DataTree."""
+    return callable(getattr(result, "groups", None)) or hasattr(result, "children")
+
+
+def is_dataset(result: Any) -> bool:
+    """Whether it is one xarray Dataset."""
+    return hasattr(result, "data_vars") and not is_inference_data(result)
+
+
+def wrong_kind(verb: str, result: Any, fix: str) -> ArgumentError:
+    """The error of a plot that was given something else than what it draws."""
+    found = f"{type(result).__name__}"
+    if is_dataset(result):
+        found = f"a Dataset of {listing('', map(str, result.data_vars))}"
+    elif is_inference_data(result):
+        found = f"{found} with the groups {listing('', map(str, _group_names(result)))}"
+    return ArgumentError(f"{verb} cannot draw {found}", fix=fix)
+
+
+def _group_names(result: Any) -> list[str]:
+    names = result.groups() if callable(getattr(result, "groups", None)) else result.children
+    return [str(n).strip("/") for n in names]
+
+
+def group_of(verb: str, result: Any, name: str, fix: str) -> Any:
+    """A group of an InferenceData as a Dataset.
+
+    Raises
+    ------
+    ArgumentError : it is not there; tells which groups are.
+    """
+    found = group(result, name) if is_inference_data(result) else None
+    if found is None:
+        raise wrong_kind(verb, result, fix)
+    return found
+
+
+def components(name: str, values: np.ndarray, leading: int) -> Iterator[tuple[str, np.ndarray]]:
+    """(label, values) of each scalar of a variable, whose first `leading` axes are kept."""
+    for index in np.ndindex(values.shape[leading:]):
+        label = name + (f"[{', '.join(map(str, index))}]" if index else "")
+        yield label, values[(slice(None),) * leading + index]
+
+
+def pick(labels: Iterable[str], var_names: Any, what: str) -> list[str]:
+    """Those of `labels` that `var_names` asks for, by a variable's name or a component's label.
+
+    Raises
+    ------
+    ArgumentError : a name that is not among them; lists those that are.
+    """
+    labels = list(labels)
+    if var_names is None:
+        return labels
+    asked = [var_names] if isinstance(var_names, str) else list(var_names)
+    found: list[str] = []
+    for name in asked:
+        own = [k for k in labels if k == name or k.split("[")[0] == name]
+        if not own:
+            known = dict.fromkeys(k.split("[")[0] for k in labels)
+            raise ArgumentError(
+                f"there is no {name!r} among {what}",
+                fix=f"var_names= takes: {listing(str(name), known)}"
+                + (", or a component such as " + repr(labels[0]) if "[" in labels[0] else "")
+                if labels
+                else "leave var_names= out",
+            )
+        found += [k for k in own if k not in found]
+    return found
+
+
+def over_time(dataset: Any) -> list[tuple[str, str]]:
+    """(mark, dim over time) of each experiment: ("", "time"), or ("_1", "time_1"), ..."""
+    dims = [str(d) for d in dataset.dims]
+    numbers = sorted(int(d[5:]) for d in dims if d.startswith("time_") and d[5:].isdigit())
+    if numbers:
+        return [(f"_{k}", f"time_{k}") for k in numbers]
+    return [("", "time")] if "time" in dims else []
+
+
+def bands(draws: np.ndarray) -> np.ndarray:
+    """(5, ...) quantiles at `LEVELS` of draws along the first axis."""
+    found: np.ndarray = np.quantile(draws, LEVELS, axis=0)
+    return found
+
+
+def observed_states(attrs: Any) -> dict[str, str]:
+    """The attribute `observes` of a result; empty where it has none."""
+    text = attrs.get("observes", "{}")
+    found = json.loads(text) if isinstance(text, str) else dict(text)
+    return {str(k): str(v) for k, v in found.items()}
+
+
+def data_of(dataset: Any, mark: str, axis: str) -> dict[str, np.ndarray]:
+    """Scalars (T,) of one experiment in a group of data; none where there is no group."""
+    found: dict[str, np.ndarray] = {}
+    for name, variable in {} if dataset is None else dataset.data_vars.items():
+        if axis in variable.dims:
+            plain = str(name).removesuffix(mark) if mark else str(name)
+            values = np.asarray(variable.transpose(axis, ...).values, dtype=float)
+            found |= components(plain, values, 1)
+    return found
+
+
+def records(result: Any, verb: str) -> list[Record]:
+    """Each experiment of a result that tells of states.
+
+    Raises
+    ------
+    ArgumentError : the result tells of none; says what to give.
+    """
+    if is_inference_data(result):
+        return _of_posterior(result, verb)
+    several = isinstance(result, (list, tuple))
+    found = []
+    for k, one in enumerate(result if several else [result], start=1):
+        if not is_dataset(one):
+            raise wrong_kind(verb, one, STATES_FROM)
+        name = f"experiment {k}" if several and len(result) > 1 else ""
+        found.append(_of_dataset(one, name, verb))
+    if not found:
+        raise ArgumentError(f"{verb} was given an empty list", fix=STATES_FROM)
+    return found
+
+
+def _of_posterior(idata: Any, verb: str) -> list[Record]:
+    posterior = group_of(verb, idata, "posterior", STATES_FROM)
+    found = []
+    several = over_time(posterior)
+    for mark, axis in several:
+        states: dict[str, np.ndarray] = {}
+        for name, variable in posterior.data_vars.items():
+            if axis in variable.dims:
+                values = variable.transpose("chain", "draw", axis, ...).values
+                flat = values.reshape(-1, *values.shape[2:])
+                plain = str(name).removesuffix(mark) if mark else str(name)
+                states |= {k: bands(v) for k, v in components(plain, flat, 2)}
+        found.append(
+            Record(
+                f"experiment {mark[1:]}" if mark else "",
+                posterior[axis].values,
+                states,
+                data_of(group(idata, "observed_data"), mark, axis),
+                data_of(group(idata, "constant_data"), mark, axis),
+                observed_states(posterior.attrs),
+                mark,
+            )
+        )
+    if not found or not found[0].states:
+        raise ArgumentError(
+            f"the posterior holds no states, only {listing('', map(str, posterior.data_vars))}",
+            fix="sample with states=True and a method that draws them, or give what ssm.smooth "
+            "returns",
+        )
+    return found
+
+
+def _of_dataset(dataset: Any, name: str, verb: str) -> Record:
+    states: dict[str, np.ndarray] = {}
+    data: dict[str, np.ndarray] = {}
+    inputs: dict[str, np.ndarray] = {}
+    for key, variable in dataset.data_vars.items():
+        label = str(key)
+        if variable.dims[:2] == ("trajectory", "time"):
+            states |= {k: bands(v) for k, v in components(label, variable.values, 2)}
+        elif f"{label}_quantile" in dataset:
+            states |= _quantiles(dataset, label, verb)
+        elif variable.dims[:1] == ("time",):
+            for suffix, into in (("_observed", data), ("_input", inputs)):
+                if label.endswith(suffix):
+                    into |= components(label.removesuffix(suffix), variable.values, 1)
+    if not states:
+        raise wrong_kind(verb, dataset, STATES_FROM)
+    return Record(name, dataset["time"].values, states, data, inputs,
+                  observed_states(dataset.attrs))  # fmt: skip
+
+
+def _quantiles(dataset: Any, name: str, verb: str) -> dict[str, np.ndarray]:
+    """Of the first draw, at `LEVELS`."""
+    variable = dataset[f"{name}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
+    known = dataset["quantile"].values
+    places = [np.flatnonzero(np.isclose(known, level)) for level in LEVELS]
+    if not all(len(p) for p in places):
+        raise ArgumentError(
+            f"{verb} draws the quantiles {_texts(LEVELS)}, and the result has {_texts(known)}",
+            fix="leave quantiles= out of the call that made it",
+        )
+    values = np.moveaxis(variable.values[..., [p[0] for p in places]], -1, 0)  # (5, T, ...)
+    return dict(components(name, values, 2))
+
+
+def _texts(levels: Sequence[float] | np.ndarray) -> str:
+    return ", ".join(f"{level:g}" for level in levels)

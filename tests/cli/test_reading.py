@@ -1,0 +1,234 @@
+"""Data from CSV, Parquet and netCDF files: the same numbers, and nothing of them is executed."""
+
+import pickle
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import ssmppl as ssm
+from ssmppl.cli.reading import as_table, read_data, read_table
+from ssmppl.errors import ArgumentError, DataError
+from ssmppl.modelfile import load_model
+from ssmppl.results import arviz
+from tests.cli.shared import answer, fails, run
+
+Q = ("-p", "q=0.3")
+
+
+def dataset(series):
+    table = pd.read_csv(series, index_col="time")
+    return xr.Dataset.from_dataframe(table)
+
+
+def log_likelihood(file):
+    (value,) = answer("log-likelihood", "walk.py", file, *Q)["log_likelihood"]
+    return value
+
+
+def test_netcdf_gives_what_csv_gives(series):
+    dataset(series).to_netcdf("new.nc", engine="h5netcdf")
+    dataset(series).to_netcdf("classic.nc", engine="scipy")
+    assert Path("classic.nc").read_bytes()[:3] == b"CDF"
+    expected = log_likelihood("sim.csv")
+    assert expected == pytest.approx(-34.31, abs=0.01)
+    assert [log_likelihood("new.nc"), log_likelihood("classic.nc")] == [expected] * 2
+
+
+def test_parquet_gives_what_csv_gives(series):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed: no Parquet file to read")
+    pd.read_csv(series).to_parquet("table.parquet")
+    pd.read_csv(series, index_col="time").to_parquet("index.parquet")
+    expected = log_likelihood("sim.csv")
+    assert [log_likelihood("table.parquet"), log_likelihood("index.parquet")] == [expected] * 2
+    run("simulate", "walk.py", "--steps", 4, *Q, "--seed", 1, "-o", "s.parquet")
+    run("simulate", "walk.py", "--steps", 4, *Q, "--seed", 1, "-o", "s.csv")
+    assert log_likelihood("s.parquet") == log_likelihood("s.csv")
+
+
+@pytest.fixture
+def arrow(monkeypatch):
+    """What stands for pyarrow where it is not installed; `calls` of the reader."""
+    module = types.ModuleType("pyarrow")
+    module.__version__ = "21.0.0"
+    calls = []
+
+    def read_parquet(path, engine):
+        calls.append((Path(path).name, engine))
+        return pd.read_csv(Path(path).with_suffix(".csv"))
+
+    monkeypatch.setitem(sys.modules, "pyarrow", module)
+    monkeypatch.setattr(pd, "read_parquet", read_parquet)
+    return types.SimpleNamespace(module=module, calls=calls)
+
+
+def test_parquet_is_read_by_pyarrow_alone(series, arrow):
+    Path("sim.parquet").write_bytes(b"PAR1")
+    assert log_likelihood("sim.parquet") == log_likelihood("sim.csv")
+    assert arrow.calls == [("sim.parquet", "pyarrow")]
+
+
+def test_an_old_pyarrow_is_refused(series, arrow):
+    arrow.module.__version__ = "14.0.0"
+    Path("sim.parquet").write_bytes(b"PAR1")
+    said = fails("explain", "walk.py", "sim.parquet")
+    assert "pyarrow 14.0.0 is too old" in said
+    assert arrow.calls == []
+
+
+def test_without_pyarrow_the_extra_is_named(series, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    Path("sim.parquet").write_bytes(b"PAR1")
+    said = fails("explain", "walk.py", "sim.parquet")
+    assert "pip install 'ssmppl[parquet]'" in said
+    said = fails("simulate", "walk.py", "--steps", 3, *Q, "-o", "s.parquet")
+    assert "pip install 'ssmppl[parquet]'" in said
+
+
+def test_a_parquet_file_that_is_none(series, arrow, monkeypatch):
+    def refusing(path, engine):
+        raise ValueError("Parquet magic bytes not found in footer.\nMore")
+
+    monkeypatch.setattr(pd, "read_parquet", refusing)
+    Path("sim.parquet").write_bytes(b"none")
+    said = fails("explain", "walk.py", "sim.parquet")
+    assert "sim.parquet cannot be read as a Parquet file: Parquet magic bytes not found" in said
+    assert "More" not in said
+
+
+def test_dates_label_the_rows_of_each_kind(series, arrow):
+    dates = pd.date_range("2024-01-31", periods=20, freq="D")
+    table = pd.read_csv(series).assign(time=dates)
+    table.to_csv("dated.csv", index=False)
+    Path("dated.parquet").write_bytes(b"PAR1")
+    xr.Dataset.from_dataframe(table.set_index("time")).to_netcdf("dated.nc", engine="h5netcdf")
+    for name in ("dated.csv", "dated.parquet", "dated.nc"):
+        run("kalman-filter", "walk.py", name, *Q, "-o", "f.nc")
+        with xr.open_dataset("f.nc", engine="h5netcdf") as found:
+            np.testing.assert_array_equal(found["time"].values, dates.values, err_msg=name)
+    answered = answer("kalman-filter", "walk.py", "dated.nc", *Q)["experiments"][0]["time"]
+    assert answered[0].startswith("2024-01-31T00:00:00")
+
+
+def test_vectors_are_columns_or_dimensions(folder):
+    u = np.arange(5.0)
+    xr.Dataset({"u": ("time", u)}).to_netcdf("u.nc", engine="h5netcdf")
+    pd.DataFrame({"u": u}).to_csv("u.csv", index=False)
+    beta = ("-p", "beta=[1, 2]", "--seed", 1)
+    for end in ("nc", "csv"):
+        run("simulate", "plane.py", "--inputs", f"u.{end}", *beta, "-o", f"from_{end}.csv")
+    assert Path("from_nc.csv").read_text() == Path("from_csv.csv").read_text()
+    run("simulate", "plane.py", "--inputs", "u.csv", *beta, "-o", "sim.nc")
+    with xr.open_dataset("sim.nc", engine="h5netcdf") as found:
+        whole = found.load().assign(u=("time", u))
+    assert whole["y"].shape == (1, 5, 2)
+    whole.to_netcdf("plane.nc", engine="h5netcdf")
+    words = ("-p", "beta=[1, 2]")
+    from_nc = answer("log-likelihood", "plane.py", "plane.nc", *words)["log_likelihood"]
+    from_csv = answer("log-likelihood", "plane.py", "from_csv.csv", *words)["log_likelihood"]
+    assert from_nc == pytest.approx(from_csv, rel=1e-12)
+    assert list(as_table(whole).columns) == ["time", "x_0", "x_1", "y_0", "y_1", "u"]
+
+
+def test_a_netcdf_file_of_several_simulations(folder):
+    run("simulate", "walk.py", "--steps", 4, *Q, "--draws", 3, "-o", "many.nc")
+    assert "draw" in fails("log-likelihood", "walk.py", "many.nc", *Q)
+
+
+# -- files that are something else
+def test_a_file_of_draws_is_no_data(posterior, monkeypatch):
+    monkeypatch.chdir(posterior)
+    said = fails("explain", "walk.py", "post.nc")
+    assert "post.nc holds the groups" in said
+    assert "posterior" in said
+
+
+def test_data_are_no_posterior(posterior, monkeypatch):
+    monkeypatch.chdir(posterior)
+    assert "sim.csv holds no posterior draws" in fails("summary", "sim.csv")
+    assert "holds no posterior draws" in fails("forecast", "walk.py", "sim.csv", "--steps", 2)
+    assert "does not exist" in fails("summary", "nowhere.nc", code=2)
+
+
+def test_a_netcdf_file_that_is_cut_short(series):
+    dataset(series).to_netcdf("whole.nc", engine="h5netcdf")
+    Path("cut.nc").write_bytes(Path("whole.nc").read_bytes()[:900])
+    assert "cut.nc cannot be read as a netCDF file" in fails("explain", "walk.py", "cut.nc")
+    assert "cut.nc holds no posterior draws" in fails("summary", "cut.nc")
+    Path("text.nc").write_text("time,y\n1,2\n", encoding="utf-8")
+    assert "text.nc is not a netCDF file" in fails("explain", "walk.py", "text.nc")
+
+
+class Trap:
+    """Unpickling it writes a file."""
+
+    def __reduce__(self):
+        return Path.touch, (Path("sprung"),)
+
+
+@pytest.mark.parametrize("name", ["t.pkl", "t.csv", "t.nc", "t.h5", "t.parquet"])
+def test_nothing_is_unpickled(folder, name):
+    Path(name).write_bytes(pickle.dumps(Trap()))
+    pickle.loads(Path(name).read_bytes())
+    assert Path("sprung").exists()  # the trap is set
+    Path("sprung").unlink()
+    with pytest.raises((DataError, ArgumentError), match=r"t\.|pyarrow"):
+        read_table(Path(name))
+    fails("summary", name)
+    assert not Path("sprung").exists()
+
+
+# -- files that are not written over
+def test_a_file_that_is_read_is_not_written_over(series):
+    before = series.read_bytes()
+    commands = (("kalman-filter", *Q), ("smooth", *Q), ("sample",), ("leave-future-out",),
+                ("maximize",))  # fmt: skip
+    for name, *words in commands:
+        said = fails(name, "walk.py", "sim.csv", *words, "-o", "./sim.csv", code=2)
+        assert "a file that is read" in said
+    Path("sim_2.csv").write_bytes(before)
+    said = fails("smooth", "walk.py", "sim.csv", "sim_2.csv", *Q, "-o", "sim.csv", code=2)
+    assert "sim_2.csv is a file that is read" in said
+    assert series.read_bytes() == Path("sim_2.csv").read_bytes() == before
+
+
+def test_draws_and_inputs_are_not_written_over(posterior, monkeypatch, folder):
+    pd.DataFrame({"u": np.arange(3.0)}).to_csv("plane.csv", index=False)
+    beta = ("-p", "beta=[1, 2]")
+    found = answer("simulate", "plane.py", "--inputs", "plane.csv", *beta)
+    assert found["files"] == ["plane_simulated.csv"]
+    assert list(pd.read_csv("plane.csv").columns) == ["u"]
+    said = fails("simulate", "plane.py", "--inputs", "plane.csv", *beta, "-o", "plane.csv", code=2)
+    assert "a file that is read" in said
+    monkeypatch.chdir(posterior)
+    before = Path("post.nc").read_bytes()
+    for words in (("summary", "post.nc"), ("forecast", "walk.py", "post.nc", "--steps", 2)):
+        assert "a file that is read" in fails(*words, "-o", "post.nc", code=2)
+    assert Path("post.nc").read_bytes() == before
+
+
+def test_default_names_leave_data_and_draws_alone(posterior, monkeypatch, tmp_path):
+    for name in ("walk.py", "sim.csv", "post.nc"):
+        (tmp_path / name).write_bytes((posterior / name).read_bytes())
+    monkeypatch.chdir(tmp_path)
+    Path("post.nc").rename("sim.nc")  # as `sample` names it
+    assert answer("smooth", "walk.py", "sim.csv", *Q)["files"] == ["sim_states.nc"]
+    assert "q" in arviz().from_netcdf("sim.nc")["posterior"]
+    dataset("sim.csv").to_netcdf("data.nc", engine="h5netcdf")
+    words = ("--draws", 4, "--warmup", 2, "--chains", 1, "--seed", 1)
+    assert answer("sample", "walk.py", "data.nc", *words)["files"] == ["data_posterior.nc"]
+    assert answer("smooth", "walk.py", "data.nc", *Q)["files"] == ["data_states.nc"]
+    assert answer("smooth", "walk.py", "sim.csv", *Q, "-o", "here.nc")["files"] == ["here.nc"]
+
+
+def test_several_files_of_several_kinds(series):
+    dataset(series).isel(time=slice(0, 7)).to_netcdf("short.nc", engine="h5netcdf")
+    read = read_data([Path("sim.csv"), Path("short.nc")])
+    expected = ssm.log_likelihood(load_model("walk.py"), read, {"q": 0.3})
+    found = answer("log-likelihood", "walk.py", "sim.csv", "short.nc", *Q)["log_likelihood"]
+    assert found == list(expected)
+    assert found[0] == pytest.approx(log_likelihood("sim.csv") + log_likelihood("short.nc"))

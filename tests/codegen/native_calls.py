@@ -1,0 +1,79 @@
+"""Functions of a random or given model, called as native code and as plain Python."""
+
+import ctypes
+import re
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.native.build import addresses
+from ssmppl.codegen.native.translate import PLANES
+from ssmppl.codegen.program import compile_trace
+from tests.codegen.harness import PARTICLES, ROOM, STEPS, plain_module
+
+MATRIX = re.compile(r"\b(cholesky|inverse|logdet|det)\(\(")  # what is left to Numba
+
+
+def called(address, names, values):
+    """Call a native function with these arguments."""
+    words = np.zeros(2 * len(names), dtype=np.int64)
+    for k, name in enumerate(names):
+        value = values[name]
+        if isinstance(value, int):
+            words[2 * k] = value
+            continue
+        assert value.flags.c_contiguous
+        words[2 * k] = value.ctypes.data
+        words[2 * k + 1] = value.shape[1 if name in PLANES else 0]
+    ctypes.CFUNCTYPE(None, ctypes.c_void_p)(address)(words.ctypes.data)
+
+
+def arguments(numbers, t, rng):
+    """An array for every argument that a generated function can have."""
+    d = len(numbers.traced.state_symbols)
+    return {
+        "theta": numbers.theta, "c": np.zeros(ROOM), "s": np.zeros(ROOM), "t": t,
+        "y_data": numbers.y, "seen_data": numbers.seen, "u_data": numbers.u,
+        "states": numbers.states[t].copy(), "states_prev": numbers.states[max(t - 1, 0)].copy(),
+        "fits": rng.uniform(0.5, 1.5, (ROOM, PARTICLES)), "log_w": rng.normal(size=PARTICLES),
+        "out": rng.normal(size=(ROOM, PARTICLES)), "noise": rng.normal(size=ROOM),
+        "reference": np.ascontiguousarray(numbers.states[t, :, 2]) if d else np.zeros(0),
+        "normals": rng.normal(size=ROOM * PARTICLES), "uniforms": rng.uniform(size=ROOM),
+        "rng": new_state(np.random.SeedSequence(3)),
+    }  # fmt: skip
+
+
+def copied(values):
+    return {k: v if isinstance(v, int) else v.copy() for k, v in values.items()}
+
+
+def sections(traced, gaps):
+    """A model's generated module in plain Python, and (name, section, text) of each part."""
+    program = compile_trace(traced, Missing(none=not gaps))
+    found = {}
+    for algorithm in program.loaded._out.algorithms.values():
+        found[algorithm.section.suffix] = algorithm.section
+    parts = [
+        (f"{traced.name}_{suffix}", section, program.loaded._out.texts[id(section)])
+        for suffix, section in found.items()
+    ]
+    return plain_module(program.module), parts
+
+
+def both_ways(plain, name, section, text, numbers, rng):
+    """For every function of a section (what it is, native numbers, plain numbers), by argument."""
+    found = addresses(name, text)
+    for t in (0, STEPS - 1):
+        values = arguments(numbers, t, rng)
+        order = ["prepare", "step", *(r for r in section.roles if r not in ("prepare", "step"))]
+        for role in order:
+            names = section.roles[role].split(", ")
+            if t == 0 and "states_prev" in names:
+                continue
+            twin = copied(values)
+            called(found[section.name(role)], names, values)
+            with np.errstate(all="ignore"):
+                getattr(plain, section.name(role))(*(twin[n] for n in names))
+            for n in set(names) - {"t"}:
+                yield f"{section.name(role)}, {n}, t={t}", values[n], twin[n]

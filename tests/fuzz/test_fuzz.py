@@ -1,0 +1,80 @@
+"""A few of the random models in every run; what the judge lets pass and what it does not."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from tests.fuzz.block import cases, recipe_of
+from tests.fuzz.calls import Wrong, judged
+from tests.fuzz.models import FAULTS, random_model
+
+ROOT, DEFAULT, SLOW = 7, 4, 30  # the root is none of those that the long runs took
+
+
+@pytest.mark.parametrize(
+    "number", [pytest.param(k, marks=[pytest.mark.slow] * (k >= DEFAULT)) for k in range(SLOW)]
+)
+def test_random_models(number, tmp_path):
+    failed = [o for o in cases(ROOT, number, tmp_path) if o.failed]
+    told = "\n\n".join(f"{o.verb}: {o.kind}\n{o.detail}" for o in failed)
+    assert not failed, f"{recipe_of(ROOT, number)[0].text}\n\n{told}"
+
+
+def warned():
+    warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)
+
+
+def raising(error):
+    def run():
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("run", "kind"),
+    [
+        (lambda: None, "result"),
+        (raising(ssm.DataError("y is 3", fix="give less")), "DataError"),
+        (raising(ssm.ModelError("x", fix="y", where="File \"m.py\", line 3")), "ModelError"),
+        (raising(ssm.ModelError("x", fix="y")), "ERROR WITHOUT A PLACE"),
+        (raising(ssm.ArgumentError("particles=0")), "ERROR WITHOUT A FIX"),
+        (raising(ValueError("not ours")), "ERROR NOT OURS"),
+        (raising(RecursionError()), "ERROR NOT OURS"),
+        (raising(Wrong("nan")), "WRONG RESULT"),
+        (warned, "WARNING OF NUMPY'S"),
+    ],
+)  # fmt: skip
+def test_the_judge(run, kind):
+    found = judged("verb", run, "m.py")
+    assert found.kind == kind
+    assert found.failed == kind.isupper()
+
+
+def test_the_models_vary_and_are_the_same_for_the_same_number():
+    texts = {recipe_of(1, k)[0].text for k in range(50)}
+    assert len(texts) == 50
+    assert recipe_of(1, 3)[0] == recipe_of(1, 3)[0]
+    recipes = [random_model(np.random.default_rng(k), broken=0.7) for k in range(900)]
+    assert {r.fault for r in recipes} == {"", *FAULTS}
+    assert {support for r in recipes for support, _ in r.channels.values()} >= {"real", "label"}
+    assert sum(r.linear for r in recipes) > 30
+
+
+def test_a_wrong_result_is_found(tmp_path, monkeypatch):
+    """A likelihood that is no number, and random numbers that a seed does not fix."""
+    plain, count = ssm.simulate, [0]
+
+    def another(*args, **more):
+        count[0] += 1
+        return plain(*args, **{**more, "seed": count[0]})
+
+    monkeypatch.setattr(ssm, "log_likelihood", lambda *a, repeats=1, **k: np.full(repeats, np.nan))
+    monkeypatch.setattr(ssm, "simulate", another)
+    number = next(k for k in range(50) if not recipe_of(ROOT, k)[0].fault)
+    found = list(cases(ROOT, number, Path(tmp_path)))
+    wrong = {o.verb for o in found if o.kind == "WRONG RESULT"}
+    assert {"log_likelihood", "simulate"} <= wrong
