@@ -3,6 +3,8 @@
 Worker processes take models in turn. One that dies, or takes longer than `--limit` seconds over a
 case, is noted as a crash or a hang with the model's text, and replaced. What failed lies in the
 output folder, with the command that runs the one model again: `python -m tests.fuzz --only NUMBER`.
+With `--table` the counts go into a CSV file, in place of those that it holds of the same root; an
+interrupt or `kill` ends the hunt early and counts what was done.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import json
 import os
 import queue
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -23,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.fuzz.block import cases, recipe_of
+from tests.fuzz.block import CALLS, cases, recipe_of
 
 MODELS_EACH = 40  # of one worker process
 
@@ -35,35 +38,39 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=float, default=120.0, help="seconds for one case")
     parser.add_argument("--output", type=Path, default=Path("build/fuzz"))
+    parser.add_argument("--calls", type=int, default=CALLS, help="of each model")
+    parser.add_argument("--table", type=Path, help="a CSV file of root, call, outcome, count")
     parser.add_argument("--only", type=int, help="this model alone, its outcomes printed")
     parser.add_argument("--first", type=int, default=0, help=argparse.SUPPRESS)
     parser.add_argument("--step", type=int, default=0, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.only is not None:
-        return _alone(given.root, given.only)
+        return _alone(given.root, given.only, given.calls)
     if given.step:
-        _work(given.root, given.first, given.step)
+        _work(given)
         return 0
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     return Hunt(given).run()
 
 
-def _alone(root: int, number: int) -> int:
+def _alone(root: int, number: int, calls: int) -> int:
     recipe, _ = recipe_of(root, number)
     print(recipe.text, f"\n# fault: {recipe.fault or 'none'}\n")
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
-        for k, outcome in enumerate(cases(root, number, Path(folder))):
+        for k, outcome in enumerate(cases(root, number, Path(folder), calls)):
             print(f"{k:3} {outcome.verb}: {outcome.kind}\n    {outcome.detail[-2000:]}")
             failed += outcome.failed
     return int(failed > 0)
 
 
-def _work(root: int, first: int, step: int) -> None:
+def _work(given: argparse.Namespace) -> None:
     """A worker: a line of JSON before each model, after each case, and at the end."""
+    first, step = given.first, given.step
     with tempfile.TemporaryDirectory() as folder:
         for number in range(first, first + step * MODELS_EACH, step):
             _say({"model": number})
-            for outcome in cases(root, number, Path(folder)):
+            for outcome in cases(given.root, number, Path(folder), given.calls):
                 _say({"verb": outcome.verb, "kind": outcome.kind, "detail": outcome.detail})
             _say(
                 {"ended": number, "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024}
@@ -103,16 +110,17 @@ class Hunt:
         begun = said = time.monotonic()
         for k in range(self.given.workers):
             self._start(k, k)
-        while self.done < self.given.cases:
-            with contextlib.suppress(queue.Empty):
-                self._hear(*self.lines.get(timeout=1.0))
-            for k, worker in self.workers.items():
-                if time.monotonic() - worker.heard > self.given.limit:
-                    self._lost(k, "HANG", f"no answer within {self.given.limit:g} s")
-            if time.monotonic() - said > 30:
-                said = time.monotonic()
-                print(f"{self.done} cases, {self.models} models, {len(self.failures)} failed, "
-                      f"{said - begun:.0f} s", flush=True)  # fmt: skip
+        with contextlib.suppress(KeyboardInterrupt):
+            while self.done < self.given.cases:
+                with contextlib.suppress(queue.Empty):
+                    self._hear(*self.lines.get(timeout=1.0))
+                for k, worker in self.workers.items():
+                    if time.monotonic() - worker.heard > self.given.limit:
+                        self._lost(k, "HANG", f"no answer within {self.given.limit:g} s")
+                if time.monotonic() - said > 30:
+                    said = time.monotonic()
+                    print(f"{self.done} cases, {self.models} models, {len(self.failures)} failed, "
+                          f"{said - begun:.0f} s", flush=True)  # fmt: skip
         for worker in self.workers.values():
             worker.process.kill()
         self._report(time.monotonic() - begun)
@@ -121,6 +129,7 @@ class Hunt:
     def _start(self, k: int, first: int) -> None:
         command = [sys.executable, "-m", "tests.fuzz", "--root", str(self.given.root)]
         command += ["--first", str(first), "--step", str(self.given.workers)]
+        command += ["--calls", str(self.given.calls)]
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
         )
@@ -186,14 +195,21 @@ class Hunt:
         rows = [["call", *kinds]]
         rows += [[v, *(str(self.counts[v, k]) for k in kinds)] for v in verbs]
         rows.append(["all", *(str(sum(self.counts[v, k] for v in verbs)) for k in kinds)])
-        folder = self.given.output
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "fuzz.csv").write_text("\n".join(",".join(r) for r in rows) + "\n")
+        if self.given.table:
+            self._keep(self.given.table)
         widths = [max(len(r[c]) for r in rows) for c in range(len(rows[0]))]
         for row in rows:
             print("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)))
         print(f"{self.done} cases on {self.models} models in {seconds:.0f} s, "
               f"{len(self.failures)} failed; at most {self.mib} MiB in a process")  # fmt: skip
+
+    def _keep(self, table: Path) -> None:
+        root = f"{self.given.root},"
+        old = table.read_text().splitlines()[1:] if table.exists() else []
+        rows = [row for row in old if not row.startswith(root)]
+        rows += [f"{root}{verb},{kind},{n}" for (verb, kind), n in sorted(self.counts.items())]
+        rows += [f"{root}(models),written,{self.models}", f"{root}(memory),MiB at most,{self.mib}"]
+        table.write_text("\n".join(["root,call,outcome,count", *rows]) + "\n")
 
 
 if __name__ == "__main__":

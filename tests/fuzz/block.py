@@ -16,7 +16,7 @@ from tests.codegen.native_calls import MATRIX, both_ways, sections
 from tests.fuzz.calls import Case, LeftOut, Outcome, Wrong, judged, random_call
 from tests.fuzz.models import Recipe, random_model
 
-CALLS = 40  # on one model
+CALLS = 40  # on one model; the first are the same whatever their number
 PARTICLES, REPEATS = 100, 200  # of the estimates that are held against an exact likelihood
 
 
@@ -26,7 +26,7 @@ def recipe_of(root: int, number: int) -> tuple[Recipe, np.random.Generator]:
     return random_model(model_rng), call_rng
 
 
-def cases(root: int, number: int, folder: Path) -> Iterator[Outcome]:
+def cases(root: int, number: int, folder: Path, calls: int = CALLS) -> Iterator[Outcome]:
     """Outcomes one after the other; a broken model ends with the error that tells it."""
     recipe, rng = recipe_of(root, number)
     file = folder / f"random_{root}_{number}.py"
@@ -45,7 +45,7 @@ def cases(root: int, number: int, folder: Path) -> Iterator[Outcome]:
     yield judged("compiled = interpreted", lambda: agree(model, rng), file.name)
     if recipe.linear:
         yield judged("unbiased", lambda: unbiased(model, recipe, rng), file.name)
-    for _ in range(CALLS):
+    for _ in range(calls):
         verb, call = random_call(Case(rng, model, recipe))
         yield judged(verb, call, file.name)
 
