@@ -11,7 +11,6 @@ import numpy as np
 from table import show
 
 from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman import kalman_filter
 from ssmppl.codegen.kernels.kalman_adjoint import zeros_like
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.kernels.random import new_state
@@ -46,7 +45,7 @@ def runs(d, k):
     )  # fmt: skip
     draw = exact_entry("draw")
     return {
-        "log-likelihood": lambda: kalman_filter(*made, y, seen, out, *none),
+        "log-likelihood": lambda: exact_entry("kalman_filter")(*made, y, seen, out, *none),
         "score": lambda: exact_entry("adjoints")(made, start, y, seen, out, zeros_like(made)),
         "smoother": lambda: exact_entry("smooth")(
             made, start, y, seen, out, *moments, None, None, None, None

@@ -103,7 +103,7 @@ class ModuleText:
         if called:
             lines += ["from ssmppl.language.primitive import REGISTRY", ""]
             lines += [f'{name} = REGISTRY["{name}"]' for name in called]
-        lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]
+        lines += ["", 'entry = numba.njit(nogil=True, error_model="numpy")', "", ""]
         return "\n".join(lines) + "\n\n".join(self.parts)
 
 

@@ -290,6 +290,6 @@ def backward_passes() -> ModuleType:
     made = [specialise(k, k.__name__, {}) for k in kernels]
     names = {n: home for m in made for n, home in m.imports.items() if n != "exact"}
     lines = [f"from {home} import {n}" for n, home in sorted(names.items())]
-    lines += ["", 'entry = numba.njit(cache=True, nogil=True, error_model="numpy")', "", ""]
+    lines += ["", 'entry = numba.njit(nogil=True, error_model="numpy")', "", ""]
     texts = [m.text.replace("@exact", "@entry", 1) for m in made]
     return cache.load("guide", HEAD + "\n".join(lines) + "\n\n".join(texts))

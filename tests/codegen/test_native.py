@@ -7,7 +7,7 @@ import pytest
 from numba.core.errors import TypingError
 
 import ssmppl as ssm
-from ssmppl.codegen import cache
+from ssmppl.codegen import folder
 from ssmppl.codegen.kernels.calls import address_of
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.random import new_state
@@ -277,5 +277,5 @@ def test_damaged_code_is_made_again(tmp_path, monkeypatch):
         values = {"theta": np.array([3.0]), "c": np.zeros(1)}
         called(native_build.addresses("doubled", text)["run"], ["theta", "c"], values)
         assert values["c"][0] == 6.0
-        (kept,) = cache.cache_folder().glob("doubled_*.o")
+        (kept,) = folder.cache_folder().glob("doubled_*.o")
         kept.write_bytes(damage(kept.read_bytes()))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen import cache
+from ssmppl.codegen import cache, folder
 from ssmppl.codegen.program import compile_trace
 from ssmppl.language.trace import trace
 from tests.codegen.models import MODELS, build
@@ -80,10 +80,10 @@ def test_settings_make_modules_of_their_own():
 
 
 def test_the_digest_knows_text_kernels_and_versions(monkeypatch):
-    assert cache.digest_of("a") != cache.digest_of("b")
-    before = cache.digest_of("a")
-    monkeypatch.setattr(cache, "_environment", lambda: b"other kernels")
-    assert cache.digest_of("a") != before
+    assert folder.digest_of("a") != folder.digest_of("b")
+    before = folder.digest_of("a")
+    monkeypatch.setattr(folder, "_environment", lambda: b"other kernels")
+    assert folder.digest_of("a") != before
 
 
 # -- cache on disk, always in processes of their own
@@ -121,6 +121,58 @@ def finish(process):
     return int(hits), int(misses), float(total), Path(path)
 
 
+def limited(place, size):
+    """The script in a process that writes no file of more than so many bytes, as on a full disk."""
+    limit = f"import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))\n"
+    return finish(start(place, limit + SCRIPT))
+
+
+def test_a_full_disk_ends_no_call(tmp_path):
+    """Nothing can be written anywhere; only the text; then there is room again."""
+    hits, misses, total, path = limited(tmp_path, 0)
+    assert (hits, misses, path.exists()) == (0, 1, False)
+    kept = tmp_path / "ssmppl"
+    assert not list(kept.iterdir())
+    assert finish(start(tmp_path))[:3] == (0, 1, total)
+    (code,), (module,) = kept.glob("*.nbc"), kept.glob("*.py")
+    between = module.stat().st_size + 1
+    assert between <= code.stat().st_size
+    module.unlink()
+    code.unlink()
+    assert limited(tmp_path, between)[:3] == (0, 1, total)
+    assert module.exists()
+    assert not code.exists()
+    assert finish(start(tmp_path))[:3] == (0, 1, total)
+    assert finish(start(tmp_path))[:3] == (1, 0, total)
+
+
+def half(content):
+    return content[: len(content) // 2]
+
+
+def emptied(content):
+    return b""
+
+
+def another(content):
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage", [half, *(pytest.param(d, marks=pytest.mark.slow) for d in (another, emptied))]
+)
+def test_what_is_damaged_is_made_anew(tmp_path, damage):
+    """Half a file, another bit, none: by a power cut, a full disk, a copy that stopped."""
+    total = finish(start(tmp_path))[2]
+    files = [f for f in (tmp_path / "ssmppl").iterdir() if f.is_file()]
+    assert {f.suffix for f in files} >= {".py", ".nbc"}
+    for file in files:
+        file.write_bytes(damage(file.read_bytes()))
+    assert finish(start(tmp_path))[:3] == (0, 1, total)
+    assert finish(start(tmp_path))[:3] == (1, 0, total)
+
+
 def test_two_processes_at_once_then_a_third(tmp_path):
     both = [finish(p) for p in [start(tmp_path), start(tmp_path)]]
     assert both[0][2:] == both[1][2:]
@@ -153,21 +205,21 @@ def test_a_file_where_the_folder_should_be(tmp_path):
     assert tmp_path not in path.parents
 
 
-def _planted(folder, text):
+def _planted(place, text):
     """In place of a generated module what somebody else would put there; raises when it is run."""
-    path = folder / f"planted_{cache.digest_of(text)}.py"
+    path = place / f"planted_{folder.digest_of(text)}.py"
     path.write_text("raise SystemExit('this is not ours')")
     return path
 
 
-def _opened(folder):
-    folder.chmod(0o777)
+def _opened(place):
+    place.chmod(0o777)
 
 
-def _given_away(folder):
+def _given_away(place):
     if os.geteuid() != 0:
         pytest.skip("only root gives folders away")
-    os.chown(folder, 12345, -1)
+    os.chown(place, 12345, -1)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +227,7 @@ def _given_away(folder):
 )
 def test_a_folder_that_others_write_to_is_not_used(tmp_path, monkeypatch, change, words):
     monkeypatch.setenv("SSMPPL_CACHE", str(tmp_path))
-    assert cache.cache_folder() == tmp_path / "ssmppl"
+    assert folder.cache_folder() == tmp_path / "ssmppl"
     assert stat.S_IMODE((tmp_path / "ssmppl").stat().st_mode) == 0o700
     text = f"x = 1  # {words}"  # each case a module of its own
     path = _planted(tmp_path / "ssmppl", text)

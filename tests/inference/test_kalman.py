@@ -196,7 +196,8 @@ def test_refuses_other_models():
 def test_compiled_once_for_all_processes(tmp_path):
     code = (
         "import numpy as np\n"
-        "from ssmppl.codegen.kernels.kalman import kalman_filter as f\n"
+        "from ssmppl.codegen.exact import exact_entry\n"
+        "f = exact_entry('kalman_filter')\n"
         "one, e = np.eye(1), np.eye(1)[None]\n"
         "v, inc, y = np.zeros((1, 1)), np.empty(3), np.zeros((3, 1))\n"
         "f(v[0], one, e, v, e, e, v, e, y, y + 1, inc, *[np.empty((0,) + s) for s in"
@@ -206,6 +207,6 @@ def test_compiled_once_for_all_processes(tmp_path):
     for expected in ("0 1", "1 0"):
         run = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True,
-            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            env={**os.environ, "SSMPPL_CACHE": str(tmp_path)},
         )  # fmt: skip
         assert run.stdout.split() == expected.split()

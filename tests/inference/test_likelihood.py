@@ -280,6 +280,16 @@ def test_improper_priors_cannot_be_simulated_from():
     assert out["y"].shape == (1, 5)
 
 
+@pytest.mark.parametrize("particles", [2, 7, 40])
+def test_probability_transforms_do_not_exceed_one(particles):
+    """Where all particles put y_t above everything, rounding of the weights' sum is not added."""
+    far = {"y": np.where(np.arange(60) % 2, 1e6, 10.0)}
+    out = ssm.particle_filter(varves, far, AT, particles=particles, repeats=5, seed=1)
+    pit = out["y_pit"].values[:, 1::2]
+    assert pit.max() == 1.0
+    assert pit.min() > 1 - 1e-12
+
+
 def test_filter_datasets():
     out = ssm.particle_filter(varves, DATA, AT, particles=200, repeats=2, seed=1)
     assert out["x"].dims == ("draw", "time")

@@ -278,6 +278,35 @@ def test_smoothed_paths_are_those_of_the_enumeration(data, exact):
     _agree(np.array([r[1] for r in runs]), second[:, 1:, 1:])
 
 
+def test_states_that_no_observation_depends_on():
+    """Two of the three are integrated out, and the data say nothing of them: their paths are those
+    of the transition, and independent."""
+    model = ssm.Model("apart")
+
+    @model.initial
+    def initial():
+        return {"k": ssm.Binomial(6, 0.4), "z": ssm.Normal(np.array([1.0, 0.0]), sd=0.5)}
+
+    @model.transition
+    def transition(k, z):
+        return {"k": ssm.Binomial(6, 0.2 + 0.1 * k), "z": ssm.Normal(0.8 * z, sd=0.3)}
+
+    @model.observation
+    def observation(k):
+        return {"y": ssm.Poisson(1.0 + k)}
+
+    z = ssm.smooth(
+        model, {"y": [2, 3, 1]}, {}, ssm.FFBSi(proposal="marginal"), particles=20,
+        trajectories=4_000, seed=seed_of("apart"),
+    )["z"].values  # fmt: skip
+    variance = [0.25, 0.64 * 0.25 + 0.09, 0.64 * (0.64 * 0.25 + 0.09) + 0.09]
+    for t in range(3):
+        wanted = np.array([0.8**t, 0.0]), variance[t] * np.eye(2)
+        error = np.sqrt(np.array([variance[t], 2 * variance[t] ** 2]) / len(z))
+        assert np.abs(z[:, t].mean(axis=0) - wanted[0]).max() < 4.5 * error[0]
+        assert np.abs(np.cov(z[:, t], rowvar=False) - wanted[1]).max() < 4.5 * error[1]
+
+
 @pytest.mark.slow
 def test_smoothed_paths_with_coupled_states(sampled_pair):
     """Against the Kalman smoother."""

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-entry = numba.njit(cache=True, nogil=True, error_model="numpy")
+from ssmppl.codegen.kernels.flags import exact
 
 
-@entry
+@exact
 def forward(start, move, log_g, increments, predicted, filtered):
     """Fill increments (T,), log p(y_t | y_{1:t-1}), and the laws (T, K) of x_t given y_{1:t-1} and
     given y_{1:t}; returns the row (from 0) at which no value is possible, -1 if none is."""
@@ -52,7 +51,7 @@ def forward(start, move, log_g, increments, predicted, filtered):
     return -1
 
 
-@entry
+@exact
 def backward(move, predicted, filtered, smoothed, pairs):
     """Fill the laws (T, K) of x_t given y_{1:T}, and pairs (T, K, K) of (x_{t-1}, x_t), row 0 zero;
     pairs of no rows are left out."""
@@ -77,7 +76,7 @@ def backward(move, predicted, filtered, smoothed, pairs):
         pairs[0] = 0.0
 
 
-@entry
+@exact
 def sample_backward(move, filtered, uniforms, paths):
     """Fill paths (M, T) with indices of values drawn from p(x_{1:T} | y_{1:T}), by uniforms of the
     same shape."""

@@ -17,9 +17,6 @@ Where A, Q, C and R do not depend on time, covariances settle (Anderson and Moor
 filtering", chapter 4). From the step on at which the root moves by rounding errors only, the arrays
 are kept and the means go on alone, until a row misses other components than the one before.
 
-Everything that the entry point calls is in this file, because Numba's disk cache notices edits of
-the entry point's own file only.
-
 Notation: D states, K observed components, T steps; a matrix that does not depend on time is given
 with a first axis of length 1 instead of T.
 """
@@ -28,7 +25,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
@@ -40,8 +36,6 @@ LOG_2PI = math.log(2.0 * math.pi)
 PIVOT, REST = 1e-14, 1e-10
 # A root that moved by no more, as a share of its rows, has settled: rounding alone moves it so.
 SETTLED = 16 * 2.0**-52
-
-entry = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @exact
@@ -257,7 +251,7 @@ def same(a, b):
     return True
 
 
-@entry
+@exact
 def kalman_filter(
     m, P, A, b, Q, C, d, R, y, seen,
     log_increment, mean, covariance, mean_predicted, covariance_predicted,

@@ -37,5 +37,6 @@ def predict_step(
             square += w[i] * (out[4 * k, i] - mean) ** 2
         prediction[t, 0, k] = mean
         prediction[t, 1, k] = weighted_mean(out[4 * k + 1], w) + square
-        prediction[t, 2, k] = weighted_mean(out[4 * k + 2], w)
-        prediction[t, 3, k] = weighted_mean(out[4 * k + 3], w)
+        for row in range(2, 4):
+            below = weighted_mean(out[4 * k + row], w)
+            prediction[t, row, k] = 1.0 if below > 1.0 else below  # weights sum to 1 + rounding

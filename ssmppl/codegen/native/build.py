@@ -9,7 +9,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-from ssmppl.codegen import cache
+from ssmppl.codegen import folder
 from ssmppl.codegen.native.library import function_ir
 from ssmppl.codegen.native.translate import Untranslatable, translate
 
@@ -30,7 +30,7 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
         raise Untranslatable(f"LLVM {llvm.llvm_version_info[0]} has typed pointers", fix="")
     with _lock:
         try:
-            key = f"{name}_{cache.digest_of(text + _machine())}"
+            key = f"{name}_{folder.digest_of(text + _machine())}"
             if key not in _built:
                 _built[key] = _load(key, text)
             return _built[key]
@@ -39,10 +39,10 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
 
 
 def _load(key: str, text: str) -> Mapping[str, int]:
-    names, code = None, cache.kept_bytes(key, ".o")
+    names, code = None, folder.kept_bytes(key, ".o")
     if code is None:
         code, names = _compiled(text)
-        cache.keep_bytes(key, ".o", code)
+        folder.keep_bytes(key, ".o", code)
     if names is None:
         names = [line[4 : line.index("(")] for line in text.splitlines() if line.startswith("def ")]
     module = llvm.parse_assembly(f'target triple = "{llvm.get_process_triple()}"\n')

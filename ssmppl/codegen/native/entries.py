@@ -34,7 +34,7 @@ import numpy as np
 from ssmppl.codegen.kernels.calls import address_of, invoke
 from ssmppl.codegen.kernels.flags import exact
 
-entry = numba.njit(cache=True, nogil=True, error_model="numpy")
+entry = numba.njit(nogil=True, error_model="numpy")
 
 
 '''

@@ -13,7 +13,7 @@ from typing import Any
 
 from numba import float64, types
 
-from ssmppl.codegen import cache
+from ssmppl.codegen import folder
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import MODULES
 
@@ -35,10 +35,10 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
     if name not in HOMES or name in MATRICES:
         raise Untranslatable(f"{name} is not a function of numbers", fix="")
     file = f"lib_{name}_{arity}"
-    text = cache.kept(file, ".ll")
+    text = folder.kept(file, ".ll")
     if text is None:
         text = _made(name, arity, draws)
-        cache.keep(file, ".ll", text)
+        folder.keep(file, ".ll", text)
     return text
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
-from ssmppl.codegen.kernels import hidden_markov as kernel
+from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kits import predictive
 from ssmppl.data import Experiment
@@ -133,7 +133,7 @@ class HiddenMarkov:
         uniforms = np.empty(draws * experiment.steps)
         fill_uniform(stream, uniforms)
         paths = np.empty((draws, experiment.steps), dtype=np.int64)
-        kernel.sample_backward(found.move, found.filtered, uniforms.reshape(paths.shape), paths)
+        exact_entry("finite_draw")(found.move, found.filtered, uniforms.reshape(paths.shape), paths)
         return self.values[paths]
 
     def quantiles(self, law: np.ndarray, levels: np.ndarray) -> np.ndarray:
@@ -221,7 +221,7 @@ class HiddenMarkov:
         out = Filtered(
             np.empty(e.steps), np.empty((e.steps, size)), np.empty((e.steps, size)), move
         )
-        stopped = kernel.forward(
+        stopped = exact_entry("finite_forward")(
             start, move, log_g, out.log_increments, out.predicted, out.filtered
         )
         return out if stopped < 0 else int(stopped)
@@ -229,7 +229,7 @@ class HiddenMarkov:
     def _smoothed(self, found: Filtered, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
         steps, size = found.filtered.shape
         law, both = np.empty((steps, size)), np.empty((steps if pairs else 0, size, size))
-        kernel.backward(found.move, found.predicted, found.filtered, law, both)
+        exact_entry("finite_backward")(found.move, found.predicted, found.filtered, law, both)
         return law, both
 
     def density(self, role: str, e: Experiment, by: Expr | None = None) -> Expr:

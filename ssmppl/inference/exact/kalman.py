@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.analysis.structure import LinearGaussian, linear_gaussian
-from ssmppl.codegen.kernels import kalman as kernel
+from ssmppl.codegen.exact import exact_entry
+from ssmppl.codegen.kernels.kalman import OK
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.program import Program
 from ssmppl.data import Experiment
@@ -101,7 +102,7 @@ class KalmanModel:
                 except Stopped:
                     return -np.inf
                 continue
-            kernel.kalman_filter(*model, e.y, e.seen, increments, *nothing)
+            exact_entry("kalman_filter")(*model, e.y, e.seen, increments, *nothing)
             total += float(increments.sum())
         return total
 
@@ -130,8 +131,8 @@ class KalmanModel:
             except Stopped as stop:
                 raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
             return out
-        status, t = kernel.kalman_filter(*model, experiment.y, experiment.seen, *arrays)
-        if status != kernel.OK:
+        status, t = exact_entry("kalman_filter")(*model, experiment.y, experiment.seen, *arrays)
+        if status != OK:
             raise kalman_matrices.failure(self.trace, theta, status, t)
         return out
 

@@ -201,11 +201,10 @@ def _draw_part(
         values[s], values[previous(s)] = paths[:, :, i], paths[:, before, i]
     fields = [getattr(found.given, name) for name in Matrices._fields]
     flat = iter(evaluate([e for f in fields for e in f.ravel()], values))
-    entries = [
-        np.stack([np.broadcast_to(next(flat), paths.shape[:2]) for _ in range(f.size)], axis=-1)
-        .reshape(*paths.shape[:2], *f.shape)
-        for f in fields
-    ]  # fmt: skip
+    entries = [np.empty((*paths.shape[:2], *f.shape)) for f in fields]
+    for f, entry in zip(fields, entries, strict=True):
+        for place in np.ndindex(f.shape):
+            entry[:, :, *place] = next(flat)
     c, exact = list(columns.channels), list(columns.coupled)
     known = np.ones((paths.shape[1], len(exact)))
     seen_rows = np.ascontiguousarray(np.hstack([experiment.seen[:, c], known]))

@@ -1,0 +1,130 @@
+"""The folder of generated modules and of what is compiled of them.
+
+One module per model and settings, `<cache>/ssmppl/<model>_<digest>.py`. The digest covers the
+text, the kernels' text and the versions of everything that Numba compiles. All is written
+atomically, so that several processes may share the folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import stat
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+
+import numba
+import numpy as np
+
+
+def cache_folder() -> Path:
+    """`$SSMPPL_CACHE`, else ssmppl's folder in the user's cache; a temporary one in place of one
+    that others can write to.
+
+    What lies there is executed: it has to be the user's own.
+    """
+    chosen = os.environ.get("SSMPPL_CACHE") or os.environ.get("XDG_CACHE_HOME")
+    base = Path(chosen).expanduser() if chosen else Path.home() / ".cache"
+    folder = base / "ssmppl"
+    return folder if _is_private(folder) else Path(_temporary_folder())
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else can put anything into a folder, which is made if need be.
+
+    A folder that cannot be made is none that others write to: what is kept there fails later.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        found = folder.stat()
+    except OSError:
+        return True
+    others_write = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    if not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not others_write):
+        return True
+    whose = "others can write to it" if others_write else "it belongs to somebody else"
+    warnings.warn(
+        f"compiled models are not kept in {folder}: {whose}, and what lies there would be run. "
+        f"Remove the folder, or name one of your own: export SSMPPL_CACHE=...",
+        stacklevel=2,
+    )
+    return False
+
+
+@cache
+def _environment() -> bytes:
+    """Text of the kernels and versions: a change in any makes new modules."""
+    digest = hashlib.sha256()
+    for file in sorted((Path(__file__).parent / "kernels").glob("*.py")):
+        digest.update(file.read_bytes())
+    versions = (numba.__version__, np.__version__, platform.python_version())
+    digest.update(repr(versions).encode())
+    return digest.digest()
+
+
+def digest_of(text: str) -> str:
+    """Short name of a generated text in this environment."""
+    return hashlib.sha256(_environment() + text.encode()).hexdigest()[:16]
+
+
+def kept(name: str, suffix: str) -> str | None:
+    """A text that was kept under this name in this environment; None where there is none."""
+    found = kept_bytes(f"{name}_{digest_of('')}", suffix)
+    return None if found is None else found.decode()
+
+
+def keep(name: str, suffix: str, text: str) -> None:
+    """Keep a text for other processes; where the folder cannot be written it is not kept."""
+    keep_bytes(f"{name}_{digest_of('')}", suffix, text.encode())
+
+
+def kept_bytes(name: str, suffix: str) -> bytes | None:
+    """What was kept under a name, whole; None where there is nothing, or half of it."""
+    try:
+        found = (cache_folder() / f"{name}{suffix}").read_bytes()
+    except OSError:
+        return None
+    body, digest = found[:-32], found[-32:]
+    return body if hashlib.sha256(body).digest() == digest else None
+
+
+def keep_bytes(name: str, suffix: str, content: bytes) -> None:
+    """Keep bytes, with their digest behind them."""
+    folder = cache_folder()
+    with contextlib.suppress(OSError):
+        _write_atomically(folder / f"{name}{suffix}", content + hashlib.sha256(content).digest())
+
+
+def written(file: str, text: str) -> Path | None:
+    """Where a text lies that is written if it is not there: in the folder, else in a temporary one;
+    None where neither takes it."""
+    path = cache_folder() / file
+    with contextlib.suppress(OSError):
+        if path.read_text() == text:
+            return path
+    for place in (lambda: path.parent, lambda: Path(_temporary_folder())):
+        with contextlib.suppress(OSError):
+            _write_atomically(place() / file, text)
+            return place() / file
+    return None
+
+
+def _write_atomically(path: Path, content: str | bytes) -> None:
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as out:
+            out.write(content.encode() if isinstance(content, str) else content)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+@cache
+def _temporary_folder() -> str:
+    return tempfile.mkdtemp(prefix="ssmppl_")
