@@ -314,15 +314,6 @@ def _constant_bounds(bounds: tuple[Expr, Expr]) -> tuple[float, float] | None:
     return (low.data, high.data) if low.op == high.op == "const" else None
 
 
-def _enclosing(bounds: tuple[Expr, Expr]) -> tuple[float, float]:
-    """The bounds that are numbers; infinite where one depends on other parameters."""
-    low, high = bounds
-    return (
-        low.data if low.op == "const" else -math.inf,
-        high.data if high.op == "const" else math.inf,
-    )
-
-
 def _open_bounds(bounds: tuple[Expr, Expr]) -> tuple[list[Expr], Callable]:
     symbols = list(symbols_of(bounds))
     return symbols, python_function(bounds, symbols)

@@ -1,8 +1,8 @@
 """Statistics of one data set from its smoothed scores per step, S (..., T, K).
 
-Weighted sums (drift, break, pulse), quadratic forms 1/2 sum_st k(s, t) S_s S_t for the kernel k of
-a latent process, and the cumulative statistic of Nyblom and Hansen. All of them take the first row
-of each experiment in `starts`, and cost a pass over the rows. A row without information is 0.
+Weighted sums (drift, break) and quadratic forms 1/2 sum_st k(s, t) S_s S_t for the kernel k of a
+latent process. They take the first row of each experiment in `starts`, and cost a pass over the
+rows. A row without information is 0.
 """
 
 from __future__ import annotations
@@ -57,36 +57,7 @@ def steps(scores: np.ndarray, dates: Sequence[int]) -> np.ndarray:
     return np.moveaxis(left[..., np.asarray(dates, int), :], -2, -1)
 
 
-def pulses(scores: np.ndarray, dates: Sequence[int], width: int) -> np.ndarray:
-    """sum_{d <= t < d + width} S_t for each date d: (..., K, D), of an event that passes."""
-    rows, first = np.shape(scores)[-2], np.asarray(dates, int)
-    last = np.minimum(first + width, rows)
-    return steps(scores, first.tolist()) - steps(scores, last.tolist())
-
-
-def break_dates(
-    rows: int, count: int = 20, trim: float = 0.1, starts: Sequence[int] = WHOLE
-) -> np.ndarray:
-    """Up to `count` dates in each experiment, as far as `trim` of its rows from both ends."""
-    found: list[int] = []
-    for s in segments(rows, starts):
-        length = s.stop - s.start
-        edge = max(2, round(trim * length))
-        if length > 2 * edge:
-            found += np.unique(
-                np.linspace(s.start + edge, s.stop - edge, count).astype(int)
-            ).tolist()
-    return np.array(found, int)
-
-
 # --- quadratic forms -----------------------------------------------------------------------------
-
-
-def lag_one(scores: np.ndarray, starts: Sequence[int] = WHOLE) -> np.ndarray:
-    """sum_t S_t S_{t-1}: (..., K), k(s, t) = 1 where |s - t| = 1: autocorrelated noise."""
-    scores = np.asarray(scores, float)
-    return sum(np.sum(scores[..., s, :][..., 1:, :] * scores[..., s, :][..., :-1, :], axis=-2)
-               for s in segments(scores.shape[-2], starts))  # fmt: skip
 
 
 def autoregressive(
@@ -118,38 +89,3 @@ def random_walk(scores: np.ndarray, starts: Sequence[int] = WHOLE) -> np.ndarray
         onwards = np.cumsum(scores[..., s, :][..., ::-1, :], axis=-2)
         found += 0.5 * np.sum(onwards**2, axis=-2)
     return found
-
-
-# --- cumulative scores ---------------------------------------------------------------------------
-
-
-def nyblom_hansen(
-    nuisance: np.ndarray, information: np.ndarray, starts: Sequence[int] = WHOLE
-) -> tuple[np.ndarray, np.ndarray]:
-    """L = (1/T) sum_t C_t' I^-1 C_t, C_t the cumulative scores of the parameters, tied at the end.
-
-    J. Nyblom, *JASA* 84 (1989); B. Hansen, *J. Policy Modeling* 14 (1992), with the bootstrap's
-    information in place of the sum of squared scores: smoothed scores are serially correlated. C_T
-    is zero at a maximum and nowhere else, so that its share t / T is taken off.
-
-    Parameters
-    ----------
-    nuisance : (..., T, P) smoothed scores per step. information : (P, P).
-
-    Returns
-    -------
-    (..., P) for each parameter by itself, and (...) for all of them at once. Experiments follow
-    each other in the one cumulative sum: a change between them is a change.
-    """
-    nuisance, information = np.asarray(nuisance, float), np.asarray(information, float)
-    rows = nuisance.shape[-2]
-    list(segments(rows, starts))
-    summed = np.cumsum(nuisance, axis=-2)
-    tied = summed - summed[..., -1:, :] * (np.arange(1, rows + 1) / rows)[:, None]
-    size = np.sqrt(np.diagonal(information))
-    scaled = np.divide(tied, size, out=np.zeros_like(tied), where=size > 0.0)
-    correlation = np.divide(information, np.outer(size, size), out=np.zeros_like(information),
-                            where=np.outer(size, size) > 0.0)  # fmt: skip
-    inverse = np.linalg.pinv(correlation, rcond=1e-10, hermitian=True)
-    joint = np.einsum("...ti,ij,...tj->...", scaled, inverse, scaled) / rows
-    return np.mean(scaled**2, axis=-2), joint

@@ -5,7 +5,6 @@ Algorithm 2 of Schön et al. (2015); see `codegen/kernels/particle_filter.py`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -297,6 +296,3 @@ def estimates_task(
 ) -> partial:
     """A function of a range of repeats, to be run by an executor."""
     return partial(repeated_estimates, problem, theta, settings, seed)
-
-
-Parameters = Mapping[str, Any]
