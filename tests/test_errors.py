@@ -865,6 +865,9 @@ BAD_DATA = {
         ),
         ["'n' holds 2 series along the dimension 'draw'", "data.isel(draw=0)"],
     ),
+    "texts in a list": (
+        "counts", counts_with(rain=["3"] * 4), ["'rain', row 1", "the text '3' stands"],
+    ),
     # which of several data sets
     "second of two": (
         "counts",

@@ -106,8 +106,9 @@ def _missing(entry: Any) -> bool:
 
 
 def short(value: Any) -> str:
-    """A value's repr, cut to one line."""
-    text = " ".join(repr(value).split())
+    """A value's repr, cut to one line; of a NumPy number or text that of Python's own."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    text = " ".join(repr(plain).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
