@@ -11,10 +11,13 @@
 #   make check      the examples against statsmodels, hmmlearn and particles
 #   make docs       the documentation, notebooks executed, warnings are errors
 #   make bench      speed against plain C and other packages
+#   make package    sdist and wheel, installed and used under every Python and set of dependencies
+#   make audit      known vulnerabilities of the dependencies
 #   make format     put the code into shape
 #   make clean      remove what the build made (the environment stays)
 #
-# PYTHON=... chooses the interpreter, VENV=... the environment, WORKERS=... the parallel tests.
+# PYTHON=... chooses the interpreter, VENV=... the environment, WORKERS=... the parallel tests;
+# PACKAGE=... and AUDIT=... are options of those two (PACKAGE=--help lists them).
 
 PYTHON  ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,$(shell command -v $(p) 2>/dev/null)))
 VENV    ?= .venv
@@ -25,7 +28,7 @@ PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow exhaustive tables gap examples check docs bench format clean
+.PHONY: help demo test slow exhaustive tables gap examples check docs bench package audit format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -94,6 +97,12 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python bench/run.py
+
+package: $(BIN)/python
+	$(BIN)/python -m tests.packaging --workers $(WORKERS) $(PACKAGE)
+
+audit: $(BIN)/python
+	$(BIN)/python -m tests.packaging.audit $(AUDIT)
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff format .

@@ -1,5 +1,6 @@
 """Models and helpers of the tests of the command line."""
 
+import inspect
 import json
 import textwrap
 from pathlib import Path
@@ -8,6 +9,10 @@ import click.testing
 
 import ssmppl as ssm
 from ssmppl import cli
+
+# click 8.1 mixes standard error into standard output unless it is told not to; 8.2 cannot be told.
+PARAMETERS = inspect.signature(click.testing.CliRunner).parameters
+SEPARATE = {"mix_stderr": False} if "mix_stderr" in PARAMETERS else {}
 
 WALK = """
     import ssmppl as ssm
@@ -82,7 +87,7 @@ def write(name, text):
 
 
 def run(*args, code=0, **settings):
-    runner = click.testing.CliRunner()
+    runner = click.testing.CliRunner(**SEPARATE)
     result = runner.invoke(cli.main, [str(a) for a in args], prog_name="ssmppl", **settings)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception

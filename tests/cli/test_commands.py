@@ -118,7 +118,7 @@ def test_smooth_writes_trajectories_of_each_experiment(folder):
     for i, one in enumerate(expected, start=1):
         with xr.open_dataset(f"s_{i}.nc", engine="h5netcdf") as written:
             np.testing.assert_array_equal(written["x"], one["x"])
-    fault = run("smooth", "walk.py", "a.csv", code=1).output
+    fault = run("smooth", "walk.py", "a.csv", code=1).stderr
     assert "no value is given for parameter 'q'" in fault
 
 
