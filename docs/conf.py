@@ -36,6 +36,15 @@ autodoc_typehints = "none"  # the docstrings give shapes, which say more
 autosummary_generate = True
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
+templates_path = ["_templates"]
+# Of what is on the pages: a summary, every parameter in its order with a description, and what is
+# returned. A docstring that lacks one of these fails the build.
+numpydoc_validation_checks = {
+    "GL05", "GL06", "GL07", "GL08", "GL09", "GL10", "SS01", "SS02", "SS03", "SS04",
+    "PR01", "PR02", "PR03", "PR07", "PR10", "RT01", "RT03", "YD01",
+}  # fmt: skip
+# What users catch or are handed, and do not make themselves: no parameters.
+numpydoc_validation_exclude = {r"Error$", r"\.UnsupportedOperation$", r"\.Plan$", r"\.Program$"}
 
 nb_code_prompt_show = "Show the code"
 nb_code_prompt_hide = "Hide the code"

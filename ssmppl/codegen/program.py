@@ -122,7 +122,12 @@ class Program:
         return self.trace.state_symbols
 
     def source(self) -> str:
-        """The generated Python module, commented with the user's lines."""
+        """The generated Python module, commented with the user's lines.
+
+        Returns
+        -------
+        str : its text.
+        """
         return self.text
 
     @property

@@ -67,7 +67,13 @@ class Plan:
     rows: int | None = None
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
-        """(title, rows of (what, how)) for each part of the plan."""
+        """The parts of the plan, as `print` shows them.
+
+        Returns
+        -------
+        list of (str, list of (str, str))
+            Of each part its title, and its rows: what, and how.
+        """
         t = self.trace
         out = [
             ("Priors", _laws(t.parameters)),
@@ -227,6 +233,7 @@ def explain(model: Model, data: Any = None) -> Plan:
 
     Parameters
     ----------
+    model : the model, as declared.
     data : checks that they fit, and takes account of what is missing in them.
 
     Returns
@@ -263,9 +270,17 @@ def explain(model: Model, data: Any = None) -> Plan:
 
 
 def compile(model: Model, data: Any = None) -> Program:
-    """The generated program: `.source()` is its text, `.path` its file.
+    """Generate the program of a model.
 
-    With data, the variant that deals with what is missing in them; else the one for complete data.
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : with them, the variant that deals with what is missing in them; None: the one for
+        complete data.
+
+    Returns
+    -------
+    Program : `.source()` is its text, `.path` its file.
 
     Raises
     ------
