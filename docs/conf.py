@@ -32,6 +32,10 @@ nb_merge_streams = True
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 
+default_role = (
+    "py:obj"  # what docstrings put between single backticks: a link if it is a public name
+)
+autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give shapes, which say more
 autosummary_generate = True
 numpydoc_class_members_toctree = False
@@ -48,9 +52,18 @@ numpydoc_validation_exclude = {r"Error$", r"\.UnsupportedOperation$", r"\.Plan$"
 
 nb_code_prompt_show = "Show the code"
 nb_code_prompt_hide = "Hide the code"
+
+# `make linkcheck` asks other sites; some are slow, some turn programs away.
+linkcheck_timeout = 20
+linkcheck_retries = 2
+linkcheck_workers = 4
+linkcheck_anchors = False
+linkcheck_ignore = [r"https://doi\.org/", r"http://(127\.0\.0\.1|localhost)"]
+
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["ssmppl.css"]
+html_domain_indices = False
 html_title = f"ssmppl {release}"
 
 

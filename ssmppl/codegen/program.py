@@ -126,9 +126,15 @@ class Program:
 
         Returns
         -------
-        str : its text.
+        str : its text; lines of a notebook go by the number of their cell.
         """
-        return self.text
+        text = self.text
+        places = (place for found in self.trace.functions.values() for place in found)
+        for file, where in {place.file: place for place in places}.items():
+            # the module itself keeps the name that cells go by, which is the same in every session
+            if where.cell:
+                text = text.replace(f"{os.path.basename(file)}:", f"{where.cell}:")
+        return text
 
     @property
     def path(self) -> Path:

@@ -34,6 +34,7 @@ from ssmppl.language.trace import Site, Trace, trace
 from ssmppl.language.transforms import transforms
 
 PAGE = 100  # columns
+LONGEST_LAW = 600  # characters of a law, some six lines
 TEMPERED = (
     "for rows that tell far more than the transition: particles are weighed by rising powers of "
     "the observation's density, and take Metropolis steps between them"
@@ -210,7 +211,15 @@ def _integrated(split: ConditionallyLinear) -> str:
 
 
 def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
-    return [(s.name, f"~ {s.distribution!r}") for s in sites.values()]
+    return [(s.name, _cut(f"~ {s.distribution!r}")) for s in sites.values()]
+
+
+def _cut(law: str) -> str:
+    """A law short enough to be read: one whose mean is a loop of small steps fills pages."""
+    if len(law) <= LONGEST_LAW:
+        return law
+    head = law[: law.rindex(" ", 0, LONGEST_LAW)]
+    return f"{head} ... (cut here; ssm.compile(model).source() has all of it, in steps)"
 
 
 def _wrapped(line: str, width: int) -> list[str]:

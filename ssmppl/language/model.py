@@ -10,7 +10,6 @@ import dis
 import inspect
 import linecache
 import numbers
-import os
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from types import CodeType, FunctionType
@@ -218,10 +217,9 @@ class Model:
         for role in ROLES:
             for function in self.functions[role]:
                 where = location_of(function)
-                place = f"{os.path.basename(where.file)}:{where.line}"
                 names = ", ".join(inspect.signature(function).parameters)
                 needs = markup.code(names) if names else markup.text("nothing")
-                rows.append((markup.text(role), needs, markup.text(place)))
+                rows.append((markup.text(role), needs, markup.text(where.place)))
                 texts.append(_source(function))
         lengths = [n + (f" ({s[0]} numbers)" if s else "") for n, s in self.inputs.items()]
         if lengths:
