@@ -61,6 +61,8 @@ from ssmppl.language.trace import Trace
 class Program:
     """The generated module of a traced model.
 
+    Attributes
+    ----------
     proposals : by name, what was derived, or the reason why not.
     """
 

@@ -45,13 +45,16 @@ TEMPERED = (
 class Plan:
     """Everything that was derived from a model; `print` it, or show it in a notebook.
 
-    structure : the model as a linear Gaussian one, or why it is not. conditional : the states that
-    are linear and Gaussian given the others, or why there are none. finite : the values that its
-    states take where they are few, or why they are not.
+    Attributes
+    ----------
+    structure : the model as a linear Gaussian one, or why it is not.
+    conditional : the states that are linear and Gaussian given the others, or why there are none.
+    finite : the values that its states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
-    memory : see `structure.deterministic_memory`. noises : what drives the states, or why it cannot
-    be told. eliminable : the parameters that PGAS can integrate out, and why not the others.
+    memory : for how many steps a deterministic state remembers; None where it never forgets.
+    noises : what drives the states, or why it cannot be told.
+    eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
     """
 
