@@ -9,7 +9,8 @@
 #   make tables     the tables of unbiasedness at full length, over an hour
 #   make examples   run what is under examples/
 #   make check      the examples against statsmodels, hmmlearn and particles
-#   make docs       the documentation, notebooks executed, warnings are errors
+#   make docs       the documentation, notebooks executed, warnings are errors, links within it checked
+#   make linkcheck  the links of the documentation to other sites; needs the network
 #   make bench      speed against plain C and other packages
 #   make package    sdist and wheel, installed and used under every Python and set of dependencies
 #   make audit      known vulnerabilities of the dependencies
@@ -28,7 +29,8 @@ PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export MPLBACKEND ?= Agg
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow exhaustive tables gap examples check docs bench package audit format clean
+.PHONY: help demo test slow exhaustive tables gap examples check docs linkcheck bench package audit
+.PHONY: format clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -94,6 +96,10 @@ check: $(VENV)/.installed-check
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -T -W --keep-going -j $(WORKERS) -b html docs docs/_build/html
+	$(BIN)/python docs/check_built.py docs/_build/html
+
+linkcheck: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -D nb_execution_mode=off -b linkcheck docs docs/_build/linkcheck
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python bench/run.py

@@ -32,16 +32,38 @@ nb_merge_streams = True
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 
+default_role = (
+    "py:obj"  # what docstrings put between single backticks: a link if it is a public name
+)
+autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give shapes, which say more
 autosummary_generate = True
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
+templates_path = ["_templates"]
+# Of what is on the pages: a summary, every parameter in its order with a description, and what is
+# returned. A docstring that lacks one of these fails the build.
+numpydoc_validation_checks = {
+    "GL05", "GL06", "GL07", "GL08", "GL09", "GL10", "SS01", "SS02", "SS03", "SS04",
+    "PR01", "PR02", "PR03", "PR07", "PR10", "RT01", "RT03", "YD01",
+}  # fmt: skip
+# What users catch or are handed, and do not make themselves: no parameters.
+numpydoc_validation_exclude = {r"Error$", r"\.UnsupportedOperation$", r"\.Plan$", r"\.Program$"}
 
 nb_code_prompt_show = "Show the code"
 nb_code_prompt_hide = "Hide the code"
+
+# `make linkcheck` asks other sites; some are slow, some turn programs away.
+linkcheck_timeout = 20
+linkcheck_retries = 2
+linkcheck_workers = 4
+linkcheck_anchors = False
+linkcheck_ignore = [r"https://doi\.org/", r"http://(127\.0\.0\.1|localhost)"]
+
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["ssmppl.css"]
+html_domain_indices = False
 html_title = f"ssmppl {release}"
 
 

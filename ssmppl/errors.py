@@ -46,10 +46,14 @@ class Location:
         return str(found[1]) if found else ""
 
     @property
+    def place(self) -> str:
+        """`varves.py:12`, in a notebook `In[3]:12`."""
+        return f"{self.cell or os.path.basename(self.file)}:{self.line}"
+
+    @property
     def short(self) -> str:
         """`varves.py:12: <the line>`, for reading rather than for finding."""
-        place = f"{self.cell or os.path.basename(self.file)}:{self.line}"
-        return f"{place}: {self.text}" if self.text else place
+        return f"{self.place}: {self.text}" if self.text else self.place
 
     def __str__(self) -> str:
         inside = f" in {self.function}()" if self.function else ""

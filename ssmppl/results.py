@@ -150,8 +150,14 @@ def to_dataset(
 def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
     """Mean, sd, their Monte Carlo errors, bulk and tail ESS, and R-hat; one row per scalar.
 
-    Without `var_names`, all of the posterior that has no time: the parameters. The numbers are
-    not rounded. R-hat is NaN for a single chain.
+    Parameters
+    ----------
+    idata : what `sample` returned.
+    var_names : names of variables; None: all of the posterior that have no time, the parameters.
+
+    Returns
+    -------
+    DataFrame : not rounded. R-hat is NaN for a single chain.
     """
     import pandas as pd
 
@@ -223,9 +229,16 @@ def summary_text(table: pd.DataFrame) -> str:
 
 
 def save(idata: Any, path: str | os.PathLike[str]) -> Path:
-    """Write a result of `to_inference_data` to a netCDF file, which `arviz.from_netcdf` reads.
+    """Write what `sample` returned to a netCDF file, which `arviz.from_netcdf` reads.
 
-    The file appears whole or not at all: it is written beside `path` first.
+    Parameters
+    ----------
+    idata : InferenceData or DataTree.
+    path : of the file, which appears whole or not at all: it is written beside `path` first.
+
+    Returns
+    -------
+    Path : the same.
     """
     target = Path(path)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")

@@ -61,6 +61,8 @@ from ssmppl.language.trace import Trace
 class Program:
     """The generated module of a traced model.
 
+    Attributes
+    ----------
     proposals : by name, what was derived, or the reason why not.
     """
 
@@ -122,8 +124,19 @@ class Program:
         return self.trace.state_symbols
 
     def source(self) -> str:
-        """The generated Python module, commented with the user's lines."""
-        return self.text
+        """The generated Python module, commented with the user's lines.
+
+        Returns
+        -------
+        str : its text; lines of a notebook go by the number of their cell.
+        """
+        text = self.text
+        places = (place for found in self.trace.functions.values() for place in found)
+        for file, where in {place.file: place for place in places}.items():
+            # the module itself keeps the name that cells go by, which is the same in every session
+            if where.cell:
+                text = text.replace(f"{os.path.basename(file)}:", f"{where.cell}:")
+        return text
 
     @property
     def path(self) -> Path:

@@ -14,6 +14,10 @@ class Catalogue:
 
     Iterating gives every form. What users need to declare their own stands here too.
 
+    Parameters
+    ----------
+    effects : those that it holds.
+
     Examples
     --------
     >>> from ssmppl.gap.catalogue import effects
@@ -41,11 +45,26 @@ class Catalogue:
         return len(self._effects)
 
     def names(self) -> list[str]:
-        """The canonical names, one per item."""
+        """The canonical names, one per item.
+
+        Returns
+        -------
+        list of str
+            In the order of the catalogue.
+        """
         return list(dict.fromkeys(e.name for e in self._effects))
 
     def get(self, name: str) -> list[Effect]:
         """The forms of one item.
+
+        Parameters
+        ----------
+        name : one of `names()`.
+
+        Returns
+        -------
+        list of Effect
+            One for each form.
 
         Raises
         ------

@@ -58,12 +58,14 @@ def diagnose(
     progress: bool = True,
     seed: int | None = 1,
 ) -> GapReport:
-    """Find where a model differs from reality, which unmodelled effect causes it, and how far the
-    gap shrinks once that effect is added.
+    """Find where a model differs from reality, and which effect that it lacks causes this.
+
+    Also how far the gap closes once that effect is added, on rows that took no part in choosing it.
 
     Parameters
     ----------
-    model : the model, as declared. data : mapping of arrays, DataFrame, Dataset, or a list of them.
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     effects : names that restrict the catalogue (`ssm.effects.names()`), effects made by
         `@ssm.effect` that join it, or a mapping that renames; None: the whole catalogue.
     mode : "fast" stops after the screen; "full" refits, confirms on held-out rows and writes the
@@ -81,8 +83,8 @@ def diagnose(
 
     Returns
     -------
-    GapReport : after Ctrl-C of the stages that are done, with `interrupted` set, if the screen is
-        among them; else KeyboardInterrupt is raised.
+    GapReport : `print` it. After Ctrl-C it is of the stages that are done, with `interrupted` set,
+        if the screen is among them; else KeyboardInterrupt is raised.
 
     Raises
     ------

@@ -87,32 +87,93 @@ Bounds = tuple[float, float] | None
 
 
 def numbers(*values: float, between: Bounds = None) -> Grid:
-    """These values as they are."""
+    """Values of a shape parameter, as they are.
+
+    Parameters
+    ----------
+    *values : the values that are tried.
+    between : as of `sds`.
+
+    Returns
+    -------
+    Grid : of values, for `shapes`.
+    """
     return Grid("number", values, between=between)
 
 
 def sds(*values: float, of: str = "", between: Bounds = None) -> Grid:
-    """Multiples of the variable's standard deviation."""
+    """Multiples of the variable's standard deviation.
+
+    Parameters
+    ----------
+    *values : the multiples that are tried.
+    of : the argument of the effect whose variable is meant; "" is the first.
+    between : bounds in the same unit, between which refits estimate the parameter; None: it stays
+        at a value of the grid.
+
+    Returns
+    -------
+    Grid : of values, for `shapes`.
+    """
     return Grid("sd", values, of, between)
 
 
 def means(*values: float, of: str = "", between: Bounds = None) -> Grid:
-    """Multiples of the variable's mean."""
+    """Multiples of the variable's mean.
+
+    Parameters
+    ----------
+    *values : the multiples that are tried.
+    of, between : as of `sds`.
+
+    Returns
+    -------
+    Grid : of values, for `shapes`.
+    """
     return Grid("mean", values, of, between)
 
 
 def quantiles(*levels: float, of: str = "", between: Bounds = None) -> Grid:
-    """Quantiles of the variable."""
+    """Quantiles of the variable.
+
+    Parameters
+    ----------
+    *levels : their levels, from 0 to 1.
+    of, between : as of `sds`.
+
+    Returns
+    -------
+    Grid : of values, for `shapes`.
+    """
     return Grid("quantile", levels, of, between)
 
 
 def sizes(*levels: float, of: str = "", between: Bounds = None) -> Grid:
-    """Quantiles of the variable's absolute value."""
+    """Quantiles of the variable's absolute value.
+
+    Parameters
+    ----------
+    *levels : their levels, from 0 to 1.
+    of, between : as of `sds`.
+
+    Returns
+    -------
+    Grid : of values, for `shapes`.
+    """
     return Grid("size", levels, of, between)
 
 
 def rows(*shares: float) -> Grid:
-    """Shares of the number of rows, rounded to whole rows."""
+    """Shares of the number of rows, rounded to whole rows.
+
+    Parameters
+    ----------
+    *shares : from 0 to 1.
+
+    Returns
+    -------
+    Grid : of values, for `shapes`.
+    """
     return Grid("rows", shares)
 
 
@@ -234,12 +295,18 @@ def effect(
 
     Parameters
     ----------
+    function : what it does; its arguments name what it depends on, `strength` among them.
     on : which equations it is offered for: "rate", "any", or the name of one, ...
     name : what the report calls it; by default the function's name with spaces.
     kind : what the function changes; see the tables of this module.
+    form : tells this effect from others of the same name.
     lower, upper : bounds of the strength. `lower` alone must be 0.
     shapes, given, states, profile, process, constant, requires, afresh, note : see
         `Effect`.
+
+    Returns
+    -------
+    Effect : for the list of effects that `diagnose` takes.
 
     Raises
     ------

@@ -93,19 +93,19 @@ class GapReport:
         no part in choosing it, with a 95% interval (infinite ends where the data do not bound it;
         F NaN where there is no measurable gap); the gain in nats per sample, and its parts in all
         from the mean and from the noise law; the error of a free run before and after.
+    detection : tests of the one-step predictions by observation channel.
+    residual_map : standardised smoothed score by equation and window of time.
+    free_run : the data, and the models run without seeing them, before and after (NaN if there is
+        no after), with 95% bands.
+    not_applicable : parts that do not apply to this model, the equation ("" if all), and why.
+    missing : estimated curve of what is missing over a state, input or time, with a 95% band.
     model, model_text : the model with the chosen effects added, and its file; None and "" if
         nothing was chosen.
     chosen : labels of the chosen effects: the effect's name, or "<effect> on <equation>" where
         one effect is chosen for two equations.
     estimates : {"before": {parameter: (value, standard error)}, "after": ...}; error 0 if fixed.
-    missing : estimated curve of what is missing over a state, input or time, with a 95% band.
-    detection : tests of the one-step predictions by observation channel.
-    residual_map : standardised smoothed score by equation and window of time.
-    free_run : the data, and the models run without seeing them, before and after (NaN if there is
-        no after), with 95% bands.
     parts : {"screen": (first, last), "confirm": ...}, row labels, or
         {"cross-fitting": number of blocks}; any further entry is text.
-    not_applicable : parts that do not apply to this model, the equation ("" if all), and why.
     notes : what has to be known before the figures are used.
     settings : the arguments used; of these the words use `alpha`, `candidates` (number tried),
         `model` (name), `samples`, `seed`.
@@ -153,7 +153,14 @@ class GapReport:
                 )
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        """Every table by name; `missing` only if there is one."""
+        """Every table by name.
+
+        Returns
+        -------
+        dict of DataFrames
+            `where`, `causes`, `classes`, `closed` and the others above; `missing` only if there is
+            one.
+        """
         names = [f.name for f in fields(self) if f.name in COLUMNS]
         found = {name: getattr(self, name) for name in names}
         return {name: table for name, table in found.items() if table is not None}
@@ -172,11 +179,20 @@ class GapReport:
         return report_html(self)
 
     def plot(self) -> Any:
-        """Residual map, ranked effects, missing term and free run, as a Matplotlib Figure."""
+        """Draw the residual map, the ranked effects, the missing term and the free run.
+
+        Returns
+        -------
+        Figure : of Matplotlib.
+        """
         return _presenter("plot")(self)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write the tables (CSV), the plots (PNG), the model file and the page to a folder.
+
+        Parameters
+        ----------
+        folder : made where there is none.
 
         Returns
         -------

@@ -91,6 +91,10 @@ class Estimate:
         """One row for each component: estimate, standard error, Monte Carlo error if there is one.
 
         The standard error of a fixed parameter is zero.
+
+        Returns
+        -------
+        DataFrame : indexed as `covariance`, with the fixed components.
         """
         import pandas as pd
 

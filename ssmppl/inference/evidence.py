@@ -55,7 +55,7 @@ REPEATS = 200  # estimates of the likelihood where there is no parameter to inte
 
 @dataclass(frozen=True)
 class Evidence:
-    """log p(y) of a model.
+    """The log evidence log p(y) of a model.
 
     Parameters
     ----------
@@ -71,7 +71,17 @@ class Evidence:
     report: Mapping[str, Any] = field(default_factory=dict)
 
     def bayes_factor(self, other: Evidence) -> tuple[float, float]:
-        """log of p(y | this model) / p(y | other), and its standard error."""
+        """Compare with another model of the same data.
+
+        Parameters
+        ----------
+        other : its evidence.
+
+        Returns
+        -------
+        tuple of float
+            Log of p(y | this model) / p(y | other), and its standard error.
+        """
         error = float(np.hypot(self.standard_error, other.standard_error))
         return self.log_evidence - other.log_evidence, error
 
@@ -93,7 +103,7 @@ def evidence(
     executor: Executor | None = None,
     progress: bool = True,
 ) -> Evidence:
-    """log p(y) = log of the likelihood averaged over the prior, with its standard error.
+    """Estimate log p(y), the log of the likelihood averaged over the prior.
 
     Posterior draws by `method` are bridged to a multivariate t fitted to the first half of them,
     on the unconstrained scale (Meng and Wong 1996; Overstall and Forster 2010), the second half
@@ -101,12 +111,18 @@ def evidence(
 
     Parameters
     ----------
-    data, start, fixed, seed, executor, progress : as in `sample`. Fixed parameters are held, not
-        integrated over.
+    model : the model, as declared.
+    data : as in `sample`.
     method : `ssm.PMMH(...)`, or `ssm.MetropolisHastings(...)` for linear Gaussian models; None:
         the exact one where it applies. `ssm.SMC2(...)` estimates it without a bridge, by `chains`
         independent runs, at least two, whose spread gives the error.
     draws, warmup, chains : of the sampler.
+    start, fixed, seed, executor, progress : as in `sample`. Fixed parameters are held, not
+        integrated over.
+
+    Returns
+    -------
+    Evidence : log p(y), and the standard error of the estimate.
 
     Raises
     ------

@@ -30,9 +30,17 @@ def kalman_filter(
 ) -> xr.Dataset | list[xr.Dataset]:
     """Run the exact filter of a linear Gaussian model (Kalman 1960).
 
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    parameters : value of each parameter of the model, {} where it has none.
+    quantiles : levels of the quantiles of the states.
+
     Returns
     -------
-    Dataset as of `particle_filter`, with one `draw` and without `ess`; everything is exact.
+    Dataset, or a list of them for several experiments
+        As of `particle_filter`, with one `draw` and without `ess`; everything is exact.
 
     Raises
     ------
@@ -75,16 +83,22 @@ def forward_filter(
 ) -> xr.Dataset | list[xr.Dataset]:
     """Run the exact filter of a model whose states take finitely many values.
 
-    The forward algorithm (Rabiner 1989, section III.A), scaled at every step. `seed` is for the
-    PIT values of discrete channels, which are spread uniformly over their jump.
+    The forward algorithm (Rabiner 1989, section III.A), scaled at every step.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    parameters : value of each parameter of the model, {} where it has none.
+    quantiles : levels of the quantiles of the states.
+    seed : for the PIT values of discrete channels, which are spread uniformly over their jump.
 
     Returns
     -------
-    Dataset as of `particle_filter`, with one `draw` and without `ess`, everything exact; and for
-    each state x
-
-        * ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate holds
-          the values.
+    Dataset, or a list of them for several experiments
+        As of `particle_filter`, with one `draw` and without `ess`, everything exact; and for each
+        state x ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate
+        holds the values.
 
     Raises
     ------

@@ -34,6 +34,7 @@ from ssmppl.language.trace import Site, Trace, trace
 from ssmppl.language.transforms import transforms
 
 PAGE = 100  # columns
+LONGEST_LAW = 600  # characters of a law, some six lines
 TEMPERED = (
     "for rows that tell far more than the transition: particles are weighed by rising powers of "
     "the observation's density, and take Metropolis steps between them"
@@ -44,13 +45,16 @@ TEMPERED = (
 class Plan:
     """Everything that was derived from a model; `print` it, or show it in a notebook.
 
-    structure : the model as a linear Gaussian one, or why it is not. conditional : the states that
-    are linear and Gaussian given the others, or why there are none. finite : the values that its
-    states take where they are few, or why they are not.
+    Attributes
+    ----------
+    structure : the model as a linear Gaussian one, or why it is not.
+    conditional : the states that are linear and Gaussian given the others, or why there are none.
+    finite : the values that its states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
-    memory : see `structure.deterministic_memory`. noises : what drives the states, or why it cannot
-    be told. eliminable : the parameters that PGAS can integrate out, and why not the others.
+    memory : for how many steps a deterministic state remembers; None where it never forgets.
+    noises : what drives the states, or why it cannot be told.
+    eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
     """
 
@@ -67,7 +71,13 @@ class Plan:
     rows: int | None = None
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
-        """(title, rows of (what, how)) for each part of the plan."""
+        """The parts of the plan, as `print` shows them.
+
+        Returns
+        -------
+        list of (str, list of (str, str))
+            Of each part its title, and its rows: what, and how.
+        """
         t = self.trace
         out = [
             ("Priors", _laws(t.parameters)),
@@ -204,7 +214,15 @@ def _integrated(split: ConditionallyLinear) -> str:
 
 
 def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
-    return [(s.name, f"~ {s.distribution!r}") for s in sites.values()]
+    return [(s.name, _cut(f"~ {s.distribution!r}")) for s in sites.values()]
+
+
+def _cut(law: str) -> str:
+    """A law short enough to be read: one whose mean is a loop of small steps fills pages."""
+    if len(law) <= LONGEST_LAW:
+        return law
+    head = law[: law.rindex(" ", 0, LONGEST_LAW)]
+    return f"{head} ... (cut here; ssm.compile(model).source() has all of it, in steps)"
 
 
 def _wrapped(line: str, width: int) -> list[str]:
@@ -227,6 +245,7 @@ def explain(model: Model, data: Any = None) -> Plan:
 
     Parameters
     ----------
+    model : the model, as declared.
     data : checks that they fit, and takes account of what is missing in them.
 
     Returns
@@ -263,9 +282,17 @@ def explain(model: Model, data: Any = None) -> Plan:
 
 
 def compile(model: Model, data: Any = None) -> Program:
-    """The generated program: `.source()` is its text, `.path` its file.
+    """Generate the program of a model.
 
-    With data, the variant that deals with what is missing in them; else the one for complete data.
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : with them, the variant that deals with what is missing in them; None: the one for
+        complete data.
+
+    Returns
+    -------
+    Program : `.source()` is its text, `.path` its file.
 
     Raises
     ------

@@ -51,16 +51,27 @@ def particle_filter(
     seed: int | None = None,
     executor: Executor | None = None,
 ) -> xr.Dataset | list[xr.Dataset]:
-    """Run the particle filter and tell what it found; arguments as in `log_likelihood`.
-
-    history : whether the result holds every particle with its weight and its ancestor, which
-        `plot_ancestry` draws: T N (D + 2) numbers for each of the repeats. "auto" then leaves the
-        Rao-Blackwellised proposals out.
+    """Run the particle filter and tell what it found.
 
     With proposal="twisted" the particles know what comes later: their sum of log-likelihood
     increments is worth most, while few of them tell the moments at single rows. "auto" leaves it
     out here. With a Rao-Blackwellised one ("marginal", ...) means and covariances of the states
     that are integrated out are exact given the particles of the others.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    parameters : value of each parameter of the model, {} where it has none.
+    particles : number N of particles.
+    repeats : number of independent filters.
+    proposal, resampling, ess_threshold, rescue : as in `log_likelihood`.
+    quantiles : levels of the quantiles of the states.
+    history : whether the result holds every particle with its weight and its ancestor, which
+        `plot_ancestry` draws: T N (D + 2) numbers for each of the repeats. "auto" then leaves the
+        Rao-Blackwellised proposals out.
+    seed : the same seed gives the same numbers, whatever the executor; None: a random one.
+    executor : any `concurrent.futures.Executor`; None: threads.
 
     Returns
     -------

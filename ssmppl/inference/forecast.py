@@ -40,7 +40,8 @@ def forecast(
 
     Parameters
     ----------
-    model : the model that was sampled. idata : what `sample` returned, with its states.
+    model : the model that was sampled.
+    idata : what `sample` returned, with its states.
     steps : number H of rows; may be left out where `inputs` tell it.
     inputs : the inputs of the rows T+1, ..., T+H: mapping of arrays, DataFrame or Dataset. The step
         into the first of them is driven by the data's last input.
@@ -49,8 +50,9 @@ def forecast(
 
     Returns
     -------
-    Dataset with states and observations (draw, time, ...) and parameters (draw, ...); all chains
-    one after the other. Its time goes on from the data's where that is evenly spaced.
+    Dataset
+        States and observations (draw, time, ...) and parameters (draw, ...); all chains one after
+        the other. Its time goes on from the data's where that is evenly spaced.
 
     Raises
     ------

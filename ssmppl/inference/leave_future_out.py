@@ -73,12 +73,14 @@ def leave_future_out(
 
     Parameters
     ----------
+    model : the model, as declared.
     data : one data set, as of `sample`.
     first : the first row that is predicted, from 2; None: a quarter of the rows after the first.
-    method, draws, warmup, chains, start, fixed : of `sample`, each time that it is called.
+    method, draws, warmup, chains : of `sample`, each time that it is called.
     threshold : Pareto shape beyond which the model is sampled anew.
     particles : of the filters that give the predictive densities of each draw, where there is no
         exact one.
+    start, fixed : as in `sample`.
     seed : the same seed gives the same numbers, whatever the executor.
     executor : any `concurrent.futures.Executor`; None: threads.
     progress : whether `sample` shows its progress, on stderr.

@@ -50,6 +50,7 @@ def log_likelihood(
 
     Parameters
     ----------
+    model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
     particles : number N of particles.
@@ -86,8 +87,9 @@ def log_likelihood(
 
     Returns
     -------
-    float64 array (repeats,). exp of each is an unbiased estimate of the likelihood (Del Moral
-    2004; Schön et al. 2015, section 5). -inf at parameters at which nothing is finite.
+    float64 array (repeats,)
+        The exp of each is an unbiased estimate of the likelihood (Del Moral 2004; Schön et al.
+        2015, section 5). -inf at parameters at which nothing is finite.
 
     Raises
     ------

@@ -106,6 +106,10 @@ def score(
     seed : the same seed gives the same numbers, whatever the executor; None: a random one.
     executor : any `concurrent.futures.Executor`; None: threads.
 
+    Returns
+    -------
+    Score : `.gradient` by name, `.information` as a table, and their Monte Carlo errors.
+
     Raises
     ------
     ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.

@@ -46,6 +46,7 @@ def simulate(
 
     Parameters
     ----------
+    model : the model, as declared.
     parameters : value of each parameter; None draws them from the prior, anew for each draw.
     steps : number T of time steps; may be left out where `inputs` tell it.
     inputs : mapping of arrays, DataFrame or Dataset with the model's inputs.
@@ -54,8 +55,9 @@ def simulate(
 
     Returns
     -------
-    Dataset with the states and observations, dims (draw, time, ...), and, where they were drawn
-    from the prior, the parameters, dims (draw, ...).
+    Dataset
+        The states and observations, dims (draw, time, ...), and, where they were drawn from the
+        prior, the parameters, dims (draw, ...).
 
     Raises
     ------

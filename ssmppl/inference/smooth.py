@@ -83,6 +83,7 @@ def smooth(
 
     Parameters
     ----------
+    model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
     method : `ssm.KalmanSmoother()`, exact, for linear Gaussian models; `ssm.ForwardBackward()`,

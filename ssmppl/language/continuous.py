@@ -40,7 +40,14 @@ def _where(condition: Any, a: Any, b: Any) -> ExprArray:
 
 
 class Normal(Distribution):
-    """Normal(mean, sd= | variance= | precision=)."""
+    """Normal(mean, sd= | variance= | precision=).
+
+    Parameters
+    ----------
+    mean : its mean.
+    sd, variance, precision : its spread, exactly one of them: standard deviation, variance or
+        1 / variance, positive.
+    """
 
     def __init__(self, mean: Any, *, sd: Any = None, variance: Any = None, precision: Any = None):
         self.spread, value = one_of(
@@ -156,7 +163,12 @@ def _all_infinite(a: Any) -> bool:
 
 
 class LogNormal(Distribution):
-    """LogNormal(mean, sd=): exp of a Normal with that mean and standard deviation of the log."""
+    """LogNormal(mean, sd=): exp of a Normal variable.
+
+    Parameters
+    ----------
+    mean, sd : mean and standard deviation of the *logarithm*; the median is exp(mean).
+    """
 
     def __init__(self, mean: Any, *, sd: Any):
         self._set(mean_=mean, sd=sd)
@@ -218,7 +230,12 @@ def _log_of_positive(value: Any) -> ExprArray:
 
 
 class Uniform(Distribution):
-    """Uniform(lower, upper)."""
+    """Uniform(lower, upper).
+
+    Parameters
+    ----------
+    lower, upper : the bounds, finite, lower < upper.
+    """
 
     closed = True
 
@@ -271,7 +288,12 @@ class Uniform(Distribution):
 
 
 class Flat(Distribution):
-    """Flat(): an improper prior, constant on the whole line; for likelihoods only."""
+    """Flat(): an improper prior, constant on the whole line; for likelihoods only.
+
+    Parameters
+    ----------
+    shape : of the variable; () is a number.
+    """
 
     proper = False
 
@@ -296,7 +318,12 @@ class Flat(Distribution):
 
 
 class HalfFlat(Flat):
-    """HalfFlat(): an improper prior, constant on the positive half line; for likelihoods only."""
+    """HalfFlat(): an improper prior, constant on the positive half line; for likelihoods only.
+
+    Parameters
+    ----------
+    shape : of the variable; () is a number.
+    """
 
     def support(self):
         return Support("interval", self._full(0.0), self._full(INFINITY))

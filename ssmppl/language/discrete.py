@@ -44,7 +44,12 @@ class _Counts(Distribution):
 
 
 class Poisson(_Counts):
-    """Poisson(rate)."""
+    """Poisson(rate): counts 0, 1, 2, ...
+
+    Parameters
+    ----------
+    rate : mean and variance, not negative.
+    """
 
     def __init__(self, rate: Any):
         self._set(rate=rate)
@@ -87,7 +92,13 @@ class Poisson(_Counts):
 
 
 class NegativeBinomial(_Counts):
-    """NegativeBinomial(mean, dispersion=): variance mean + mean^2 / dispersion."""
+    """NegativeBinomial(mean, dispersion=): counts of variance mean + mean^2 / dispersion.
+
+    Parameters
+    ----------
+    mean : not negative.
+    dispersion : positive; the larger, the nearer to Poisson(mean).
+    """
 
     def __init__(self, mean: Any, *, dispersion: Any):
         self._set(mean_=mean, dispersion=dispersion)
@@ -145,7 +156,13 @@ class NegativeBinomial(_Counts):
 
 
 class Binomial(_Counts):
-    """Binomial(n, p)."""
+    """Binomial(n, p): successes out of n.
+
+    Parameters
+    ----------
+    n : number of trials, a whole number; it may depend on states.
+    p : probability of each success.
+    """
 
     def __init__(self, n: Any, p: Any):
         self._set(n=n, p=p)
@@ -210,7 +227,12 @@ class Binomial(_Counts):
 
 
 class Bernoulli(_Counts):
-    """Bernoulli(p): 1 with probability p, else 0."""
+    """Bernoulli(p): 1 with probability p, else 0.
+
+    Parameters
+    ----------
+    p : the probability.
+    """
 
     def __init__(self, p: Any):
         self._set(p=p)
@@ -247,7 +269,13 @@ class Bernoulli(_Counts):
 
 
 class Categorical(_Counts):
-    """Categorical(p): 0, ..., K-1 with probabilities p, shape (K,)."""
+    """Categorical(p): 0, ..., K-1 with probabilities p.
+
+    Parameters
+    ----------
+    p : probabilities, shape (K,), of sum 1; a row ``P[state]`` of a transition matrix (K, K) for a
+        Markov chain.
+    """
 
     def __init__(self, p: Any):
         self.joint, self.shape = True, ()
@@ -305,7 +333,12 @@ class Categorical(_Counts):
 
 
 class Dirac(Distribution):
-    """Dirac(value): a deterministic component."""
+    """Dirac(value): a deterministic component.
+
+    Parameters
+    ----------
+    value : what it is.
+    """
 
     discrete = False
 

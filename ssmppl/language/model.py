@@ -10,7 +10,6 @@ import dis
 import inspect
 import linecache
 import numbers
-import os
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from types import CodeType, FunctionType
@@ -30,15 +29,15 @@ ROLES = ("prior", "initial", "transition", "observation", "proposal")
 class Model:
     """A state space model, declared by decorated functions.
 
+    The decorators `prior`, `initial`, `transition` and `observation` each take a function that
+    returns ``{name: distribution}`` and whose arguments name what it depends on: parameters,
+    states (their value at t), inputs, and ``t``. All but `initial` may be used several times.
+
     Parameters
     ----------
     name : shown in results and messages.
     inputs : names of the measured inputs u_t; a mapping name -> length where some are vectors, with
         None for a number.
-
-    The decorators `prior`, `initial`, `transition` and `observation` each take a function that
-    returns ``{name: distribution}`` and whose arguments name what it depends on: parameters,
-    states (their value at t), inputs, and ``t``. All but `initial` may be used several times.
 
     Examples
     --------
@@ -104,24 +103,72 @@ class Model:
         self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
 
     def prior(self, function: Law = _MISSING) -> Law:
-        """Declare priors of parameters; arguments are parameters declared earlier."""
+        """Declare priors of parameters.
+
+        Parameters
+        ----------
+        function : returns their laws by name; its arguments are parameters declared earlier.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
         return self._declare("prior", function)
 
     def initial(self, function: Law = _MISSING) -> Law:
-        """Declare the law of x_1; arguments are parameters, inputs and ``t``."""
+        """Declare the law of x_1, the state at the first row of the data.
+
+        Parameters
+        ----------
+        function : returns the laws of all states by name; its arguments are parameters, inputs
+            and ``t``.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
         return self._declare("initial", function)
 
     def transition(self, function: Law = _MISSING) -> Law:
-        """Declare the law of x_{t+1} given x_t (and u_t, t, y_t where the arguments name them)."""
+        """Declare the law of x_{t+1} given x_t (and u_t, t, y_t where the arguments name them).
+
+        Parameters
+        ----------
+        function : returns the laws of states by name; its arguments are parameters, states,
+            inputs, observation channels and ``t``.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
         return self._declare("transition", function)
 
     def observation(self, function: Law = _MISSING) -> Law:
-        """Declare the law of y_t given x_t (and u_t, t)."""
+        """Declare the law of y_t given x_t (and u_t, t).
+
+        Parameters
+        ----------
+        function : returns the laws of channels by name; its arguments are parameters, states,
+            inputs and ``t``.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
         return self._declare("observation", function)
 
     def proposal(self, function: Law = _MISSING) -> Law:
-        """Override the derived proposal of x_{t+1}: arguments as in a transition, and
-        observation channels, which mean y_{t+1} here."""
+        """Override the derived proposal of x_{t+1}, from which particles are drawn.
+
+        Parameters
+        ----------
+        function : returns the laws of all states by name; its arguments are those of a transition,
+            but observation channels mean y_{t+1} here.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
         return self._declare("proposal", function)
 
     def _declare(self, role: str, function: Law) -> Law:
@@ -170,10 +217,9 @@ class Model:
         for role in ROLES:
             for function in self.functions[role]:
                 where = location_of(function)
-                place = f"{os.path.basename(where.file)}:{where.line}"
                 names = ", ".join(inspect.signature(function).parameters)
                 needs = markup.code(names) if names else markup.text("nothing")
-                rows.append((markup.text(role), needs, markup.text(place)))
+                rows.append((markup.text(role), needs, markup.text(where.place)))
                 texts.append(_source(function))
         lengths = [n + (f" ({s[0]} numbers)" if s else "") for n, s in self.inputs.items()]
         if lengths:

@@ -63,7 +63,14 @@ class _Joint(Distribution):
 
 
 class MvNormal(_Joint):
-    """MvNormal(mean, covariance= | precision= | cholesky=), mean of shape (d,)."""
+    """MvNormal(mean, covariance= | precision= | cholesky=): a vector (d,).
+
+    Parameters
+    ----------
+    mean : shape (d,), or one number for all components.
+    covariance, precision, cholesky : exactly one of them, (d, d): the covariance, its inverse, or
+        its lower factor L with L L' = covariance.
+    """
 
     def __init__(
         self, mean: Any, *, covariance: Any = None, precision: Any = None, cholesky: Any = None
@@ -158,8 +165,13 @@ def _surely_positive(m: ExprArray) -> bool:
 
 
 class Dirichlet(_Joint):
-    """Dirichlet(concentration): shares (K,), or for concentrations (R, K) independent rows (R, K)
-    of shares, as in the transition matrix of a Markov chain."""
+    """Dirichlet(concentration): positive shares of sum 1.
+
+    Parameters
+    ----------
+    concentration : positive, (K,); or (R, K) for R independent rows of shares, as in the transition
+        matrix of a Markov chain.
+    """
 
     def __init__(self, concentration: Any):
         self._set(concentration=concentration)
@@ -244,7 +256,13 @@ class _WishartFamily(_Joint):
 
 
 class Wishart(_WishartFamily):
-    """Wishart(df, scale=V): mean df V; df > p - 1."""
+    """Wishart(df, scale=V): positive definite matrices (p, p) of mean df V.
+
+    Parameters
+    ----------
+    df : degrees of freedom, more than p - 1.
+    scale : V, (p, p), symmetric and positive definite.
+    """
 
     def log_densities(self, value):
         x, p, nu = array(value), len(self.scale), self.df[()]
@@ -268,7 +286,16 @@ class Wishart(_WishartFamily):
 
 
 class InverseWishart(_WishartFamily):
-    """InverseWishart(df, scale=S): X^-1 ~ Wishart(df, scale=S^-1); mean S / (df - p - 1)."""
+    """InverseWishart(df, scale=S): X^-1 ~ Wishart(df, scale=S^-1).
+
+    The conjugate prior of a covariance matrix.
+
+    Parameters
+    ----------
+    df : degrees of freedom, more than p - 1.
+    scale : S, (p, p), symmetric and positive definite; the mean is S / (df - p - 1) where
+        df > p + 1.
+    """
 
     def log_densities(self, value):
         x, p, nu = array(value), len(self.scale), self.df[()]

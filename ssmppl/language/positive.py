@@ -31,7 +31,13 @@ class _Positive(Distribution):
 
 
 class Exponential(_Positive):
-    """Exponential(rate= | scale=); a bare argument is the rate."""
+    """Exponential(rate= | scale=); a bare argument is the rate.
+
+    Parameters
+    ----------
+    rate : 1 / mean, positive.
+    scale : the mean; one of the two is given.
+    """
 
     closed = True
 
@@ -82,7 +88,13 @@ class Exponential(_Positive):
 
 
 class Gamma(_Positive):
-    """Gamma(shape, rate= | scale=)."""
+    """Gamma(shape, rate= | scale=): mean shape / rate = shape scale.
+
+    Parameters
+    ----------
+    shape : positive.
+    rate, scale : exactly one of them, positive; scale = 1 / rate.
+    """
 
     def __init__(self, shape: Any, *, rate: Any = None, scale: Any = None):
         self.spread, value = one_of("Gamma", {"rate": rate, "scale": scale})
@@ -125,7 +137,14 @@ class Gamma(_Positive):
 
 
 class InverseGamma(_Positive):
-    """InverseGamma(shape, scale=): 1 / X for X ~ Gamma(shape, rate=scale)."""
+    """InverseGamma(shape, scale=): 1 / X for X ~ Gamma(shape, rate=scale).
+
+    The conjugate prior of a variance.
+
+    Parameters
+    ----------
+    shape, scale : positive; the mean is scale / (shape - 1) for shape > 1.
+    """
 
     def __init__(self, shape: Any, *, scale: Any):
         self._set(shape_=shape, scale=scale)
@@ -180,7 +199,12 @@ def log_gamma_draw(draws: Draws, shape: Expr) -> Expr:
 
 
 class Beta(Distribution):
-    """Beta(a, b)."""
+    """Beta(a, b), on (0, 1): mean a / (a + b).
+
+    Parameters
+    ----------
+    a, b : positive; the larger a + b, the narrower.
+    """
 
     def __init__(self, a: Any, b: Any):
         self._set(a=a, b=b)

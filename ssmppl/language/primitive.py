@@ -86,6 +86,10 @@ def primitive(function: Callable[..., float]) -> Primitive:
     ----------
     function : takes floats by position and returns a float; Numba must be able to compile it.
 
+    Returns
+    -------
+    Primitive : takes numbers as the function does, and symbols inside of a law.
+
     Raises
     ------
     ModelError : Numba cannot compile it; names the function, its line and Numba's reason.

@@ -44,7 +44,14 @@ class _Symmetric(Distribution):
 
 
 class StudentT(_Symmetric):
-    """StudentT(df, loc, scale=)."""
+    """StudentT(df, loc, scale=): loc + scale Z, Z Student's t.
+
+    Parameters
+    ----------
+    df : degrees of freedom, positive; the smaller, the heavier the tails.
+    loc : its centre, the mean where df > 1.
+    scale : positive; the variance is scale^2 df / (df - 2) where df > 2.
+    """
 
     def __init__(self, df: Any, loc: Any, *, scale: Any):
         self._set(df=df, loc=loc, scale=scale)
@@ -96,7 +103,13 @@ class StudentT(_Symmetric):
 
 
 class Laplace(_Symmetric):
-    """Laplace(loc, scale=): density ``exp(-|x - loc| / scale) / (2 scale)``."""
+    """Laplace(loc, scale=): density ``exp(-|x - loc| / scale) / (2 scale)``.
+
+    Parameters
+    ----------
+    loc : its mean.
+    scale : positive; the variance is 2 scale^2.
+    """
 
     def __init__(self, loc: Any, *, scale: Any):
         self._set(loc=loc, scale=scale)
@@ -151,7 +164,13 @@ def cut_exponential(p: ExprArray, q: ExprArray, width: ExprArray) -> ExprArray:
 
 
 class Cauchy(_Symmetric):
-    """Cauchy(loc, scale=)."""
+    """Cauchy(loc, scale=): tails so heavy that there is no mean.
+
+    Parameters
+    ----------
+    loc : its median.
+    scale : half of the distance between the quartiles, positive.
+    """
 
     def __init__(self, loc: Any, *, scale: Any):
         self._set(loc=loc, scale=scale)
@@ -199,7 +218,12 @@ class _Half(Distribution):
 
 
 class HalfNormal(_Half):
-    """HalfNormal(sd=): ``|X|`` for X ~ Normal(0, sd=sd)."""
+    """HalfNormal(sd=): ``|X|`` for X ~ Normal(0, sd=sd).
+
+    Parameters
+    ----------
+    sd : standard deviation of X, positive; the mean of ``|X|`` is 0.80 sd.
+    """
 
     def __init__(self, *, sd: Any):
         self._set(sd=sd)
@@ -234,7 +258,12 @@ class HalfNormal(_Half):
 
 
 class HalfCauchy(_Half):
-    """HalfCauchy(scale=): ``|X|`` for X ~ Cauchy(0, scale=scale)."""
+    """HalfCauchy(scale=): ``|X|`` for X ~ Cauchy(0, scale=scale).
+
+    Parameters
+    ----------
+    scale : the median of ``|X|``, positive.
+    """
 
     def __init__(self, *, scale: Any):
         self._set(scale=scale)

@@ -26,7 +26,13 @@ MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by 
 
 
 class Truncated(Distribution):
-    """Truncated(dist, lower=None, upper=None): bounds are included for discrete distributions."""
+    """Truncated(dist, lower=, upper=): dist given that it lies between the bounds, normalised.
+
+    Parameters
+    ----------
+    dist : a distribution of numbers, continuous or discrete.
+    lower, upper : the bounds, one of them or both; of discrete distributions they are included.
+    """
 
     closed = True
     by_name = "bounds"

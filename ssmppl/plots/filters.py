@@ -61,7 +61,8 @@ def plot_filter(result: Any, *, ax: Any = None) -> Any:
 
     Returns
     -------
-    Axes; of several panels an array of them, as of `plt.subplots`.
+    Axes
+        Of several panels an array of them, as of `plt.subplots`.
 
     Raises
     ------
@@ -169,12 +170,14 @@ def plot_ancestry(
     result : what ``ssm.particle_filter(..., history=True)`` returns; without `history` a result
         does not hold the particles.
     var_names : states that are drawn, or components; None: all.
-    draw : which of the repeats, from 0. experiment : which one, from 1, where there are several.
+    draw : which of the repeats, from 0.
+    experiment : which one, from 1, where there are several.
     ax : Matplotlib axes, as many as there are states; None: a new figure.
 
     Returns
     -------
-    Axes; of several states an array of them, as of `plt.subplots`.
+    Axes
+        Of several states an array of them, as of `plt.subplots`.
 
     Raises
     ------

@@ -71,7 +71,7 @@ def plot_likelihood(
 
     Returns
     -------
-    Axes.
+    Axes : those drawn on.
 
     Raises
     ------

@@ -65,7 +65,8 @@ def plot_prior_posterior(
 
     Returns
     -------
-    Axes; of several panels an array of them, as of `plt.subplots`.
+    Axes
+        Of several panels an array of them, as of `plt.subplots`.
 
     Raises
     ------
@@ -154,7 +155,8 @@ def plot_maximization(estimate: Any, *, var_names: Any = None, ax: Any = None) -
 
     Returns
     -------
-    Axes; of several panels an array of them, as of `plt.subplots`.
+    Axes
+        Of several panels an array of them, as of `plt.subplots`.
 
     Raises
     ------

@@ -56,7 +56,8 @@ def plot_predictions(result: Any, *, var_names: Any = None, ax: Any = None) -> A
 
     Returns
     -------
-    Axes; of several panels an array of them, as of `plt.subplots`.
+    Axes
+        Of several panels an array of them, as of `plt.subplots`.
 
     Raises
     ------

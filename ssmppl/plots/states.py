@@ -57,7 +57,8 @@ def plot_states(result: Any, *, var_names: Any = None, ax: Any = None) -> Any:
 
     Returns
     -------
-    Axes; of several panels an array of them, as of `plt.subplots`.
+    Axes
+        Of several panels an array of them, as of `plt.subplots`.
 
     Raises
     ------
@@ -127,7 +128,8 @@ def plot_forecast(
 
     Returns
     -------
-    Axes; of several panels an array of them, as of `plt.subplots`.
+    Axes
+        Of several panels an array of them, as of `plt.subplots`.
 
     Raises
     ------

@@ -1,8 +1,12 @@
 """What notebooks show of a model, a plan, an estimate and a report: tables, escaped, uncoloured."""
 
 import dataclasses
+import sys
 from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import ssmppl as ssm
@@ -69,6 +73,21 @@ def test_a_model_shows_its_laws_and_where_they_stand():
     assert "ssm.Normal(x + np.array([push, 0.0]), sd=q)" in read.words
 
 
+def test_cells_of_a_notebook_go_by_their_number(monkeypatch):
+    def named(file):
+        return ("Cell", "In[3]") if file == __file__ else None
+
+    compiler = SimpleNamespace(format_code_name=named)
+    shell = SimpleNamespace(get_ipython=lambda: SimpleNamespace(compile=compiler))
+    model, file = steps_of(1), Path(__file__).name
+    line = model.functions["transition"][0].__code__.co_firstlineno + 1  # below its decorator
+    outside = model._repr_html_(), ssm.compile(model).source()
+    assert all(f"{file}:{line}" in text for text in outside)
+    monkeypatch.setitem(sys.modules, "IPython", shell)
+    inside = model._repr_html_(), ssm.compile(model).source()
+    assert all(f"In[3]:{line}" in text and f"{file}:" not in text for text in inside)
+
+
 def test_models_without_functions_or_text_are_shown_too():
     assert "Nothing is declared yet" in ssm.Model("empty")._repr_html_()
     typed = ssm.Model("typed")
@@ -84,6 +103,33 @@ def test_a_plan_shows_its_sections():
     rows = [row for _, rows in plan.sections() for row in rows]
     assert [tuple(r) for r in read.rows] == rows
     assert all(title in read.words for title, _ in plan.sections())
+
+
+def steps_of(count):
+    """A model whose transition is a loop of so many small steps."""
+    model = ssm.Model("small steps")
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+
+    @model.transition
+    def transition(x):
+        mean = x
+        for _ in range(count):
+            mean = mean + 0.01 * np.sin(mean)
+        return {"x": ssm.Normal(mean, sd=1)}
+
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    return model
+
+
+def test_a_law_that_would_fill_pages_is_cut():
+    laws = {n: dict(ssm.explain(steps_of(n)).sections())["Transition, x_prev to x"] for n in (2, 8)}
+    ((_, short),) = laws[2]
+    ((_, long),) = laws[8]
+    assert short.startswith("~ Normal(mean=x_prev + 0.01*sin(x_prev) + 0.01*sin(")
+    assert short.endswith("sd=1)")
+    assert long.startswith("~ Normal(mean=x_prev + 0.01*sin(x_prev) + 0.01*sin(")
+    assert long.endswith("ssm.compile(model).source() has all of it, in steps)")
+    assert len(long) < 700
 
 
 def test_an_estimate_shows_its_table():
