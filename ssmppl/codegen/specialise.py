@@ -1,11 +1,11 @@
 """An algorithm's text with a model's functions put in place of its parameters.
 
-Numba's disk cache finds only module-level functions again, and not those that are handed other
-compiled functions as arguments. So the kernels under `kernels/` are written with the model's
-functions as their first parameters, readable and testable as they stand, and `specialise` copies
-their text, comments included, into the generated module with these parameters bound to names.
-Branches that the bound parameters decide are decided in the text: what a model does not need is
-neither read nor compiled.
+What is kept on disk is found again for module-level functions only, and not for those that are
+handed other compiled functions as arguments. So the kernels under `kernels/` are written with the
+model's functions as their first parameters, readable and testable as they stand, and `specialise`
+copies their text, comments included, into the generated module with these parameters bound to
+names. Branches that the bound parameters decide are decided in the text: what a model does not need
+is neither read nor compiled.
 """
 
 from __future__ import annotations
