@@ -161,6 +161,7 @@ LAWS = [
     lambda x: ssm.StudentT(4, 0, scale=x), lambda x: ssm.Laplace(0, scale=x),
     lambda x: ssm.NegativeBinomial(x, dispersion=2),
     lambda x: ssm.Truncated(ssm.Gamma(2, rate=x), upper=3),
+    lambda x: ssm.Truncated(ssm.Exponential(rate=x), upper=3),
     lambda x: ssm.Truncated(ssm.Normal(0, sd=x), lower=-3, upper=3),
     lambda x: ssm.Categorical(np.stack([x, 1 - x])),
     lambda x: ssm.Normal(0, sd=np.where(x < 0, -1.0, 1.0)),
