@@ -24,7 +24,7 @@ from scipy import stats
 
 import ssmppl as ssm
 
-from . import models
+from . import models, wider_models
 from .checks import seed_of
 
 KEPT = 63  # L: ranks from 0 to 63
@@ -80,6 +80,15 @@ BLOCKS = {  # joint conjugate blocks, states drawn exactly
     "vector_ar_apart": (("a[0]", "a[1]", "a[3]", "Q[0, 0]", "Q[0, 1]", "Q[1, 1]"), "x"),
     "three_regimes": (("row0[0]", "row1[0]", "row2[1]", "level[0]", "level[1]", "v"), "k"),
 }
+WIDER = {  # for the two samplers that need no structure
+    "leverage": (("mu", "phi", "tau", "k"), "x"),
+    "ricker": (("log_r", "q", "scale", "dispersion"), "x"),
+    "growth": (("a", "b", "q", "r"), "x"),
+    "bounded": (("phi", "s"), "x"),
+}
+DELAYED = {  # linear Gaussian too, but with a deterministic state
+    "delay": (("a", "c", "b", "q"), "x"),
+}
 METHODS = (
     ssm.PGAS(particles=20, interweave=False),
     ssm.PGAS(particles=20, interweave=True),
@@ -88,14 +97,25 @@ METHODS = (
     ssm.SMC2(parameters=4 * KEPT, particles=50),
 )
 EXACT = (ssm.Gibbs(interweave=False), ssm.Gibbs(interweave=True), ssm.MetropolisHastings())
-MISSING = {"vector_ar", "vector_ar_apart"}  # of their data, some steps and single entries
+PLAIN = (METHODS[0], METHODS[3])
+MISSING = {"vector_ar", "vector_ar_apart", "bounded"}  # of their data, some steps and entries
 STUDIES = {
     study.name: study
-    for models_, methods in ((MODELS, METHODS), (LINEAR, EXACT), (BLOCKS, EXACT[:1]))
+    for models_, methods in (
+        (MODELS, METHODS),
+        (LINEAR, EXACT),
+        (BLOCKS, EXACT[:1]),
+        (WIDER, PLAIN),
+        (DELAYED, (METHODS[0], EXACT[0], EXACT[2])),
+    )
     for name, (parameters, state) in models_.items()
     for method in methods
     for study in [Study(name, method, parameters, state)]
 }
+
+
+def model_of(study: Study) -> ssm.Model:
+    return getattr(wider_models if hasattr(wider_models, study.model) else models, study.model)
 
 
 def inputs_of(model: ssm.Model) -> dict[str, np.ndarray]:
@@ -105,7 +125,7 @@ def inputs_of(model: ssm.Model) -> dict[str, np.ndarray]:
 
 def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     """Truth and one chain's draws (draw,) of every ranked quantity, for one simulated data set."""
-    model = getattr(models, study.model)
+    model = model_of(study)
     seeds = np.random.SeedSequence(seed_of("sbc", label, study.name, replication)).spawn(2)
     first, second = (int(s.generate_state(1)[0]) for s in seeds)
     u = inputs_of(model)
@@ -114,7 +134,9 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     truth = ssm.simulate(model, steps=STEPS, inputs=u or None, seed=first)
     y = truth["y"].values[0].copy()
     if study.model in MISSING:
-        y[10:13] = y[20:25, 0] = y[40, 1] = np.nan
+        y[10:13] = np.nan
+        if y.ndim > 1:
+            y[20:25, 0] = y[40, 1] = np.nan
     data = {"y": y} | u
     idata = ssm.sample(
         model, data, study.method, draws=draws, warmup=warmup, chains=1, thin=thin, progress=False,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from .checks import LEVEL
-from .sbc import BINS, BLOCKS, KEPT, STUDIES, calibrate, histogram, uniform_p
+from .sbc import BINS, BLOCKS, DELAYED, KEPT, STUDIES, WIDER, calibrate, histogram, uniform_p
 
 SETS = int(os.environ.get("SSMPPL_SBC_SETS", "24"))  # `make exhaustive` asks for 100
 QUANTITIES = sum(len(study.ranked) for study in STUDIES.values())
@@ -25,10 +25,12 @@ def test_statistic_knows_uniform_from_not():
     assert uniform_p(narrow) < LEVEL
 
 
-# The studies of joint blocks, interweaved moves and eliminated parameters take an hour together.
+# The studies of joint blocks, interweaved moves, eliminated parameters and of the wider models take
+# hours together.
 LONG = [
     n for n, s in STUDIES.items()
-    if s.model in BLOCKS or "interweaved" in s.label or "eliminated" in s.label
+    if s.model in {*BLOCKS, *WIDER, *DELAYED}
+    or "interweaved" in s.label or "eliminated" in s.label
     or n == "two_states PMMH"
 ]  # fmt: skip
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n in LONG)) for n in STUDIES]
