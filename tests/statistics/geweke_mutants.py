@@ -3,7 +3,7 @@
     python -m tests.statistics.geweke_mutants [repeats]
 
 writes docs/figures/geweke_power.csv: for each mutant, out of how many runs of the length of the
-slow tests it was found. Two mutants of PMMH are beyond the power of this length, as its page says.
+slow tests it was found. Three are beyond the power of this length, as its page says.
 """
 
 from __future__ import annotations
