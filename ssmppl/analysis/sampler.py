@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class Sampler:
     """An update made ready to draw from: nothing symbolic is left to do but in open bounds."""
 
     def __init__(self, update: Update):
-        self.update = update
+        self._update = ref(update)  # which keeps its sampler; the other way round both would stay
         functions, components = update.functions, update.components
         self.log_density = _guarded(python_sum(functions, components))
         self.corrections = update.correction
@@ -75,6 +75,13 @@ class Sampler:
             v in symbols_of(functions[j]) for j in update.correction
         )
         self.natural = natural
+
+    @property
+    def update(self) -> Update:
+        """What is drawn; whoever draws holds it."""
+        found = self._update()
+        assert found is not None
+        return found
 
     # -- the pieces of one draw
     def limits(self, rest: Mapping[Expr, float]) -> list[tuple[float, float]]:
@@ -264,7 +271,7 @@ _samplers: WeakKeyDictionary[Update, Sampler] = WeakKeyDictionary()
 
 
 def sampler_of(update: Update) -> Sampler:
-    """The update's sampler, made when it is first asked for."""
+    """The update's sampler, made when it is first asked for; it lives as long as the update."""
     found = _samplers.get(update)
     if found is None:
         _samplers[update] = found = Sampler(update)

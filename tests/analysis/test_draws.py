@@ -5,6 +5,9 @@ component, and the product of the first two, is compared by a Kolmogorov-Smirnov
 divided by the number of comparisons in this file (about 300).
 """
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,6 +22,18 @@ from tests.analysis.corpus import CORPUS, build
 from tests.analysis.exact import Conditional, kolmogorov_smirnov, matrices
 
 LEVEL = 1e-3 / 300
+
+
+def test_a_sampler_goes_with_its_update():
+    """Each call of `sample` derives updates of its own: what they need must not stay."""
+    model, *_ = build(next(iter(CORPUS)))
+    updates = list(derive_updates(trace(model)))
+    samplers = [weakref.ref(sampler_of(u)) for u in updates]
+    assert all(s() is sampler_of(u) for s, u in zip(samplers, updates, strict=True))
+    updates.clear()
+    gc.collect()
+    assert samplers
+    assert not any(s() for s in samplers)
 
 
 def conditionals(model, seed=0):
