@@ -18,7 +18,7 @@ from ssmppl.analysis.check import verify
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.describe import Explanation, joined
 from ssmppl.analysis.describe_matrices import matrix_statistics, named, shown_as_matrices
-from ssmppl.analysis.families import Normal, NormalGamma
+from ssmppl.analysis.families import Gamma, Normal, NormalGamma
 from ssmppl.analysis.sampler import draw, natural_bounds, sampler_of
 from ssmppl.analysis.search import Found, Search, kind_of
 from ssmppl.analysis.sufficient import (
@@ -131,6 +131,8 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
+    if isinstance(update.conditional, Gamma) and _may_be_improper(update, update.conditional):
+        notes.append("slice steps where the shape or the rate is not positive")
     if update.left:
         laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
         notes.append(
@@ -155,6 +157,14 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
     elif isinstance(update.conditional, Normal):
         notes.append("slice steps where the precision H is not positive definite")
     return notes
+
+
+def _may_be_improper(update: Update, family: Gamma) -> bool:
+    """Whether prior and initial law alone do not give the Gamma a positive shape."""
+    parts = [update.coefficients[r][family.log] for r in ("prior", "initial")]
+    if any(e.op != "const" for e in parts):
+        return False
+    return (math.fsum(e.data for e in parts) + 1.0) / family.power <= 0.0
 
 
 def _may_be_bounded(update: Update) -> bool:

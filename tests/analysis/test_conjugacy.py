@@ -70,6 +70,13 @@ def test_explanations_have_every_part(name):
         assert all(len(line) < 700 for line in str(explanation).splitlines())
 
 
+@pytest.mark.parametrize(("name", "improper"), [("half_cauchy_sd", True), ("two_variances", False)])
+def test_a_gamma_that_the_data_must_make_proper_is_told_so(name, improper):
+    """A half-Cauchy prior gives the inverse Gamma of the square no positive shape of its own."""
+    for update in derive_updates(trace(build(name)[0])):
+        assert ("shape or the rate is not positive" in str(update.explanation)) == improper
+
+
 def test_matrices_are_told_in_matrix_notation():
     told = {u.block: u.explanation for u in derive_updates(trace(build("vector_regression")[0]))}
     normal, wishart = told["A", "B", "c"], told["Q",]
