@@ -63,6 +63,7 @@ class ExactClimb:
         self.iterates: list[np.ndarray] = []
         self.values: list[float] = []
         self.evaluations = 0
+        self.known: dict[bytes, float] = {}  # objective at the points since the last iterate
 
     def run(self) -> Ascent:
         """All climbs, and Newton's steps from the best point."""
@@ -115,6 +116,7 @@ class ExactClimb:
             value, slope = value + point.log_prior, slope + point.d_log_prior
         if not np.isfinite(value) or not np.all(np.isfinite(slope)):
             return nothing
+        self.known[z.tobytes()] = value
         if value > self.best_value:
             self.best, self.best_value = np.array(z), value
         return value, slope
@@ -157,10 +159,11 @@ class ExactClimb:
 
     def _remember(self, z: np.ndarray) -> None:
         """z is one of the iterates."""
-        point, theta = self.setup.chart.at(z), self.setup.space.parameters(z)[0].copy()
-        value = self.model.log_likelihood(self.experiments, theta)
-        self.iterates.append(theta)
-        self.values.append(value + point.log_prior if self.setup.with_prior else value)
+        if z.tobytes() not in self.known:
+            self.value(z)
+        self.iterates.append(self.setup.space.parameters(z)[0].copy())
+        self.values.append(self.known.get(z.tobytes(), -np.inf))
+        self.known.clear()
 
     def _curvature(self, z: np.ndarray) -> np.ndarray:
         return _curvature(self.setup, self.exact, z)
