@@ -8,6 +8,7 @@ from ssmppl.data.binding import Experiment, bind, bind_inputs
 from ssmppl.data.parameters import (
     check_parameters,
     check_values,
+    spelled,
     unpack_observations,
     unpack_parameters,
     unpack_states,
@@ -19,6 +20,7 @@ __all__ = [
     "bind_inputs",
     "check_parameters",
     "check_values",
+    "spelled",
     "unpack_observations",
     "unpack_parameters",
     "unpack_states",

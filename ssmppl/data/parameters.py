@@ -159,6 +159,13 @@ def unpack_parameters(trace: Trace, theta: np.ndarray) -> dict[str, np.ndarray]:
     return unpack(trace.parameters.values(), theta)
 
 
+def spelled(trace: Trace, theta: np.ndarray) -> str:
+    """theta (P,) by name, for messages."""
+    values = unpack_parameters(trace, theta).items()
+    each = [f"{n} = {np.array2string(np.asarray(v), precision=6)}" for n, v in values]
+    return ", ".join(each) or "none"
+
+
 def unpack_states(trace: Trace, x: np.ndarray) -> dict[str, np.ndarray]:
     """States (..., D) as name -> (..., *shape)."""
     return unpack(trace.initial.values(), x)

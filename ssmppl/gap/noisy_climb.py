@@ -34,7 +34,7 @@ def noisy_climb(
         step = _step(h, g)
         if 0.5 * g @ step < NEAR:
             break
-        step *= size * min(1.0, FARTHEST / np.max(np.abs(step)))
+        step *= size * _shortened(step)
         new = gradient(z + step)
         if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
             size *= 0.4
@@ -47,13 +47,19 @@ def noisy_climb(
     for k in range(AVERAGED):
         step = _step(h, g)
         distance = 0.5 * float(g @ step)
-        step *= size * min(1.0, FARTHEST / np.max(np.abs(step))) / (k + 1.0)
+        step *= size * _shortened(step) / (k + 1.0)
         new = gradient(z + step)
         if new is None or new[0] < value - CLIFF:
             size *= 0.4
             continue
         z, (value, g) = z + step, new
     return z, h, distance
+
+
+def _shortened(step: np.ndarray) -> float:
+    """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
+    coordinate at all."""
+    return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
 
 
 def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:

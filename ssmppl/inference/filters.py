@@ -201,8 +201,8 @@ def _predictions(
     # randomised PIT (Czado, Gneiting and Held 2009): uniform between P(Y < y) and P(Y <= y)
     pit = strictly + rng.uniform(size=below.shape) * (below - strictly)
     pit = np.where(experiment.seen > 0, pit, np.nan)
-    parts = {"predicted": prediction[:, :, 0], "predicted_sd": np.sqrt(prediction[:, :, 1])}
-    parts["pit"] = pit
+    variance = np.maximum(prediction[:, :, 1], 0.0)  # rounding can leave it below
+    parts = {"predicted": prediction[:, :, 0], "predicted_sd": np.sqrt(variance), "pit": pit}
     return {
         f"{name}_{what}": values
         for what, array in parts.items()

@@ -14,7 +14,13 @@ from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.labels import observes
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.posterior_draws import group, parameters_of, posterior_of, states_of
+from ssmppl.inference.posterior_draws import (
+    all_draws,
+    group,
+    parameters_of,
+    posterior_of,
+    states_of,
+)
 from ssmppl.inference.simulation import check_finite, feeds_back
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
@@ -68,7 +74,7 @@ def forecast(
             "the posterior holds no trajectories: a forecast starts from the last state",
             fix="sample with states=True",
         )
-    theta, paths = theta.reshape(-1, theta.shape[-1]), paths.reshape(-1, *paths.shape[2:])
+    theta, paths = all_draws(theta), all_draws(paths)
     rows = paths.shape[1]
     given = _past(idata, "constant_data", traced.inputs, mark, rows)
     columns = [given[n].reshape(rows, -1) for n in traced.inputs]

@@ -35,7 +35,7 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.posterior_draws import parameters_of, posterior_of
+from ssmppl.inference.posterior_draws import all_draws, parameters_of, posterior_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.runner import run_tasks
 from ssmppl.inference.sample import sample
@@ -219,7 +219,7 @@ def _increments(
     executor: Executor | None,
 ) -> np.ndarray:  # fmt: skip
     """(S, T) log p(y_t | y_{1:t-1}, theta) of each draw, chains one after the other."""
-    flat = theta.reshape(-1, theta.shape[-1])
+    flat = all_draws(theta)
     settings = None
     if isinstance(exact_model(problem.trace), NotApplicable):
         middle = np.median(flat, axis=0)

@@ -68,6 +68,11 @@ def parameters_of(trace: Trace, posterior: Any) -> np.ndarray:
     return pack(trace.parameters.values(), values)
 
 
+def all_draws(values: np.ndarray) -> np.ndarray:
+    """(chain, draw, ...) as (chain * draw, ...); said by numbers, as the rest may be empty."""
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
+
+
 def states_of(trace: Trace, posterior: Any, mark: str, axis: str) -> np.ndarray | None:
     """(chain, draw, T, D) trajectories of one experiment; None where they were not kept.
 

@@ -19,7 +19,7 @@ from ssmppl.data import (
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
-from ssmppl.inference.posterior_draws import parameters_of, posterior_of, states_of
+from ssmppl.inference.posterior_draws import all_draws, parameters_of, posterior_of, states_of
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.simulation import check_drawable, check_finite, feeds_back
 from ssmppl.language.model import Model
@@ -90,9 +90,9 @@ def predict(
         if conditional is not False:
             paths = states_of(traced, posterior, labels.mark(i), labels.axis(i))
             _check_paths(paths, e, conditional)
-        flat = theta.reshape(-1, theta.shape[-1])
+        flat = all_draws(theta)
         if paths is not None:
-            drawn = _observed(program, e, flat, paths.reshape(-1, *paths.shape[2:]), root, i)
+            drawn = _observed(program, e, flat, all_draws(paths), root, i)
         else:
             check_drawable(traced)
             drawn = _simulated(program, e, flat, root, i)

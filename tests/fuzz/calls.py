@@ -195,15 +195,14 @@ def _finite(found: Any, name: str) -> None:
         _check(bool(np.isfinite(one[name].values).all()), f"{name} holds what is no number")
 
 
-WEIGHTS = {
+WEIGHTS: dict[str, float] = {
     "log_likelihood": 45, "particle_filter": 12, "simulate": 14, "kalman_filter": 6, "smooth": 5,
     "forward_filter": 3, "score": 3, "explain": 4, "sample": 4, "predict": 3, "maximize": 1,
 }  # fmt: skip
 
 
-def random_call(case: Case) -> tuple[str, Callable[[], Any]]:
+def random_call(case: Case, weights: dict[str, float]) -> tuple[str, Callable[[], Any]]:
     """A verb, and the call."""
-    names = list(WEIGHTS)
-    shares = np.array(list(WEIGHTS.values()), dtype=float)
-    verb = str(case.rng.choice(names, p=shares / shares.sum()))
+    shares = np.array(list(weights.values()), dtype=float)
+    verb = str(case.rng.choice(list(weights), p=shares / shares.sum()))
     return verb, getattr(case, verb)

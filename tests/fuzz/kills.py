@@ -65,6 +65,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--table", type=Path, help="a CSV file for the counts")
     given = parser.parse_args()
+    # where this was started in the background, SIGINT is ignored, by what it starts too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     rng, counts = np.random.default_rng(given.seed), Counter[tuple[str, str]]()
     lost: list[str] = []
     with tempfile.TemporaryDirectory() as first:

@@ -23,6 +23,12 @@ def test_random_models(number, tmp_path):
     assert not failed, f"{recipe_of(ROOT, number)[0].text}\n\n{told}"
 
 
+def test_infinite_densities_are_no_comparison(tmp_path):
+    """A model of a long run, whose density at two random points of the check is infinite."""
+    loaded = next(cases(16, 66, tmp_path))
+    assert loaded.kind == "result", loaded.detail
+
+
 def warned():
     warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)
 

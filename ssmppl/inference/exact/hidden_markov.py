@@ -18,13 +18,13 @@ from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kits import predictive
-from ssmppl.data import Experiment
+from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.inference.exact.differences import observed_information
-from ssmppl.inference.exact.kalman_matrices import spelled, values_of
+from ssmppl.inference.exact.kalman_matrices import values_of
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.language.trace import Trace, previous, seen
 

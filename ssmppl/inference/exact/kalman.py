@@ -18,7 +18,7 @@ from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.kalman import OK
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.program import Program
-from ssmppl.data import Experiment
+from ssmppl.data import Experiment, spelled
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact import kalman_matrices
 from ssmppl.inference.exact.differences import observed_information
@@ -221,8 +221,7 @@ class KalmanModel:
         matrix, _ = observed_information(lambda v: self.score(data, v, wanted)[1], theta, wanted)
         if not np.isfinite(matrix).all():
             raise SamplingError(
-                "the log-likelihood has no second derivative at "
-                f"{kalman_matrices.spelled(self.trace, theta)}",
+                f"the log-likelihood has no second derivative at {spelled(self.trace, theta)}",
                 fix="the parameters lie at the edge of where the model has a density: fix the one "
                 "that is at its bound by fixed={...}",
             )

@@ -7,7 +7,7 @@ import numpy as np
 from ssmppl.analysis.structure import LinearGaussian
 from ssmppl.codegen.kernels import kalman as kernel
 from ssmppl.codegen.kernels.kalman_steps import Matrices
-from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
@@ -67,12 +67,4 @@ def failure(trace: Trace, theta: np.ndarray, status: int, t: int) -> SamplingErr
         f"{found} at t={t + 1}; parameters: {spelled(trace, theta)}",
         fix=fix,
         where=site.distribution.location,
-    )
-
-
-def spelled(trace: Trace, theta: np.ndarray) -> str:
-    """theta (P,) by name."""
-    return ", ".join(
-        f"{name} = {np.array2string(np.asarray(value), precision=6)}"
-        for name, value in unpack_parameters(trace, theta).items()
     )

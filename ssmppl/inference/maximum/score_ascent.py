@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy
 
+from ssmppl.data import spelled
 from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.maximum.ascent import Ascent, Setup
@@ -185,10 +186,19 @@ def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
         each = each + point.d_log_prior
     natural = found.information if found.information is not None else np.zeros_like(hessian)
     rest = -second.theta - prior
-    return Slope(
+    slope = Slope(
         z, gradient, each, log_z, j.T @ found.gradient_covariance @ j,
         j.T @ natural @ j + rest, -j.T @ hessian @ j + rest, natural,
     )  # fmt: skip
+    if not all(
+        np.all(np.isfinite(m)) for m in (gradient, slope.noise, slope.information, slope.complete)
+    ):
+        raise SamplingError(
+            "the log joint density has no finite second derivative at "
+            f"{spelled(setup.problem.trace, point.theta)}",
+            fix="give start={name: value} off the edges of the laws, or use IF2",
+        )
+    return slope
 
 
 def _preconditioner(b: np.ndarray | None, slope: Slope) -> np.ndarray:

@@ -24,7 +24,7 @@ from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kernels.weights import OK
-from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.data import Experiment, spelled
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure, run_filter
 from ssmppl.inference.problem import Problem
@@ -184,7 +184,7 @@ def draw_paths(
     else:
         status, t = run(*given, paths)
     if status != OK:
-        raise _failure(problem, theta, status, t, experiment)
+        raise pair_failure(problem, theta, status, t, experiment)
     return np.ascontiguousarray(np.moveaxis(paths, 2, 0))
 
 
@@ -208,14 +208,11 @@ def draw_particles(weights: np.ndarray, draws: int, stream: np.ndarray) -> np.nd
     return np.searchsorted(cumulative, uniforms * cumulative[-1], side="right")
 
 
-def _failure(
+def pair_failure(
     problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
 ) -> SamplingError:
+    """The error of a density from a particle at step t (from 0) to a later state."""
     label = "" if experiment.time is None else f" (time {experiment.time[t + 1]})"
-    parameters = ", ".join(
-        f"{n} = {np.array2string(np.asarray(v), precision=6)}"
-        for n, v in unpack_parameters(problem.trace, theta).items()
-    )
     site = next(iter(problem.trace.transition.values()))
     what = "is not a number for some particle"
     fix = "some parameter, state or input leads outside the domain of an operation"
@@ -223,7 +220,8 @@ def _failure(
         what = "lies above the bound that was derived for it"
         fix = 'a fault of ssmppl: use kernel="exact", and report the model'
     return SamplingError(
-        f"the transition density into t={t + 2}{label} {what}; parameters: {parameters}",
+        f"the transition density into t={t + 2}{label} {what}; "
+        f"parameters: {spelled(problem.trace, theta)}",
         fix=fix,
         where=site.distribution.location,
     )

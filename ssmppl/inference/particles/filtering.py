@@ -14,7 +14,7 @@ import numpy as np
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
-from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.data import Experiment, spelled
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
@@ -269,10 +269,6 @@ def failure(
         f"{name} = {np.array2string(np.asarray(values[t]), precision=6)}"
         for name, values in experiment.observed.items()
     )
-    parameters = ", ".join(
-        f"{n} = {np.array2string(np.asarray(v), precision=6)}"
-        for n, v in unpack_parameters(problem.trace, theta).items()
-    )
     site = next(iter(problem.trace.observations.values()))
     where: Location = site.distribution.location
     fix = {
@@ -282,7 +278,7 @@ def failure(
     }.get(status, "some parameter, state or input leads outside the domain of an operation")
     return SamplingError(
         f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "
-        f"parameters: {parameters}",
+        f"parameters: {spelled(problem.trace, theta)}",
         fix=fix,
         where=where,
     )

@@ -17,12 +17,13 @@ import numpy as np
 
 from ssmppl.analysis.density import Term, terms
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
+from ssmppl.codegen.kernels.weights import NAN
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.particles.backward import ParticleSystem, draw_particles
+from ssmppl.inference.particles.backward import ParticleSystem, draw_particles, pair_failure
 from ssmppl.inference.particles.marginal import (
     MOST_VALUES,
     at_rows,
@@ -112,6 +113,8 @@ def backward_pass(
         for first in range(0, trajectories, width):
             part = slice(first, min(first + width, trajectories))
             log_w = step.log_weights(x[:, part], z[:, part])
+            if not np.all(np.isfinite(log_w.max(axis=0))):
+                raise pair_failure(problem, theta, NAN, t, experiment)
             chosen[part] = _drawn_indices(log_w, uniforms[part])
         z = step.draw(x, z, chosen, stream)
         paths[:, t], linear[:, t] = system.particles[t][:, chosen].T, z.T

@@ -22,6 +22,8 @@ from functools import partial
 
 import numpy as np
 
+from ssmppl.data import spelled
+from ssmppl.errors import SamplingError
 from ssmppl.inference.particles.backward import backward_draws
 from ssmppl.inference.particles.complete_score import CompleteScores
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
@@ -75,13 +77,22 @@ def one_run(
 
     Raises
     ------
-    SamplingError : all weights vanish, or some density is NaN.
+    SamplingError : all weights vanish, some density is NaN, or the log joint density has no finite
+        derivative on a trajectory.
     """
     paths, log_z = backward_draws(
         scores.problem, theta, smoothing.settings, smoothing.trajectories,
         random_state(seed, number), smoothing.kernel,
     )  # fmt: skip
     s = scores.gradient(theta, paths)
+    if not np.all(np.isfinite(s)):
+        names = scores.problem.trace.parameter_symbols
+        bad = [repr(n) for n, c in zip(names, s.T, strict=True) if not np.all(np.isfinite(c))]
+        raise SamplingError(
+            f"the log joint density has no finite derivative in {', '.join(bad)} on a trajectory "
+            f"drawn at {spelled(scores.problem.trace, theta)}",
+            fix="keep parameters and states off the edges where a law's density is 0 or infinite",
+        )
     hessian = scores.hessian(theta, paths).mean(axis=0) if second else None
     return Run(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
 
@@ -137,4 +148,5 @@ def _louis(runs: Sequence[Run], w: np.ndarray) -> np.ndarray:
     own = (means * (w**2)[:, None]).T @ means
     product = (np.outer(total, total) - own) / (1.0 - w @ w)
     inside = [-r.hessian - r.square for r in runs if r.hessian is not None]
-    return np.tensordot(w, np.stack(inside), axes=1) + product
+    with np.errstate(invalid="ignore"):  # no information where a second derivative is infinite
+        return np.tensordot(w, np.stack(inside), axes=1) + product

@@ -182,7 +182,8 @@ def _try(
         except SamplingError:
             continue
         finite = np.isfinite(log_z)
-        sd = float(np.std(log_z[finite], ddof=1)) if finite.mean() > 0.9 else float("inf")
+        with np.errstate(over="ignore"):  # of estimates beyond 1e154, which spread hopelessly
+            sd = float(np.std(log_z[finite], ddof=1)) if finite.mean() > 0.9 else float("inf")
         figures[name] = (sd, times * cost(proposal))
 
 

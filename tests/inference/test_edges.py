@@ -1,0 +1,140 @@
+"""Models without parameters, and numbers at the edge of what floats and densities can be.
+
+NumPy's warnings are errors here, as they are where verbs are called at random.
+"""
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+SHORT = {"draws": 3, "warmup": 3, "chains": 2, "progress": False, "seed": 1}
+
+
+def swing():
+    """Nothing in it is unknown."""
+    model = ssm.Model("swing")
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.Normal(0.9 * np.sin(x), sd=0.3)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=0.2)}
+
+    return model
+
+
+@pytest.fixture(scope="module")
+def swung():
+    model = swing()
+    data = {"y": ssm.simulate(model, {}, steps=30, seed=2)["y"].values[0]}
+    return model, data, ssm.sample(model, data, ssm.PGAS(particles=10), **SHORT)
+
+
+def test_predictions_of_a_model_without_parameters(swung):
+    model, data, idata = swung
+    ahead = ssm.forecast(model, idata, steps=4, seed=1)
+    assert ahead["y"].shape == (6, 4)
+    found = ssm.predict(model, idata, data, seed=1)["posterior_predictive"]
+    assert found["y"].shape == (2, 3, 30)
+    # given the trajectory, predictions spread by the noise of the observation alone
+    assert np.std(found["y"].values - idata["posterior"]["x"].values) == pytest.approx(0.2, rel=0.3)
+
+
+def test_a_simulator_without_parameters_is_diagnosed(swung):
+    model, data, _ = swung
+    report = ssm.diagnose(model, data, ["constant load"], mode="fast", particles=50, progress=False)
+    assert "constant load" in str(report)
+
+
+def test_estimates_too_far_apart_to_be_squared(swung):
+    """The search for a proposal compares the spread of estimates, here of -5e199."""
+    model, _, _ = swung
+    found = ssm.log_likelihood(model, {"y": [1e100, 2.0]}, {}, seed=1)
+    assert found[0] == pytest.approx(-0.5 * (1e100 / 0.2) ** 2, rel=0.9)
+
+
+def test_the_spread_of_a_certain_prediction():
+    model = ssm.Model("certain")
+
+    @model.prior
+    def prior():
+        return {"b": ssm.Gamma(2, rate=2)}
+
+    @model.initial
+    def initial():
+        return {"k": ssm.Categorical(np.array([0.379, 0.379, 0.242]))}
+
+    @model.transition
+    def transition():
+        return {"k": ssm.Categorical(np.array([0.379, 0.379, 0.242]))}
+
+    @model.observation
+    def observation(b, t):
+        return {"y": ssm.Bernoulli(0.5 + 0.5 * np.tanh(b * t))}
+
+    for b in np.linspace(0.5, 8.0, 16):
+        sd = ssm.forward_filter(model, {"y": np.ones(20)}, {"b": b}, seed=1)["y_predicted_sd"]
+        p = 0.5 + 0.5 * np.tanh(b * np.arange(1, 21))
+        np.testing.assert_allclose(sd.values[0], np.sqrt(p * (1 - p)), atol=1e-7)
+
+
+def test_a_score_that_is_infinite_is_no_score():
+    """Most draws of a Gamma law of shape 0.001 are 0 to the last bit, and their logarithm -inf."""
+    model = ssm.Model("underflow")
+
+    @model.prior
+    def prior():
+        return {"k": ssm.Gamma(2, rate=2)}
+
+    @model.initial
+    def initial(k):
+        return {"x": ssm.Gamma(k, rate=1)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.Normal(x, sd=1)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1)}
+
+    data = {"y": [0.0, 0.1]}
+    with pytest.raises(ssm.SamplingError, match=r"no finite derivative in k .* at k = 0\.001"):
+        ssm.score(model, data, {"k": 0.001}, seed=1, particles=20)
+    with pytest.raises(ssm.SamplingError, match="no finite derivative in k"):
+        ssm.maximize(
+            model, data, ssm.ScoreAscent(particles=20, iterations=3), start={"k": 0.001}, seed=1,
+            progress=False,
+        )  # fmt: skip
+
+
+def test_paths_of_states_that_are_no_numbers():
+    """The logarithm of a negative parameter, in a state that nothing observes."""
+    model = ssm.Model("nowhere")
+
+    @model.prior
+    def prior():
+        return {"p": ssm.Laplace(0.0, scale=1.0)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1), "z": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x, z, p):
+        return {"x": ssm.Normal(np.sin(x), sd=1), "z": ssm.Normal(0.5 * z + np.log(p), sd=1)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1)}
+
+    with pytest.raises(ssm.SamplingError, match="p = -1"):
+        ssm.smooth(model, {"y": [0.3, 0.1, 0.2]}, {"p": -1.0}, particles=20, trajectories=5, seed=1)
