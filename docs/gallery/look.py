@@ -1,6 +1,5 @@
 """What the pages of the gallery share: the look of the plots, and where an example's files are."""
 
-import logging
 import sys
 from pathlib import Path
 
@@ -17,7 +16,6 @@ plt.rcParams.update({
     "legend.frameon": False,
     "font.size": 9,
 })  # fmt: skip
-logging.getLogger("arviz").setLevel(logging.ERROR)  # its notes on small samples are on the pages
 
 
 def example(name):
