@@ -137,6 +137,7 @@ class LaterCase(Case):
                     words += ["-p", *(f"{n}={v}" for n, v in at.items())]
             if verb == "sample":
                 words += ["--draws", "3", "--warmup", "3", "--chains", "1"]
+            if verb in ("sample", "particle-filter"):
                 words += ["-o", f"{folder}/found.nc"]
             if self.rng.random() < 0.3:
                 words += ["--json"]
