@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.data.times import label_text
 from ssmppl.data.values import Fault, as_numbers, short
 from ssmppl.errors import DataError
 from ssmppl.language.model import Model
@@ -51,7 +52,7 @@ class Source:
         """The label of a row, in brackets; empty where rows have none."""
         if self.time is None or row >= len(self.time):
             return ""
-        return f" ({self.time_name} {self.time[row]})"
+        return f" ({self.time_name} {label_text(self.time[row])})"
 
 
 def sources(data: Any, named: Iterable[str], argument: str = "data") -> list[Source]:
@@ -249,7 +250,8 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
     for row, value in enumerate(labels.tolist()):
         if value in first:
             raise DataError(
-                f"the {name} {labels[row]} stands in rows {first[value] + 1} and {row + 1}",
+                f"the {name} {label_text(labels[row])} stands in rows {first[value] + 1} "
+                f"and {row + 1}",
                 fix="one data set holds one experiment with one row for each time: remove the "
                 "repetition, or pass a list of data sets for several experiments",
                 where=where,
@@ -258,8 +260,8 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
     if ordered and len(labels) > 1 and not (labels[1:] > labels[:-1]).all():
         row = int(np.argmax(~(labels[1:] > labels[:-1]))) + 1
         raise DataError(
-            f"the {name} is not increasing: {labels[row]} in row {row + 1} follows "
-            f"{labels[row - 1]} in row {row}",
+            f"the {name} is not increasing: {label_text(labels[row])} in row {row + 1} follows "
+            f"{label_text(labels[row - 1])} in row {row}",
             fix="sort the rows by time (data.sort_index() or data.sort_values('time')); years "
             "before an epoch are negative",
             where=where,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from ssmppl.data.times import label_text
+
 __all__ = ["DASH", "interval", "is_number", "number", "p_text", "percent", "span", "with_error"]
 
 DASH = "–"
@@ -106,4 +108,4 @@ def _label(value: Any) -> str:
     if is_number(value):  # without commas: it may be a year
         x = float(value)
         return str(int(x)) if x == int(x) else f"{x:.6g}"
-    return str(value).removesuffix(" 00:00:00")
+    return label_text(value).removesuffix(" 00:00:00")

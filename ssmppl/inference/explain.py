@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,8 @@ from ssmppl.analysis.noises import Noises, noises
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
 from ssmppl.analysis.tempered import tempered
 from ssmppl.codegen.program import Program, compile_trace
-from ssmppl.data import bind
+from ssmppl.data import Experiment, bind
+from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.interweaving import applicable, with_states
 from ssmppl.inference.exact.models import exact_model, kind_of
@@ -69,6 +71,7 @@ class Plan:
     eliminable: Eliminable
     data: str = ""
     rows: int | None = None
+    labels: tuple[tuple[str, str], ...] = ()
 
     def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
         """The parts of the plan, as `print` shows them.
@@ -89,7 +92,7 @@ class Plan:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
         if self.data:
-            out.append(("Data", [("bound", self.data)]))
+            out.append(("Data", [("bound", self.data), *self.labels]))
         out.append(("Structure", self._structure()))
         rows = [self._proposal(n, p) for n, p in self.proposals.items()]
         guided = self.proposals.get("guided")
@@ -258,6 +261,7 @@ def explain(model: Model, data: Any = None) -> Plan:
     """
     traced = trace(model)
     missing, bound, rows = Missing(none=True), "", None
+    labels: tuple[tuple[str, str], ...] = ()
     if data is not None:
         experiments = bind(traced, data)
         missing = missing_of(experiments)
@@ -265,6 +269,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
+        labels = _labels(experiments)
     program = compile_trace(traced, missing)
     return Plan(
         traced,
@@ -278,7 +283,18 @@ def explain(model: Model, data: Any = None) -> Plan:
         eliminable(traced, (), missing),
         bound,
         rows,
+        labels,
     )
+
+
+def _labels(experiments: Sequence[Experiment]) -> tuple[tuple[str, str], ...]:
+    """How rows are labelled: the ends of each data set that has labels, and uneven steps."""
+    times = [e.time for e in experiments if e.time is not None]
+    if not times:
+        return ()
+    ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
+    uneven = next((found for t in times if (found := spacing(t))), "")
+    return (("labels", ends), *([("steps", uneven)] if uneven else []))
 
 
 def compile(model: Model, data: Any = None) -> Program:

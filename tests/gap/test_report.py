@@ -48,6 +48,8 @@ def empty(verdict="no measurable gap", **fields):
         (span(1, 400), "t = 1 to 400"), (span(1899.0, 1899), "t = 1899"), (span(NAN, 3), ""),
         (span(np.datetime64("2024-01-01").astype(object), "2024-02-01 00:00:00"),
          "t = 2024-01-01 to 2024-02-01"),
+        (span(np.datetime64("2024-01-01", "us"), np.datetime64("2024-02-01T06", "us")),
+         "t = 2024-01-01 to 2024-02-01T06:00:00"),
     ],
 )  # fmt: skip
 def test_numbers_are_written_for_readers(text, found):

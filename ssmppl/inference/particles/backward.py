@@ -25,6 +25,7 @@ from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.data import Experiment, spelled
+from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure, run_filter
 from ssmppl.inference.problem import Problem
@@ -212,7 +213,7 @@ def pair_failure(
     problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
 ) -> SamplingError:
     """The error of a density from a particle at step t (from 0) to a later state."""
-    label = "" if experiment.time is None else f" (time {experiment.time[t + 1]})"
+    label = "" if experiment.time is None else f" (time {label_text(experiment.time[t + 1])})"
     site = next(iter(problem.trace.transition.values()))
     what = "is not a number for some particle"
     fix = "some parameter, state or input leads outside the domain of an operation"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.data.times import label_text
 
 FEW = 0.01  # of the values that there could be, below which the spread of the draws means little
 
@@ -32,7 +33,7 @@ def collapse(
     if not rows:
         return {}
     worst = min(rows, key=lambda t: found[t])
-    label = "" if experiment.time is None else f" (time {experiment.time[worst]})"
+    label = "" if experiment.time is None else f" (time {label_text(experiment.time[worst])})"
     count = int(found[worst])
     text = (
         f"the smoother has collapsed: at t={worst + 1}{label} its {draws} draws share {count} "

@@ -15,6 +15,7 @@ from ssmppl.codegen.kernels.random import new_state
 from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
 from ssmppl.data import Experiment, spelled
+from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
@@ -264,7 +265,7 @@ def failure(
     problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
 ) -> SamplingError:
     """The error of a run that stopped at step t (from 0)."""
-    label = "" if experiment.time is None else f" (time {experiment.time[t]})"
+    label = "" if experiment.time is None else f" (time {label_text(experiment.time[t])})"
     row = ", ".join(
         f"{name} = {np.array2string(np.asarray(values[t]), precision=6)}"
         for name, values in experiment.observed.items()
