@@ -19,6 +19,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
+from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import DataError
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model import Model
@@ -363,3 +364,47 @@ def test_an_index_of_tuples_labels_rows_by_their_text():
     index = pd.Index([("a", 1), ("a", 2)], tupleize_cols=False)
     e = one(scalar(), pd.DataFrame({"y": [1.0, 2.0]}, index=index))
     assert list(e.time) == ["('a', 1)", "('a', 2)"]
+
+
+# -- labels of rows
+@pytest.mark.parametrize(
+    ("label", "text"),
+    [
+        (np.datetime64("2024-03-01T00:00:00.000000"), "2024-03-01"),
+        (np.datetime64("2024-03-01T00:00"), "2024-03-01"),
+        (np.datetime64("2024-03-10"), "2024-03-10"),
+        (np.datetime64("2024-03-01T06:30:00.000000000"), "2024-03-01T06:30:00"),
+        (np.datetime64("2024-03-01T06:30:00.250"), "2024-03-01T06:30:00.25"),
+        (np.int64(1900), "1900"),
+        (np.str_("row 100"), "row 100"),
+    ],
+)
+def test_labels_are_written_without_an_empty_clock(label, text):
+    assert label_text(label) == text
+
+
+@pytest.mark.parametrize(
+    ("time", "found"),
+    [
+        (pd.date_range("2024-01-01", periods=30, freq="MS"), ""),
+        (pd.date_range("2024-01-01", periods=9, freq="W").delete([3, 4]), "from 7 days to 21 days"),
+        (pd.date_range("2024-01-01", periods=9, freq="h").delete(3), "from 1 h to 2 h"),
+        (np.array([0.0, 0.1, 0.2, 0.5]), "from 0.1 to 0.3"),
+        (np.arange(1900, 1920), ""),
+        (np.array(["a", "b", "c", "d"]), ""),
+        (np.array([1.0, 5.0]), ""),
+    ],
+)
+def test_steps_that_differ_in_length_are_told(time, found):
+    text = spacing(np.asarray(time))
+    assert text.startswith(found)
+    assert bool(text) == bool(found)
+
+
+def test_the_first_text_that_is_no_number_is_named_and_not_the_numbers_before_it():
+    column = pd.Series(["18.0", NAN, "ca. 20", "7", "many"])
+    with pytest.raises(DataError) as caught:
+        bind(scalar(), pd.DataFrame({"y": column}))
+    assert "row 3" in str(caught.value)
+    assert "the text 'ca. 20' stands" in str(caught.value)
+    assert "as does one other" in str(caught.value)

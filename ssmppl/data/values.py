@@ -77,6 +77,9 @@ def as_numbers(value: Any) -> np.ndarray | Fault:
 
 
 def _objects(plain: np.ndarray) -> np.ndarray | Fault:
+    odd = _no_number(plain)
+    if odd is not None:
+        return odd
     out = np.empty(plain.shape)
     for index in np.ndindex(plain.shape):
         entry = plain[index]
@@ -99,6 +102,35 @@ def _objects(plain: np.ndarray) -> np.ndarray | Fault:
                 else "give numbers, NaN where a value is missing",
             )
     return out
+
+
+def _no_number(plain: np.ndarray) -> Fault | None:
+    """The first text that spells no number, in an array that has others which do.
+
+    One such entry makes text of a whole column when a file is read, and is what there is to mend.
+    """
+    texts = [(i, v) for i, v in np.ndenumerate(plain) if isinstance(v, str)]
+    odd = [(index, text) for index, text in texts if not _spells_number(text)]
+    if not odd or len(odd) == len(texts):
+        return None
+    index, text = odd[0]
+    others = len(odd) - 1
+    more = f", as {'does one other' if others == 1 else f'do {others} others'}" if others else ""
+    return Fault(
+        index,
+        f"the text {short(text)} stands where a number is expected{more}; it makes text of the "
+        "whole column",
+        "write a number there, or nothing if the value is missing; "
+        "pd.to_numeric(column, errors='coerce') makes NaN of all such entries",
+    )
+
+
+def _spells_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _missing(entry: Any) -> bool:
