@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["labelled", "load_model", "parse_assignments", "parse_settings", "read_csv"]
 
+DATA_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq", ".nc")
+
 
 def load_model(spec: str) -> Model:
     """The model in a Python file, `file.py`, or the one called `name` there, `file.py:name`.
@@ -88,11 +90,27 @@ def _execute(path: Path) -> ModuleType:
     except (Exception, SystemExit) as error:
         raise ModelError(
             f"{type(error).__name__}: {error}" if str(error) else type(error).__name__,
-            fix="the file has to run from top to end; what shall not run here goes below "
-            'if __name__ == "__main__":',
+            fix=_fix(error, path),
             where=_place(error, path),
         ) from error
     return module
+
+
+def _fix(error: BaseException, path: Path) -> str:
+    """What to do about an error that the file raised when it was run."""
+    if path.suffix.lower() in DATA_SUFFIXES:
+        return f"{path.name} looks like data: the model file, MODEL.py, comes first, then DATA"
+    if isinstance(error, SyntaxError):
+        return "mend that line, or the one above it: it is not Python as it stands"
+    if isinstance(error, ModuleNotFoundError):
+        return (
+            "install it into the environment that ssmppl runs in, or put its file into the folder "
+            "of the model file"
+        )
+    return (
+        "the file has to run from top to end; what shall not run here goes below "
+        'if __name__ == "__main__":'
+    )
 
 
 def _place(error: BaseException, path: Path) -> Location:
@@ -109,7 +127,8 @@ def _place(error: BaseException, path: Path) -> Location:
 
 
 def read_csv(path: Path) -> pd.DataFrame:
-    """A CSV file as a table; a first column without a name labels the rows, and so does `time`.
+    """A CSV file as a table; `time` labels the rows, or else a first column of dates or without a
+    name.
 
     Labels that are dates become dates. An empty cell is a missing value.
 
@@ -121,6 +140,8 @@ def read_csv(path: Path) -> pd.DataFrame:
 
     try:
         table = pd.read_csv(path, skipinitialspace=True)
+        if len(table.columns) == 1 or table.index.nlevels > 1:
+            _check_separator(path)
     except (ValueError, UnicodeDecodeError, OSError) as error:  # pandas' own derive from ValueError
         raise DataError(
             f"{path} cannot be read as a CSV file: {str(error).strip()}",
@@ -130,12 +151,29 @@ def read_csv(path: Path) -> pd.DataFrame:
     return labelled(table)
 
 
+def _check_separator(path: Path) -> None:
+    """Refuse a table whose values are separated by semicolons or tabs, as spreadsheets write it."""
+    header = path.open(encoding="utf-8", errors="replace").readline()
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        if mark in header and "," not in header:
+            raise DataError(
+                f"the values in {path} are separated by {name}: {header.strip()!r}",
+                fix="separate them by commas, with points in decimal numbers; in Python "
+                f"pd.read_csv({str(path)!r}, sep={mark!r}).to_csv('commas.csv', index=False), with "
+                "decimal=',' for numbers such as 3,5",
+            )
+
+
 def labelled(table: pd.DataFrame) -> pd.DataFrame:
     """A table as it was read, with the labels of its rows recognised: a first column without a
-    name, or `time`, whose text becomes dates where it is of such."""
+    name, `time`, or else a first column of dates. Text becomes dates where it is of such."""
     table.columns = table.columns.map(lambda name: str(name).strip())
     first = table.columns[0] if len(table.columns) else ""
     label = first if first.startswith("Unnamed:") or first == "" else "time"
+    if label not in table.columns and len(table.columns):
+        # text that is dates can be no observation and no input, whatever its name
+        if table[first].dtype.kind not in "biuf" and table[first].notna().any():
+            label = first if _dates(table[first]).dtype.kind == "M" else label
     if label in table.columns and table[label].dtype.kind not in "iufM":
         table[label] = _dates(table[label])
     if label != "time" and label in table.columns:

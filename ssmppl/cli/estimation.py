@@ -78,10 +78,11 @@ def sample(
     """Sample the posterior of MODEL.py given DATA.
 
     Prints a table of the parameters and writes all draws to a netCDF file, which
-    arviz.from_netcdf reads. A column time, or a first column without a name, labels the rows; an
-    empty cell is a missing observation. Several DATA are several experiments of one system.
-    Ctrl-C ends sampling early, and what was drawn is kept. With --checkpoint the same command goes
-    on from there, as after a crash, and its draws are those of a run that was never stopped.
+    arviz.from_netcdf reads. A column time, or a first column of dates or without a name,
+    labels the rows; an empty cell is a missing observation. Several DATA are several experiments
+    of one system. Ctrl-C ends sampling early, and what was drawn is kept. With --checkpoint the
+    same command goes on from there, as after a crash, and its draws are those of a run that was
+    never stopped.
 
     \b
         ssmppl sample model.py data.csv -o posterior.nc

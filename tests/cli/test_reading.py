@@ -12,12 +12,84 @@ import xarray as xr
 
 import ssmppl as ssm
 from ssmppl.cli.reading import as_table, read_data, read_table
-from ssmppl.errors import ArgumentError, DataError
+from ssmppl.errors import ArgumentError, DataError, ModelError
 from ssmppl.modelfile import load_model
 from ssmppl.results import arviz
 from tests.cli.shared import answer, fails, run
 
 Q = ("-p", "q=0.3")
+
+
+# -- tables as spreadsheets and beginners write them
+@pytest.fixture
+def dated(tmp_path):
+    """Writes a CSV file of dates, counts and text, and gives its path."""
+
+    def write(text, name="dated.csv"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("name", ["date", "week", ""])
+def test_a_first_column_of_dates_labels_the_rows_whatever_its_name(dated, name):
+    table = read_table(dated(f"{name},y\n2024-01-01,1\n2024-01-08,\n"))
+    assert list(table.index) == list(pd.to_datetime(["2024-01-01", "2024-01-08"]))
+    assert table.index.name == "time"
+    assert list(table.columns) == ["y"]
+
+
+def test_what_is_no_date_labels_nothing_and_time_goes_before_a_date(dated):
+    assert list(read_table(dated("site,y\nnorth,1\nsouth,2\n")).columns) == ["site", "y"]
+    assert list(read_table(dated("year,y\n1999,1\n2000,2\n")).columns) == ["year", "y"]
+    both = read_table(dated("date,time,y\n2024-01-01,1,5\n2024-01-02,2,6\n"))
+    assert list(both.columns) == ["date", "time", "y"]
+
+
+def test_dates_that_are_not_in_order_are_refused(folder, dated):
+    path = dated("date,y\n2024-01-08,1\n2024-01-01,2\n")
+    assert "2024-01-01 in row 2 follows 2024-01-08 in row 1" in fails(
+        "log-likelihood", "walk.py", path, *Q
+    )
+
+
+def test_explain_tells_how_rows_are_labelled_and_of_a_week_that_is_not_there(folder, dated):
+    path = dated("week,y\n2024-01-01,1\n2024-01-08,2\n2024-01-22,4\n")
+    text = " ".join(run("explain", "walk.py", path).stdout.split())
+    assert "labels 2024-01-01 to 2024-01-22 steps from 7 days to 14 days long" in text
+    path = dated("week,y\n2024-01-01,1\n2024-01-08,2\n2024-01-15,4\n")
+    assert "one row is one step" not in run("explain", "walk.py", path).stdout
+    path = dated("y\n1\n2\n")
+    assert "labels" not in run("explain", "walk.py", path).stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [("t;y\n1;2\n", "semicolons"), ("t;y\n1;2,5\n", "semicolons"),
+     ("t;a;y\n1;2,5;3,5\n", "semicolons"), ("t\ty\n1\t2\n", "tabs")],
+)  # fmt: skip
+def test_other_separators_are_named(dated, text, found):
+    with pytest.raises(DataError, match=f"are separated by {found}: .*\n?.*sep="):
+        read_table(dated(text))
+
+
+def test_one_column_is_a_table(dated):
+    assert list(read_table(dated("y\n1\n2\n"))["y"]) == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fix"),
+    [("a.py", "def f()\n", "it is not Python as it stands"),
+     ("b.py", "import nothing_of_that_name\n", "install it into the environment"),
+     ("c.csv", "t,y\n2021-01-04,3\n", "c.csv looks like data"),
+     ("d.py", "1 / 0\n", "has to run from top to end")],
+)  # fmt: skip
+def test_a_model_file_that_does_not_run_gets_a_fix_that_fits(dated, name, text, fix):
+    with pytest.raises(ModelError) as caught:
+        load_model(str(dated(text, name)))
+    assert fix in caught.value.fix
 
 
 def dataset(series):
