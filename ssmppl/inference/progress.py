@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 from tqdm import tqdm
 
-__all__ = ["Progress"]
+__all__ = ["Progress", "announced"]
 
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
 
 # Where there is no terminal: one line for so much of the work done, and seconds since the last.
 SPARSE_SHARE = 0.2
 SPARSE_SECONDS = 5.0
+
+# Work without a bar that takes longer is told of; that on a model compiled before seldom does.
+SILENT_SECONDS = 2.0
 
 
 class Progress:
@@ -82,6 +88,26 @@ class Progress:
         print(f"{self.title}:", *parts, note, file=sys.stderr, flush=True)
         self._last_line = now
         self._next_share = self.done / self.total + SPARSE_SHARE
+
+
+@contextmanager
+def announced(title: str, what: str, shown: bool = True) -> Iterator[None]:
+    """Say what is going on where it takes long and there is nothing to count."""
+
+    def tell() -> None:
+        print(
+            f"{title}: {what}; a new model is compiled first, once, which may take a minute",
+            file=sys.stderr, flush=True,
+        )  # fmt: skip
+
+    timer = threading.Timer(SILENT_SECONDS, tell)
+    timer.daemon = True
+    if shown:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _colour() -> str | None:

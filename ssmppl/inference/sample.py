@@ -38,6 +38,7 @@ from ssmppl.inference.particles import pilot, proposal_choice
 from ssmppl.inference.particles.filtering import check_count, seed_sequence
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.progress import announced
 from ssmppl.inference.runner import Block, ChainDraws, run_chains, stack
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import transforms
@@ -187,7 +188,8 @@ def _drawn(
 ) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:  # fmt: skip
     """The chains of a method, and what it has to report."""
     if kept is None or kept.report is None or not kept.finished(setup.warmup + draws):
-        sampler = prepare(setup, method)
+        with announced(type(method).__name__, "preparing", shown=progress):
+            sampler = prepare(setup, method)
         if kept is not None:
             kept.report = sampler.report
     else:  # nothing is left to draw, and nothing needs to be compiled for it

@@ -5,13 +5,15 @@ import os
 import pty
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.progress import Progress
+from ssmppl.inference import progress as progress_module
+from ssmppl.inference.progress import Progress, announced
 from tests.cli.shared import QUICK, answer, fails, interrupted_after, run
 from tests.gap.made_up import effect_found
 
@@ -162,6 +164,24 @@ def test_the_bar_has_colours_unless_none_are_wanted(monkeypatch, capsys, variabl
     text = bar()
     assert "drawing" in text
     assert "\x1b[36m" not in text
+
+
+@pytest.mark.parametrize(("seconds", "shown", "told"), [(0.0, True, True), (9.0, True, False),
+                                                       (0.0, False, False)])  # fmt: skip
+def test_long_work_without_a_bar_is_told_of(monkeypatch, capsys, seconds, shown, told):
+    monkeypatch.setattr(progress_module, "SILENT_SECONDS", seconds)
+    with announced("PGAS", "preparing", shown=shown):
+        time.sleep(0.2)
+    assert capsys.readouterr().err.startswith("PGAS: preparing; a new model is compiled") == told
+
+
+@pytest.mark.parametrize("verb", [("sample", *QUICK), ("maximize",)], ids=["sample", "maximize"])
+def test_the_verbs_tell_of_it(series, monkeypatch, verb):
+    name, *few = verb
+    monkeypatch.setattr(progress_module, "SILENT_SECONDS", 0.0)
+    told = "a new model is compiled first, once"
+    assert told in run(name, "walk.py", series, *few).stderr
+    assert told not in run(name, "walk.py", series, "--no-progress", *few).stderr
 
 
 # -- what is said of a run

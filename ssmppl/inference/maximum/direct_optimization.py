@@ -21,6 +21,7 @@ from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.particles.filtering import check_count
+from ssmppl.inference.progress import announced
 
 NEWTON_STEPS = 8
 GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
@@ -47,8 +48,10 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
                 fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
                 where=reason.where or setup.exact.where,
             )
-        return smooth_likelihood.climb(setup, method)
-    return ExactClimb(setup, setup.exact, method).run()
+    with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
+        if isinstance(setup.exact, NotApplicable):
+            return smooth_likelihood.climb(setup, method)
+        return ExactClimb(setup, setup.exact, method).run()
 
 
 class ExactClimb:
