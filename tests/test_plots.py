@@ -17,7 +17,7 @@ import ssmppl.plots as plots
 from ssmppl.errors import ArgumentError
 from ssmppl.gap.report import COLUMNS, GapReport, tabulate
 from ssmppl.plots.figure import TITLES
-from ssmppl.plots.style import AFTER, BEFORE
+from ssmppl.plots.style import AFTER, BEFORE, times
 from tests.gap.made_up import (
     ALL,
     NAN,
@@ -211,6 +211,15 @@ def test_rows_may_be_labelled_by_dates_and_by_text(ax, time):
     assert (np.diff(x) > 0).all()
     shown = "".join(t.get_text() for t in ax.get_xticklabels())
     assert ("row" in shown) if isinstance(time, list) else ("Feb" in shown)
+
+
+@pytest.mark.parametrize("days", [1.5, 40, 500, 800, 1090, 1100, 20000])
+def test_dates_of_any_span_get_a_few_ticks_without_a_warning(ax, recwarn, days):
+    dates = pd.date_range("2021-01-04", periods=156, freq=pd.Timedelta(days=days / 155))
+    ax.plot(times(ax, dates), np.zeros(156))
+    ax.figure.draw_without_rendering()
+    assert 2 <= len(ax.get_xticks()) <= 9
+    assert not [w for w in recwarn if "Locator" in str(w.message)]
 
 
 # -- put together

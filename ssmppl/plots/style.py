@@ -77,7 +77,9 @@ def times(ax: Any, values: Any) -> np.ndarray:
     if pd.api.types.is_datetime64_any_dtype(series):
         from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
-        locator = AutoDateLocator(maxticks=6)
+        # its steps of months reach six, and from three years on it takes years: seven ticks cover
+        # every span, where fewer leave gaps that it warns of
+        locator = AutoDateLocator(minticks=3, maxticks=7)
         ax.xaxis.set_major_locator(locator)
         ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         dates: np.ndarray = date2num(series.dt.to_pydatetime())
