@@ -5,7 +5,6 @@ import os
 import pty
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -166,19 +165,31 @@ def test_the_bar_has_colours_unless_none_are_wanted(monkeypatch, capsys, variabl
     assert "\x1b[36m" not in text
 
 
-@pytest.mark.parametrize(("seconds", "shown", "told"), [(0.0, True, True), (9.0, True, False),
-                                                       (0.0, False, False)])  # fmt: skip
-def test_long_work_without_a_bar_is_told_of(monkeypatch, capsys, seconds, shown, told):
-    monkeypatch.setattr(progress_module, "SILENT_SECONDS", seconds)
+class Late:
+    """A timer whose time has come when it is started."""
+
+    def __init__(self, seconds, tell):
+        self.start = tell
+
+    def cancel(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("late", "shown", "told"), [(True, True, True), (False, True, False), (True, False, False)]
+)
+def test_long_work_without_a_bar_is_told_of(monkeypatch, capsys, late, shown, told):
+    if late:
+        monkeypatch.setattr(progress_module.threading, "Timer", Late)
     with announced("PGAS", "preparing", shown=shown):
-        time.sleep(0.2)
+        pass
     assert capsys.readouterr().err.startswith("PGAS: preparing; a new model is compiled") == told
 
 
 @pytest.mark.parametrize("verb", [("sample", *QUICK), ("maximize",)], ids=["sample", "maximize"])
 def test_the_verbs_tell_of_it(series, monkeypatch, verb):
     name, *few = verb
-    monkeypatch.setattr(progress_module, "SILENT_SECONDS", 0.0)
+    monkeypatch.setattr(progress_module.threading, "Timer", Late)
     told = "a new model is compiled first, once"
     assert told in run(name, "walk.py", series, *few).stderr
     assert told not in run(name, "walk.py", series, "--no-progress", *few).stderr

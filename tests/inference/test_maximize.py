@@ -12,6 +12,7 @@ from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
 from ssmppl.inference import maximize as verb
 from ssmppl.inference.exact.exact_score import ExactScore
+from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.maximum.ascent import Ascent
 from ssmppl.inference.maximum.chart import Chart
 from ssmppl.inference.particles.pilot import space_of
@@ -317,6 +318,31 @@ def test_a_prior_without_derivative_in_closed_form_is_differenced():
     np.testing.assert_allclose(point.d_log_prior + point.d_log_jacobian, expected, atol=1e-5)
     assert np.all(np.isfinite(chart.curvature(z, np.ones(2)).log_prior))
     assert set(unpack_parameters(space.problem.trace, point.theta)) == {"k", "m"}
+
+
+@pytest.mark.parametrize("objective", ["likelihood", "posterior"])
+def test_the_objective_of_each_iterate_is_kept_and_not_computed_again(monkeypatch, objective):
+    y = ssm.simulate(models.stationary, {"phi": 0.7, "tau": 2.0}, steps=40, seed=3)["y"].values[0]
+    plain, calls = KalmanModel.log_likelihood, []
+    monkeypatch.setattr(
+        KalmanModel, "log_likelihood", lambda *args: calls.append(1) or plain(*args)
+    )
+    found = ssm.maximize(
+        models.stationary, {"y": y}, ssm.DirectOptimization(), objective=objective, seed=1,
+        progress=False,
+    )  # fmt: skip
+    assert len(calls) < 3  # at the end, not at each iterate
+    monkeypatch.undo()
+    way = found.iterates
+    assert len(way["iteration"]) > 6
+    phi, tau = way["phi"].values, way["tau"].values
+    exact = np.array([
+        ssm.log_likelihood(models.stationary, {"y": y}, {"phi": p, "tau": t})[0]
+        for p, t in zip(phi, tau, strict=True)
+    ])  # fmt: skip
+    if objective == "posterior":
+        exact += stats.gamma(6, scale=1 / 3).logpdf(tau) + stats.uniform(-0.5, 1.48).logpdf(phi)
+    np.testing.assert_allclose(way["objective"].values, exact, atol=1e-8)
 
 
 def test_an_ascent_may_know_its_likelihood_and_its_error(monkeypatch):
