@@ -138,6 +138,15 @@ def nearest_first(name: Any, known: Iterable[str]) -> list[str]:
     return sorted(known, key=lambda k: (-score[k], k))
 
 
+def written_as(given: Any, kinds: Iterable[type], argument: str = "method") -> str:
+    """What to write for a class, or for its name, where an object of one of `kinds` is taken;
+    empty where `given` is neither."""
+    for kind in kinds:
+        if given is kind or (isinstance(given, str) and given.lower() == kind.__name__.lower()):
+            return f"write {argument}=ssm.{kind.__name__}()"
+    return ""
+
+
 def listing(name: Any, known: Iterable[str]) -> str:
     """`known` as text, nearest spelling to `name` first; "none" when empty."""
     return ", ".join(nearest_first(name, known)) or "none"

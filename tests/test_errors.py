@@ -613,6 +613,86 @@ def any_other_exception():
     return declare(transition=transition)
 
 
+@bad("takes an element", "without brackets")
+def element_of_a_number():
+    def transition(x):
+        return {"x": ssm.Normal(x[0], sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("rounds a symbol", "np.floor(x + 0.5)")
+def rounding_by_python():
+    def transition(x):
+        return {"x": ssm.Normal(round(x), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("len() of a symbol", "write 1")
+def length_of_a_number():
+    def transition(x):
+        return {"x": ssm.Normal(len(x), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("as through a list", "without a loop")
+def sum_over_a_number():
+    def transition(x):
+        return {"x": ssm.Normal(sum(x), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("formats a symbol", "out of the law")
+def formatted_symbol():
+    def transition(x):
+        return {"x": ssm.Normal(float(f"{x:.2f}"), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("calls a symbol", "x * (...)")
+def symbol_called():
+    def transition(x):
+        return {"x": ssm.Normal(x(2), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("by @", "write * for")
+def matrix_product_of_numbers():
+    def transition(x):
+        return {"x": ssm.Normal(x @ x, sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("divmod() of a symbol", "x // n")
+def divmod_of_a_symbol():
+    def transition(x):
+        return {"x": ssm.Normal(divmod(x, 2)[0], sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("a symbol and a str", "use numbers")
+def symbol_plus_text():
+    def transition(x):
+        return {"x": ssm.Normal(x + "a", sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("asks a symbol for 'sum'", "NumPy's functions")
+def attribute_of_a_symbol():
+    def transition(x):
+        return {"x": ssm.Normal(x.sum(), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
 @pytest.mark.parametrize(
     ("builder", "error", "fragments"), BAD_MODELS, ids=[b.__name__ for b, *_ in BAD_MODELS]
 )
@@ -625,6 +705,7 @@ def test_bad_model(builder, error, fragments):
     text = str(caught.value)
     assert f'File "{__file__}", line {marked[0]}' in text, text
     assert "Fix: " in text
+    assert "'Expr'" not in text  # the symbols' class is no word of the language
     for fragment in fragments:
         assert fragment in text, text
 

@@ -103,6 +103,10 @@ def conjugate_update(search: Search, found: Found) -> Update:
         conditional=family,
         left=tuple(factor for factor, _ in form.left),
     )
+    hyperparameters = search.unread(found.components)
+    if hyperparameters is not None and not found.correction and not form.left:
+        told = describe.prior_alone(found.components, hyperparameters, "from which it is drawn")
+        return replace(update, explanation=told)
     title = name = joined(found.components)
     lines = None
     if shown_as_matrices(family):
@@ -195,6 +199,11 @@ def _slice(
     law = f"{how}, {cost}"
     if degenerate(search.data, unit) is not None:
         law = f"{how}, given the noisy states alone, from which the deterministic ones follow anew"
+    notes = (f"because {why.reason}", *([why.where.short] if why.where else []))
+    explanation = Explanation(joined(unit), law, describe.statistics(form) if form else (), notes)
+    hyperparameters = search.unread(unit)
+    if hyperparameters is not None:
+        explanation = describe.prior_alone(unit, hyperparameters, f"moved by {how}")
     return Update(
         block=(unit[0].data[1],),
         components=unit,
@@ -203,12 +212,7 @@ def _slice(
         coefficients=form.coefficients if form else dict.fromkeys(ROLES, ()),
         correction=(),
         bounds=tuple(search.bound[c] for c in unit),
-        explanation=Explanation(
-            joined(unit),
-            law,
-            describe.statistics(form) if form else (),
-            (f"because {why.reason}", *([why.where.short] if why.where else [])),
-        ),
+        explanation=explanation,
         reason=why.reason,
         where=why.where,
         needs_log_joint=form is None,

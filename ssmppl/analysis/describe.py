@@ -47,6 +47,19 @@ class Explanation:
         return "\n".join(lines)
 
 
+def prior_alone(
+    components: Sequence[Expr], hyperparameters: Sequence[str], how: str
+) -> Explanation:
+    """The explanation of a block that no law of the model reads, moved as `how` says."""
+    given = f", given {', '.join(hyperparameters)}," if hyperparameters else ""
+    pronoun, noun = ("it", "its") if len(components) == 1 else ("them", "their")
+    return Explanation(
+        joined(components),
+        f"no law of the model reads {pronoun}, so that the data tell nothing of {pronoun}: {noun} "
+        f"posterior{given} is {noun} prior, {how}",
+    )
+
+
 def joined(components: Sequence[Expr]) -> str:
     """The components' names: "phi", "(phi, tau)"."""
     names = [to_text(c) for c in components]

@@ -68,6 +68,16 @@ class Search:
                 out += [(c,) for c in site.components]
         return out
 
+    def unread(self, components: Iterable[Expr]) -> list[str] | None:
+        """None where some law reads one of these components; else the parameters that their own
+        prior depends on."""
+        block, trace = frozenset(components), self.data.trace
+        for group in (trace.parameters, trace.initial, trace.transition, trace.observations):
+            if any(block & _read_by(site) for site in group.values()):
+                return None
+        own = frozenset[Expr]().union(*(_read_by(self.site(c)) for c in block))
+        return [n for n, s in trace.parameters.items() if not own.isdisjoint(s.components)]
+
     def site(self, component: Expr) -> Site:
         return self.sites[component.data[1]]
 
@@ -312,3 +322,8 @@ def bounds_of(site: Site) -> dict[Expr, tuple[Expr, Expr]]:
         value: (low, high)
         for value, low, high in zip(site.value.ravel(), lower, upper, strict=True)
     }
+
+
+def _read_by(site: Site) -> frozenset[Expr]:
+    """The symbols in the arguments of a law."""
+    return symbols_of(e for p in site.distribution.parameters.values() for e in p.ravel())

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data import check_values
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import kind_of
@@ -101,7 +101,8 @@ def maximize(
     if method is not None and type(method) not in CLIMBS:
         names = ", ".join(f"ssm.{c.__name__}(...)" for c in CLIMBS)
         raise ArgumentError(
-            f"method={method!r} is no method of maximisation", fix=f"use {names} or None"
+            f"method={method!r} is no method of maximisation",
+            fix=written_as(method, CLIMBS) or f"use {names} or None",
         )
     problem = pose(model, data)
     held = check_values(problem.trace, fixed, argument="fixed")

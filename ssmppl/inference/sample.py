@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.data import check_values, unpack_parameters, unpack_states
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, written_as
 from ssmppl.inference.chains import (
     elimination,
     gibbs,
@@ -148,7 +148,8 @@ def sample(
     if prepare is None and not isinstance(chosen, SMC2):
         names = ", ".join(f"ssm.{m.__name__}(...)" for m in (*PREPARE, SMC2))
         raise ArgumentError(
-            f"method={method!r} is no method of sampling", fix=f"use {names} or None"
+            f"method={method!r} is no method of sampling",
+            fix=written_as(method, (*PREPARE, SMC2)) or f"use {names} or None",
         )
     if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
         states, warmup, thin = False, 0, 1

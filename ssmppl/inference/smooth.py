@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
-from ssmppl.errors import ArgumentError, NotApplicable, listing
+from ssmppl.errors import ArgumentError, NotApplicable, listing, written_as
 from ssmppl.inference.chains import pgas
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
@@ -180,17 +180,19 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
         kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
         chosen, why = choose_smoother(kind)
         return chosen, f"automatically: {why}"
+    kinds = (KalmanSmoother, ForwardBackward, FFBSi, FixedLag, PGAS)
     if isinstance(method, str):
         if method not in NAMES:
             raise ArgumentError(
-                f"method={method!r} is unknown", fix=f"use one of: {listing(method, NAMES)}"
+                f"method={method!r} is unknown",
+                fix=written_as(method, kinds) or f"use one of: {listing(method, NAMES)}",
             )
         method = NAMES[method]
     if not isinstance(method, SmoothingMethod):
-        kinds = (KalmanSmoother, ForwardBackward, FFBSi, FixedLag, PGAS)
         names = ", ".join(f"ssm.{t.__name__}(...)" for t in kinds)
         raise ArgumentError(
-            f"method={method!r} is no method of smoothing", fix=f"use {names}, a name, or None"
+            f"method={method!r} is no method of smoothing",
+            fix=written_as(method, kinds) or f"use {names}, a name, or None",
         )
     needed: tuple[str, KalmanModel | HiddenMarkov | NotApplicable] | None = None
     if isinstance(method, KalmanSmoother):

@@ -21,10 +21,53 @@ from ssmppl.language.model import location_of, outer_values, plain_function
 Law = Callable[..., Any]
 Known = Mapping[str, str]  # name of a quantity -> its role
 # NumPy's messages about object arrays, which np.array makes of symbols
-_OBJECT_ARRAY = re.compile(
-    r"has no callable|dtype\('O'\)|^'Expr' object has no attribute"
-    r"|not supported for the input types"
+_OBJECT_ARRAY = re.compile(r"has no callable|dtype\('O'\)|not supported for the input types")
+_BUILD = (
+    "np.array([...]) of symbols is a plain object array to NumPy: build vectors by "
+    "np.stack([a, b]) and matrices by np.block([[a, b], [c, d]])"
 )
+_NO_ELEMENTS = (
+    "write the name without brackets and without a loop over it; what has several components is "
+    "declared with a vector law (MvNormal, or arguments that are arrays)"
+)
+# Python's messages about a scalar symbol: what was asked of it, and what to write instead
+_ASKED_OF_SYMBOLS = tuple(
+    (re.compile(pattern), found, fix)
+    for pattern, found, fix in (
+        (r"^'Expr' object is not subscriptable",
+         "takes an element, [...], of a symbol that is one number", _NO_ELEMENTS),
+        (r"^'Expr' object does not support item",
+         "assigns to an element, [...], of a symbol", "compute a new value under a new name"),
+        (r"^'Expr' object is not iterable|cannot unpack non-iterable Expr",
+         "goes through a symbol that is one number as through a list (for, in, sum(), max(), "
+         "unpacking)", _NO_ELEMENTS),
+        (r"^object of type 'Expr' has no len",
+         "asks for the len() of a symbol that is one number",
+         "write 1, or the count itself: lengths are known when the model is written"),
+        (r"doesn't define __round__",
+         "rounds a symbol by Python's round()", "write np.floor(x + 0.5)"),
+        (r"doesn't define __trunc__|Expr.__trunc__",
+         "cuts a symbol to a whole number by Python's trunc()",
+         "write np.sign(x) * np.floor(np.abs(x))"),
+        (r"format string passed to Expr",
+         "formats a symbol as a number (an f-string, format())",
+         "take the text out of the law: a symbol has no value while the model is traced"),
+        (r"^'Expr' object is not callable",
+         "calls a symbol as a function", "write x * (...) for a product"),
+        (r"for divmod\(\).*'Expr'", "asks for divmod() of a symbol", "write x // n and x % n"),
+        (r"for @.*'Expr'", "multiplies numbers by @, which is for vectors and matrices",
+         "write * for a product of numbers"),
+        (r"unsupported operand type\(s\) for (\S+?):? .*'Expr' and '(\w+)'",
+         "has a symbol and a {1} on the two sides of {0}",
+         "use numbers, symbols and arrays of them"),
+        (r"unsupported operand type\(s\) for (\S+?):? '(\w+)' and 'Expr'",
+         "has a {1} and a symbol on the two sides of {0}",
+         "use numbers, symbols and arrays of them"),
+        (r"^'Expr' object has no attribute '(\w+)'",
+         "asks a symbol for {0!r}, which it does not have",
+         "use NumPy's functions on it, such as np.exp(x); " + _BUILD),
+    )
+)  # fmt: skip
 _INSTALLED = tuple(
     path for key in ("stdlib", "platstdlib", "purelib", "platlib")
     if (path := sysconfig.get_path(key))
@@ -163,14 +206,25 @@ def _wrapped(
     if isinstance(error, NameError) and (role_of := known.get(str(error.name))):
         fix = f"add {error.name!r}, {role_of} of the model, to the arguments of "
         fix += function.__name__
+    elif told := _of_a_symbol(error):
+        found, fix = f"@{role} {function.__name__} {told[0]}", told[1]
     elif _OBJECT_ARRAY.search(str(error)):
-        fix = "np.array([...]) of symbols is a plain object array to NumPy: build vectors by "
-        fix += "np.stack([a, b]) and matrices by np.block([[a, b], [c, d]])"
+        fix = _BUILD
     elif isinstance(error, IndexError) and "only integers, slices" in str(error):
         fix = f"if the index is a symbol: {INDEX_BY_SYMBOL}"
     elif isinstance(error, AttributeError) and (attribute := _ssm_attribute(error)):
         fix = attribute
     return ModelError(found, fix=fix, where=where)
+
+
+def _of_a_symbol(error: Exception) -> tuple[str, str] | None:
+    """What was asked of a scalar symbol that only other objects of Python have, and the fix."""
+    if not isinstance(error, (TypeError, AttributeError)):
+        return None
+    for pattern, found, fix in _ASKED_OF_SYMBOLS:
+        if match := pattern.search(str(error)):
+            return found.format(*match.groups()), fix.format(*match.groups())
+    return None
 
 
 def _ssm_attribute(error: AttributeError) -> str:

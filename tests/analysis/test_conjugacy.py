@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from ssmppl.analysis.check import verify
 from ssmppl.analysis.conjugacy import derive_updates
 from ssmppl.analysis.sufficient import complete_data
 from ssmppl.expressions.expr import to_text
+from ssmppl.language import distributions as ssm
+from ssmppl.language.model import Model
 from ssmppl.language.trace import trace
 from tests.analysis.corpus import CORPUS, build
 
@@ -91,3 +94,25 @@ def test_matrices_are_told_in_matrix_notation():
         "S: [[1, 0], [0, 1]] + sum_{t=2}^T r r'",
         "r = x - (A x_prev + B u_prev + c)",
     )
+
+
+def test_a_parameter_that_no_law_reads_is_told_to_keep_its_prior():
+    """Hyperparameters count as read; of their unread child the prior is the law given them."""
+    model = Model("unread")
+    model.prior(
+        lambda: {
+            "phi": ssm.Normal(0, sd=1), "b": ssm.Normal(2, sd=1), "u": ssm.Uniform(0, 1),
+            "m": ssm.Normal(0, sd=1),
+        }
+    )  # fmt: skip
+    model.prior(lambda m: {"c": ssm.Normal(1, sd=np.exp(m))})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, phi: {"x": ssm.Normal(phi * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    told = {u.block: str(u.explanation) for u in derive_updates(trace(model))}
+    unread = {b for b, text in told.items() if "no law of the model reads" in text}
+    assert unread == {("b",), ("u",), ("c",)}, told
+    assert "its posterior is its prior, from which it is drawn" in told["b",]
+    assert "/ H" not in told["b",]
+    assert "its posterior is its prior, moved by a slice step" in told["u",]
+    assert "its posterior, given m, is its prior" in told["c",]

@@ -151,3 +151,30 @@ def test_paths_of_states_that_are_no_numbers():
 
     with pytest.raises(ssm.SamplingError, match="p = -1"):
         ssm.smooth(model, {"y": [0.3, 0.1, 0.2]}, {"p": -1.0}, particles=20, trajectories=5, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("verb", "method", "written"),
+    [
+        (ssm.sample, ssm.PGAS, "PGAS"), (ssm.sample, "pgas", "PGAS"),
+        (ssm.sample, "smc2", "SMC2"), (ssm.maximize, ssm.EM, "EM"), (ssm.maximize, "em", "EM"),
+    ],
+)  # fmt: skip
+def test_a_class_or_a_name_for_a_method_is_told_how_to_be_written(verb, method, written):
+    model = ssm.Model("walk")
+    model.prior(lambda: {"s": ssm.Gamma(2, rate=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {"x": ssm.Normal(x, sd=s)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    with pytest.raises(ssm.ArgumentError, match=rf"Fix: write method=ssm\.{written}\(\)$"):
+        verb(model, {"y": np.zeros(4)}, method=method)
+
+
+@pytest.mark.parametrize("method", [ssm.FFBSi, "FFBSi"])
+def test_a_class_for_a_method_of_smoothing_is_told_how_to_be_written(method):
+    model = ssm.Model("walk")
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    with pytest.raises(ssm.ArgumentError, match=r"Fix: write method=ssm\.FFBSi\(\)$"):
+        ssm.smooth(model, {"y": np.zeros(4)}, {}, method=method)
