@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 
 __all__ = ["labelled", "load_model", "parse_assignments", "parse_settings", "read_csv"]
 
+# 04.01.2021, 1/4/21, 4 Jan 2021, Jan 4, 2021: which is day and which is month is not guessed
+OTHER_DATES = (
+    r"\s*(\d{1,2}([./-])\d{1,2}\2(\d{4}|\d{2})|\d{1,2}[. -]+[A-Za-z]{3,9}\.?[ -]+\d{2,4}"
+    r"|[A-Za-z]{3,9}\.? \d{1,2},? \d{4})(\s.*)?$"
+)
 DATA_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq", ".nc")
 
 
@@ -187,7 +192,16 @@ def _dates(labels: pd.Series) -> pd.Series:
     try:
         return pd.to_datetime(labels, format="ISO8601")
     except (ValueError, TypeError):
-        return labels  # text, then
+        pass
+    written = labels.dropna().astype(str)
+    if len(written) and written.str.match(OTHER_DATES).all():
+        raise DataError(
+            f"the column {labels.name!r} holds dates in another form than ISO's: its first entry "
+            f"is {written.iloc[0]!r}",
+            fix="write them year first, 2021-01-04: in Python pd.to_datetime(table["
+            f"{labels.name!r}], format='%d.%m.%Y'), with the order of day and month that is meant",
+        )
+    return labels  # text, then
 
 
 def parse_assignments(texts: Iterable[str], option: str) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.prior import draw_prior
+from ssmppl.inference.ranges import out_of_range
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
 from ssmppl.results import to_dataset
@@ -131,10 +132,18 @@ def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) ->
             site = (traced.initial if t == 0 and sites is traced.transition else sites)[
                 symbols[k].data[1]
             ]
+            now = traced.state_symbols if sites is traced.observations else []
+            before = traced.state_prev_symbols if t else []
+            known = dict(zip(now, states[draw, t], strict=False))
+            known |= dict(zip(before, states[draw, t - 1], strict=False))
+            why, fix = out_of_range(site.distribution, known) or (
+                "",
+                "a parameter of its law leaves its range there (a negative spread, the log of a "
+                "negative number, ...): check the values, or bound them by np.maximum",
+            )
             raise SamplingError(
-                f"{symbols[k]!r} is nan at t={t + 1} of draw {draw + 1}",
-                fix="a parameter of its law leaves its range there (a negative spread, the log "
-                "of a negative number, ...): check the values, or bound them by np.maximum",
+                f"{symbols[k]!r} is nan at t={t + 1} of draw {draw + 1}" + (why and f": {why}"),
+                fix=fix,
                 where=site.distribution.location,
             )
 

@@ -48,6 +48,13 @@ def test_what_is_no_date_labels_nothing_and_time_goes_before_a_date(dated):
     assert list(both.columns) == ["date", "time", "y"]
 
 
+@pytest.mark.parametrize("first", ["04.01.2021", "1/4/2021", "04-01-21", "4 Jan 2021"])
+@pytest.mark.parametrize("name", ["date", "time"])
+def test_dates_in_another_form_are_told_and_never_guessed(dated, name, first):
+    with pytest.raises(DataError, match=f"column '{name}'.*is '{first}'\n.*2021-01-04"):
+        read_table(dated(f"{name},y\n{first},1\n{first.replace('4', '5')},2\n"))
+
+
 def test_dates_that_are_not_in_order_are_refused(folder, dated):
     path = dated("date,y\n2024-01-08,1\n2024-01-01,2\n")
     assert "2024-01-01 in row 2 follows 2024-01-08 in row 1" in fails(

@@ -1,5 +1,7 @@
 """The verbs round the likelihood: arguments, limits, errors at run time."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -302,3 +304,28 @@ def test_filter_datasets():
     total = out["log_likelihood_increment"].sum("time").values
     assert np.all(np.isfinite(total))
     assert np.all(out["ess"] <= 200)
+
+
+@pytest.mark.parametrize(
+    ("law", "argument", "fix"),
+    [
+        (lambda x: ssm.Poisson(x), "the rate of Poisson, x,", "np.exp(x)"),
+        (lambda x: ssm.Gamma(x, rate=1), "the shape of Gamma, x,", "np.exp(x)"),
+        (lambda x: ssm.Binomial(5, x), " of Binomial, x,", "1 / (1 + np.exp(-(x)))"),
+    ],
+)
+def test_an_argument_out_of_range_is_named_with_its_value_and_a_fix(law, argument, fix):
+    model = ssm.Model("negative")
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(lambda x: {"y": law(x)})
+    with pytest.raises(ssm.SamplingError) as simulated:
+        ssm.simulate(model, steps=20, seed=1)
+    assert re.search(re.escape(argument) + r" is -[.0-9]+ there, outside", str(simulated.value))
+    assert fix in str(simulated.value)
+    if "Gamma" in argument:  # its density has no logarithm of the shape
+        return
+    with pytest.raises(ssm.SamplingError, match="a weight is nan at t=1") as filtered:
+        ssm.log_likelihood(model, {"y": np.ones(3)}, {}, seed=1, particles=100)
+    assert argument + " has to lie in" in str(filtered.value)
+    assert fix in str(filtered.value)

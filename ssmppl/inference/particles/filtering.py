@@ -20,6 +20,7 @@ from ssmppl.errors import ArgumentError, Location, SamplingError, listing
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.ranges import DOMAIN, out_of_range
 
 SCHEMES = {
     "systematic": SYSTEMATIC,
@@ -276,10 +277,14 @@ def failure(
         ALL_ZERO: "no particle can have produced this row under these parameters: check the row "
         "for an outlier, give the observation heavier tails, use more particles, or draw until "
         "some survive (rescue=100; of log_likelihood, particle_filter, FFBSi and PMMH)",
-    }.get(status, "some parameter, state or input leads outside the domain of an operation")
+    }.get(status, DOMAIN)
+    why = ""
+    if status == NAN:
+        known = dict(zip(problem.trace.parameter_symbols, theta, strict=True))
+        why, fix = out_of_range(site.distribution, known) or (why, fix)
     return SamplingError(
         f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "
-        f"parameters: {spelled(problem.trace, theta)}",
+        f"parameters: {spelled(problem.trace, theta)}" + (why and f"; {why}"),
         fix=fix,
         where=where,
     )

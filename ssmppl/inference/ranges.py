@@ -1,0 +1,57 @@
+"""Which argument of a law left its range, and what to write so that it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.language.distributions import Distribution
+
+__all__ = ["DOMAIN", "out_of_range"]
+
+DOMAIN = "some parameter, state or input leads outside the domain of an operation"
+
+
+def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, str] | None:
+    """What was found, and the fix; None where no argument that has a range can be at fault.
+
+    values : of the symbols, as far as they are known. An argument whose value they tell is named
+        with it, where it lies outside; else the arguments that might are named with their ranges.
+    """
+    law = getattr(law, "base", law)  # of a truncated law
+    name, might = type(law).__name__, []
+    for argument, (low, high, strict) in law.ranges.items():
+        called = argument.rstrip("_")
+        brackets = "()" if strict else "[]"
+        allowed = f"{brackets[0]}{low:g}, {high:g}{brackets[1] if np.isfinite(high) else ')'}"
+        for e in law.parameters[argument].ravel():
+            needed = symbols_of(e)
+            if not needed:
+                continue
+            fix = _fix(called, e, low, high)
+            if needed <= set(values):
+                value = float(evaluate(e, values))
+                if np.isnan(value):
+                    return f"the {called} of {name}, {e!r}, is nan there", DOMAIN
+                if not (low < value < high if strict else low <= value <= high):
+                    found = (
+                        f"the {called} of {name}, {e!r}, is {value:.6g} there, outside {allowed}"
+                    )
+                    return found, fix
+            else:
+                demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
+                might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
+    return might[0] if might else None
+
+
+def _fix(called: str, e: Expr, low: float, high: float) -> str:
+    """A function that maps all numbers into the range."""
+    if (low, high) == (0.0, 1.0):
+        logistic = f"1 / (1 + np.exp(-({e!r})))"
+        return f"write a {called} between 0 and 1 whatever the state, such as {logistic}"
+    if low == 0.0 and high == np.inf:
+        return f"write a {called} that is positive whatever the state, such as np.exp({e!r})"
+    return f"keep the {called} inside by np.clip or np.maximum"
