@@ -11,12 +11,17 @@ from tests.fuzz.block import cases, recipe_of
 from tests.fuzz.calls import Wrong, judged
 from tests.fuzz.models import FAULTS, random_model
 
-ROOT, DEFAULT, SLOW = 7, 4, 30  # the root is none of those that the long runs took
+ROOT, DEFAULT, SLOW, ALL = 7, 4, 12, 30  # the root is none of those that the long runs took
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(k, marks=[pytest.mark.slow] * (k >= DEFAULT)) for k in range(SLOW)]
-)
+def marks_of(number):
+    """Compiling a random model takes seconds: few in every run, the rest in later stages."""
+    if number < DEFAULT:
+        return []
+    return [pytest.mark.slow if number < SLOW else pytest.mark.exhaustive]
+
+
+@pytest.mark.parametrize("number", [pytest.param(k, marks=marks_of(k)) for k in range(ALL)])
 def test_random_models(number, tmp_path):
     failed = [o for o in cases(ROOT, number, tmp_path) if o.failed]
     told = "\n\n".join(f"{o.verb}: {o.kind}\n{o.detail}" for o in failed)

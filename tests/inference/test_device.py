@@ -61,7 +61,7 @@ def test_the_simulator_finds_the_numbers_of_numpy():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("every", [10, pytest.param(1, marks=pytest.mark.exhaustive)])
 def test_the_simulator_finds_the_numbers_of_numpy_for_every_model(every):
     cases = []
     for name in MODELS:

@@ -161,7 +161,8 @@ def named(combinations):
 @pytest.mark.parametrize(
     "combination",
     [
-        *some(named(c for c in COMBINATIONS if c not in STEERED), 2, EXHAUSTIVE),
+        # one in CI, the last: auxiliary and adaptive, of whose evidences peers have had wrong ones
+        *some(named(c for c in COMBINATIONS if c not in STEERED)[::-1], 1, EXHAUSTIVE),
         *some(named(STEERED), 1, EXHAUSTIVE),
     ],
 )
