@@ -72,7 +72,7 @@ from ssmppl.language.distributions import (
 )
 from ssmppl.language.model import Model
 from ssmppl.language.primitive import primitive
-from ssmppl.results import summary
+from ssmppl.tables import summary
 
 if TYPE_CHECKING:
     from ssmppl import plots

@@ -11,31 +11,22 @@ import json
 import os
 import platform
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssmppl.errors import ArgumentError, listing
-
 if TYPE_CHECKING:
-    import pandas as pd
     import xarray as xr
 
 __all__ = [
     "arviz",
     "save",
-    "state_table",
-    "summary",
-    "summary_text",
     "to_dataset",
     "to_inference_data",
-    "wide_table",
 ]
-
-SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
 # Groups of draws all of whose variables have a time axis.
 BY_ROW = ("log_likelihood", "prior_predictive", "posterior_predictive")
@@ -145,87 +136,6 @@ def to_dataset(
         coords=coords or {},
         attrs=_provenance() | netcdf_attributes(attrs or {}),
     )
-
-
-def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
-    """Mean, sd, their Monte Carlo errors, bulk and tail ESS, and R-hat; one row per scalar.
-
-    Parameters
-    ----------
-    idata : what `sample` returned.
-    var_names : names of variables; None: all of the posterior that have no time, the parameters.
-
-    Returns
-    -------
-    DataFrame : not rounded. R-hat is NaN for a single chain.
-    """
-    import pandas as pd
-
-    posterior = idata["posterior"]
-    if var_names is None:
-        names = [name for name, v in posterior.data_vars.items() if not _has_time(v.dims)]
-    else:
-        names = list(var_names)
-        unknown = [name for name in names if name not in posterior.data_vars]
-        if unknown:
-            known = listing(str(unknown[0]), map(str, posterior.data_vars))
-            raise ArgumentError(
-                f"the posterior has no variable {unknown[0]!r}.", fix=f"it has {known}"
-            )
-    if not names:
-        return pd.DataFrame(columns=SUMMARY_COLUMNS, dtype=float)
-    table = arviz().summary(idata, var_names=names, round_to="none", kind="all")
-    return pd.DataFrame(table)[SUMMARY_COLUMNS].astype(float)
-
-
-def state_table(dataset: xr.Dataset) -> pd.DataFrame:
-    """Mean and standard deviation of each state over time, of a result of `smooth`; time its rows.
-
-    From moments, dim `draw` of length 1, or over the dim `trajectory`.
-    """
-    import pandas as pd
-
-    columns: dict[str, np.ndarray] = {}
-    for name, variable in dataset.data_vars.items():
-        if variable.dims[:2] == ("trajectory", "time"):
-            mean, sd = variable.mean("trajectory").values, variable.std("trajectory", ddof=1).values
-        elif f"{name}_sd" in dataset:
-            mean, sd = variable.values[0], dataset[f"{name}_sd"].values[0]
-        else:
-            continue
-        for index in np.ndindex(*mean.shape[1:]):
-            label = "_".join(map(str, (name, *index)))
-            columns[f"{label} mean"] = mean[(slice(None), *index)]
-            columns[f"{label} sd"] = sd[(slice(None), *index)]
-    return pd.DataFrame(columns, index=pd.Index(dataset["time"].values, name="time"))
-
-
-def wide_table(dataset: xr.Dataset) -> pd.DataFrame:
-    """A Dataset of simulations as a table, (draw, time) its rows and scalars its columns."""
-    import pandas as pd
-
-    draws, steps = dataset.sizes["draw"], dataset.sizes["time"]
-    columns: dict[str, Any] = {}
-    if draws > 1:
-        columns["draw"] = np.repeat(np.arange(1, draws + 1), steps)
-    columns["time"] = np.tile(dataset["time"].values, draws)
-    for name, variable in dataset.data_vars.items():
-        values = variable.values
-        if "time" not in variable.dims:
-            values = np.repeat(values[:, None], steps, axis=1)
-        values = values.reshape(draws * steps, *values.shape[2:])
-        for index in np.ndindex(*values.shape[1:]):
-            columns["_".join(map(str, (name, *index)))] = values[(slice(None), *index)]
-    return pd.DataFrame(columns)
-
-
-def summary_text(table: pd.DataFrame) -> str:
-    """The summary with four digits, effective sample sizes whole."""
-    if table.empty:
-        return "There are no parameters to summarise: all are fixed, or the model has none."
-    whole = {name: "{:.0f}".format for name in table.columns if name.startswith("ess")}
-    others = {name: "{:.4g}".format for name in table.columns if name not in whole}
-    return table.to_string(formatters={**whole, **others, "r_hat": "{:.3f}".format})
 
 
 def save(idata: Any, path: str | os.PathLike[str]) -> Path:
@@ -362,11 +272,6 @@ def _labels(values: Any) -> np.ndarray:
     """Coordinate values in a type that netCDF can hold: objects other than text become text."""
     array = np.asarray(values)
     return array.astype(str) if array.dtype == object else array
-
-
-def _has_time(dims: Iterable[Any]) -> bool:
-    """Whether there is a time axis: `time`, or `time_<experiment>` where there are several."""
-    return any(dim == "time" or str(dim).startswith("time_") for dim in dims)
 
 
 def _container(groups: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Any:

@@ -17,6 +17,7 @@ ALLOWED = {layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)}
 # Arrays in, ArviZ out, and the embedded series stand beside it ...
 ALLOWED["data"] = {"errors", "expressions", "language"}
 ALLOWED["results"] = {"errors"}
+ALLOWED["tables"] = {"errors", "results"}
 ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows.
 ALLOWED["inference"] = {*CHAIN, "data", "results"}
@@ -25,7 +26,7 @@ ALLOWED["plots"] = ALLOWED["gap"] | {"gap"}
 # What the command line is made of: the demonstration, written as a user would, and files read.
 ALLOWED["demo"] = {PACKAGE, "datasets", "results"}
 ALLOWED["modelfile"] = {"errors", "language"}
-OWN = {"plots", "datasets", "demo", "modelfile", PACKAGE}
+OWN = {"plots", "datasets", "demo", "modelfile", "tables", PACKAGE}
 ALLOWED["cli"] = ALLOWED["plots"] | OWN
 ALLOWED["__main__"] = {"cli"}
 # The package itself holds the public names: it may import all but those who are above it.

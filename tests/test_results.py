@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ssmppl import results
+from ssmppl import results, tables
 from ssmppl.errors import ArgumentError
 
 CHAINS, DRAWS, T = 3, 200, 7
@@ -167,12 +167,12 @@ def test_dims_of_single_variables():
     assert posterior["time_1"].values.tolist() == [1900, 1901, 1902, 1903]
     assert posterior["time_2"].values.tolist() == [0, 1, 2, 3, 4, 5]
     assert posterior["wheel"].values.tolist() == ["left", "right"]
-    assert list(results.summary(idata).index) == ["b[left]", "b[right]"]
+    assert list(tables.summary(idata).index) == ["b[left]", "b[right]"]
 
 
 def test_summary_is_of_the_parameters_and_agrees_with_numpy(idata, arrays):
-    table = results.summary(idata)
-    assert list(table.columns) == results.SUMMARY_COLUMNS
+    table = tables.summary(idata)
+    assert list(table.columns) == tables.SUMMARY_COLUMNS
     assert list(table.index) == ["phi", "Q[0, 0]", "Q[0, 1]", "Q[1, 0]", "Q[1, 1]"]
     phi = arrays["posterior"]["phi"]
     assert table.loc["phi", "mean"] == pytest.approx(phi.mean())
@@ -184,14 +184,22 @@ def test_summary_is_of_the_parameters_and_agrees_with_numpy(idata, arrays):
 
 
 def test_summary_of_named_variables(idata):
-    assert len(results.summary(idata, ["x"])) == T
+    assert len(tables.summary(idata, ["x"])) == T
     with pytest.raises(ArgumentError, match=r"no variable 'psi'.*\n.*it has phi,"):
-        results.summary(idata, ["psi"])
+        tables.summary(idata, ["psi"])
 
 
 def test_summary_of_states_alone_is_empty():
     idata = results.to_inference_data(posterior={"x": np.zeros((2, 5, T))}, over_time={"x"})
-    assert results.summary(idata).empty
+    assert tables.summary(idata).empty
+
+
+def test_summary_of_something_without_posterior_draws():
+    filtered = results.to_dataset({"x": np.zeros((1, T))})
+    with pytest.raises(ArgumentError, match="summary of a Dataset, which holds no posterior draws"):
+        tables.summary(filtered)
+    with pytest.raises(ArgumentError, match="summary of a ndarray"):
+        tables.summary(np.zeros(3))
 
 
 def test_disagreeing_shapes_are_refused():

@@ -22,7 +22,7 @@ from ssmppl.cli.reading import as_table, read_data, read_table
 from ssmppl.cli.rendering import answer, say, write
 from ssmppl.cli.targets import file_of_model, target
 from ssmppl.modelfile import load_model, parse_assignments
-from ssmppl.results import wide_table
+from ssmppl.tables import wide_table
 
 __all__ = ["compile", "explain", "simulate"]
 

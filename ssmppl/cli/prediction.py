@@ -41,7 +41,7 @@ from ssmppl.cli.rendering import (
 )
 from ssmppl.cli.targets import file_of_model, new_file, target
 from ssmppl.modelfile import load_model, parse_assignments
-from ssmppl.results import wide_table
+from ssmppl.tables import wide_table
 
 __all__ = ["forecast", "leave_future_out", "predict"]
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.modelfile import labelled, read_csv
-from ssmppl.results import arviz, wide_table
+from ssmppl.results import arviz
+from ssmppl.tables import wide_table
 
 if TYPE_CHECKING:
     import pandas as pd

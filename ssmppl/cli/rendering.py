@@ -19,7 +19,8 @@ import numpy as np
 from ssmppl.cli.group import AS_JSON, INTERRUPTED
 from ssmppl.cli.reading import PARQUET, pyarrow
 from ssmppl.errors import ArgumentError
-from ssmppl.results import save, state_table, summary_text
+from ssmppl.results import save
+from ssmppl.tables import state_table, summary_text
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,7 +14,7 @@ from ssmppl.cli.options import option, output
 from ssmppl.cli.rendering import answer, fitting_rows, note, say, stop_interrupted, wants_json
 from ssmppl.cli.templates import TEMPLATES, skeleton
 from ssmppl.errors import ArgumentError
-from ssmppl.results import wide_table
+from ssmppl.tables import wide_table
 
 __all__ = ["demo", "new"]
 

@@ -26,7 +26,7 @@ from ssmppl.cli.rendering import answer, columns_of, heading, say, table_text, w
 from ssmppl.cli.targets import numbered, target
 from ssmppl.inference.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments
-from ssmppl.results import state_table
+from ssmppl.tables import state_table
 
 __all__ = ["forward_filter", "kalman_filter", "particle_filter", "smooth"]
 
