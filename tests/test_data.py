@@ -154,6 +154,7 @@ def test_a_dataset_says_the_same_in_any_order_of_dimensions():
         pd.Series([1, pd.NA, 2], dtype=object),
         xr.DataArray([1, NAN, 2], dims="time"),
         [decimal.Decimal(1), None, np.int8(2)],
+        [decimal.Decimal(1), decimal.Decimal("sNaN"), decimal.Decimal(2)],
         [True, None, 2],
     ],
     ids=lambda v: type(v).__name__,

@@ -938,6 +938,16 @@ BAD_DATA = {
         xr.Dataset({k: ("step", v) for k, v in counts_with().items()}),
         ["no dimension 'time'", "rename"],
     ),
+    "variable of a Dataset without time": (
+        "counts",
+        xr.Dataset({k: ("step" if k == "n" else "time", v) for k, v in counts_with().items()}),
+        ["In data, 'n'", "no dimension 'time'", "are: step", "rename({'step': 'time'})"],
+    ),
+    "structured array": (
+        "counts",
+        np.ones(5, dtype=[(k, float) for k in counts_with()]),
+        ["structured array with the fields", "pd.DataFrame(data)"],
+    ),
     "several draws": (
         "counts",
         xr.Dataset(

@@ -99,6 +99,9 @@ def _not_a_data_set(data: Any, label: str, argument: str, named: list[str]) -> D
     elif isinstance(data, Model):
         found = f"{label} is the model {data.name!r}"
         fix = "pass the model first and the data second"
+    elif getattr(getattr(data, "dtype", None), "names", None):
+        found = f"{label} is a structured array with the fields {', '.join(data.dtype.names)}"
+        fix = f"make a table of it: pd.DataFrame({argument})"
     elif isinstance(data, (np.ndarray, list, tuple)) or hasattr(data, "__array__"):
         found = f"{label} is {short(data)} of type {type(data).__name__}, which names no variable"
         fix = f"name it: {{{some!r}: {argument}}}"
@@ -176,8 +179,8 @@ def _from_dataset(data: Any, label: str) -> Source:
             where=source.place(),
         )
     for name, variable in data.data_vars.items():
-        if "time" not in variable.dims:
-            source.columns[str(name)] = variable
+        if "time" not in variable.dims:  # its rows are counted otherwise, if it has any
+            source.columns[str(name)] = _Timeless(variable.dims) if variable.dims else variable
             continue
         extra = [d for d in variable.dims if d in ("draw", "trajectory", "chain", "sample")]
         wide = [d for d in extra if variable.sizes[d] > 1]
@@ -199,8 +202,23 @@ class _Wide:
     size: int
 
 
+@dataclass(frozen=True)
+class _Timeless:
+    """Stands for a variable of a Dataset that has dimensions, and no `time` among them."""
+
+    dims: tuple[Any, ...]
+
+
 def check_single(value: Any, name: str, source: Source) -> None:
-    """Refuse a variable that holds several draws of the series."""
+    """Refuse a variable of a Dataset that is not one series over its rows."""
+    if isinstance(value, _Timeless):
+        dims = ", ".join(map(str, value.dims))
+        raise DataError(
+            f"{name!r} has no dimension 'time', which counts the rows; its dimensions are: {dims}",
+            fix="if these are the same rows, rename it: "
+            f"data[{name!r}].rename({{{str(value.dims[0])!r}: 'time'}})",
+            where=source.place(name),
+        )
     if isinstance(value, _Wide):
         raise DataError(
             f"{name!r} holds {value.size} series along the dimension {value.dim!r}",

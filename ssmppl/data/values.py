@@ -134,6 +134,8 @@ def _spells_number(text: str) -> bool:
 
 
 def _missing(entry: Any) -> bool:
+    if isinstance(entry, Decimal) and entry.is_nan():  # a signalling one has no float
+        return True
     return entry is None or type(entry).__name__ in ("NAType", "NaTType", "MaskedConstant")
 
 
