@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 __all__ = ["labelled", "load_model", "parse_assignments", "parse_settings", "read_csv"]
 
 # 04.01.2021, 1/4/21, 4 Jan 2021, Jan 4, 2021: which is day and which is month is not guessed
+MONTH = r"(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\.?"
 OTHER_DATES = (
-    r"\s*(\d{1,2}([./-])\d{1,2}\2(\d{4}|\d{2})|\d{1,2}[. -]+[A-Za-z]{3,9}\.?[ -]+\d{2,4}"
-    r"|[A-Za-z]{3,9}\.? \d{1,2},? \d{4})(\s.*)?$"
+    r"(?i)\s*(?:\d{1,2}([./-])\d{1,2}\1(?:\d{4}|\d{2})"
+    rf"|\d{{1,2}}[. -]+{MONTH}[ -]+\d{{2,4}}|{MONTH} \d{{1,2}},? \d{{4}})(?:\s.*)?$"
 )
 DATA_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq", ".nc")
 

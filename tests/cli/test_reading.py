@@ -48,11 +48,18 @@ def test_what_is_no_date_labels_nothing_and_time_goes_before_a_date(dated):
     assert list(both.columns) == ["date", "time", "y"]
 
 
-@pytest.mark.parametrize("first", ["04.01.2021", "1/4/2021", "04-01-21", "4 Jan 2021"])
+@pytest.mark.parametrize(
+    "first", ["04.01.2021", "1/4/2021", "04-01-21", "4 Jan 2021", "may 4 2021"]
+)
 @pytest.mark.parametrize("name", ["date", "time"])
 def test_dates_in_another_form_are_told_and_never_guessed(dated, name, first):
     with pytest.raises(DataError, match=f"column '{name}'.*is '{first}'\n.*2021-01-04"):
         read_table(dated(f"{name},y\n{first},1\n{first.replace('4', '5')},2\n"))
+
+
+def test_text_that_only_resembles_a_date_stays_text(dated):
+    table = read_table(dated("date,y\n3 plot 12,1\n4 plot 12,2\n"))
+    assert list(table["y"]) == [1, 2]
 
 
 def test_dates_that_are_not_in_order_are_refused(folder, dated):

@@ -271,8 +271,8 @@ def failure(
         f"{name} = {np.array2string(np.asarray(values[t]), precision=6)}"
         for name, values in experiment.observed.items()
     )
-    site = next(iter(problem.trace.observations.values()))
-    where: Location = site.distribution.location
+    laws = [site.distribution for site in problem.trace.observations.values()]
+    where: Location = laws[0].location
     fix = {
         ALL_ZERO: "no particle can have produced this row under these parameters: check the row "
         "for an outlier, give the observation heavier tails, use more particles, or draw until "
@@ -281,7 +281,10 @@ def failure(
     why = ""
     if status == NAN:
         known = dict(zip(problem.trace.parameter_symbols, theta, strict=True))
-        why, fix = out_of_range(site.distribution, known) or (why, fix)
+        for law in laws:
+            if found := out_of_range(law, known):
+                (why, fix), where = found, law.location
+                break
     return SamplingError(
         f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "
         f"parameters: {spelled(problem.trace, theta)}" + (why and f"; {why}"),
