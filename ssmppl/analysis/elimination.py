@@ -23,6 +23,7 @@ the columns too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -214,8 +215,9 @@ class _Build:
                 return NotApplicable(form.reason, term.where)
             assert isinstance(form, Separation)
             rest = form.terms.get(ONE, ZERO)
-            for inside in _conditions(term.log_density):
-                rest = apply("where", inside, rest, constant(-INFINITY))
+            for inside, outside in _conditions(term.log_density):
+                if not symbols_of(inside) & self.block:  # its own law keeps the block in range
+                    rest = apply("where", inside, rest, outside)
             out.append(Term(term.site, rest, term.guard))
         return tuple(out)
 
@@ -256,13 +258,16 @@ def _of_states(e: Expr) -> bool:
     return any(s.data[0] in ("state", "state_prev") for s in symbols_of(e))
 
 
-def _conditions(guarded: Expr) -> list[Expr]:
-    """The supports that a log density is guarded by: where(inside, density, -inf), summed."""
+def _conditions(guarded: Expr) -> list[tuple[Expr, Expr]]:
+    """What guards a log density, summed, the innermost first: where(inside, density, outside) with
+    -inf outside the support and NaN where a parameter is out of its range.
+    """
     if guarded.op == "add":
         return [c for a in guarded.args for c in _conditions(a)]
     if guarded.op == "where" and guarded.args[2].op == "const":
-        if guarded.args[2].data == -INFINITY:
-            return [guarded.args[0]]
+        inside, density, outside = guarded.args
+        if not math.isfinite(outside.data):
+            return [*_conditions(density), (inside, outside)]
     return []
 
 

@@ -16,6 +16,7 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import constant
 from ssmppl.language.continuous import _each, _where
 from ssmppl.language.distribution import INFINITY, Distribution, Support
+from ssmppl.language.positive import log_gamma
 
 
 def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
@@ -107,7 +108,7 @@ class NegativeBinomial(_Counts):
 
     def log_densities(self, value):
         v, m, r = array(value), self.mean_, self.dispersion
-        choose = ew("gammaln", v + r) - array(ew("gammaln", r)) - ew("gammaln", v + 1.0)
+        choose = ew("gammaln", v + r) - log_gamma(r) - ew("gammaln", v + 1.0)
         return choose - r * ew("log1p", m / r) + _times_log(v, m / (r + m))
 
     def sample(self, draws):

@@ -18,6 +18,7 @@ import numpy as np
 from ssmppl.errors import Location, ModelError, UnsupportedOperation, nearest_first
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, constant, user_location
+from ssmppl.expressions.signs import never_negative
 from ssmppl.language.draws import Draws
 
 INFINITY = math.inf
@@ -129,8 +130,9 @@ class Distribution:
             values = self.parameters[name]
             if all(e.op == "const" for e in values.ravel()):
                 continue
-            slack = 0.0 if strict else ROUNDING
-            own = [elementwise("le", low - slack, values)]
+            slack, own = 0.0 if strict else ROUNDING, []
+            if low != 0.0 or not all(map(never_negative, values.ravel())):
+                own.append(elementwise("le", low - slack, values))
             if high < INFINITY:
                 own.append(elementwise("le", values, high + slack))
             for condition in own:
@@ -265,8 +267,12 @@ class Distribution:
         return None
 
     def guarded_log_densities(self, value: ExprArray) -> ExprArray:
-        """`log_densities`, and -inf outside the support."""
-        support, inside = self.support(), None
+        """`log_densities`, and -inf outside the support.
+
+        Of a discrete law NaN where a parameter is out of its range: a count of 0 takes no
+        logarithm of it. The formulas of continuous laws are NaN there by themselves.
+        """
+        support = self.support()
         density = array(self.log_densities(value))
         if support.kind not in ("interval", "integers"):
             return density
@@ -288,7 +294,8 @@ class Distribution:
                 whole = apply("eq", v[i], apply("floor", v[i]))
                 inside = whole if inside.op == "const" else apply("and", inside, whole)
             out[i] = apply("where", inside, density[i], -INFINITY)
-        return array(out)
+        allowed = self.in_range() if self.discrete else None
+        return array(out if allowed is None else elementwise("where", allowed, out, math.nan))
 
     def log_density(self, value: Any, guard: bool = True) -> Expr:
         """Log density of the whole value, one expression; -inf outside the support.

@@ -21,7 +21,7 @@ from ssmppl.expressions.linear import cholesky, inverse, log_determinant, square
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Support, one_of
 from ssmppl.language.draws import Draws
-from ssmppl.language.positive import log_gamma_draw, needs_log_gamma
+from ssmppl.language.positive import log_gamma, log_gamma_draw, needs_log_gamma
 
 
 class _Joint(Distribution):
@@ -193,7 +193,7 @@ class Dirichlet(_Joint):
     def log_densities(self, value):
         total, rows = constant(0.0), array(value).reshape(-1, self.shape[-1]).view(np.ndarray)
         for a, v in zip(self._rows(), rows, strict=True):
-            norm = np.sum(array(ew("gammaln", a))) - ew("gammaln", np.sum(a))
+            norm = np.sum(log_gamma(a)) - ew("gammaln", np.sum(a))
             total = total + np.sum((a - 1.0) * ew("log", array(v))) - norm
         return array(total)
 
@@ -222,7 +222,7 @@ def _log_gamma_p(x: Any, p: int) -> Any:
     """log of the multivariate gamma function of dimension p."""
     total = constant(0.25 * p * (p - 1) * math.log(math.pi))
     for j in range(p):
-        total = total + ew("gammaln", x - 0.5 * j)
+        total = total + log_gamma(array(x - 0.5 * j))
     return total
 
 

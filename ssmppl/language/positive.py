@@ -12,6 +12,7 @@ from typing import Any
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, apply
+from ssmppl.expressions.signs import never_negative
 from ssmppl.language.continuous import _NAN, _each, _where
 from ssmppl.language.distribution import (
     INFINITY,
@@ -108,7 +109,7 @@ class Gamma(_Positive):
 
     def log_densities(self, value):
         a, b, v = self.shape_, self._rate(), array(value)
-        return a * ew("log", b) + (a - 1.0) * ew("log", v) - b * v - ew("gammaln", a)
+        return a * ew("log", b) + (a - 1.0) * ew("log", v) - b * v - log_gamma(a)
 
     def sample(self, draws):
         return _each(self, lambda i: draws.gamma(self.shape_[i])) / self._rate()
@@ -153,7 +154,7 @@ class InverseGamma(_Positive):
 
     def log_densities(self, value):
         a, b, v = self.shape_, self.scale, array(value)
-        return a * ew("log", b) - (a + 1.0) * ew("log", v) - b / v - ew("gammaln", a)
+        return a * ew("log", b) - (a + 1.0) * ew("log", v) - b / v - log_gamma(a)
 
     def sample(self, draws):
         return self.scale / _each(self, lambda i: draws.gamma(self.shape_[i]))
@@ -188,6 +189,13 @@ def _lower_end(e: Expr) -> float:
     return e.data if e.op == "const" else 0.0
 
 
+def log_gamma(a: ExprArray) -> ExprArray:
+    """log of the gamma function, NaN below 0: it is finite there, where no law has a density."""
+    if not all(map(never_negative, a.ravel())):
+        a = _where(ew("le", 0.0, a), a, _NAN)
+    return array(ew("gammaln", a))
+
+
 def needs_log_gamma(shapes: ExprArray) -> bool:
     """Whether ratios of gamma draws of these shapes may be 0 / 0."""
     return min(map(_lower_end, shapes.ravel())) < SMALL_SHAPE
@@ -216,7 +224,7 @@ class Beta(Distribution):
 
     def log_densities(self, value):
         a, b, v = self.a, self.b, array(value)
-        norm = ew("gammaln", a) + ew("gammaln", b) - ew("gammaln", a + b)
+        norm = log_gamma(a) + log_gamma(b) - ew("gammaln", a + b)
         return (a - 1.0) * ew("log", v) + (b - 1.0) * ew("log1p", -v) - norm
 
     def sample(self, draws):

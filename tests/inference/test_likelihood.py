@@ -331,17 +331,7 @@ def test_simulate_names_the_argument_out_of_range_with_its_value_and_a_fix(name)
     assert fix in str(simulated.value)
 
 
-FINITE = "the densities of Gamma and Beta are finite at a negative shape"
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "Poisson",
-        "Binomial",
-        pytest.param("Gamma", marks=pytest.mark.xfail(reason=FINITE, strict=True)),
-    ],
-)
+@pytest.mark.parametrize("name", LAWS_OF_A_STATE)
 def test_a_filter_names_the_argument_that_may_be_out_of_range_and_a_fix(name):
     law, argument, fix = LAWS_OF_A_STATE[name]
     data = {"z": np.zeros(3), "y": np.ones(3)}
