@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 
 from ssmppl.expressions.graph import topological
 from ssmppl.expressions.node import MATRIX_OPS, Expr, behaviour
@@ -41,6 +42,13 @@ def _matrix_name(node: Expr) -> str | None:
     return None
 
 
+def _bare(a: Expr) -> Expr:
+    """a of where(0 <= a, a, nan): what the densities of laws put in place of their a."""
+    if a.op == "where" and a.args[2].op == "const" and math.isnan(a.args[2].data):
+        return a.args[1] if a.args[0] is behaviour["apply"]("le", 0.0, a.args[1]) else a
+    return a
+
+
 def to_text(root: Expr, longest: int = LONGEST) -> str:
     """The expression as a person writes it.
 
@@ -72,6 +80,8 @@ def to_text(root: Expr, longest: int = LONGEST) -> str:
             done[node] = (f"{node.op}({inside})", 9)
         elif node.op == "item":
             done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
+        elif node.op == "gammaln":
+            done[node] = (f"gammaln({done[_bare(node.args[0])][0]})", 9)
         else:
             name = node.data[0] if node.op == "random" else node.op
             done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)

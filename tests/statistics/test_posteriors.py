@@ -11,6 +11,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import scipy.stats as st
 from numpy.polynomial import Chebyshev
 
 import ssmppl as ssm
@@ -199,3 +200,37 @@ def test_posterior_of_several_experiments(method):
         f"experiments {method}", models.lgss, experiments(), method, 4000, fixed={"c": 1.0}
     )
     assert_within(deviations(np.log(posterior["theta"].values), exact.mean, exact.sd))
+
+
+# --- parameters whose prior reaches where a law has no density ------------------------------------
+
+
+def of_an_argument(law):
+    """a, Normal a priori, is the argument of the law of y and has to be positive."""
+    model = ssm.Model("argument")
+    model.prior(lambda: {"a": ssm.Normal(0.3, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.5 * x, sd=1)})
+    model.observation(lambda x, a: {"y": law(a), "z": ssm.Normal(x, sd=1)})
+    return model
+
+
+ARGUMENTS = {  # law of y, SciPy's of the same, y: at these a negative a had a finite density
+    "Poisson": (lambda a: ssm.Poisson(a), st.poisson.logpmf, [0.0, 0.0]),
+    "Gamma": (lambda a: ssm.Gamma(a, rate=1), st.gamma.logpdf, [0.05, 0.3]),
+}
+
+
+@pytest.mark.parametrize("method", [ssm.PGAS(10), ssm.PMMH(50)], ids=["PGAS", "PMMH"])
+@pytest.mark.parametrize("name", some(ARGUMENTS, 1))
+def test_a_prior_beyond_the_range_of_an_argument(name, method):
+    law, log_density, y = ARGUMENTS[name]
+    a = np.linspace(0, 8, 400_001)[1:]
+    p = st.norm.logpdf(a, 0.3, 1) + sum(log_density(v, a) for v in y)
+    p = np.exp(p - p.max()) / np.exp(p - p.max()).sum()
+    mean = p @ a
+    data = {"y": np.array(y), "z": np.array([0.1, -0.2])}
+    label = f"argument of {name} {type(method).__name__}"
+    posterior, _ = draw(label, of_an_argument(law), data, method, 2000)
+    assert posterior["a"].values.min() > 0
+    assert_within(deviations(posterior["a"].values, mean, np.sqrt(p @ (a - mean) ** 2)))
