@@ -90,6 +90,8 @@ def predict(
         if conditional is not False:
             paths = states_of(traced, posterior, labels.mark(i), labels.axis(i))
             _check_paths(paths, e, conditional)
+            if paths is not None and i == 0:
+                _check_count(posterior, len(experiments))
         flat = all_draws(theta)
         if paths is not None:
             drawn = _observed(program, e, flat, all_draws(paths), root, i)
@@ -115,6 +117,16 @@ def _check_paths(paths: np.ndarray | None, e: Experiment, conditional: bool | No
             f"the trajectories of the posterior have {paths.shape[2]} rows, the data {e.steps}",
             fix="give the data that were sampled, conditional=False for other data, or "
             "ssm.forecast for the rows after them",
+        )
+
+
+def _check_count(posterior: Any, given: int) -> None:
+    """Trajectories belong to data sets by their place in the list, so that all have to be there."""
+    sampled = sum(str(d).rpartition("_")[0] == "time" or d == "time" for d in posterior.dims)
+    if sampled != given:
+        raise ArgumentError(
+            f"the posterior holds trajectories of {sampled} data sets, the data are {given}",
+            fix="give all the data sets that were sampled, in their order, or conditional=False",
         )
 
 

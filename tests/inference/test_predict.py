@@ -115,6 +115,11 @@ def test_what_cannot_be_predicted_is_said():
         ssm.predict(model(), posterior(), {"y": np.zeros(3), "u": U[:3]})
     with pytest.raises(ArgumentError, match="conditional=True"):
         ssm.predict(model(), posterior(states=False), data, conditional=True)
+    three = [data, data, data]
+    whole = ssm.sample(model(), three, draws=5, warmup=2, chains=1, seed=1, progress=False)
+    with pytest.raises(ArgumentError, match="trajectories of 3 data sets, the data are 2"):
+        ssm.predict(model(), whole, three[:2])
+    ssm.predict(model(), whole, three[:2], conditional=False)
     with pytest.raises(ModelError, match="Flat"):
         ssm.predict(model(ssm.Flat()), None, data)
     blind = ssm.Model("blind")

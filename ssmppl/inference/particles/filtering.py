@@ -29,6 +29,8 @@ SCHEMES = {
     "multinomial": MULTINOMIAL,
 }
 
+MOST = 2**32  # of particles, draws and whatever else is counted: 32 GiB of each of its numbers
+
 
 @dataclass(frozen=True)
 class FilterSettings:
@@ -104,16 +106,20 @@ def check_count(name: str, value: Any, least: int) -> None:
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not whole or value < least:
         raise ArgumentError(f"{name}={value!r}", fix=f"give a whole number of at least {least}")
+    if value > MOST:
+        raise ArgumentError(
+            f"{name}={value!r} is more than memory holds", fix=f"give at most {MOST}, or far fewer"
+        )
 
 
 def seed_sequence(seed: Any) -> np.random.SeedSequence:
     """The root of a call's random numbers."""
-    try:
-        return np.random.SeedSequence(seed)
-    except (TypeError, ValueError):
+    whole = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
+    if seed is not None and (not whole or seed < 0):
         raise ArgumentError(
             f"seed={seed!r}", fix="give a whole number of at least 0, or None for a random one"
-        ) from None
+        )
+    return np.random.SeedSequence(seed)
 
 
 def random_state(root: np.random.SeedSequence, *path: int) -> np.ndarray:
