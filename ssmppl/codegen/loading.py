@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from numba import config
+from numba.core import event
 
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels import backward, backward_pairs, guide, steering
@@ -22,6 +23,9 @@ from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.entries import entry
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import ModuleText
+from ssmppl.codegen.waiting import notice
+
+event.register("numba:compile", notice)
 
 # Specialised functions that kernels call, some of them in place of a model's own.
 HELPERS: dict[str, Any] = {

@@ -37,6 +37,7 @@ from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.workshop import Workshop, proposal_of
 from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
 from ssmppl.inference.problem import pose
+from ssmppl.inference.progress import announced
 from ssmppl.language.model import Model
 
 SETS = {"fast": 100, "full": 200}  # simulated data sets
@@ -252,7 +253,8 @@ class _Diagnosis:
         def numbers() -> Numbers:
             return base.fit(experiments, self._seed(seed), start, searched=searched).numbers
 
-        fit = base.restored(experiments, self.kept.of(stage, numbers))
+        with announced("diagnose", stage, shown=self.kept.progress):
+            fit = base.restored(experiments, self.kept.of(stage, numbers))
         if not fit.converged:
             self.notes.append(
                 f"the fit of the model did not settle ({stage}): about {fit.distance:.1f} nats may "

@@ -12,6 +12,8 @@ from types import TracebackType
 
 from tqdm import tqdm
 
+from ssmppl.codegen.waiting import notice
+
 __all__ = ["Progress", "announced"]
 
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}{postfix}]"
@@ -40,6 +42,7 @@ class Progress:
         self.title = title
         self.done = self.before = before
         self._started = self._last_line = time.monotonic()
+        self._first: tuple[float, int] | None = None  # when, and how many: code was compiled before
         self._next_share = before / max(total, 1) + SPARSE_SHARE
         self._lines = shown and not sys.stderr.isatty()
         self._bar = None
@@ -73,6 +76,7 @@ class Progress:
             self._bar.set_postfix_str(note, refresh=False)
             self._bar.update(steps)
         elif self._lines:
+            self._first = self._first or (time.monotonic(), self.done)
             self._print_sparsely(note)
 
     def _print_sparsely(self, note: str) -> None:
@@ -82,7 +86,10 @@ class Progress:
         if not finished and (early or now - self._last_line < SPARSE_SECONDS):
             return
         elapsed = now - self._started
-        left = elapsed * (self.total - self.done) / (self.done - self.before)
+        since, had = self._first or (self._started, self.before)
+        if self.done == had:
+            since, had = self._started, self.before
+        left = (now - since) * (self.total - self.done) / (self.done - had)
         clock = f"{_clock(elapsed)}<{_clock(left)}" if not finished else _clock(elapsed)
         parts = [f"{100 * self.done // self.total}%", f"{self.done}/{self.total}", f"[{clock}]"]
         print(f"{self.title}:", *parts, note, file=sys.stderr, flush=True)
@@ -103,6 +110,7 @@ def announced(title: str, what: str, shown: bool = True) -> Iterator[None]:
     timer = threading.Timer(SILENT_SECONDS, tell)
     timer.daemon = True
     if shown:
+        notice.told = True  # by this
         timer.start()
     try:
         yield

@@ -165,6 +165,17 @@ def test_the_bar_has_colours_unless_none_are_wanted(monkeypatch, capsys, variabl
     assert "\x1b[36m" not in text
 
 
+def test_the_time_left_is_that_of_draws_without_what_was_compiled_before_the_first(
+    monkeypatch, capsys
+):
+    clock = iter([0.0, 60.0, 60.0, 70.0])  # begun; the first quarter, after a minute; the second
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
+    with Progress(4, "drawing") as progress:
+        progress.advance(1)
+        progress.advance(1)
+    assert "50% 2/4 [01:10<00:20]" in capsys.readouterr().err
+
+
 class Late:
     """A timer whose time has come when it is started."""
 
