@@ -4,7 +4,7 @@ Whatever the user gives (a mapping, a DataFrame, a Dataset, or a list of them) b
 arrays over the trace's symbols, or an error that names data set, variable, row and column.
 """
 
-from ssmppl.data.binding import Experiment, bind, bind_inputs
+from ssmppl.data.binding import Experiment, bind, bind_inputs, unread
 from ssmppl.data.parameters import (
     check_parameters,
     check_values,
@@ -24,4 +24,5 @@ __all__ = [
     "unpack_observations",
     "unpack_parameters",
     "unpack_states",
+    "unread",
 ]

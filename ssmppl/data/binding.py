@@ -70,6 +70,15 @@ def bind(
     return [_bind(trace, s, need_observations, steps) for s in sources(data, named)]
 
 
+def unread(trace: Trace, data: Any) -> list[str]:
+    """The columns that neither are named as an observation or input of the model nor begin with
+    such a name and `[` or `_`, as the components of vectors do."""
+    named = [*trace.observations, *trace.inputs]
+    columns = dict.fromkeys(str(c) for s in sources(data, named) for c in s.columns)
+    parts = tuple(f"{n}{mark}" for n in named for mark in "[_")
+    return [c for c in columns if c not in (*named, "time") and not c.startswith(parts)]
+
+
 def bind_inputs(
     trace: Trace, inputs: Any, steps: int | None
 ) -> tuple[np.ndarray, int, np.ndarray | None]:

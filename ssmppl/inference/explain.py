@@ -19,7 +19,7 @@ from ssmppl.analysis.noises import Noises, noises
 from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
 from ssmppl.analysis.tempered import tempered
 from ssmppl.codegen.program import Program, compile_trace
-from ssmppl.data import Experiment, bind
+from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.interweaving import applicable, with_states
@@ -37,6 +37,7 @@ from ssmppl.language.transforms import transforms
 
 PAGE = 100  # columns
 LONGEST_LAW = 600  # characters of a law, some six lines
+MOST_NAMED = 8  # columns that are not read
 TEMPERED = (
     "for rows that tell far more than the transition: particles are weighed by rising powers of "
     "the observation's density, and take Metropolis steps between them"
@@ -269,7 +270,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
-        labels = _labels(experiments)
+        labels = _labels(experiments) + _unread(unread(traced, data), experiments)
     program = compile_trace(traced, missing)
     return Plan(
         traced,
@@ -295,6 +296,18 @@ def _labels(experiments: Sequence[Experiment]) -> tuple[tuple[str, str], ...]:
     ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
     uneven = next((found for t in times if (found := spacing(t))), "")
     return (("labels", ends), *([("steps", uneven)] if uneven else []))
+
+
+def _unread(
+    columns: Sequence[str], experiments: Sequence[Experiment]
+) -> tuple[tuple[str, str], ...]:
+    """Columns that no law reads, one of which may have been meant to name the rows."""
+    if not columns:
+        return ()
+    named = ", ".join(columns[:MOST_NAMED]) + (", ..." if len(columns) > MOST_NAMED else "")
+    if all(e.time is None for e in experiments):
+        named += "; rows have numbers: call a column of times or dates `time` to name them"
+    return (("not read", named),)
 
 
 def compile(model: Model, data: Any = None) -> Program:

@@ -79,6 +79,17 @@ def test_explain_tells_how_rows_are_labelled_and_of_a_week_that_is_not_there(fol
     assert "labels" not in run("explain", "walk.py", path).stdout
 
 
+def test_explain_tells_which_columns_no_law_reads(folder, dated):
+    path = dated("year,y,y_0,depth\n1871,1,0,3\n1872,2,0,4\n")
+    text = " ".join(run("explain", "walk.py", path).stdout.split())
+    assert "not read year, depth; rows have numbers: call a column of times" in text
+    path = dated("time,y,depth\n1871,1,3\n1872,2,4\n")
+    text = " ".join(run("explain", "walk.py", path).stdout.split())
+    assert "not read depth Structure" in text.replace("-", "")
+    path = dated("time,y\n1871,1\n1872,2\n")
+    assert "not read" not in run("explain", "walk.py", path).stdout
+
+
 @pytest.mark.parametrize(
     ("text", "found"),
     [("t;y\n1;2\n", "semicolons"), ("t;y\n1;2,5\n", "semicolons"),
