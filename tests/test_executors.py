@@ -383,7 +383,8 @@ def test_a_killed_process_costs_no_draws(kind):
     else:
         pool = ProcessPoolExecutor(2, get_context(kind))
     with pool:
-        kill = KillAt(12, killer(pool))
+        # late enough that each of three chains has draws, however two busy workers take turns
+        kill = KillAt(60, killer(pool))
         with pytest.warns(UserWarning, match=r"of 100000 draws of each chain are returned: a wor"):
             chains = run_chains(
                 partial(walk, pause=0.001), walks(3), 10**5, 20, executor=pool, block=20,
