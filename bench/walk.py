@@ -15,13 +15,16 @@ the page on performance.
 from __future__ import annotations
 
 import csv
+import fcntl
 import os
 import pty
 import select
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
+import termios
 import time
 from pathlib import Path
 
@@ -112,6 +115,7 @@ def at_terminal(
     RuntimeError : the command failed, or took too long.
     """
     ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 100, 0, 0))
     begun = last = time.monotonic()
     process = subprocess.Popen(
         command, shell=True, cwd=folder, env=environment, stdin=theirs, stdout=theirs,
@@ -151,7 +155,6 @@ def main(kept: Path) -> None:
         }
         environment |= {
             "SSMPPL_CACHE": str(Path(home) / "cache"), "MPLBACKEND": "Agg", "TERM": "xterm",
-            "COLUMNS": "100",
         }  # fmt: skip
         os.mkdir(environment["SSMPPL_CACHE"], 0o700)
         rows = []

@@ -34,7 +34,7 @@ class Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
         with self._lock:
             self._running += 1
-            if self._running > 1 or self.told or not sys.stderr.isatty():
+            if self._running > 1 or self.told or not (sys.stderr and sys.stderr.isatty()):
                 return
             self._since = time.monotonic()
             self._timer = threading.Timer(max(SILENT_SECONDS - self._spent, 0.0), self._tell)

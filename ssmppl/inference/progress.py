@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
+from typing import Any
 
 from tqdm import tqdm
 
@@ -54,7 +55,7 @@ class Progress:
                 bar_format=BAR,
                 colour=_colour(),
                 file=sys.stderr,
-                dynamic_ncols=True,
+                **_shape(),
             )
 
     def __enter__(self) -> Progress:
@@ -116,6 +117,16 @@ def announced(title: str, what: str, shown: bool = True) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+def _shape() -> dict[str, Any]:
+    """As wide as the terminal, also once that is changed; where it does not tell its size, as
+    within some containers and editors, and no bar would fit, 80 columns."""
+    try:
+        known = os.get_terminal_size(sys.stderr.fileno()).columns > 0
+    except (OSError, ValueError, AttributeError):
+        known = False
+    return {"dynamic_ncols": True} if known else {"ncols": 80, "nrows": 24}
 
 
 def _colour() -> str | None:

@@ -1,10 +1,13 @@
 """What a shell and a terminal see: completion, colours, warnings, exit codes."""
 
 import dataclasses
+import fcntl
 import os
 import pty
+import struct
 import subprocess
 import sys
+import termios
 import warnings
 from pathlib import Path
 
@@ -118,11 +121,12 @@ def test_rows_are_marked_by_how_they_mixed(posterior, monkeypatch):
     assert f"{YELLOW}q " in few
 
 
-def terminal(*args, **environment):
-    """What a process writes to a terminal."""
+def terminal(*args, columns=0, **environment):
+    """What a run of Python with these arguments writes to a terminal."""
     ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", columns // 2, columns, 0, 0))
     process = subprocess.Popen(
-        [sys.executable, "-m", "ssmppl", *args], stdout=theirs, stderr=theirs, stdin=theirs,
+        [sys.executable, *args], stdout=theirs, stderr=theirs, stdin=theirs,
         env=os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm"} | environment,
     )  # fmt: skip
     os.close(theirs)
@@ -141,7 +145,7 @@ def terminal(*args, **environment):
 
 @pytest.mark.parametrize(("environment", "plain"), [({}, False), ({"NO_COLOR": "1"}, True)])
 def test_a_terminal(folder, environment, plain):
-    code, text = terminal("explain", "none.py", **environment)
+    code, text = terminal("-m", "ssmppl", "explain", "none.py", **environment)
     assert code == 1
     assert "there: plane.py, walk.py" in text
     assert ("\x1b[" in text) != plain
@@ -174,6 +178,22 @@ def test_the_time_left_is_that_of_draws_without_what_was_compiled_before_the_fir
         progress.advance(1)
         progress.advance(1)
     assert "50% 2/4 [01:10<00:20]" in capsys.readouterr().err
+
+
+PROGRESS = """
+from ssmppl.inference.progress import Progress
+with Progress(4, "drawing") as progress:
+    progress.advance(2)
+"""
+
+
+@pytest.mark.parametrize(("columns", "width"), [(0, 80), (60, 60), (120, 120)])
+def test_a_bar_is_as_wide_as_the_terminal_and_there_where_that_does_not_tell(columns, width):
+    code, text = terminal("-c", PROGRESS, columns=columns, NO_COLOR="1")
+    assert code == 0
+    bars = [bar for bar in text.replace("\n", "\r").split("\r") if "50%" in bar]
+    assert bars
+    assert abs(len(bars[-1].rstrip()) - width) <= 1
 
 
 class Late:
