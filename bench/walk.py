@@ -1,4 +1,4 @@
-"""The first half hour of somebody new, from a fresh clone: each step timed, as at a terminal.
+"""What somebody new does first, from a fresh clone: each step timed, as at a terminal.
 
 A clone in a temporary folder, with no environment, no cache of compiled models, and settings of its
 own. Model and data of the later steps are new to the package: the Nile's flow, with outliers. Each
