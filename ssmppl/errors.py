@@ -35,6 +35,7 @@ class Location:
     @property
     def text(self) -> str:
         """The source line itself, stripped; empty where the file is not at hand."""
+        linecache.checkcache(self.file)  # it may have been edited and run again
         return linecache.getline(self.file, self.line).strip()
 
     @property

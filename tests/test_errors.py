@@ -992,8 +992,8 @@ BAD_INPUTS = {
     "none given": ("counts", None, 10, ["has inputs, and none were given", "{'u': array}"]),
     "not declared": ("none", {"u": np.ones(3)}, 3, ["declares no inputs", "inputs=('u',)"]),
     "no steps": ("none", None, None, ["neither steps nor inputs", "steps=100"]),
-    "steps of zero": ("none", None, 0, ["steps is 0", "at least 1"]),
-    "steps no whole number": ("none", None, 2.5, ["steps is 2.5", "whole number"]),
+    "steps of zero": ("none", None, 0, ["steps=0", "at least 1"]),
+    "steps no whole number": ("none", None, 2.5, ["steps=2.5", "whole number"]),
     "wrong length": ("counts", {"u": np.ones(9)}, 10, ["'u' has 9 rows, and steps is 10"]),
     "NaN": ("counts", {"u": [1.0, np.nan]}, None, ["'u', row 2", "interpolation"]),
     "several": ("counts", [{"u": [1.0]}, {"u": [1.0]}], None, ["2 data sets", "one experiment"]),
@@ -1105,3 +1105,13 @@ def test_cells_of_a_notebook_have_the_names_that_its_tracebacks_use(monkeypatch)
     assert file.short == "model.py:3"
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: None))
     assert cell.short == "123.py:3"
+
+
+def test_a_file_edited_and_run_again_is_quoted_as_it_is_now(tmp_path):
+    file, quoted = tmp_path / "own.py", []
+    for law in ("Normal(0, 1)", "Gamma(2,   1)"):
+        file.write_text(f"law = ssm.{law}\n")
+        with pytest.raises(ModelError) as caught:
+            exec(compile(file.read_text(), file, "exec"), {"ssm": ssm})
+        quoted.append(caught.value.where.text)
+    assert quoted == ["law = ssm.Normal(0, 1)", "law = ssm.Gamma(2,   1)"]

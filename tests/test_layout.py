@@ -15,12 +15,13 @@ LONGEST = 380
 CHAIN = ["errors", "markup", "expressions", "language", "analysis", "codegen"]
 ALLOWED = {layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)}
 # Arrays in, ArviZ out, and the embedded series stand beside it ...
-ALLOWED["data"] = {"errors", "expressions", "language"}
+ALLOWED["counts"] = {"errors"}
+ALLOWED["data"] = {"counts", "errors", "expressions", "language"}
 ALLOWED["results"] = {"errors"}
 ALLOWED["tables"] = {"errors", "results"}
 ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows.
-ALLOWED["inference"] = {*CHAIN, "data", "results"}
+ALLOWED["inference"] = {*CHAIN, "counts", "data", "results"}
 ALLOWED["gap"] = ALLOWED["inference"] | {"inference"}
 ALLOWED["plots"] = ALLOWED["gap"] | {"gap"}
 # What the command line is made of: the demonstration, written as a user would, and files read.

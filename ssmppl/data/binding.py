@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.counts import check_count
 from ssmppl.data.channels import channel, holds
 from ssmppl.data.parameters import pack
 from ssmppl.data.sources import Source, sources
@@ -63,7 +64,7 @@ def bind(
     DataError : the data do not fit the model; names data set, variable, row and column.
     """
     if steps is not None:
-        _check_steps(steps)
+        check_count("steps", steps, 1)
     if data is None and not need_observations:
         data = {}
     named = [*trace.observations, *trace.inputs]
@@ -88,7 +89,7 @@ def bind_inputs(
     whose number of rows is `steps` unless both are given, and then they must agree.
     """
     if steps is not None:
-        _check_steps(steps)
+        check_count("steps", steps, 1)
     if inputs is None:
         if trace.inputs:
             names = ", ".join(f"{n!r}: array" for n in trace.inputs)
@@ -118,12 +119,6 @@ def bind_inputs(
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
     return _input_array(trace, values, rows), rows, source.time
-
-
-def _check_steps(steps: Any) -> None:
-    whole = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool)
-    if not whole or steps < 1:
-        raise ArgumentError(f"steps is {steps!r}", fix="give a whole number of at least 1")
 
 
 def _bind(trace: Trace, source: Source, need: bool, steps: int | None) -> Experiment:

@@ -13,7 +13,6 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distribution import isinstance_bound_closed
 from ssmppl.language.distributions import Beta, Distribution, Truncated
 
 Values = Mapping[Expr, np.ndarray]
@@ -166,7 +165,7 @@ def outside(distribution: Distribution, values: np.ndarray, env: Values) -> Faul
         return None
     lower = _bound(support.lower, env, len(values), -math.inf)
     upper = _bound(support.upper, env, len(values), math.inf)
-    closed = support.kind == "integers" or isinstance_bound_closed(distribution)
+    closed = support.kind == "integers" or distribution.closed
     with np.errstate(invalid="ignore"):
         bad = (values < lower) | (values > upper)
         if not closed:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.counts import check_count
 from ssmppl.data import Experiment, check_values
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.gap.answer import Results, answer
@@ -35,7 +36,7 @@ from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.share import HowFar, how_far
 from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.workshop import Workshop, proposal_of
-from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import pose
 from ssmppl.inference.progress import announced
 from ssmppl.language.model import Model

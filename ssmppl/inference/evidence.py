@@ -19,6 +19,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from ssmppl.analysis.density import terms
+from ssmppl.counts import check_count
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.evaluate import evaluate
@@ -30,7 +31,6 @@ from ssmppl.inference.exact.models import exact_log_likelihood, exact_model, fil
 from ssmppl.inference.methods import PMMH, SMC2, MetropolisHastings
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
-    check_count,
     log_likelihood_estimate,
     log_of_mean,
     random_state,

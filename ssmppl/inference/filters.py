@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.models import EXACT
@@ -17,7 +18,6 @@ from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterRun,
     FilterSettings,
-    check_count,
     full_run,
     random_state,
     seed_sequence,
@@ -102,6 +102,12 @@ def particle_filter(
     check_count("repeats", repeats, 1)
     if proposal == "auto":
         proposal = choose(problem, theta, exact=False, integrate=not history).name
+    if history:
+        rows, d = problem.rows, len(problem.trace.state_symbols)
+        check_room(
+            f"history=True of {rows} rows with particles={particles}, repeats={repeats}",
+            rows * particles * repeats * (d + 2), "give fewer particles, or history=False",
+        )  # fmt: skip
     if history and is_marginal(proposal):
         raise ArgumentError(
             f'history=True with proposal="{proposal}", whose particles are of some states only',

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.counts import check_room
 from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
@@ -76,6 +77,10 @@ def forecast(
         )
     theta, paths = all_draws(theta), all_draws(paths)
     rows = paths.shape[1]
+    d, k = paths.shape[2], len(traced.observation_symbols)
+    check_room(
+        f"{len(paths)} draws of {steps} rows", len(paths) * steps * (d + k), "ask for fewer rows"
+    )
     given = _past(idata, "constant_data", traced.inputs, mark, rows)
     columns = [given[n].reshape(rows, -1) for n in traced.inputs]
     u = np.concatenate([np.concatenate([np.zeros((rows, 0)), *columns], axis=1), future])

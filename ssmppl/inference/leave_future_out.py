@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
+from ssmppl.counts import check_count
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.models import exact_model
 from ssmppl.inference.methods import Method
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
-    check_count,
     failure,
     random_state,
     seed_sequence,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.codegen.kernels.resampling import SYSTEMATIC
+from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact.hidden_markov import hidden_markov
@@ -17,7 +18,6 @@ from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.exact.models import EXACT, exact_log_likelihood, exact_model, filter_of
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
-    check_count,
     estimates_task,
     filter_settings,
     seed_sequence,
@@ -131,6 +131,8 @@ def settle(
     whole, integrate : as in `choose`.
     """
     settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
+    each = 2 * len(problem.trace.state_symbols) + 2  # of this row and the last; weight and ancestor
+    check_room(f"particles={particles}", each * settings.particles, "give fewer particles")
     if device != "cpu":
         return _on_device(problem, theta, settings, resampling, device)
     if proposal == "auto":

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.counts import check_count, check_room
 from ssmppl.data import (
     Experiment,
     bind,
@@ -18,7 +19,7 @@ from ssmppl.data import (
 )
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.inference.labels import Labels, observes
-from ssmppl.inference.particles.filtering import check_count, random_state, seed_sequence
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.posterior_draws import all_draws, parameters_of, posterior_of, states_of
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.simulation import check_drawable, check_finite, feeds_back
@@ -183,6 +184,7 @@ def _each(
     program: Program, e: Experiment, n: int, one: Callable[[int, np.ndarray, np.ndarray], None]
 ) -> Drawn:
     d, k = len(program.trace.state_symbols), len(program.trace.observation_symbols)
+    check_room(f"{n} draws of {e.steps} rows", n * e.steps * (d + k), "ask for fewer of them")
     states, observations = np.empty((n, e.steps, d)), np.empty((n, e.steps, k))
     for r in range(n):
         x, y = np.empty((e.steps, d, 1)), np.empty((e.steps, k, 1))

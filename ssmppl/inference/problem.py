@@ -27,6 +27,11 @@ class Problem:
     experiments: tuple[Experiment, ...]
     program: Program
 
+    @property
+    def rows(self) -> int:
+        """Of all data sets together."""
+        return sum(e.steps for e in self.experiments)
+
     def proposal(self, name: str, integrate: bool = False) -> Proposal:
         """A derived proposal.
 

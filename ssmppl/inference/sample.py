@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
 from ssmppl.inference.chains import (
@@ -35,7 +36,7 @@ from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.particles import pilot, proposal_choice
-from ssmppl.inference.particles.filtering import check_count, seed_sequence
+from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.progress import announced
@@ -154,6 +155,15 @@ def sample(
     if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
         states, warmup, thin = False, 0, 1
         chosen = smc2.settled(chosen, draws)
+    if states and checkpoint is None:  # twice: of each chain, and put together
+        numbers = problem.rows * len(problem.trace.state_symbols)
+        check_room(
+            f"{chains} chains of {draws} draws of the states of {problem.rows} rows, twice while "
+            "they are put together",
+            2 * chains * draws * numbers,
+            "states=False leaves them out, thin= with fewer draws keeps fewer, checkpoint= keeps "
+            "them on disk",
+        )
     root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl.counts import check_count
 from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.estimate import by_name, free_components, table
@@ -16,7 +17,7 @@ from ssmppl.inference.exact.exact_score import ExactScore, exact_score
 from ssmppl.inference.exact.models import EXACT, exact_model
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.filtering import check_count, seed_sequence
+from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.particles.particle_score import (
     ParticleScore,
     Smoothing,

@@ -10,6 +10,7 @@ import numpy as np
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.program import compile_trace
+from ssmppl.counts import check_count, check_room
 from ssmppl.data import (
     bind_inputs,
     check_parameters,
@@ -19,11 +20,7 @@ from ssmppl.data import (
 )
 from ssmppl.errors import ModelError, SamplingError
 from ssmppl.expressions.expr import topological
-from ssmppl.inference.particles.filtering import (
-    check_count,
-    random_state,
-    seed_sequence,
-)
+from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.ranges import out_of_range
 from ssmppl.language.model import Model
@@ -68,6 +65,8 @@ def simulate(
     check_drawable(traced)
     u, steps, time = bind_inputs(traced, inputs, steps)
     check_count("draws", draws, 1)
+    d, k = len(traced.state_symbols), len(traced.observation_symbols)
+    check_room(f"{draws} draws of {steps} rows", draws * steps * (d + k), "give fewer of them")
     root = seed_sequence(seed)
     program = compile_trace(traced, Missing(none=True))
     rng = random_state(root)
@@ -77,7 +76,6 @@ def simulate(
         theta = draw_prior(traced, np.random.default_rng(root), draws)
     else:
         theta = np.empty((1, 0))
-    d, k = len(traced.state_symbols), len(traced.observation_symbols)
     states, observations = np.empty((draws, steps, d)), np.empty((draws, steps, k))
     feedback = feeds_back(traced)
     side_by_side = draws if len(theta) == 1 and not feedback else 1

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import ndtri
 
+from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, listing, written_as
 from ssmppl.inference.chains import pgas
@@ -24,12 +25,7 @@ from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.degeneracy import collapse, distinct
-from ssmppl.inference.particles.filtering import (
-    FilterSettings,
-    check_count,
-    random_state,
-    seed_sequence,
-)
+from ssmppl.inference.particles.filtering import FilterSettings, random_state, seed_sequence
 from ssmppl.inference.particles.fixed_lag import LAG, lag_moments
 from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.marginal_backward import marginal_paths, may_integrate
@@ -223,6 +219,7 @@ def _exact(
     out = []
     for i, e in enumerate(call.problem.experiments):
         if call.trajectories is not None:
+            _check_draws(call, call.trajectories)
             stream = random_state(call.root, i)
             paths = model.draw(e, call.theta, stream, call.trajectories)
             exact = model.log_likelihood([e], call.theta)
@@ -251,16 +248,29 @@ def _filter(call: _Call, method: FFBSi | FixedLag, integrate: bool = False) -> F
     if proposal == "auto":
         proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name
     n = PARTICLES if call.particles is None else call.particles
-    return settle(
+    settings = settle(
         call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
         method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
     )  # fmt: skip
+    longest = max(e.steps for e in call.problem.experiments)
+    each = len(call.problem.trace.state_symbols) + 2  # with weight and ancestor
+    check_room(
+        f"{n} particles of each of {longest} rows", longest * n * each, "give fewer particles"
+    )
+    return settings
+
+
+def _check_draws(call: _Call, draws: int) -> None:
+    rows = call.problem.rows
+    numbers = draws * rows * len(call.problem.trace.state_symbols)
+    check_room(f"{draws} trajectories of {rows} rows", numbers, "give fewer trajectories")
 
 
 def _ffbsi(call: _Call, method: FFBSi) -> list[_Found]:
     settings = _filter(call, method, integrate=may_integrate(call.problem, method))
     check_count("moves", method.moves, 0)
     draws = TRAJECTORIES if call.trajectories is None else call.trajectories
+    _check_draws(call, draws)
     marginal = is_marginal(settings.proposal)
     kernel, why = "exact", "states that are linear given the others are integrated out"
     if not marginal:

@@ -14,14 +14,8 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.language.distribution import (
-    INFINITY,
-    Distribution,
-    Draws,
-    Support,
-    log_difference,
-    one_of,
-)
+from ssmppl.language.constructing import one_of
+from ssmppl.language.distribution import INFINITY, Distribution, Draws, Support, log_difference
 
 LOG_2PI = math.log(2.0 * math.pi)
 _NAN = math.nan

@@ -6,19 +6,17 @@ generated code. A sampler is an expression over the "random" nodes of `draws.py`
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import Location, ModelError, UnsupportedOperation, nearest_first
+from ssmppl.errors import Location, ModelError, UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, constant, user_location
 from ssmppl.expressions.signs import never_negative
+from ssmppl.language.constructing import checking_arguments
 from ssmppl.language.draws import Draws
 
 INFINITY = math.inf
@@ -51,6 +49,7 @@ class Distribution:
     joint = False
     discrete = False
     proper = True
+    closed = False  # whether the lower bound itself belongs to the support
     by_name = "spread"  # what the keyword-only arguments are called in messages
     parameters: dict[str, ExprArray]
     ranges: dict[str, tuple[float, float, bool]]  # by parameter: low, high, without the ends
@@ -59,7 +58,7 @@ class Distribution:
 
     def __init_subclass__(cls) -> None:
         if "__init__" in cls.__dict__:
-            cls.__init__ = _checking_arguments(cls.__init__)  # type: ignore[method-assign]
+            cls.__init__ = checking_arguments(cls.__init__)  # type: ignore[method-assign]
 
     def _set(self, **parameters: Any) -> None:
         """Convert, broadcast (elementwise distributions) and remember the parameters.
@@ -285,7 +284,7 @@ class Distribution:
         for i in np.ndindex(density.shape):
             inside = constant(1.0)
             if not (lower[i].op == "const" and lower[i].data == -INFINITY):
-                closed = self.discrete or isinstance_bound_closed(self)
+                closed = self.discrete or self.closed
                 inside = apply("le" if closed else "lt", lower[i], v[i])
             if not (upper[i].op == "const" and upper[i].data == INFINITY):
                 below = apply("le", v[i], upper[i])
@@ -320,57 +319,3 @@ def _never_above(a: Expr, b: Expr) -> bool:
 def _plain_name(name: str) -> str:
     """A parameter as the user knows it."""
     return name.removeprefix("like_").rstrip("_")
-
-
-def _checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
-    """`init`, with a ModelError in place of Python's TypeError where the arguments do not fit."""
-    signature = inspect.signature(init)
-    by_name = [p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY]
-    positional = [
-        p.name for p in signature.parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD
-    ][1:]
-
-    @functools.wraps(init)
-    def checked(self: Distribution, *args: Any, **kwargs: Any) -> None:
-        try:
-            signature.bind(self, *args, **kwargs)
-        except TypeError as error:
-            name = type(self).__name__
-            given = f"{len(args)} without a name"
-            given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
-            found = f"{name}: {error}; given were {given}"
-            known = [f"{k}=" for k in by_name]
-            *most, last = known or [""]
-            options = f"{', '.join(most)} or {last}" if most else last
-            unknown = [k for k in kwargs if k not in (*positional, *by_name)]
-            if unknown:
-                nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
-                fix = f"the arguments of {name} are {nearest}"
-            elif by_name and len(args) > len(positional):
-                found = f"{name} takes its {self.by_name} by name: {options}"
-                fix = f"write {name}({', '.join([*positional, f'{by_name[0]}=...'])})"
-            else:
-                fix = f"write {name}({', '.join([*positional, *known])})"
-            raise ModelError(found, fix=fix, where=user_location()) from None
-        init(self, *args, **kwargs)
-
-    return checked
-
-
-def isinstance_bound_closed(distribution: Distribution) -> bool:
-    """Whether the lower bound itself belongs to the support."""
-    return getattr(type(distribution), "closed", False)
-
-
-def one_of(name: str, options: dict[str, Any], where: Location | None = None) -> tuple[str, Any]:
-    """The one spread that was given; an error naming the options where there is none or several."""
-    given = {k: v for k, v in options.items() if v is not None}
-    if len(given) != 1:
-        wanted = ", ".join(f"{k}=" for k in options)
-        found = ", ".join(f"{k}=" for k in given) or "none of them"
-        raise ModelError(
-            f"{name} takes exactly one of {wanted}; found {found}",
-            fix=f"name the spread, for example {name}(..., {next(iter(options))}=1.0)",
-            where=where or user_location(),
-        )
-    return next(iter(given.items()))

@@ -254,6 +254,7 @@ def location_of(function: Callable[..., Any]) -> Location:
     """Where a function is defined: the line of its `def`, below its decorators."""
     code = plain_function(function).__code__
     line = code.co_firstlineno
+    linecache.checkcache(code.co_filename)  # it may have been edited and run again
     for candidate in range(line, line + 20):
         text = linecache.getline(code.co_filename, candidate).lstrip()
         if text.startswith(("def ", "async def ")) or "lambda" in text:

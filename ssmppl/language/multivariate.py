@@ -18,8 +18,9 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.expr import as_expr, constant
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
+from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import LOG_2PI
-from ssmppl.language.distribution import Distribution, Support, one_of
+from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.draws import Draws
 from ssmppl.language.positive import log_gamma, log_gamma_draw, needs_log_gamma
 

@@ -13,14 +13,9 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, apply
 from ssmppl.expressions.signs import never_negative
+from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import _NAN, _each, _where
-from ssmppl.language.distribution import (
-    INFINITY,
-    Distribution,
-    Draws,
-    Support,
-    one_of,
-)
+from ssmppl.language.distribution import INFINITY, Distribution, Draws, Support
 from ssmppl.language.symmetric import cut_exponential
 
 SMALL_SHAPE = 0.1  # below it, gamma draws may be too small for floating point

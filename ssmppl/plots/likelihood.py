@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.counts import check_count
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.estimate import Estimate
@@ -16,7 +17,6 @@ from ssmppl.inference.exact.models import EXACT, exact_log_likelihood
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
-    check_count,
     log_of_mean,
     repeated_estimates,
     seed_sequence,

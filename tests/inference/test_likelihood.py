@@ -345,10 +345,3 @@ def test_a_filter_names_the_argument_that_may_be_out_of_range_and_a_fix(name):
 def test_a_seed_is_one_whole_number(seed):
     with pytest.raises(ssm.ArgumentError, match="seed="):
         ssm.log_likelihood(varves, DATA, AT, seed=seed)
-
-
-def test_counts_beyond_memory_are_refused_before_anything_is_drawn():
-    with pytest.raises(ssm.ArgumentError, match="particles=1000000000000 is more than memory"):
-        ssm.log_likelihood(varves, DATA, AT, particles=10**12)
-    with pytest.raises(ssm.ArgumentError, match="draws=1000000000000 is more than memory"):
-        ssm.sample(varves, DATA, ssm.PGAS(), draws=10**12)

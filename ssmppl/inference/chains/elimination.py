@@ -169,7 +169,7 @@ class Eliminating(ParameterSteps):
         return [self.rows(e, theta, path).total for e, path in pairs]
 
     def _mean_increment(self, totals: list[np.ndarray]) -> np.ndarray:
-        return np.sum(totals, axis=0) / sum(e.steps for e in self.problem.experiments)
+        return np.sum(totals, axis=0) / self.problem.rows
 
     def prior(self, theta: np.ndarray) -> np.ndarray:
         """The prior's part of the statistics, given the other parameters."""

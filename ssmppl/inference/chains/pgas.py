@@ -14,6 +14,7 @@ import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.counts import check_count
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.chains.elimination import Eliminating, Learned, describe
 from ssmppl.inference.chains.elimination import asked as asked_to_eliminate
@@ -26,7 +27,7 @@ from ssmppl.inference.chains.parameter_steps import (
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.methods import PGAS
-from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure
+from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import Block

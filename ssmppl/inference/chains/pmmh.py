@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.chains.coordinates import Coordinates, coordinates
 from ssmppl.inference.chains.curvature import fitted_covariance
@@ -34,12 +35,7 @@ from ssmppl.inference.chains.walk import (
     start_chain,
 )
 from ssmppl.inference.methods import PMMH, MetropolisHastings
-from ssmppl.inference.particles.filtering import (
-    FilterSettings,
-    check_count,
-    check_rescue,
-    random_state,
-)
+from ssmppl.inference.particles.filtering import FilterSettings, check_rescue, random_state
 from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.pilot import (
     SCALE_REPEATS,

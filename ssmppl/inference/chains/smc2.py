@@ -27,13 +27,14 @@ from ssmppl.analysis.density import terms
 from ssmppl.codegen.kernels.resampling import PADDING, systematic
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
 from ssmppl.codegen.rowwise import compile_filter_rows
+from ssmppl.counts import check_count
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.methods import SMC2
-from ssmppl.inference.particles.filtering import check_count, failure, log_of_mean
+from ssmppl.inference.particles.filtering import failure, log_of_mean
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.prior import draw_prior
@@ -303,7 +304,7 @@ def run_smc2(setup: Setup, method: SMC2, executor: Any, progress: bool) -> Runs:
     )  # improper: refused now
     filters = Filters(setup.space, method, _proposal(setup, method))
     states = [begin(filters, setup, r) for r in range(setup.chains)]
-    rows = sum(e.steps for e in setup.problem.experiments)
+    rows = setup.problem.rows
     chains: Sequence[ChainDraws[State]] = run_chains(
         partial(rows_block, filters), states, rows, executor=executor, progress=progress,
         title="SMC2", describe=_describe, keep=setup.memory,

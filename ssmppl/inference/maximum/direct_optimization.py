@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from ssmppl.analysis.smooth import smooth_filter_applies
+from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.exact_score import exact_score
@@ -20,7 +21,6 @@ from ssmppl.inference.exact.models import ExactModel, filter_name
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
-from ssmppl.inference.particles.filtering import check_count
 from ssmppl.inference.progress import announced
 
 NEWTON_STEPS = 8

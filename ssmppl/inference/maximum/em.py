@@ -27,6 +27,7 @@ from ssmppl.analysis.expectation import (
     moments_of,
 )
 from ssmppl.analysis.mstep import MStep
+from ssmppl.counts import check_count
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
@@ -39,7 +40,6 @@ from ssmppl.inference.maximum.baum_welch import FiniteSteps
 from ssmppl.inference.maximum.expected_climb import climbed
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods import EM
-from ssmppl.inference.particles.filtering import check_count
 from ssmppl.language.trace import Trace, previous, seen
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.perturbed import Perturbed
+from ssmppl.counts import check_count
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, listing
 from ssmppl.inference.maximum.ascent import Ascent, Setup
@@ -36,7 +37,7 @@ from ssmppl.inference.maximum.m_step import starts
 from ssmppl.inference.maximum.summit import Summit, fitted_curvature, summit
 from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swarm_block
 from ssmppl.inference.methods import IF2
-from ssmppl.inference.particles.filtering import check_count, random_state
+from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.runner import run_chains, stack
 

@@ -27,13 +27,14 @@ from functools import partial
 
 import numpy as np
 
+from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import ParticleEM
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.filtering import FilterSettings, check_count, random_state
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.runner import Block
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
     PARTICLES,
@@ -36,7 +37,7 @@ from ssmppl.inference.chains.pgas import (
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import PSAEM
-from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure, random_state
+from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state
 from ssmppl.inference.runner import Block
 
 

@@ -23,13 +23,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy
 
+from ssmppl.counts import check_count
 from ssmppl.data import spelled
 from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import ScoreAscent
 from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.filtering import check_count
 from ssmppl.inference.particles.particle_score import (
     Run,
     Smoothing,

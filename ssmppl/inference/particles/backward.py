@@ -24,10 +24,11 @@ from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.counts import check_count
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference.particles.filtering import FilterSettings, check_count, failure, run_filter
+from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.problem import Problem
 
 __all__ = [

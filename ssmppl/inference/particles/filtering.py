@@ -14,6 +14,7 @@ import numpy as np
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
+from ssmppl.counts import check_count
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
@@ -28,8 +29,6 @@ SCHEMES = {
     "residual": RESIDUAL,
     "multinomial": MULTINOMIAL,
 }
-
-MOST = 2**32  # of particles, draws and whatever else is counted: 32 GiB of each of its numbers
 
 
 @dataclass(frozen=True)
@@ -98,17 +97,6 @@ def check_rescue(rescue: Any) -> None:
         raise ArgumentError(
             "rescue=1 allows a row the N particles that it has anyway",
             fix="give how many times N particles a row may take, as rescue=100; 0: no rescue",
-        )
-
-
-def check_count(name: str, value: Any, least: int) -> None:
-    """Refuse what is no whole number of at least `least`."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or value < least:
-        raise ArgumentError(f"{name}={value!r}", fix=f"give a whole number of at least {least}")
-    if value > MOST:
-        raise ArgumentError(
-            f"{name}={value!r} is more than memory holds", fix=f"give at most {MOST}, or far fewer"
         )
 
 

@@ -1,0 +1,45 @@
+"""What a call counts: whole numbers, and whether the machine's memory holds that many."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import ArgumentError
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    """Refuse what is no whole number of at least `least`, or more than memory holds."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < least:
+        raise ArgumentError(f"{name}={value!r}", fix=f"give a whole number of at least {least}")
+    check_room(f"{name}={value}", value, f"give a smaller {name}=")
+
+
+def check_room(what: str, numbers: int, fix: str) -> None:
+    """Refuse what takes more memory than the machine has: it would be ended by the system.
+
+    what : which arguments ask for it, as the user wrote them.
+    numbers : how many floating-point numbers of 8 bytes are held at a time, at least.
+    """
+    wanted, there = 8 * int(numbers), memory()
+    if there is not None and wanted > there:
+        raise ArgumentError(
+            f"{what}: {_gigabytes(wanted)} of numbers, and this machine's memory is "
+            f"{_gigabytes(there)}",
+            fix=fix,
+        )
+
+
+def memory() -> int | None:
+    """Bytes of this machine's memory; None where the system does not tell."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # Windows, and whatever knows no such name
+        return None
+
+
+def _gigabytes(size: int) -> str:
+    return f"{size / 1e9:,.0f} GB" if size >= 1e10 else f"{size / 1e9:.1f} GB"
