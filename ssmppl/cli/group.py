@@ -20,6 +20,7 @@ from typing import IO, Any, TypeVar
 
 import click
 
+from ssmppl.cli.wording import in_words_of
 from ssmppl.errors import SSMError
 
 __all__ = ["AS_JSON", "INTERRUPTED", "Argument", "Commands", "Option", "command", "plain_option"]
@@ -94,7 +95,9 @@ class Commands(click.Group):
             try:
                 return super().invoke(ctx)
             except SSMError as error:
-                raise Fault(_message(error)) from error
+                called = self.commands[str(ctx.invoked_subcommand)]
+                fix = in_words_of(called.params, self.commands, error.fix)
+                raise Fault(_message(error, fix)) from error
             except KeyboardInterrupt:
                 click.echo(
                     "Interrupted before there was anything to keep: nothing written.", err=True
@@ -202,8 +205,9 @@ def _plain() -> bool:
     return bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
 
 
-def _message(error: SSMError) -> str:
-    return "\n".join([f"{type(error).__name__}\n{error}", *getattr(error, "__notes__", ())])
+def _message(error: SSMError, fix: str) -> str:
+    told = str(error).removesuffix(error.fix) + fix
+    return "\n".join([f"{type(error).__name__}\n{told}", *getattr(error, "__notes__", ())])
 
 
 def _show_warning(

@@ -90,7 +90,10 @@ class MethodName(click.Choice):
 
     def __init__(self, kinds: Mapping[str, type]):
         super().__init__(list(kinds), case_sensitive=False)
-        self._full = {_bare(kind.__name__): name for name, kind in kinds.items()}
+        self.short: dict[str, str] = {}  # name of a class: the first of its names here
+        for name, kind in kinds.items():
+            self.short.setdefault(kind.__name__, name)
+        self._full = {_bare(kind): name for kind, name in self.short.items()}
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         return super().convert(self._full.get(_bare(str(value)), value), param, ctx)

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import click
-
 import ssmppl as ssm
 from ssmppl.cli.group import command
 from ssmppl.cli.options import (
@@ -17,6 +15,7 @@ from ssmppl.cli.options import (
     PARTICLE_FILTER,
     QUANTILES,
     SEED,
+    MethodName,
     drawn_seed,
     option,
     output,
@@ -171,7 +170,7 @@ def _experiment(i: int, datasets: list[Any]) -> str:
 @NEEDED_DATA
 @PARAMETERS
 @option(
-    "--method", type=click.Choice([*SMOOTHERS], case_sensitive=False),
+    "--method", type=MethodName({name: type(method) for name, method in SMOOTHERS.items()}),
     help="How to smooth [default: exact where the model allows it, else ffbsi].",
 )  # fmt: skip
 @option("--particles", type=int, help="Number of particles [default: 1000; pgas: 25].")
