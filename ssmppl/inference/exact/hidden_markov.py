@@ -23,9 +23,9 @@ from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant
-from ssmppl.inference.exact.differences import observed_information
 from ssmppl.inference.exact.kalman_matrices import values_of
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
+from ssmppl.inference.exact.scored import Scored
 from ssmppl.language.trace import Trace, previous, seen
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
@@ -46,10 +46,9 @@ class Filtered:
 
 
 @dataclass(frozen=True)
-class HiddenMarkov:
+class HiddenMarkov(Scored):
     """A traced model as one of finitely many values (K, D), and its exact passes."""
 
-    trace: Trace
     form: FiniteStates
     _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
 
@@ -189,26 +188,6 @@ class HiddenMarkov:
                 slopes = [self.density(role, e, s) for s in symbols]
                 gradient[wanted] += self.expected(e, theta, role, slopes, own)
         return total, gradient
-
-    def information(
-        self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
-    ) -> np.ndarray:
-        """The observed information -d^2 log p(y | theta), (P, P), by differences of the score.
-
-        Raises
-        ------
-        SamplingError : theta lies at the edge of where the density exists.
-        """
-        data = list(experiments)
-        wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
-        matrix, _ = observed_information(lambda v: self.score(data, v, wanted)[1], theta, wanted)
-        if not np.isfinite(matrix).all():
-            raise SamplingError(
-                f"the log-likelihood has no second derivative at {spelled(self.trace, theta)}",
-                fix="the parameters lie at the edge of where the model has a density: fix the one "
-                "that is at its bound by fixed={...}",
-            )
-        return matrix
 
     # -- the pieces
     def _forward(self, e: Experiment, theta: np.ndarray) -> Filtered | int:

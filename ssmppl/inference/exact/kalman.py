@@ -18,10 +18,9 @@ from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.kalman import OK
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.codegen.program import Program
-from ssmppl.data import Experiment, spelled
-from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.data import Experiment
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact import kalman_matrices
-from ssmppl.inference.exact.differences import observed_information
 from ssmppl.inference.exact.kalman_diffuse import check_agreement, diffuse_filter, start_of
 from ssmppl.inference.exact.kalman_moments import (
     Disturbances,
@@ -31,6 +30,7 @@ from ssmppl.inference.exact.kalman_moments import (
     smoothed,
 )
 from ssmppl.inference.exact.kalman_score import Slopes, check_free, score, slopes
+from ssmppl.inference.exact.scored import Scored
 from ssmppl.language.trace import Trace
 
 __all__ = [
@@ -69,10 +69,9 @@ class KalmanMoments:
 
 
 @dataclass(frozen=True)
-class KalmanModel:
+class KalmanModel(Scored):
     """A traced model as a linear Gaussian one, and its filter."""
 
-    trace: Trace
     form: LinearGaussian
 
     def matrices(self, experiment: Experiment, theta: np.ndarray) -> Matrices:
@@ -202,30 +201,6 @@ class KalmanModel:
             check_agreement(self.trace, start, log_given)
             total, gradient = total + start.log_density(log_given), gradient + slope
         return total, np.where(wanted, gradient, 0.0)
-
-    def information(
-        self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
-    ) -> np.ndarray:
-        """The observed information -d^2 log p(y | theta), (P, P), by differences of the score.
-
-        Extrapolated to zero step (`differences.py`): errors of about 1e-9 of
-        sqrt(I_ii I_jj). free : as in `score`; rows and columns of the others are zero.
-
-        Raises
-        ------
-        ArgumentError : as of `score`.
-        SamplingError : theta lies at the edge of where the density exists.
-        """
-        data = list(experiments)
-        wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
-        matrix, _ = observed_information(lambda v: self.score(data, v, wanted)[1], theta, wanted)
-        if not np.isfinite(matrix).all():
-            raise SamplingError(
-                f"the log-likelihood has no second derivative at {spelled(self.trace, theta)}",
-                fix="the parameters lie at the edge of where the model has a density: fix the one "
-                "that is at its bound by fixed={...}",
-            )
-        return matrix
 
     def _smooth(
         self, experiment: Experiment, theta: np.ndarray, noises: bool = False
