@@ -4,35 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import ndtri
 
-from ssmppl.counts import check_count, check_room
-from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
+from ssmppl.counts import check_count
+from ssmppl.data import Experiment, check_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, listing, written_as
-from ssmppl.inference.chains import pgas
-from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
-from ssmppl.inference.exact.models import EXACT, exact_model, kind_of
+from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.filters import LEVELS, quantile_levels
 from ssmppl.inference.labels import observes, with_data
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS
-from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
-from ssmppl.inference.particles.degeneracy import collapse, distinct
-from ssmppl.inference.particles.filtering import FilterSettings, random_state, seed_sequence
-from ssmppl.inference.particles.fixed_lag import LAG, lag_moments
-from ssmppl.inference.particles.marginal import is_marginal
-from ssmppl.inference.particles.marginal_backward import marginal_paths, may_integrate
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.particles.proposal_choice import choose
+from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import run_chains
+from ssmppl.inference.smoothers import Call, Found, by_exact_passes, by_ffbsi, by_fixed_lag, by_pgas
 from ssmppl.inference.smoothing_methods import (
     FFBSi,
     FixedLag,
@@ -46,8 +35,6 @@ from ssmppl.results import to_dataset
 if TYPE_CHECKING:
     import xarray as xr
 
-PARTICLES, TRAJECTORIES = 1000, 1000
-PGAS_WARMUP = 100  # sweeps that are dropped
 
 # what a method may be called by
 NAMES: dict[str, SmoothingMethod] = {
@@ -61,7 +48,6 @@ NAMES: dict[str, SmoothingMethod] = {
     "fixed_lag": FixedLag(),
     "pgas": PGAS(),
 }
-COLLAPSED = 'Use more particles, proposal="twisted", or method=ssm.PGAS().'
 
 
 def smooth(
@@ -124,15 +110,15 @@ def smooth(
     for name, value, least in (("particles", particles, 1), ("trajectories", trajectories, 1)):
         if value is not None:
             check_count(name, value, least)
-    call = _Call(problem, theta, particles, trajectories, levels, root)
+    call = Call(problem, theta, particles, trajectories, levels, root)
     if isinstance(chosen, KalmanSmoother | ForwardBackward):
-        found = _exact(call, chosen, method)
+        found = by_exact_passes(call, chosen, method)
     elif isinstance(chosen, FFBSi):
-        found = _ffbsi(call, chosen)
+        found = by_ffbsi(call, chosen)
     elif isinstance(chosen, FixedLag):
-        found = _fixed_lag(call, chosen)
+        found = by_fixed_lag(call, chosen)
     else:
-        found = _pgas(call, chosen)
+        found = by_pgas(call, chosen)
     attrs = {
         "model": problem.trace.name, "method": type(chosen).__name__, "method_chosen": why,
         "settings": asdict(chosen), "seed": str(root.entropy),
@@ -142,32 +128,6 @@ def smooth(
         _dataset(call, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
     ]
     return datasets if len(datasets) > 1 else datasets[0]
-
-
-@dataclass(frozen=True)
-class _Call:
-    """A call of `smooth`, checked; None where the caller left a number to the method."""
-
-    problem: Problem
-    theta: np.ndarray
-    particles: int | None
-    trajectories: int | None
-    levels: np.ndarray
-    root: np.random.SeedSequence
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What a method gives for one experiment: draws (M, T, D), or moments; and its report.
-
-    moments : mean (T, D), covariance (T, D, D), cross (T, D, D), quantiles (T, P, D).
-    over_time : further variables (T,).
-    """
-
-    attrs: dict[str, Any]
-    paths: np.ndarray | None = None
-    moments: tuple[np.ndarray, ...] | None = None
-    over_time: Mapping[str, np.ndarray] | None = None
 
 
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
@@ -204,146 +164,7 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
     return method, "by the user"
 
 
-def _exact(
-    call: _Call, chosen: SmoothingMethod, method: SmoothingMethod | str | None
-) -> list[_Found]:
-    """Exact moments, or exact draws."""
-    if call.particles is not None and method is not None:
-        raise ArgumentError(
-            f"particles={call.particles}: {type(chosen).__name__} is exact and has none",
-            fix="leave particles= out, or use method=ssm.FFBSi()",
-        )
-    trace = call.problem.trace
-    model = kalman_model(trace) if isinstance(chosen, KalmanSmoother) else hidden_markov(trace)
-    assert not isinstance(model, NotApplicable)
-    out = []
-    for i, e in enumerate(call.problem.experiments):
-        if call.trajectories is not None:
-            _check_draws(call, call.trajectories)
-            stream = random_state(call.root, i)
-            paths = model.draw(e, call.theta, stream, call.trajectories)
-            exact = model.log_likelihood([e], call.theta)
-            out.append(_Found({"log_likelihood": exact}, paths=paths))
-            continue
-        m = model.smooth(e, call.theta)
-        if isinstance(model, HiddenMarkov):
-            spread = model.quantiles(model.probabilities(e, call.theta), call.levels)
-        else:
-            sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
-            spread = m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :]
-        moments = m.mean, m.covariance, m.cross, spread
-        out.append(_Found({"log_likelihood": m.log_likelihood}, moments=moments))
-    return out
-
-
-def _filter(call: _Call, method: FFBSi | FixedLag, integrate: bool = False) -> FilterSettings:
-    """The filter's settings, "auto" resolved among the particle proposals."""
-    proposal = method.proposal
-    if proposal in EXACT:
-        exact = "KalmanSmoother" if proposal == "kalman" else "ForwardBackward"
-        raise ArgumentError(
-            f'{type(method).__name__}(proposal="{proposal}") has no particles',
-            fix=f"use ssm.{exact}(), or another proposal",
-        )
-    if proposal == "auto":
-        proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name
-    n = PARTICLES if call.particles is None else call.particles
-    settings = settle(
-        call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
-        method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
-    )  # fmt: skip
-    longest = max(e.steps for e in call.problem.experiments)
-    each = len(call.problem.trace.state_symbols) + 2  # with weight and ancestor
-    check_room(
-        f"{n} particles of each of {longest} rows", longest * n * each, "give fewer particles"
-    )
-    return settings
-
-
-def _check_draws(call: _Call, draws: int) -> None:
-    rows = call.problem.rows
-    numbers = draws * rows * len(call.problem.trace.state_symbols)
-    check_room(f"{draws} trajectories of {rows} rows", numbers, "give fewer trajectories")
-
-
-def _ffbsi(call: _Call, method: FFBSi) -> list[_Found]:
-    settings = _filter(call, method, integrate=may_integrate(call.problem, method))
-    check_count("moves", method.moves, 0)
-    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
-    _check_draws(call, draws)
-    marginal = is_marginal(settings.proposal)
-    kernel, why = "exact", "states that are linear given the others are integrated out"
-    if not marginal:
-        kernel, why = choose_kernel(call.problem, settings, draws, method.kernel)
-    out = []
-    for i, e in enumerate(call.problem.experiments):
-        stream = random_state(call.root, i)
-        system = particle_system(call.problem, call.theta, settings, e, stream)
-        own = call.problem, call.theta, e, system, draws, stream
-        paths = marginal_paths(*own) if marginal else draw_paths(*own, kernel, method.moves)
-        report = {
-            "particles": settings.particles, "proposal": settings.proposal, "kernel": kernel,
-            "kernel_chosen": why, "log_likelihood": system.log_Z,
-        }  # fmt: skip
-        over_time = {"distinct": distinct(paths), "ess": system.ess}
-        if not marginal:
-            report |= collapse(over_time["distinct"], system.particles, draws, e, COLLAPSED)
-        out.append(_Found(report, paths=paths, over_time=over_time))
-    return out
-
-
-def _fixed_lag(call: _Call, method: FixedLag) -> list[_Found]:
-    if call.trajectories is not None:
-        raise ArgumentError(
-            f"trajectories={call.trajectories}: FixedLag knows marginals only, no joint law to "
-            "draw trajectories from",
-            fix="leave trajectories= out, or use ssm.FFBSi()",
-        )
-    settings = _filter(call, method)
-    lag = LAG if method.lag is None else method.lag
-    check_count("lag", lag, 0)
-    out = []
-    for i, e in enumerate(call.problem.experiments):
-        stream = random_state(call.root, i)
-        system = particle_system(call.problem, call.theta, settings, e, stream)
-        m = lag_moments(system, lag, call.levels)
-        report = {
-            "particles": settings.particles, "proposal": settings.proposal, "lag": lag,
-            "log_likelihood": system.log_Z,
-        }  # fmt: skip
-        moments = m.mean, m.covariance, m.cross, m.quantiles
-        over_time = {"distinct": m.distinct, "ess": system.ess}
-        n = settings.particles
-        report |= collapse(m.distinct, system.particles, n, e, COLLAPSED)
-        out.append(_Found(report, moments=moments, over_time=over_time))
-    return out
-
-
-def _pgas(call: _Call, method: PGAS) -> list[_Found]:
-    """Successive trajectories of one chain at fixed parameters."""
-    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
-    if method.particles is None and call.particles is not None:
-        method = PGAS(call.particles, method.proposal)
-    held = unpack_parameters(call.problem.trace, call.theta)
-    space = space_of(call.problem, held, {})
-    setup = Setup(call.problem, space, held, 1, PGAS_WARMUP, 1, call.root)
-    sampler = pgas.prepare(setup, method)
-    (chain,) = run_chains(
-        sampler.step_block, sampler.states, draws, PGAS_WARMUP, progress=False
-    )  # fmt: skip
-    report = {k: sampler.report[k] for k in ("particles", "proposal", "ancestor_sampling")}
-    report |= {"warmup": PGAS_WARMUP, "update_rate": float(chain.stats["update_rate"].mean())}
-    report["trajectories_are"] = "successive draws of a Markov chain, correlated"
-    out = []
-    for i in range(len(call.problem.experiments)):
-        paths = chain.draws[f"path_{i}"]
-        out.append(_Found(report, paths=paths, over_time={"distinct": distinct(paths)}))
-    return out
-
-
-def _dataset(
-    call: _Call, experiment: Experiment, found: _Found, attrs: dict[str, Any]
-) -> xr.Dataset:
+def _dataset(call: Call, experiment: Experiment, found: Found, attrs: dict[str, Any]) -> xr.Dataset:
     trace = call.problem.trace
     dims: dict[str, list[str]] = {}
     coords: dict[str, Any] = {}
