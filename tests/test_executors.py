@@ -25,8 +25,10 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference import executors
+from ssmppl.inference.draws import stack
 from ssmppl.inference.executors import Absent, Sent, workers_of
-from ssmppl.inference.runner import run_chains, run_tasks, stack
+from ssmppl.inference.runner import run_chains
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language import packing
 from ssmppl.language.trace import trace
 

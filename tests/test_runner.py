@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from ssmppl.inference import runner
-from ssmppl.inference.runner import Block, run_chains, run_tasks, stack
+from ssmppl.inference.draws import Block, stack
+from ssmppl.inference.runner import run_chains
+from ssmppl.inference.tasks import run_tasks
 
 TESTS = Path(__file__).parent
 

@@ -30,7 +30,7 @@ from ssmppl.inference.checkpoints.origin import (
     sources_digest,
     text_of,
 )
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.trace import Trace
 
 SECONDS = 5.0  # between two writings, at least

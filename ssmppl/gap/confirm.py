@@ -12,7 +12,7 @@ from ssmppl.data import Experiment
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.smoothing import Pass
 from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 
 RUNS = 8  # of the particle filter
 FREE_RUNS = 100  # simulations behind a free run

@@ -29,7 +29,7 @@ from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.pilot import Space, at, climb_to_mode, space_of
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 
 LARGEST = 1e100  # of a score: what is beyond is an overflow
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix

@@ -40,8 +40,8 @@ from ssmppl.inference.particles.filtering import (
 from ssmppl.inference.particles.pilot import Space, find_mode, space_of, tune_particles
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import run_tasks
 from ssmppl.inference.sample import sample
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import unconstrain
 

@@ -25,7 +25,7 @@ from ssmppl.inference.particles.filtering import (
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.results import to_dataset
 

@@ -37,8 +37,8 @@ from ssmppl.inference.particles.filtering import (
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.posterior_draws import all_draws, parameters_of, posterior_of
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import run_tasks
 from ssmppl.inference.sample import sample
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.results import arviz, to_dataset
 

@@ -25,7 +25,7 @@ from ssmppl.inference.particles.filtering import (
 from ssmppl.inference.particles.on_device import check_device
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 
 TASKS = 8  # pieces that repeats are cut into, so that an executor has something to share out

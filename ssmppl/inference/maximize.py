@@ -37,7 +37,7 @@ from ssmppl.inference.particles.particle_score import Smoothing, combine, severa
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import pose
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 
 # The methods: what climbs under each class of settings.

@@ -13,15 +13,16 @@ from __future__ import annotations
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from ssmppl.errors import ExecutorError
+from ssmppl.inference.draws import Arrays, Block, ChainDraws, Keep, Standing, joined
 from ssmppl.inference.executors import (
     Absent,
     Sent,
@@ -32,13 +33,9 @@ from ssmppl.inference.executors import (
 )
 from ssmppl.inference.interrupts import interrupt_flag
 from ssmppl.inference.progress import Progress
-from ssmppl.inference.tasks import POLL_SECONDS, run_tasks
-
-__all__ = ["Block", "ChainDraws", "Keep", "Standing", "run_chains", "run_tasks", "stack"]
+from ssmppl.inference.tasks import POLL_SECONDS
 
 State = TypeVar("State")
-
-Arrays = Mapping[str, np.ndarray]
 
 # Seconds that a block should take, at least so many times what it costs to send it (up to a limit),
 # and how fast its size may grow.
@@ -46,72 +43,6 @@ BLOCK_SECONDS = 0.3
 LONGEST_SECONDS = 5.0
 TIMES_SENDING = 20
 GROWTH = 4
-
-
-@dataclass(frozen=True)
-class Block:
-    """Consecutive draws of one chain.
-
-    Parameters
-    ----------
-    draws : by variable, shape (n, ...).
-    stats : by statistic, shape (n, ...); what goes to `sample_stats`.
-    """
-
-    draws: Arrays
-    stats: Arrays
-
-
-@dataclass(frozen=True)
-class ChainDraws(Generic[State]):
-    """What one chain gave.
-
-    Parameters
-    ----------
-    draws, stats : after warmup, first axis the draw.
-    warmup_stats : the statistics during warmup; empty unless asked for.
-    state : where the chain stands; running on from it continues the chain. After an interrupt
-        that is possibly later than the last of `draws`.
-    interrupted : whether the run was stopped before its end.
-    lost : the error of the executor that stopped it, if one did.
-    """
-
-    draws: dict[str, np.ndarray]
-    stats: dict[str, np.ndarray]
-    warmup_stats: dict[str, np.ndarray]
-    state: State
-    interrupted: bool = False
-    lost: ExecutorError | None = None
-
-
-@dataclass(frozen=True)
-class Standing(Generic[State]):
-    """How far a chain has come.
-
-    Parameters
-    ----------
-    state : where it goes on from.
-    done : draws made, those of the warmup included.
-    blocks : what was drawn after warmup, in order.
-    """
-
-    state: State
-    done: int = 0
-    blocks: tuple[Block, ...] = ()
-
-
-class Keep(Protocol):
-    """What keeps chains beyond the life of a process."""
-
-    def standings(self) -> Sequence[Standing[Any]] | None:
-        """How far the chains have come in an earlier process; None: they have not begun."""
-
-    def due(self, chains: Sequence[Standing[Any]]) -> bool:
-        """Whether it is time to keep them again."""
-
-    def keep(self, chains: Sequence[Standing[Any]], last: bool) -> Sequence[Standing[Any]]:
-        """Keep them as they stand. Returns them with the draws that need to be in memory, after
-        the last time with all."""
 
 
 Describe = Callable[[Sequence[Arrays]], str]
@@ -194,15 +125,6 @@ def run_chains(
             if keep is not None:
                 run.go_on(keep.keep(run.standings(), last=True))
     return run.result()
-
-
-def stack(chains: Sequence[ChainDraws[Any]]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Draws and statistics of all chains, shape (chain, draw, ...)."""
-    first = chains[0]
-    return (
-        {name: np.stack([chain.draws[name] for chain in chains]) for name in first.draws},
-        {name: np.stack([chain.stats[name] for chain in chains]) for name in first.stats},
-    )
 
 
 @dataclass(frozen=True)
@@ -302,9 +224,9 @@ class _Run(Generic[State]):
             )
         return [
             ChainDraws(
-                draws=_join([block.draws for block in chain.blocks], kept),
-                stats=_join([block.stats for block in chain.blocks], kept),
-                warmup_stats=_join(chain.warmup_stats),
+                draws=joined([block.draws for block in chain.blocks], kept),
+                stats=joined([block.stats for block in chain.blocks], kept),
+                warmup_stats=joined(chain.warmup_stats),
                 state=chain.state,
                 interrupted=interrupted,
                 lost=self.lost,
@@ -370,11 +292,3 @@ def _fitting_size(n: int, seconds: float, sending: float) -> int:
     """Draws that fill a block, when n took so many seconds (compilation, possibly, included)."""
     fill = max(BLOCK_SECONDS, min(TIMES_SENDING * sending, LONGEST_SECONDS))
     return max(1, min(round(fill * n / max(seconds, 1e-9)), GROWTH * n))
-
-
-def _join(parts: Sequence[Arrays], length: int | None = None) -> dict[str, np.ndarray]:
-    if not parts:
-        return {}
-    if length is not None and len(next(iter(parts[0].values()))) >= length:
-        return {name: values[:length] for name, values in parts[0].items()}  # not read from disk
-    return {name: np.concatenate([part[name] for part in parts])[:length] for name in parts[0]}

@@ -31,6 +31,7 @@ from ssmppl.inference.chains.update_rates import told
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
+from ssmppl.inference.draws import Block, ChainDraws, stack
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
@@ -40,7 +41,7 @@ from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.progress import announced
-from ssmppl.inference.runner import Block, ChainDraws, run_chains, stack
+from ssmppl.inference.runner import run_chains
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import transforms
 from ssmppl.results import to_inference_data

@@ -22,7 +22,7 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.plots.density import supports
 from ssmppl.plots.drawing import key, panels, styled

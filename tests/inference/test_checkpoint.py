@@ -30,7 +30,8 @@ from ssmppl.inference.checkpoints import archive, chains
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec, Store
 from ssmppl.inference.checkpoints.origin import Origin
-from ssmppl.inference.runner import Block, run_chains, stack
+from ssmppl.inference.draws import Block, stack
+from ssmppl.inference.runner import run_chains
 
 ROOT = Path(__file__).parents[2]
 N, WARMUP, CHAINS, WIDTH = 60, 20, 3, 4

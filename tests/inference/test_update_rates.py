@@ -8,8 +8,8 @@ import pytest
 import ssmppl as ssm
 from ssmppl.inference.chains import update_rates
 from ssmppl.inference.chains.update_rates import movement, random_components, told
+from ssmppl.inference.draws import ChainDraws
 from ssmppl.inference.problem import pose
-from ssmppl.inference.runner import ChainDraws
 from ssmppl.inference.sample import _chosen
 
 

@@ -23,10 +23,10 @@ from ssmppl.inference.chains.parameter_steps import (
     plan_updates,
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.draws import Block
 from ssmppl.inference.exact.models import ExactModel, filter_of
 from ssmppl.inference.methods import Gibbs
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
-from ssmppl.inference.runner import Block
 
 
 @dataclass(frozen=True)

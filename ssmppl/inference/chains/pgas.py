@@ -26,11 +26,11 @@ from ssmppl.inference.chains.parameter_steps import (
     plan_updates,
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.draws import Block
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import Block
 
 PARTICLES = 25
 PARTICLES_WITHOUT_ANCESTORS = 200

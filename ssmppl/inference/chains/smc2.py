@@ -33,13 +33,14 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.draws import Block, ChainDraws
 from ssmppl.inference.methods import SMC2
 from ssmppl.inference.particles.filtering import failure, log_of_mean
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import Block, ChainDraws, run_chains
+from ssmppl.inference.runner import run_chains
 from ssmppl.language.transforms import transforms, unconstrain
 
 STEP = 2.38  # of the random walk, over sqrt(F), in standard deviations (Roberts et al. 1997)

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.inference.draws import ChainDraws
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import ChainDraws
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Site
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.inference.chains.coordinates import Coordinates
-from ssmppl.inference.runner import Block
+from ssmppl.inference.draws import Block
 
 ADAPTATION_POWER = 0.66
 STARTS = 50  # runs of the likelihood at a start until one is positive

@@ -32,6 +32,7 @@ from ssmppl.analysis.perturbed import Perturbed
 from ssmppl.counts import check_count
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, listing
+from ssmppl.inference.draws import stack
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import starts
 from ssmppl.inference.maximum.summit import Summit, fitted_curvature, summit
@@ -39,7 +40,7 @@ from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swar
 from ssmppl.inference.methods import IF2
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.runner import run_chains, stack
+from ssmppl.inference.runner import run_chains
 
 USUAL = 0.02  # standard deviation of a step
 MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row

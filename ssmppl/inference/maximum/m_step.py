@@ -19,12 +19,13 @@ from ssmppl.analysis.mstep import MStep, counted, derive_m_step
 from ssmppl.analysis.sufficient import complete_data, restricted
 from ssmppl.codegen.statistics import compile_statistics
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.draws import Block, stack
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.chart import Chart
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
 from ssmppl.inference.particles.pilot import Space, at, dispersed
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import Block, run_chains, stack
+from ssmppl.inference.runner import run_chains
 
 __all__ = ["Chains", "Maximiser", "Pooled", "maximiser", "pool", "run_to_estimate", "starts"]
 

@@ -29,6 +29,7 @@ import numpy as np
 
 from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.draws import Block
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import ParticleEM
@@ -36,7 +37,6 @@ from ssmppl.inference.particles.backward import choose_kernel, draw_paths, parti
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.runner import Block
 
 
 def climb(setup: Setup, method: ParticleEM) -> Ascent:

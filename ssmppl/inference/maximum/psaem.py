@@ -34,11 +34,11 @@ from ssmppl.inference.chains.pgas import (
     pgas_proposal,
     start_chain,
 )
+from ssmppl.inference.draws import Block
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import PSAEM
 from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state
-from ssmppl.inference.runner import Block
 
 
 def climb(setup: Setup, method: PSAEM) -> Ascent:

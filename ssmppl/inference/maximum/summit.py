@@ -19,7 +19,7 @@ from ssmppl.inference.particles.filtering import (
 from ssmppl.inference.particles.pilot import scale_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 
 HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
 INFORMATION_RUNS = 16  # filters behind each point of the quadratic

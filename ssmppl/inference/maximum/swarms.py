@@ -12,10 +12,10 @@ import numpy as np
 from ssmppl.analysis.perturbed import Perturbed, perturbed
 from ssmppl.codegen.iterated import compile_iterated_filter
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.inference.draws import Block
 from ssmppl.inference.particles.filtering import failure
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import Block
 
 
 @dataclass(frozen=True)

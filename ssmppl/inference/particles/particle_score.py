@@ -27,7 +27,7 @@ from ssmppl.errors import SamplingError
 from ssmppl.inference.particles.backward import backward_draws
 from ssmppl.inference.particles.complete_score import CompleteScores
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
-from ssmppl.inference.runner import run_tasks
+from ssmppl.inference.tasks import run_tasks
 
 LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
 LEAST_RUNS = 1.1  # of one run alone nothing is known about products of different ones
