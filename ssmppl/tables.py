@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["state_table", "summary", "summary_text", "wide_table"]
+__all__ = ["quantiles_of", "state_table", "summary", "summary_text", "wide_table"]
 
 SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
@@ -52,6 +52,14 @@ def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
         return pd.DataFrame(columns=SUMMARY_COLUMNS, dtype=float)
     table = arviz().summary(idata, var_names=names, round_to="none", kind="all")
     return pd.DataFrame(table)[SUMMARY_COLUMNS].astype(float)
+
+
+def quantiles_of(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
+    """Quantiles along the first axis, (levels, ...): between draws where all are finite, else a
+    draw itself, as nothing lies between infinities."""
+    between: Any = "linear" if np.isfinite(draws).all() else "inverted_cdf"
+    found: np.ndarray = np.quantile(draws, levels, axis=0, method=between)
+    return found
 
 
 def state_table(dataset: xr.Dataset) -> pd.DataFrame:

@@ -23,7 +23,7 @@ ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows.
 ALLOWED["inference"] = {*CHAIN, "counts", "data", "results"}
 ALLOWED["gap"] = ALLOWED["inference"] | {"inference"}
-ALLOWED["plots"] = ALLOWED["gap"] | {"gap"}
+ALLOWED["plots"] = ALLOWED["gap"] | {"gap", "tables"}
 # What the command line is made of: the demonstration, written as a user would, and files read.
 ALLOWED["demo"] = {PACKAGE, "datasets", "results"}
 ALLOWED["modelfile"] = {"errors", "language"}

@@ -20,7 +20,7 @@ from ssmppl.cli.group import AS_JSON, INTERRUPTED
 from ssmppl.cli.reading import PARQUET, pyarrow
 from ssmppl.errors import ArgumentError
 from ssmppl.results import save
-from ssmppl.tables import state_table, summary_text
+from ssmppl.tables import quantiles_of, state_table, summary_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,8 +141,9 @@ def spread(variables: Mapping[str, xr.DataArray], over: tuple[str, ...]) -> dict
         for index in np.ndindex(*values.shape[2:]):
             label = "_".join(map(str, (name, *index)))
             own = values[(slice(None), slice(None), *index)]
-            found[label] = {"mean": own.mean(axis=0), "sd": own.std(axis=0, ddof=1)}
-            quantiles = np.quantile(own, LEVELS, axis=0)
+            with np.errstate(invalid="ignore"):  # of infinite draws
+                found[label] = {"mean": own.mean(axis=0), "sd": own.std(axis=0, ddof=1)}
+            quantiles = quantiles_of(own, LEVELS)
             found[label] |= {
                 f"q{round(100 * p):02d}": q for p, q in zip(LEVELS, quantiles, strict=True)
             }

@@ -15,6 +15,7 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.inference.posterior_draws import group
+from ssmppl.tables import quantiles_of
 
 __all__ = [
     "LEVELS",
@@ -137,8 +138,7 @@ def over_time(dataset: Any) -> list[tuple[str, str]]:
 
 def bands(draws: np.ndarray) -> np.ndarray:
     """(5, ...) quantiles at `LEVELS` of draws along the first axis."""
-    found: np.ndarray = np.quantile(draws, LEVELS, axis=0)
-    return found
+    return quantiles_of(draws, LEVELS)
 
 
 def observed_states(attrs: Any) -> dict[str, str]:

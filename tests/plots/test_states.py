@@ -1,5 +1,7 @@
 """`plot_states` and `plot_forecast`: what is drawn are the quantiles, the data and the inputs."""
 
+import warnings
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from ssmppl.language.trace import trace
 from ssmppl.plots.drawing import styled
 from ssmppl.plots.style import DATA, MAIN, OTHER
 from ssmppl.results import to_dataset, to_inference_data
+from ssmppl.tables import quantiles_of
 from tests.plots.results import DATES, TRUTH, data, filtered, level, sampled, smoothed
 
 mpl.use("Agg")
@@ -230,6 +233,18 @@ def test_forecasts_show_as_much_of_the_past_as_is_asked_for(ahead):
     assert len(before.get_xdata()) == 5
     alone = ssm.plot_forecast(ahead, var_names="y")
     assert len(alone.lines) == 1
+
+
+def test_forecasts_that_are_infinite_in_part_are_drawn(ahead):
+    last = ahead["y"].copy()
+    last[: len(last) // 10, -1] = -np.inf  # of a law at the logarithm of a count, say
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ax = ssm.plot_forecast(ahead.assign(y=last), var_names="y")
+    middle = ax.lines[-1].get_ydata()
+    ordered = np.sort(last.values[:, -1])
+    assert middle[-1] == ordered[int(np.ceil(0.5 * len(ordered))) - 1]
+    assert quantiles_of(last.values[:, -1:], LEVELS)[0, 0] == -np.inf
 
 
 def test_a_forecast_of_one_experiment_is_put_after_that_one():
