@@ -115,3 +115,9 @@ def test_a_count_is_a_whole_number(value):
 
 def test_this_machine_tells_its_memory():
     assert counts.memory() is None or counts.memory() > 2**28
+
+
+@pytest.mark.parametrize("value", ["10", 2.5, True, [10]])
+def test_particles_whose_history_is_asked_for_are_a_whole_number_too(value):
+    with pytest.raises(ssm.ArgumentError, match="particles="):
+        ssm.particle_filter(model, DATA, AT, particles=value, history=True)

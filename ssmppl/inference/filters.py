@@ -102,12 +102,6 @@ def particle_filter(
     check_count("repeats", repeats, 1)
     if proposal == "auto":
         proposal = choose(problem, theta, exact=False, integrate=not history).name
-    if history:
-        rows, d = problem.rows, len(problem.trace.state_symbols)
-        check_room(
-            f"history=True of {rows} rows with particles={particles}, repeats={repeats}",
-            rows * particles * repeats * (d + 2), "give fewer particles, or history=False",
-        )  # fmt: skip
     if history and is_marginal(proposal):
         raise ArgumentError(
             f'history=True with proposal="{proposal}", whose particles are of some states only',
@@ -122,6 +116,12 @@ def particle_filter(
             f'particle_filter with proposal="{settings.proposal}"',
             fix=f"call ssm.{instead} instead",
         )
+    if history:
+        rows, d = problem.rows, len(problem.trace.state_symbols)
+        check_room(
+            f"history=True of {rows} rows with particles={particles}, repeats={repeats}",
+            rows * particles * repeats * (d + 2), "give fewer particles, or history=False",
+        )  # fmt: skip
     levels = quantile_levels(quantiles)
     root = seed_sequence(seed)
 
