@@ -135,6 +135,17 @@ def test_r_hat_of_still_and_of_moving_chains():
     assert found[2] == np.inf
 
 
+def test_states_that_overflow_are_no_warning_of_numpys():
+    paths = np.random.default_rng(3).normal(size=(3, 50, 2, 2))
+    paths[1, 20:, 0, 0], paths[:, :, 1, 1] = np.inf, 1e200
+    paths[:, ::2, 1, 1] = -1e300
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rate, _, apart = movement(paths)
+    assert apart[0, 0] == 1.0
+    assert rate[0, 1] == 1.0
+
+
 @pytest.mark.parametrize("size", [1, 1000, 5000])
 def test_draws_that_are_read_in_pieces_count_as_whole_ones(monkeypatch, size):
     rng = np.random.default_rng(4)

@@ -81,9 +81,11 @@ def random_components(problem: Problem, steps: int) -> tuple[np.ndarray, np.ndar
     return free, discrete
 
 
+@np.errstate(invalid="ignore", over="ignore")  # of states that overflow, which say nothing here
 def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of each chain's draws (draws, T, D), which may lie on disk and are read in pieces: the share
-    of successive draws that differ, whether any differ, and R-hat; (T, D) each."""
+    of successive draws that differ, whether any differ, and R-hat, 1 where draws are not finite;
+    (T, D) each."""
     n, shape = len(paths[0]), paths[0].shape[1:]
     size = max(1, PIECE // max(1, len(paths) * paths[0][0].nbytes))
     changed, ever = np.zeros(shape, dtype=int), np.zeros(shape, dtype=bool)
