@@ -301,7 +301,8 @@ def _restricted(site: Site, components: Sequence[Expr]) -> Site:
     elif isinstance(d, MvNormal):
         law = MvNormal(mean, covariance=array(d.covariance_matrix()[np.ix_(at, at)]))
     else:
-        law = Normal(mean, variance=array(array(d.variance()).ravel()[at]))
+        assert isinstance(d, Normal)
+        law = Normal(mean, variance=array(d.variance_in_range().ravel()[at]))
     return _site(site.name, site.role, law, components, d.location)
 
 

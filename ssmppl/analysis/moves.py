@@ -62,13 +62,15 @@ def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
     return out
 
 
-def drawn(site: Site) -> ExprArray:
+def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
     """A draw from a law, of its shape; NaN where a parameter is out of its range.
 
     Of a flat law NaN, for code that is never run: no algorithm starts from it.
+
+    draws : the random numbers that it is made of; None: its own.
     """
     law = site.distribution
-    sample = array(law.sample(Draws(site.name)) if law.proper else law.mean())
+    sample = array(law.sample(draws or Draws(site.name)) if law.proper else law.mean())
     inside = law.in_range()
     return sample if inside is None else array(elementwise("where", inside, sample, math.nan))
 

@@ -38,7 +38,7 @@ def gaussian_block(sites: Sequence[Site]) -> GaussianBlock:
     for site in sites:
         d = site.distribution
         if isinstance(d, Normal):
-            blocks += [np.array([[v]], dtype=object) for v in array(d.variance()).ravel()]
+            blocks += [np.array([[v]], dtype=object) for v in d.variance_in_range().ravel()]
             means += list(array(d.mean()).ravel())
         elif isinstance(d, MvNormal):
             blocks.append(d.covariance_matrix().view(np.ndarray))

@@ -24,7 +24,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.laplace import written_cholesky
-from ssmppl.analysis.moves import Proposal
+from ssmppl.analysis.moves import Proposal, drawn
 from ssmppl.analysis.proposals import LARGEST_EXPONENT
 from ssmppl.analysis.structure import flat_start
 from ssmppl.errors import NotApplicable
@@ -122,7 +122,7 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
             return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new
-        sample = array(d.sample(given_draws(site.name, new))).ravel()
+        sample = drawn(site, given_draws(site.name, new)).ravel()
         value.update(zip(own, sample, strict=True))
         recovered += list(d.standard(site.value).ravel())
     return NoiseForm(tuple(noise), array([value[s] for s in states]), array(recovered))

@@ -14,6 +14,8 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import apply
+from ssmppl.expressions.signs import never_negative
 from ssmppl.language.constructing import one_of
 from ssmppl.language.distribution import INFINITY, Distribution, Draws, Support, log_difference
 
@@ -69,6 +71,17 @@ class Normal(Distribution):
         return {"sd": lambda: s**2, "variance": lambda: s, "precision": lambda: 1.0 / s}[
             self.spread
         ]()
+
+    def variance_in_range(self) -> ExprArray:
+        """The variance; NaN where the standard deviation, whose square it is, is negative."""
+        variance = array(self.variance())
+        if self.spread != "sd":
+            return variance
+        sd = self.parameters["sd"]
+        forms = zip(sd.ravel(), variance.ravel(), strict=True)
+        own = [v if never_negative(s) else apply("where", apply("le", 0.0, s), v, math.nan)
+               for s, v in forms]  # fmt: skip
+        return array(own).reshape(variance.shape)
 
     def log_densities(self, value):
         s, d = self.parameters[self.spread], array(value) - self.mean_

@@ -23,7 +23,7 @@ import numpy as np
 from ssmppl.codegen.kernels.flags import exact, kernel
 from ssmppl.codegen.kernels.particle_filter import add, take_log
 from ssmppl.codegen.kernels.random import uniform
-from ssmppl.codegen.kernels.weights import OK, draw_relative, relative_weights
+from ssmppl.codegen.kernels.weights import OK, draw_relative, relative_weights, rule_out
 
 
 @exact
@@ -103,15 +103,18 @@ def backward_weights(
         changed = t + horizon if horizon > 0 else n_steps - 1  # the last step that t changes
         connect(theta, c, s, x, reference, joined)
         weigh_observed(theta, c, s, joined, part)
+        rule_out(part)
         add(log_v, part)
         for later in range(t + 2, min(changed + 2, n_steps)):
             step(theta, c, y, seen, u, later, s_later)
             column(paths[later], m, reference)
             connect(theta, c, s_later, joined, reference, joined_next)
             weigh_connected(theta, c, s_later, joined, joined_next, part)
+            rule_out(part)
             add(log_v, part)
             if later <= changed:
                 weigh_observed(theta, c, s_later, joined_next, part)
+                rule_out(part)
                 add(log_v, part)
             joined, joined_next = joined_next, joined
 

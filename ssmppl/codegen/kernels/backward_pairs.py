@@ -24,7 +24,7 @@ from ssmppl.codegen.kernels.backward import draw_last, draw_tabulated, tabulate,
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import add, copy, take_log
 from ssmppl.codegen.kernels.random import uniform
-from ssmppl.codegen.kernels.weights import NAN, OK, draw_relative, relative_weights
+from ssmppl.codegen.kernels.weights import NAN, OK, draw_relative, relative_weights, rule_out
 
 ABOVE_BOUND = 4
 """A density above what was derived as its bound."""
@@ -51,6 +51,7 @@ def continuation(
     if horizon != 0:
         changed = t + horizon if horizon > 0 else n_steps - 1
         weigh_observed(theta, c, s, joined, part)
+        rule_out(part)
         add(log_v, part)
         for later in range(t + 2, min(changed + 2, n_steps)):
             step(theta, c, y, seen, u, later, s_later)
@@ -58,9 +59,11 @@ def continuation(
                 copy(paths[later, k], joined_next[k])
             complete(theta, c, s_later, joined, joined_next)
             weigh_connected(theta, c, s_later, joined, joined_next, part)
+            rule_out(part)
             add(log_v, part)
             if later <= changed:
                 weigh_observed(theta, c, s_later, joined_next, part)
+                rule_out(part)
                 add(log_v, part)
             joined, joined_next = joined_next, joined
 

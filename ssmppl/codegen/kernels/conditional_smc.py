@@ -53,6 +53,7 @@ from ssmppl.codegen.kernels.weights import (
     draw_relative,
     normalise,
     relative_weights,
+    rule_out,
 )
 
 
@@ -115,13 +116,16 @@ def conditional_smc(
                 add(log_v, log_base)
                 if horizon > 0:
                     weigh_observed(theta, c, s, joined, part)
+                    rule_out(part)
                     add(log_v, part)
                 for ahead_by in range(1, min(horizon, n_steps - 1 - t) + 1):
                     step(theta, c, y, seen, u, t + ahead_by, s_later)
                     connect(theta, c, s_later, joined, reference[t + ahead_by], joined_next)
                     weigh_connected(theta, c, s_later, joined, joined_next, part)
+                    rule_out(part)
                     add(log_v, part)
                     weigh_observed(theta, c, s_later, joined_next, part)
+                    rule_out(part)
                     add(log_v, part)
                     joined, joined_next = joined_next, joined
                 if eliminated:

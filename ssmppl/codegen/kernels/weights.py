@@ -49,6 +49,15 @@ def largest(values):
     return bits_float(_ordered(top))
 
 
+@exact
+def rule_out(log_v):
+    """-inf in place of NaN: for states that no filter has drawn, but a path recomputed from another
+    ancestor leads to. Where they lead a law out of its range, that path is impossible."""
+    for i in range(log_v.size):
+        if log_v[i] != log_v[i]:
+            log_v[i] = -_INF
+
+
 @kernel
 def _fault(log_w):
     """Why the largest log-weight is not finite, or the sum is NaN."""
