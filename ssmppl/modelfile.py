@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 import traceback
+import warnings
 from collections.abc import Iterable
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import module_from_spec
@@ -145,15 +146,30 @@ def read_csv(path: Path) -> pd.DataFrame:
     import pandas as pd
 
     try:
-        table = pd.read_csv(path, skipinitialspace=True)
-        if len(table.columns) == 1 or table.index.nlevels > 1:
-            _check_separator(path)
+        names = pd.read_csv(path, skipinitialspace=True, header=None, nrows=1, dtype=str).iloc[0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            table = pd.read_csv(path, skipinitialspace=True, index_col=False)
+    except pd.errors.ParserWarning as error:  # pandas would leave out what has no name
+        _check_separator(path)
+        raise DataError(
+            f"the rows of {path} have more values than its first line has names, {len(names)}",
+            fix="give each column a name, and write decimal numbers with points",
+        ) from error
     except (ValueError, UnicodeDecodeError, OSError) as error:  # pandas' own derive from ValueError
         raise DataError(
             f"{path} cannot be read as a CSV file: {str(error).strip()}",
             fix="give a text file with the names of its columns in the first line, values "
             "separated by commas",
         ) from error
+    if len(table.columns) == 1:
+        _check_separator(path)
+    given = names.dropna().str.strip()
+    if given.duplicated().any():
+        raise DataError(
+            f"{path} has more than one column named {given[given.duplicated()].iloc[0]!r}",
+            fix="rename or drop one of them",
+        )
     return labelled(table)
 
 

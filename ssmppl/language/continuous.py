@@ -81,7 +81,7 @@ class Normal(Distribution):
         forms = zip(sd.ravel(), variance.ravel(), strict=True)
         own = [v if never_negative(s) else apply("where", apply("le", 0.0, s), v, math.nan)
                for s, v in forms]  # fmt: skip
-        return array(own).reshape(variance.shape)
+        return array(array(own).reshape(variance.shape))
 
     def log_densities(self, value):
         s, d = self.parameters[self.spread], array(value) - self.mean_

@@ -100,6 +100,29 @@ def test_other_separators_are_named(dated, text, found):
         read_table(dated(text))
 
 
+@pytest.mark.parametrize("rows", ["1,1,5\n2,2,5\n", "1,2,\n2,3,4\n", "a,1,2\nb,2,3\n"])
+def test_rows_of_more_values_than_names_are_no_table(dated, rows):
+    """pandas takes the first value as a label, and all others stand one column too far left."""
+    with pytest.raises(
+        DataError, match=r"more values than its first line has names, 2(.|\n)*points"
+    ):
+        read_table(dated(f"time,y\n{rows}"))
+
+
+@pytest.mark.parametrize("names", ["time,y", "time,y,"])
+def test_a_comma_that_ends_every_row_is_nothing(dated, names):
+    table = read_table(dated(f"{names}\n1,1.5,\n2,2.5,\n"))
+    assert list(table["time"]) == [1, 2]
+    assert list(table["y"]) == [1.5, 2.5]
+
+
+@pytest.mark.parametrize("names", ["time,y,y", "time,y, y", "y,time,y"])
+def test_a_name_that_stands_twice_is_told(dated, names):
+    with pytest.raises(DataError, match="more than one column named 'y'"):
+        read_table(dated(f"{names}\n1,9,1.5\n2,9,2.5\n"))
+    assert list(read_table(dated("time,y,y.1\n1,9,1.5\n"))["y"]) == [9]
+
+
 def test_one_column_is_a_table(dated):
     assert list(read_table(dated("y\n1\n2\n"))["y"]) == [1, 2]
 
