@@ -13,7 +13,7 @@ from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.models import EXACT
-from ssmppl.inference.labels import observes, with_data
+from ssmppl.inference.labels import component_dims, observes, with_data
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterRun,
@@ -164,9 +164,11 @@ def filter_dataset(
     covariance = np.stack([r.covariance for r in runs])
     variables: dict[str, np.ndarray] = dict(unpack_states(trace, mean))
     sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
-    variables |= {f"{n}_sd": v for n, v in unpack_states(trace, sd).items()}
-    variables["covariance"] = covariance
     dims = {"covariance": ["time", "state", "state_"]}
+    for name, values in unpack_states(trace, sd).items():
+        variables[f"{name}_sd"] = values
+        dims[f"{name}_sd"] = ["time", *component_dims(name, values, 2)]
+    variables["covariance"] = covariance
     coords: dict[str, Any] = {"state": [repr(s) for s in trace.state_symbols]}
     coords["state_"] = coords["state"]
     if len(levels):
@@ -174,11 +176,13 @@ def filter_dataset(
         by_name = [unpack_states(trace, q) for q in spread]
         for name in by_name[0]:
             variables[f"{name}_quantile"] = np.stack([q[name] for q in by_name], axis=-1)
-            own = [f"{name}_dim_{i}" for i in range(by_name[0][name].ndim - 2)]
+            own = component_dims(name, by_name[0][name], 2)
             dims[f"{name}_quantile"] = ["time", *own, "quantile"]
         coords["quantile"] = levels
     prediction = np.stack([r.prediction for r in runs])
-    variables |= _predictions(problem, experiment, prediction, root)
+    for (name, what), values in _predictions(problem, experiment, prediction, root).items():
+        variables[f"{name}_{what}"] = values
+        dims[f"{name}_{what}"] = ["time", *component_dims(name, values, 2)]
     variables["ess"] = np.stack([r.ess for r in runs])
     variables["log_likelihood_increment"] = np.stack([r.log_increments for r in runs])
     histories = [r.history for r in runs if r.history is not None]
@@ -186,7 +190,7 @@ def filter_dataset(
         particles, weights, ancestors = (np.stack(h) for h in zip(*histories, strict=True))
         for name, values in unpack_states(trace, np.moveaxis(particles, 3, 0)).items():
             variables[f"{name}_particles"] = np.moveaxis(values, 0, -1)
-            own = [f"{name}_dim_{i}" for i in range(values.ndim - 3)]
+            own = component_dims(name, values, 3)
             dims[f"{name}_particles"] = ["time", *own, "particle"]
         variables |= {"particle_weight": weights, "particle_ancestor": ancestors}
         dims |= {n: ["time", "particle"] for n in ("particle_weight", "particle_ancestor")}
@@ -197,8 +201,8 @@ def filter_dataset(
 
 def _predictions(
     problem: Problem, experiment: Experiment, prediction: np.ndarray, root: np.random.SeedSequence
-) -> dict[str, np.ndarray]:
-    """Predictive moments and PIT values by channel, from (draw, T, 4, K)."""
+) -> dict[tuple[str, str], np.ndarray]:
+    """Predictive moments and PIT values by channel and by what they are, from (draw, T, 4, K)."""
     trace = problem.trace
     rng = np.random.default_rng(
         np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 2**31))
@@ -210,7 +214,7 @@ def _predictions(
     variance = np.maximum(prediction[:, :, 1], 0.0)  # rounding can leave it below
     parts = {"predicted": prediction[:, :, 0], "predicted_sd": np.sqrt(variance), "pit": pit}
     return {
-        f"{name}_{what}": values
+        (name, what): values
         for what, array in parts.items()
         for name, values in unpack_observations(trace, array).items()
     }

@@ -24,8 +24,14 @@ def with_data(result: xr.Dataset, experiment: Experiment) -> xr.Dataset:
     """`result` and the data that it is about, (time, ...): `y_observed`, `u_input`."""
     data = {f"{n}_observed": v for n, v in experiment.observed.items()}
     data |= {f"{n}_input": v for n, v in experiment.inputs.items()}
-    dims = {n: ("time", *(f"{n}_dim_{k}" for k in range(v.ndim - 1))) for n, v in data.items()}
-    return result.assign({n: (dims[n], v) for n, v in data.items()})
+    named = {n: ["time", *component_dims(n.rpartition("_")[0], v, 1)] for n, v in data.items()}
+    return result.assign({n: (named[n], v) for n, v in data.items()})
+
+
+def component_dims(name: str, values: np.ndarray, leading: int) -> list[str]:
+    """Dims of the components of a state, channel or input, whatever it is that is told of them:
+    what has the same dims can be added, and is not spread out into a table."""
+    return [f"{name}_dim_{k}" for k in range(values.ndim - leading)]
 
 
 def observes(trace: Trace) -> dict[str, str]:
@@ -75,7 +81,7 @@ class Labels:
         named = {f"{n}{self.mark(i)}": v for n, v in values.items()}
         if self.several:
             for n, v in named.items():
-                rest = [f"{n}_dim_{k}" for k in range(v.ndim - leading)]
+                rest = component_dims(n, v, leading)
                 # the log likelihood has none but time
                 self.dims.setdefault(n, [self.axis(i), *rest])
         return named

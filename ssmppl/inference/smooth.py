@@ -16,7 +16,7 @@ from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.filters import LEVELS, quantile_levels
-from ssmppl.inference.labels import observes, with_data
+from ssmppl.inference.labels import component_dims, observes, with_data
 from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.filtering import seed_sequence
@@ -180,7 +180,7 @@ def _dataset(call: Call, experiment: Experiment, found: Found, attrs: dict[str, 
         sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
         for n, v in unpack_states(trace, sd).items():
             variables[f"{n}_sd"] = v
-            dims[f"{n}_sd"] = ["time", *(f"{n}_dim_{i}" for i in range(v.ndim - 2))]
+            dims[f"{n}_sd"] = ["time", *component_dims(n, v, 2)]
         variables |= {"covariance": covariance, "covariance_previous": cross}
         dims |= {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
         coords["state"] = coords["state_"] = [repr(s) for s in trace.state_symbols]
@@ -188,7 +188,7 @@ def _dataset(call: Call, experiment: Experiment, found: Found, attrs: dict[str, 
             by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(call.levels))]
             for name in by_level[0]:
                 variables[f"{name}_quantile"] = np.stack([q[name] for q in by_level], axis=-1)
-                own = [f"{name}_dim_{i}" for i in range(by_level[0][name].ndim - 2)]
+                own = component_dims(name, by_level[0][name], 2)
                 dims[f"{name}_quantile"] = ["time", *own, "quantile"]
             coords["quantile"] = call.levels
     out = to_dataset(

@@ -113,7 +113,8 @@ def _of_filter(result: Any) -> tuple[list[Record], list[dict[str, np.ndarray]]]:
             if name == str(key_) or f"{name}_predicted_sd" not in own:
                 continue
             mean, sd = own[f"{name}_predicted"].values, own[f"{name}_predicted_sd"].values
-            spread = ndtri(np.array(LEVELS)).reshape(-1, *[1] * mean.ndim) * sd
+            with np.errstate(invalid="ignore"):  # no band where the variance is infinite
+                spread = ndtri(np.array(LEVELS)).reshape(-1, *[1] * mean.ndim) * sd
             states |= components(name, mean + spread, 2)
             if f"{name}_observed" in own:
                 data |= components(name, own[f"{name}_observed"].values, 1)
