@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.data.values import Fault, as_numbers, number, outside, short
+from ssmppl.data.values import Fault, as_numbers, asymmetry, number, outside, short
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.trace import Site, Trace
@@ -106,6 +106,13 @@ def _value(site: Site, value: Any, argument: str) -> np.ndarray:
         raise ArgumentError(
             f"{argument}: parameter {site.name!r}{_index(index)} is {number(array[index])}",
             fix="give a finite number",
+        )
+    # of an asymmetric matrix a likelihood would read one half only
+    cone = site.distribution.support().kind == "positive definite"
+    if cone and (fault := asymmetry(array)) is not None:
+        raise ArgumentError(
+            f"{argument}: parameter {site.name!r}{_index((fault.index or ())[1:])}: {fault.found}",
+            fix=f"give {fault.fix}",
         )
     return array
 

@@ -226,19 +226,27 @@ def _outside_simplex(distribution: Distribution, values: np.ndarray) -> Fault | 
     return None
 
 
+def asymmetry(m: np.ndarray, row: int = 0) -> Fault | None:
+    """What keeps a matrix, at this row of the data, from being symmetric."""
+    gap = np.abs(m - m.T)
+    if not (gap > 1e-8 * max(1e-300, float(np.abs(m).max()))).any():
+        return None
+    i, j = (int(k) for k in np.unravel_index(np.argmax(gap), m.shape))
+    return Fault(
+        (row, i, j),
+        f"the matrix is not symmetric: entry [{i}, {j}] is {number(m[i, j])}, "
+        f"[{j}, {i}] is {number(m[j, i])}",
+        "a symmetric matrix, for example (m + m.T) / 2",
+    )
+
+
 def _outside_cone(distribution: Distribution, values: np.ndarray) -> Fault | None:
     for row, m in enumerate(values):
         if not np.isfinite(m).all():
             continue
-        gap = np.abs(m - m.T)
-        if (gap > 1e-8 * max(1e-300, float(np.abs(m).max()))).any():
-            i, j = (int(k) for k in np.unravel_index(np.argmax(gap), m.shape))
-            return Fault(
-                (row, i, j),
-                f"the matrix is not symmetric: entry [{i}, {j}] is {number(m[i, j])}, "
-                f"[{j}, {i}] is {number(m[j, i])}",
-                "a symmetric matrix, for example (m + m.T) / 2",
-            )
+        fault = asymmetry(m, row)
+        if fault is not None:
+            return fault
         least = float(np.linalg.eigvalsh(m)[0])
         if not least > 0:
             return Fault(

@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+# A forecast starts from draws of the last state, which known parameters have as well.
+KNOWN = (
+    "give what ssm.sample returns; at known parameters that is "
+    "ssm.sample(model, data, fixed=estimate.parameters, warmup=0)"
+)
+
+
 def forecast(
     model: Model,
     idata: Any,
@@ -65,7 +72,7 @@ def forecast(
     ------
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     """
-    traced, posterior = trace(model), posterior_of(idata)
+    traced, posterior = trace(model), posterior_of(idata, KNOWN)
     future, steps, labels = bind_inputs(traced, inputs, steps)
     mark, axis = _which(traced, posterior, experiment)
     theta = parameters_of(traced, posterior)

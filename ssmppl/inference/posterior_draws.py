@@ -24,7 +24,7 @@ def group(idata: Any, name: str) -> Any:
     return found.to_dataset() if hasattr(found, "to_dataset") else found
 
 
-def posterior_of(idata: Any) -> Any:
+def posterior_of(idata: Any, fix: str = "give what ssm.sample returns") -> Any:
     """Its posterior.
 
     Raises
@@ -36,7 +36,7 @@ def posterior_of(idata: Any) -> Any:
     if found is None:
         raise ArgumentError(
             f"idata is {type(idata).__name__} without a group `posterior`",
-            fix="give what ssm.sample returns, or None to draw from the prior",
+            fix=fix,
         )
     return found
 

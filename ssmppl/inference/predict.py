@@ -82,7 +82,7 @@ def predict(
     }  # fmt: skip
     if idata is None:
         return _from_prior(traced, program, experiments, labels, draws, root, attrs)
-    posterior = posterior_of(idata)
+    posterior = posterior_of(idata, "give what ssm.sample returns, or None to draw from the prior")
     theta = parameters_of(traced, posterior)
     lead = theta.shape[:2]
     predicted: dict[str, np.ndarray] = {}

@@ -8,7 +8,7 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import Distribution
+from ssmppl.language.distributions import Binomial, Distribution
 
 __all__ = ["DOMAIN", "out_of_range"]
 
@@ -31,7 +31,7 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
             needed = symbols_of(e)
             if not needed:
                 continue
-            fix = _fix(called, e, low, high)
+            fix = _fix(called, e, low, high, count=isinstance(law, Binomial) and called == "n")
             if needed <= set(values):
                 value = float(evaluate(e, values))
                 if np.isnan(value):
@@ -47,8 +47,13 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
     return might[0] if might else None
 
 
-def _fix(called: str, e: Expr, low: float, high: float) -> str:
+def _fix(called: str, e: Expr, low: float, high: float, count: bool = False) -> str:
     """A function that maps all numbers into the range."""
+    if count:
+        return (
+            f"write a {called} that is never below 0, np.maximum({e!r}, 0); where several flows "
+            "empty one compartment, draw each out of what the others have left"
+        )
     if (low, high) == (0.0, 1.0):
         logistic = f"1 / (1 + np.exp(-({e!r})))"
         return f"write a {called} between 0 and 1 whatever the state, such as {logistic}"

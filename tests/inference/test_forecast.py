@@ -118,6 +118,8 @@ def test_what_cannot_be_continued_is_said():
         ssm.forecast(model(), bare, inputs={"u": FUTURE})
     with pytest.raises(ArgumentError, match="without a group `posterior`"):
         ssm.forecast(model(), {"a": 1.0}, inputs={"u": FUTURE})
+    with pytest.raises(ArgumentError, match=r"fixed=estimate.parameters, warmup=0\)$"):
+        ssm.forecast(model(), None, inputs={"u": FUTURE})
     with pytest.raises(ArgumentError, match="no parameter 'b'"):
         ssm.forecast(model(), to_inference_data(posterior={"a": np.zeros((1, 2))}),
                      inputs={"u": FUTURE})  # fmt: skip

@@ -310,6 +310,11 @@ LAWS_OF_A_STATE = {  # law of y, the argument that the state leads out of its ra
     "Poisson": (lambda x: ssm.Poisson(x), "the rate of Poisson, x,", "np.exp(x)"),
     "Binomial": (lambda x: ssm.Binomial(5, x), " of Binomial, x,", "1 / (1 + np.exp(-(x)))"),
     "Gamma": (lambda x: ssm.Gamma(x, rate=1), "the shape of Gamma, x,", "np.exp(x)"),
+    "trials": (
+        lambda x: ssm.Binomial(10 * x, 0.5),
+        "the n of Binomial, 10*x,",
+        "np.maximum(10*x, 0)",
+    ),
 }
 
 
@@ -339,6 +344,18 @@ def test_a_filter_names_the_argument_that_may_be_out_of_range_and_a_fix(name):
         ssm.log_likelihood(negative(law), data, {}, seed=1, particles=100)
     assert argument + " has to lie in" in str(filtered.value)
     assert fix in str(filtered.value)
+
+
+def test_an_asymmetric_matrix_has_no_likelihood():
+    model = ssm.Model("vector")
+    model.prior(lambda: {"Q": ssm.InverseWishart(5, scale=np.eye(2))})
+    model.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=np.eye(2))})
+    model.transition(lambda x, Q: {"x": ssm.MvNormal(0.5 * x, covariance=Q)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    data = {"y": np.ones((4, 2))}
+    with pytest.raises(ssm.ArgumentError, match=r"'Q'\[0, 1\]: the matrix is not symmetric"):
+        ssm.log_likelihood(model, data, {"Q": [[1.0, 0.4], [0.3, 0.8]]})
+    assert np.isfinite(ssm.log_likelihood(model, data, {"Q": [[1.0, 0.3], [0.3, 0.8]]})[0])
 
 
 @pytest.mark.parametrize("seed", [True, 1.0, -1, [1, 2], "1"])
