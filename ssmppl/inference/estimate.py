@@ -121,8 +121,8 @@ class Estimate:
         elif self.attrs.get("converged") is False:
             reason = self.attrs.get("stopped", "")
             out.append("not converged" + (f": {reason}" if reason else ""))
-        text = str(self.attrs.get("covariance", ""))
-        return [*out, text] if text.startswith("none") else out
+        how, _, reason = str(self.attrs.get("covariance", "")).partition(": ")
+        return [*out, f"no standard errors: {reason}"] if how == "none" else out
 
 
 def free_components(trace: Trace, held: dict[str, np.ndarray]) -> np.ndarray:

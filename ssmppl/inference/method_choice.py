@@ -95,6 +95,8 @@ def why_stuck(trace: Trace, rows: int | None) -> str:
     random = [
         s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
     ]
+    if not random:
+        return "every state follows from those before it, so that PGAS has no trajectory to move"
     reason = (
         "a deterministic component never forgets its past, so that PGAS cannot join a trajectory "
         "to other ancestors"

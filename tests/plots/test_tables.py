@@ -139,7 +139,7 @@ def test_an_estimate_shows_its_table():
     assert read.rows[1][:2] == ["q", f"{estimate.parameters['q']:.6g}"]
     assert f"log-likelihood {estimate.log_likelihood:.6f}" in read.words
     noted = dataclasses.replace(estimate, attrs={**estimate.attrs, "covariance": "none: <b>"})
-    assert "Note: none: <b>" in Read(noted._repr_html_()).words
+    assert "Note: no standard errors: <b>" in Read(noted._repr_html_()).words
 
 
 def test_a_report_says_what_it_prints():
