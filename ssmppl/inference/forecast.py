@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -124,6 +125,13 @@ def after(time: np.ndarray, steps: int) -> np.ndarray:
         spacing = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
         if spacing is not None:
             return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=spacing)[1:])
+        if len(time) > 2:
+            warnings.warn(
+                "the dates of the data are not evenly spaced, so that the rows of the forecast are "
+                f"numbered on from {len(time) + 1}. Where a row is absent from the data, give it, "
+                "with NaN for what was not measured: each row is one step of the model",
+                stacklevel=3,
+            )
     elif np.issubdtype(time.dtype, np.number) and len(time):
         gaps = np.diff(time) if len(time) > 1 else np.ones(1, time.dtype)
         if np.allclose(gaps, gaps[0], rtol=1e-6):

@@ -103,6 +103,8 @@ def test_time_goes_on():
     assert after(months, 2).astype("datetime64[D]").astype(str).tolist() == [
         "2020-05-31", "2020-06-30",
     ]  # fmt: skip
+    with pytest.warns(UserWarning, match="not evenly spaced(.|\n)*numbered on from 4"):
+        assert after(np.delete(months, 1), 2).tolist() == [4, 5]
     np.testing.assert_allclose(after(np.array([0.0, 0.1, 0.2]), 2), [0.3, 0.4])
     assert after(np.arange(1871, 1971), 2).tolist() == [1971, 1972]
     assert after(np.array([1.0, 2.0, 5.0]), 2).tolist() == [4, 5]
