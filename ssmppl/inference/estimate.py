@@ -10,6 +10,8 @@ import numpy as np
 
 from ssmppl import markup
 from ssmppl.data import unpack_parameters
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.trace import Trace
 from ssmppl.results import to_dataset
 
@@ -121,6 +123,11 @@ class Estimate:
         elif self.attrs.get("converged") is False:
             reason = self.attrs.get("stopped", "")
             out.append("not converged" + (f": {reason}" if reason else ""))
+        out += [
+            f"{label} is within a standard error of {edge:g}, the edge of what it can be: no "
+            "interval about it follows from that standard error"
+            for label, edge in self.attrs.get("at_edge", {}).items()
+        ]
         how, _, reason = str(self.attrs.get("covariance", "")).partition(": ")
         return [*out, f"no standard errors: {reason}"] if how == "none" else out
 
@@ -143,6 +150,24 @@ def table(labels: list[str], matrix: np.ndarray) -> pd.DataFrame:
     return pd.DataFrame(matrix, index=labels, columns=labels)
 
 
+def _edges(trace: Trace, theta: np.ndarray, errors: np.ndarray) -> dict[str, float]:
+    """The components within a standard error of an end of their supports, and that end."""
+    env = dict(zip(trace.parameter_symbols, theta, strict=True))
+    spread = dict(zip(trace.parameter_symbols, errors, strict=True))
+    found: dict[str, float] = {}
+    for site in trace.parameters.values():
+        support = site.distribution.support()
+        if support.kind != "interval":
+            continue
+        ends = (np.broadcast_to(e.view(np.ndarray), site.shape).ravel()
+                for e in (array(support.lower), array(support.upper)))  # fmt: skip
+        for s, *own in zip(site.value.ravel(), *ends, strict=True):
+            for edge in evaluate(own, env):
+                if abs(env[s] - float(edge)) < spread[s]:
+                    found[repr(s)] = float(edge)
+    return found
+
+
 def make_estimate(
     trace: Trace, theta: np.ndarray, covariance: np.ndarray, log_likelihood: float,
     iterates: np.ndarray, held: dict[str, np.ndarray], attrs: dict[str, Any],
@@ -159,6 +184,8 @@ def make_estimate(
     errors = np.full(len(theta), np.nan)
     with np.errstate(invalid="ignore"):
         errors[free] = np.sqrt(np.diagonal(covariance)[free])
+    edges = _edges(trace, theta, errors)
+    attrs = {**attrs, "at_edge": edges} if edges else attrs
     variables = unpack_parameters(trace, iterates) if len(theta) else {}
     variables |= figures or {}
     return Estimate(

@@ -375,3 +375,22 @@ def test_the_diffuse_maximum_of_the_nile():
     assert estimate.parameters["r"] == pytest.approx(15098.5, abs=0.06)
     assert estimate.parameters["q"] == pytest.approx(1469.17, abs=0.02)
     assert estimate.log_likelihood == pytest.approx(-632.5456, abs=1e-4)
+
+
+def test_an_estimate_at_the_edge_of_its_support_says_so():
+    """All of thirty throws come up: the likelihood grows up to p = 1; of q it has a maximum."""
+    model = ssm.Model("throws")
+    model.prior(lambda: {"p": ssm.Uniform(0, 1), "q": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.Normal(np.sin(x) + q, sd=1)})
+    model.observation(lambda x, p: {"y": ssm.Bernoulli(p), "z": ssm.Normal(x, sd=1)})
+    z = np.random.default_rng(1).normal(size=30)
+    found = ssm.maximize(model, {"y": np.ones(30), "z": z}, seed=1, progress=False)
+    assert found.attrs["at_edge"] == {"p": 1.0}
+    (note,) = found.notes
+    assert note.startswith("p is within a standard error of 1, the edge")
+    half = ssm.maximize(
+        model, {"y": np.arange(30.0) % 2, "z": z}, seed=1, progress=False, fixed={"q": 0.0}
+    )
+    assert not half.notes
+    assert abs(half.parameters["p"] - 0.5) < 0.01
