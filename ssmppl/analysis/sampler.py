@@ -217,7 +217,9 @@ class Sampler:
             )
             raise SamplingError(
                 f"the conditional density is zero at the current value: {named}",
-                fix="start inside the support; given these states no value near is possible",
+                fix="start inside the support; given these states no value near is possible. Where "
+                "a covariance is singular no density exists: give components that follow without "
+                "a noise of their own the law Dirac",
                 where=update.where,
             )
         if update.kind == "simplex":

@@ -178,3 +178,18 @@ def test_a_class_for_a_method_of_smoothing_is_told_how_to_be_written(method):
     model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     with pytest.raises(ssm.ArgumentError, match=r"Fix: write method=ssm\.FFBSi\(\)$"):
         ssm.smooth(model, {"y": np.zeros(4)}, {}, method=method)
+
+
+def test_a_singular_covariance_is_told_to_be_a_dirac():
+    model = ssm.Model("second order")
+    model.prior(lambda: {"q": ssm.InverseGamma(3, scale=1)})
+    model.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=np.eye(2))})
+    model.transition(lambda x, q: {
+        "x": ssm.MvNormal(
+            np.stack([0.5 * x[0] + 0.2 * x[1], x[0]]), covariance=q * np.diag([1.0, 0.0])
+        )
+    })  # fmt: skip
+    model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
+    data = {"y": np.random.default_rng(1).normal(size=20)}
+    with pytest.raises(ssm.SamplingError, match=r"covariance is singular no density.*Dirac"):
+        ssm.sample(model, data, ssm.Gibbs(), draws=5, warmup=5, seed=1, progress=False)
