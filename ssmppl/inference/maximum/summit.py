@@ -23,6 +23,7 @@ from ssmppl.inference.tasks import run_tasks
 
 HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
 INFORMATION_RUNS = 16  # filters behind each point of the quadratic
+SCALE_RUNS = 2  # and behind the points that tell how far to scatter those, which is a guess
 
 
 @dataclass(frozen=True)
@@ -111,16 +112,16 @@ def fitted_curvature(setup: Setup, method: IF2, z: np.ndarray) -> np.ndarray:
     theta, _ = setup.space.parameters(z)
     settings = FilterSettings(method.particles, choose(problem, theta.copy(), exact=False).name)
 
-    def log_likelihood(z: np.ndarray) -> float:
+    def log_likelihood(z: np.ndarray, runs: int = INFORMATION_RUNS) -> float:
         theta, log_prior = setup.space.parameters(z)
         if log_prior == -np.inf:
             return -np.inf
         try:
-            log_z = repeated_estimates(problem, theta, settings, seed, range(INFORMATION_RUNS))
+            log_z = repeated_estimates(problem, theta, settings, seed, range(runs))
         except SamplingError:
             return -np.inf
         return log_of_mean(log_z)[0]
 
-    scale = scale_of(z, log_likelihood)
+    scale = scale_of(z, partial(log_likelihood, runs=SCALE_RUNS))
     inner = fitted_information(log_likelihood, z, np.diag(scale), np.random.default_rng(seed))
     return setup.natural(z, inner / np.outer(scale, scale))
