@@ -84,7 +84,7 @@ def test_the_maximum_is_that_of_the_sums():
     top = slice(values.argmax() - 3, values.argmax() + 4)
     a, b, _ = np.polyfit(grid[top], values[top], 2)
     found = ssm.maximize(model, DATA, ssm.ScoreAscent(), seed=1, progress=False)
-    assert abs(found.parameters["g"] + b / (2 * a)) < 0.3 * found.standard_errors["g"]
+    assert abs(found.parameters["g"] + b / (2 * a)) < 4.5 * found.attrs["monte_carlo_errors"]["g"]
 
 
 # -- a path that another ancestor makes impossible two rows later
