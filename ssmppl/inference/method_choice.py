@@ -55,7 +55,8 @@ def choose_sampler(
         )
     if kind == KIND[Deterministic]:
         return MetropolisHastings(), (
-            f"the model is {kind}, so that its likelihood is exact: a random walk on it"
+            f"the model is {kind}, so that its likelihood is exact, and its gradient, where "
+            "there is one in closed form, guides the steps"
         )
     open_ = [c for u in updates if u.conditional is None for c in u.block]
     if not open_:

@@ -9,9 +9,10 @@ from typing import Any
 
 @dataclass(frozen=True)
 class MetropolisHastings:
-    """Metropolis-Hastings with the exact likelihood of a linear Gaussian model (Schön et al. 2015,
-    algorithm 1): a random walk on the parameters, the states drawn afterwards, given each kept
-    draw, by exact backward sampling.
+    """Metropolis-Hastings with the exact likelihood of a linear Gaussian model, of one of finitely
+    many states, or of one without noise in them (Schön et al. 2015, algorithm 1): a random walk on
+    the parameters, or Langevin steps along the exact gradient; the states are drawn afterwards,
+    given each kept draw, by exact backward sampling.
 
     Priors may be improper (`Flat`, `HalfFlat`). Whether the posterior is proper is then for the
     user to know: a chain cannot tell, and its draws mean nothing where it is not.
@@ -19,7 +20,11 @@ class MetropolisHastings:
     Parameters
     ----------
     covariance, scale, transform, adapt, target_acceptance : the walk, as in `PMMH`; the usual
-        acceptance rates are those of Gelman, Roberts and Gilks (1996).
+        acceptance rates are those of Gelman, Roberts and Gilks (1996), for order 1 that of Roberts
+        and Rosenthal (1998).
+    order : 0: a random walk. 1: Langevin steps along the exact gradient of the log posterior, with
+        a fixed metric, the covariance (Roberts and Tweedie 1996). None: 1 where the states have no
+        noise, so that the gradient costs little, and more than two numbers are free; else 0.
     """
 
     covariance: Any = None
@@ -27,6 +32,7 @@ class MetropolisHastings:
     transform: Mapping[str, str] | None = None
     adapt: bool | None = None
     target_acceptance: float | None = None
+    order: int | None = None
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,9 @@ WIDER = {  # for the two samplers that need no structure
 DELAYED = {  # linear Gaussian too, but with a deterministic state
     "delay": (("a", "c", "b", "q"), "x"),
 }
+NOISELESS = {  # states that follow from what was observed
+    "garch": (("w", "a", "b", "h_1"), "h"),
+}
 METHODS = (
     ssm.PGAS(particles=20, interweave=False),
     ssm.PGAS(particles=20, interweave=True),
@@ -107,6 +110,7 @@ STUDIES = {
         (BLOCKS, EXACT[:1]),
         (WIDER, PLAIN),
         (DELAYED, (METHODS[0], EXACT[0], EXACT[2])),
+        (NOISELESS, EXACT[2:]),
     )
     for name, (parameters, state) in models_.items()
     for method in methods

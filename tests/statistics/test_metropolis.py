@@ -119,6 +119,7 @@ NATURAL = {"scale": "natural", "transform": {"tau": "reciprocal"}}
 GIVEN = {"covariance": [[0.03, -0.015], [-0.015, 0.08]]}
 METHODS = {
     "MH": (ssm.MetropolisHastings(), 1_500),
+    "MH1": (ssm.MetropolisHastings(order=1), 1_500),
     "Gibbs": (ssm.Gibbs(), 1_500),
     "PMH0, natural": (ssm.PMMH(**BOOTSTRAP, **NATURAL, **GIVEN), 4_000),
     "PMH1": (ssm.PMMH(order=1, lag=4, **BOOTSTRAP), 2_000),
@@ -126,6 +127,7 @@ METHODS = {
     "correlated": (ssm.PMMH(correlation=0.9, **BOOTSTRAP), 4_000),
 }
 LONG = {
+    "MH1, natural": (ssm.MetropolisHastings(order=1, **NATURAL), 6_000),
     "MH, natural": (
         ssm.MetropolisHastings(scale="natural", covariance=np.diag([0.08, 0.4])), 6_000,
     ),

@@ -6,6 +6,7 @@ ricker : a population that overshoots, counted with negative binomial error.
 growth : the nonlinear benchmark of Gordon, Salmond and Smith (1993), with time in its transition.
 bounded : parameters between bounds (Beta, truncated Normal), outliers, gaps in the data.
 delay : an input, and a state that acts two steps later.
+garch : a variance that follows from the observations before, without noise of its own.
 """
 
 from __future__ import annotations
@@ -150,3 +151,31 @@ def delay_transition(x, before, u, a, c, b, q):
 @delay.observation
 def delay_observation(x):
     return {"y": ssm.Normal(x, sd=0.5)}
+
+
+garch = ssm.Model("garch")
+
+
+@garch.prior
+def garch_prior():
+    return {
+        "w": ssm.Gamma(4, rate=20),
+        "a": ssm.Beta(2, 8),
+        "b": ssm.Beta(6, 4),
+        "h_1": ssm.InverseGamma(4, scale=3),
+    }
+
+
+@garch.initial
+def garch_initial(h_1):
+    return {"h": ssm.Dirac(h_1)}
+
+
+@garch.transition
+def garch_transition(h, y, w, a, b):
+    return {"h": ssm.Dirac(w + a * y**2 + b * h)}
+
+
+@garch.observation
+def garch_observation(h):
+    return {"y": ssm.Normal(0, variance=h)}

@@ -7,24 +7,29 @@ states follow given each kept draw by backward sampling.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.coordinates import coordinates
-from ssmppl.inference.chains.pmmh import adapts, settings_of, walk_factor
+from ssmppl.inference.chains.langevin import Langevin
+from ssmppl.inference.chains.pmmh import STRETCH, adapts, settings_of, walk_factor
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.chains.walk import (
     Metropolis,
     Point,
+    Proposal,
     RandomWalk,
     Run,
     metropolis_block,
     start_chain,
 )
+from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.deterministic import Deterministic
+from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import ExactModel, exact_model, filter_name, filter_of
 from ssmppl.inference.methods import MetropolisHastings
 from ssmppl.inference.particles.pilot import dispersed, find_mode
@@ -59,15 +64,22 @@ def needed_model(problem: Problem, method: str) -> ExactModel:
 
 @dataclass(frozen=True)
 class ExactLikelihood:
-    """The exact filter's likelihood; states, if they are wanted, by backward sampling."""
+    """The exact filter's likelihood; states, if they are wanted, by backward sampling.
+
+    scored : (P,) the parameters in which each run tells the gradient too; None: in none.
+    """
 
     problem: Problem
     states: bool
+    scored: np.ndarray | None = None
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
         model = needed_model(self.problem, "MetropolisHastings")
-        value = model.log_likelihood(self.problem.experiments, theta)
-        return Run(value) if value > -np.inf else None
+        if self.scored is None:
+            value, slope = model.log_likelihood(self.problem.experiments, theta), None
+        else:
+            value, slope = model.score(self.problem.experiments, theta, self.scored)
+        return Run(value, score=slope) if value > -np.inf else None
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
         model = needed_model(self.problem, "MetropolisHastings")
@@ -79,28 +91,60 @@ class ExactLikelihood:
 
 
 def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
-    """Find the mode and the information there, and start the chains."""
+    """Find the mode and the information there, and start the chains.
+
+    Raises
+    ------
+    ArgumentError : the likelihood is not exact, or a setting is out of range or does not apply.
+    """
     problem, space = setup.problem, setup.space
     exact = needed_model(problem, "MetropolisHastings")
+    if method.order not in (None, 0, 1):
+        raise ArgumentError(
+            f"order={method.order!r}",
+            fix="use 0 (random walk), 1 (Langevin, by the gradient) or None",
+        )
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     factor = walk_factor(setup, method, where, pilot, kind)
     d = len(where)
-    target = method.target_acceptance or (0.44 if d <= 1 else 0.35 if d == 2 else 0.234)
+    tuning: Any = factor
+    move: Proposal = RandomWalk()
+    scored: np.ndarray | None = None
+    usual = 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
+    free = free_components(problem.trace, setup.held)
+    order = method.order
+    if order is None:
+        cheap = isinstance(exact, Deterministic) and d > 2
+        order = int(cheap and not _without_gradient(exact, setup, free))
+    elif order and (reason := _without_gradient(exact, setup, free)):
+        raise ArgumentError(
+            f"order=1 does not apply: {reason}", fix="use ssm.MetropolisHastings(order=0)"
+        )
+    if order:
+        scored = free
+        if method.covariance is None:
+            factor = factor * np.sqrt(max(d, 1)) / STRETCH  # steps of one standard deviation
+        move, tuning, usual = Langevin(where, factor, newton=False), 0.0, 0.574
     kernel = Metropolis(
-        where, ExactLikelihood(problem, setup.states), RandomWalk(), setup.warmup,
-        setup.warmup if adapts(method) else 0, target, setup.thin,
+        where, ExactLikelihood(problem, setup.states, scored), move, setup.warmup,
+        setup.warmup if adapts(method) else 0, method.target_acceptance or usual, setup.thin,
     )  # fmt: skip
     starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
     for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
-        states.append(start_chain(kernel, where.at(z), factor, generator, stream))
+        states.append(start_chain(kernel, where.at(z), tuning, generator, stream))
     report = {
-        "settings": settings_of(method),
+        "settings": settings_of(replace(method, order=order)),
         "likelihood": f"exact, by {filter_name(exact)}",
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
         "walk_covariance": (factor @ factor.T).tolist(),
     }
     return Sampler(partial(metropolis_block, kernel), states, report)
+
+
+def _without_gradient(exact: ExactModel, setup: Setup, free: np.ndarray) -> str:
+    """Why the likelihood has no gradient in closed form; empty where it has."""
+    return exact_score(exact, setup.problem.experiments, free, setup.space.theta).differences

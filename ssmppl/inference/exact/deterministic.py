@@ -20,7 +20,7 @@ from ssmppl.analysis.structure import without_noise
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.codegen.program import compile_trace
 from ssmppl.data import Experiment
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.scored import Scored
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
@@ -102,7 +102,8 @@ class Deterministic(Scored):
 
         Raises
         ------
-        ArgumentError : a law's support, or the law by steps, depends on a free parameter.
+        ArgumentError : the states go through an opaque primitive, or a law's support, or the law
+            by steps, depends on a free parameter.
         """
         data = tuple(experiments)
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
@@ -130,7 +131,13 @@ class Deterministic(Scored):
         problem = self._problem(data)
         key = held, problem.program.missing
         if key not in self._scores:
-            self._scores[key] = complete_scores(problem, held)
+            found = complete_scores(problem, held)
+            if "score" in found.differences:
+                raise ArgumentError(
+                    f"the states have no derivatives in closed form: {found.differences['score']}",
+                    fix="write the primitive in NumPy, or use a method without scores",
+                )
+            self._scores[key] = found
         return self._scores[key].of(problem)
 
 
