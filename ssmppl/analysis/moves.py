@@ -13,8 +13,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.structure import GaussianBlock, gaussian_block
+from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, attributed, depends_on, substitute, topological
 from ssmppl.language.distributions import Draws
@@ -38,7 +41,10 @@ class Proposal:
 
 
 def bootstrap(trace: Trace, missing: Missing) -> Proposal:
-    """Move by the transition, weigh by the observation (Gordon, Salmond and Smith 1993)."""
+    """Move by the transition, weigh by the observation (Gordon, Salmond and Smith 1993).
+
+    The draw of a state whose own transition has no sampler is NaN where @proposal gives one.
+    """
     observed = tuple(terms(trace, "observation", missing))
     return Proposal(
         "bootstrap",
@@ -57,7 +63,10 @@ def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
     for site in sites:
         law = site.distribution
         with attributed(trace.locations, law.location):
-            sample = drawn(site)
+            if not law.drawable and site.name in trace.proposal:
+                sample = nothing(site)
+            else:
+                sample = drawn(site)
         out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
     return out
 
@@ -73,6 +82,20 @@ def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
     sample = array(law.sample(draws or Draws(site.name)) if law.proper else law.mean())
     inside = law.in_range()
     return sample if inside is None else array(elementwise("where", inside, sample, math.nan))
+
+
+def nothing(site: Site) -> ExprArray:
+    """NaN in place of a draw, for code that is never run."""
+    return array(np.full(site.shape, math.nan))
+
+
+def undrawable(trace: Trace) -> NotApplicable | None:
+    """Why particles cannot move by the transition itself; None where they can."""
+    for site in trace.transition.values():
+        if not site.distribution.drawable:
+            reason = f"the transition law of {site.name}, {type(site.distribution).__name__}, "
+            return NotApplicable(reason + "has no sampler", site.distribution.location)
+    return None
 
 
 def resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:

@@ -34,6 +34,7 @@ from ssmppl.language.distributions import (
     StudentT,
     Truncated,
 )
+from ssmppl.language.written import Written
 
 Index = tuple[int, ...]
 Changes = Mapping[Index, Expr]
@@ -65,6 +66,8 @@ def rebuilt(d: Distribution, parameters: Mapping[str, Any]) -> Distribution:
         new: Distribution = truncated(rebuilt(d.base, wide | inside), bounds)
     elif isinstance(d, Flat):
         return d
+    elif isinstance(d, Written):
+        return d.with_parameters({**d.parameters, **{n: array(v) for n, v in parameters.items()}})
     else:
         values = {**d.parameters, **parameters}
         new = type(d)(**{n.rstrip("_"): array(v) for n, v in values.items()})  # type: ignore[call-arg]

@@ -24,7 +24,7 @@ from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.ranges import out_of_range
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Trace, trace
+from ssmppl.language.trace import Site, Trace, trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
@@ -100,18 +100,32 @@ def simulate(
 
 
 def check_drawable(traced: Trace) -> None:
-    """Refuse a model whose x_1 has no proper law.
+    """Refuse a model whose x_1 has no proper law, and one of whose laws has no sampler.
 
     Raises
     ------
-    ModelError : naming the state and its line.
+    ModelError : naming the state or channel and its line.
     """
+    for sites in (traced.initial, traced.transition, traced.observations):
+        check_samplers(sites)
     for site in flat_start(traced):
         raise ModelError(
             f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
             fix="give it a proper law in @initial to simulate",
             where=site.distribution.location,
         )
+
+
+def check_samplers(sites: Mapping[str, Site]) -> None:
+    """Refuse laws that nothing can be drawn from.
+
+    Raises
+    ------
+    ModelError : naming the law and its line.
+    """
+    for site in sites.values():
+        if not site.distribution.drawable:
+            raise site.distribution.undrawable(f"{site.name!r} has to be drawn here")
 
 
 def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) -> None:
