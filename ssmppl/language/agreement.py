@@ -1,9 +1,10 @@
 """Whether what a user declared of a law agrees with its density, by quadrature and by a test.
 
-A continuous support is mapped to the line (x = sinh s; lower + e^s; a logistic function of s between
-two bounds), where densities with the heavy tails and the integrable singularities of the usual laws
-fall off exponentially, and cut at the mode, at steps from it that double, and at the draws. On each
-piece Gauss-Legendre rules of 10 and of 20 nodes are compared, and pieces halved until they agree.
+A continuous support is mapped to the line (x = sinh s; lower + e^s; a logistic function of s
+between two bounds), where densities with the heavy tails and the integrable singularities of the
+usual laws fall off exponentially, and cut at the mode, at steps from it that double, and at the
+draws. On each piece Gauss-Legendre rules of 10 and of 20 nodes are compared, and pieces halved
+until they agree.
 The test of the draws is Kolmogorov's, with the exact distribution of its statistic for their number
 (Simard and L'Ecuyer 2011, *J. Statist. Software* 39(11)).
 """
@@ -15,7 +16,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
 
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import array
@@ -28,6 +28,9 @@ TOLERANCE = 1e-6  # of what is integrated and compared
 EXACT = 1e-11  # of a piece, where it is halved no more
 HALVINGS = 50
 FARTHEST = 700.0  # of s: e^700 is the end of floating point
+FAR = 1e100
+LEVELS = (0.001, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99, 0.999)  # at which quantiles are compared
+REFINEMENTS = 12  # of the place of the mode, each by a factor of about 20
 FIRST, MOST_TERMS = 1 << 10, 1 << 24  # terms of a sum over whole numbers
 _RULES = [np.polynomial.legendre.leggauss(n) for n in (10, 20)]
 
@@ -63,58 +66,23 @@ def agreement(
 
     places : of the functions that were declared, by part.
     """
-    lower, upper = (float(evaluate(array(b)[()])) for b in
-                    (law.support().lower, law.support().upper))  # fmt: skip
-    drawn = _draws(law, draws, seed) if law.drawable else np.empty(0)
-    outside = drawn[~((drawn >= lower) & (drawn <= upper))]
-    where = places.get("draw", places["density"])
-    if outside.size:
-        raise ModelError(f"the sampler of {law!r} drew {outside[0]:.6g}, which is outside of its "
-                         f"support, {lower:g} to {upper:g}",
-                         fix="correct the sampler or the bounds", where=where)  # fmt: skip
-    if law.discrete and np.any(drawn != np.floor(drawn)):
-        value = drawn[drawn != np.floor(drawn)][0]
-        raise ModelError(f"the sampler of {law!r} drew {value:.6g}, which is no whole number",
-                         fix="correct the sampler, or leave out discrete=True", where=where)  # fmt: skip
-    found = (_summed if law.discrete else _integrated)(law, lower, upper, np.sort(drawn), places)
-    kind = "sums" if law.discrete else "integrates"
-    lines = [f"{law!r}: the density {kind} to {found.total:.9g}"]
-    if abs(found.total - 1.0) > TOLERANCE + found.error:
-        raise ModelError(
-            f"the density of {law!r} {kind} to {found.total:.9g}, not to 1",
-            fix=f"add {-math.log(found.total):.9g} to the log density there, or correct it or the "
-            "bounds" if found.total > 0.0 else "correct the density or the bounds",
-            where=places["density"],
-        )  # fmt: skip
+    support = law.support()
+    lower, upper = (float(evaluate(array(b)[()])) for b in (support.lower, support.upper))
+    drawn = np.sort(_draws(law, draws, seed)) if law.drawable else np.empty(0)
+    by_draw = places.get("draw", places["density"])
+    _check_inside(law, drawn, lower, upper, by_draw)
+    found = (_summed if law.discrete else _integrated)(law, lower, upper, drawn, places)
+    lines = [_check_total(law, found, places["density"])]
     for part, own in (("mean", found.mean), ("variance", found.variance)):
         if part in places:
-            told = float(evaluate(array(getattr(law, part)())[()]))
-            if not math.isfinite(told):  # what the integral tends to is not seen
-                continue
-            if not abs(told - own) <= 1e-5 * (1.0 + abs(own)):
-                raise _differs(law, f"the {part}", told, own, places[part])
-            lines.append(f"the {part} is {own:.6g}, as declared")
+            lines += _check_moment(law, part, own, places[part])
     if "cdf" in places:
-        at, below = found.at, found.below
-        told_at = np.broadcast_to(evaluate(array(law.cdf(VALUE))[()], {VALUE: at}), at.shape)
-        gap = np.where(np.isnan(told_at), np.inf, np.abs(told_at - below))
-        if gap.size and gap.max() > TOLERANCE + found.error:
-            k = int(gap.argmax())
-            raise _differs(law, f"the distribution function at {at[k]:.6g}", told_at[k], below[k],
-                           places["cdf"])  # fmt: skip
-        lines.append(f"the distribution function agrees at {at.size} values")
+        lines.append(_check_cdf(law, found, places["cdf"]))
+        if "quantile" in places:
+            lines.append(_check_quantile(law, places["quantile"]))
     p_value = None
     if drawn.size:
-        from scipy.stats import kstwo  # slow to import
-
-        p_value = float(kstwo.sf(found.distance, drawn.size))
-        if p_value < level:
-            raise ModelError(
-                f"{drawn.size} draws of {law!r} do not follow its density: "
-                f"Kolmogorov-Smirnov, p = {p_value:.2g}, below the level {level:g}",
-                fix="correct the sampler or the density",
-                where=where,
-            )
+        p_value = _check_draws(law, found, len(drawn), level, by_draw)
         lines.append(f"{drawn.size} draws follow it: Kolmogorov-Smirnov, p = {p_value:.3f}")
     return Agreement(found.total, p_value, found.mean, found.variance, tuple(lines))
 
@@ -133,6 +101,86 @@ class _Found:
     error: float = 0.0
 
 
+def _check_inside(
+    law: Written, drawn: np.ndarray, lower: float, upper: float, where: Location
+) -> None:
+    outside = drawn[~((drawn >= lower) & (drawn <= upper))]
+    if outside.size:
+        raise ModelError(
+            f"the sampler of {law!r} drew {outside[0]:.6g}, which is outside of its support, "
+            f"{lower:g} to {upper:g}",
+            fix="correct the sampler or the bounds",
+            where=where,
+        )
+    between = drawn[drawn != np.floor(drawn)]
+    if law.discrete and between.size:
+        raise ModelError(
+            f"the sampler of {law!r} drew {between[0]:.6g}, which is no whole number",
+            fix="correct the sampler, or leave out discrete=True",
+            where=where,
+        )
+
+
+def _check_total(law: Written, found: _Found, where: Location) -> str:
+    told = f"{'sums' if law.discrete else 'integrates'} to {found.total:.9g}"
+    if not abs(found.total - 1.0) <= TOLERANCE + found.error:
+        fix = "correct the density or the bounds"
+        if 0.0 < found.total < math.inf:
+            fix = f"add {-math.log(found.total):.9g} to the log density there, or {fix}"
+        raise ModelError(f"the density of {law!r} {told}, not to 1", fix=fix, where=where)
+    return f"{law!r}: the density {told}"
+
+
+def _check_moment(law: Written, part: str, own: float, where: Location) -> list[str]:
+    told = float(evaluate(array(getattr(law, part)())[()]))
+    if not math.isfinite(told):  # what the integral tends to is not seen
+        return []
+    if not abs(told - own) <= 1e-5 * (1.0 + abs(own)):
+        raise _differs(law, f"the {part}", told, own, where)
+    return [f"the {part} is {own:.6g}, as declared"]
+
+
+def _check_cdf(law: Written, found: _Found, where: Location) -> str:
+    at, below = found.at, found.below
+    told = np.broadcast_to(evaluate(array(law.cdf(VALUE))[()], {VALUE: at}), at.shape)
+    gap = np.where(np.isnan(told), np.inf, np.abs(told - below))
+    k = int(gap.argmax())
+    if gap[k] > TOLERANCE + found.error:
+        raise _differs(law, f"the distribution function at {at[k]:.6g}", told[k], below[k], where)
+    return f"the distribution function agrees at {at.size} values"
+
+
+def _check_quantile(law: Written, where: Location) -> str:
+    for p in LEVELS:
+        at = array(law.quantile(array(p)))
+        low, high = (float(evaluate(array(law.cdf(v))[()])) for v in (at - 1.0, at))
+        right = low < p + TOLERANCE and high > p - TOLERANCE if law.discrete else (
+            abs(high - p) <= TOLERANCE
+        )  # fmt: skip
+        if not right:
+            raise ModelError(
+                f"the quantile of {law!r} at {p:g} is {float(evaluate(at[()])):.9g}, where its "
+                f"distribution function is {high:.9g}",
+                fix="correct the one or the other",
+                where=where,
+            )
+    return f"its inverse agrees at {len(LEVELS)} levels"
+
+
+def _check_draws(law: Written, found: _Found, n: int, level: float, where: Location) -> float:
+    from scipy.stats import kstwo  # slow to import
+
+    p_value = float(kstwo.sf(found.distance, n))
+    if p_value < level:
+        raise ModelError(
+            f"{n} draws of {law!r} do not follow its density: Kolmogorov-Smirnov, "
+            f"p = {p_value:.2g}, below the level {level:g}",
+            fix="correct the sampler or the density",
+            where=where,
+        )
+    return p_value
+
+
 def _differs(law: Written, what: str, told: float, own: float, where: Location) -> ModelError:
     return ModelError(f"{what} of {law!r} is {told:.9g}, by its density {own:.9g}",
                       fix="correct the one or the other", where=where)  # fmt: skip
@@ -149,6 +197,8 @@ def _log_density(law: Written, places: Mapping[str, Location]) -> Function:
 
     def at(x: np.ndarray) -> np.ndarray:
         found = np.array(np.broadcast_to(evaluate(form, {VALUE: x}), x.shape), dtype=float)
+        far = np.abs(x) > FAR  # where squares are infinite, and differences of them nan
+        found[np.isnan(found) & far] = -np.inf
         bad = np.isnan(found) | (found == np.inf)
         if bad.any():
             raise ModelError(
@@ -177,6 +227,7 @@ def _integrated(
         return out
 
     mode, width = _mode(log_g, to_s(drawn))
+    centre = float(to_x(np.array(mode)))
     steps = width * 2.0 ** np.arange(-6.0, 64.0)
     cuts = np.concatenate([mode - steps, [mode], mode + steps, np.arange(-FARTHEST, FARTHEST)])
     values = np.clip(to_s(drawn), -FARTHEST, FARTHEST)
@@ -185,7 +236,7 @@ def _integrated(
     def moments(s: np.ndarray) -> np.ndarray:
         g, x = np.exp(log_g(s)), to_x(s)
         with np.errstate(all="ignore"):
-            own = np.where(g > 0.0, x, 0.0)
+            own = np.where(g > 0.0, x - centre, 0.0)
             return np.nan_to_num(np.stack([g, g * own, g * own**2]), posinf=0.0, neginf=0.0)
 
     pieces = _pieces(moments, cuts)
@@ -195,7 +246,7 @@ def _integrated(
     own = below[np.searchsorted(cuts, values)]
     distance = float(np.max([ranks[1:] / n - own, own - ranks[:-1] / n], initial=0.0))
     body = (below > EXACT) & (below < total - EXACT)
-    return _Found(float(total), float(first), float(second - first**2), to_x(cuts[body]),
+    return _Found(float(total), centre + float(first), float(second - first**2), to_x(cuts[body]),
                   below[body], distance)  # fmt: skip
 
 
@@ -229,15 +280,13 @@ def _mode(log_g: Function, drawn: np.ndarray) -> tuple[float, float]:
     """Where the density on the line is largest, and how far from there it falls by a factor e."""
     tried = np.unique(np.concatenate([np.linspace(-FARTHEST, FARTHEST, 4801),
                                       np.clip(drawn, -FARTHEST, FARTHEST)]))  # fmt: skip
-    values = log_g(tried)
-    k = int(np.argmax(values))
-    low, high = tried[max(k - 1, 0)], tried[min(k + 1, len(tried) - 1)]
-    best = scipy.optimize.minimize_scalar(
-        lambda s: -log_g(np.array([s]))[0], bounds=(low, high), method="bounded",
-        options={"xatol": 1e-12},
-    )  # fmt: skip
-    mode = float(best.x) if -best.fun > values[k] else float(tried[k])
-    top = log_g(np.array([mode]))[0]
+    for _ in range(REFINEMENTS):
+        values = log_g(tried)
+        k = int(np.argmax(values))
+        mode, top = float(tried[k]), values[k]
+        tried = np.append(np.linspace(tried[max(k - 1, 0)], tried[min(k + 1, len(tried) - 1)], 40),
+                          mode)  # fmt: skip
+        tried.sort()
     steps = 2.0 ** np.arange(-40.0, 10.0)
     fallen = (log_g(mode + steps) < top - 1.0) | (log_g(mode - steps) < top - 1.0)
     return mode, float(steps[np.argmax(fallen)]) if fallen.any() else 1.0
@@ -255,7 +304,8 @@ def _pieces(f: Callable[[np.ndarray], np.ndarray], cuts: np.ndarray) -> np.ndarr
         ]
         bound = EXACT * np.maximum(np.abs(rules[1]), 2.0**-halving)
         done = (np.abs(rules[1] - rules[0]) <= bound)[:2].all(axis=0) | (halving == HALVINGS)
-        np.add.at(out, (slice(None), index[done]), rules[1][:, done])
+        for sums, found in zip(out, rules[1], strict=True):
+            np.add.at(sums, index[done], found[done])
         left = ~done
         if not left.any():
             break

@@ -325,7 +325,8 @@ def distribution(
         where, bounds = location_of(function), Bounds(discrete=discrete, closed=closed)
         for name, given in (("lower", lower), ("upper", upper)):
             if given is not None:
-                bounds = replace(bounds, **{name: _bound(name, given, function, discrete)})
+                own: Any = {name: _bound(name, given, function, discrete)}
+                bounds = replace(bounds, **own)
         if not (isinstance(bounds.lower, str) or isinstance(bounds.upper, str)) and not (
             bounds.lower < bounds.upper or (discrete and bounds.lower == bounds.upper)
         ):
