@@ -17,7 +17,6 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.structure import GaussianBlock, gaussian_block
-from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, attributed, depends_on, substitute, topological
 from ssmppl.language.distributions import Draws
@@ -41,10 +40,7 @@ class Proposal:
 
 
 def bootstrap(trace: Trace, missing: Missing) -> Proposal:
-    """Move by the transition, weigh by the observation (Gordon, Salmond and Smith 1993).
-
-    The draw of a state whose own transition has no sampler is NaN where @proposal gives one.
-    """
+    """Move by the transition, weigh by the observation (Gordon, Salmond and Smith 1993)."""
     observed = tuple(terms(trace, "observation", missing))
     return Proposal(
         "bootstrap",
@@ -63,10 +59,7 @@ def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
     for site in sites:
         law = site.distribution
         with attributed(trace.locations, law.location):
-            if not law.drawable and site.name in trace.proposal:
-                sample = nothing(site)
-            else:
-                sample = drawn(site)
+            sample = drawn(site)
         out.update(zip(site.value.ravel(), sample.ravel(), strict=True))
     return out
 
@@ -74,28 +67,17 @@ def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
 def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
     """A draw from a law, of its shape; NaN where a parameter is out of its range.
 
-    Of a flat law NaN, for code that is never run: no algorithm starts from it.
+    Of a flat law, and of an observation's without a sampler, NaN, for code that is never run: no
+    algorithm starts from the one, and what would draw the other refuses.
 
     draws : the random numbers that it is made of; None: its own.
     """
     law = site.distribution
+    if not law.drawable:
+        return array(np.full(site.shape, math.nan))
     sample = array(law.sample(draws or Draws(site.name)) if law.proper else law.mean())
     inside = law.in_range()
     return sample if inside is None else array(elementwise("where", inside, sample, math.nan))
-
-
-def nothing(site: Site) -> ExprArray:
-    """NaN in place of a draw, for code that is never run."""
-    return array(np.full(site.shape, math.nan))
-
-
-def undrawable(trace: Trace) -> NotApplicable | None:
-    """Why particles cannot move by the transition itself; None where they can."""
-    for site in trace.transition.values():
-        if not site.distribution.drawable:
-            reason = f"the transition law of {site.name}, {type(site.distribution).__name__}, "
-            return NotApplicable(reason + "has no sampler", site.distribution.location)
-    return None
 
 
 def resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:

@@ -14,15 +14,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
 from ssmppl.analysis.laplace import NEWTON_STEPS, gaussian_fit
-from ssmppl.analysis.moves import (
-    Proposal,
-    Split,
-    bootstrap,
-    draws_of,
-    resolved,
-    split,
-    undrawable,
-)
+from ssmppl.analysis.moves import Proposal, Split, bootstrap, draws_of, resolved, split
 from ssmppl.analysis.structure import GaussianBlock, affine_observation, flat_start
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
@@ -53,8 +45,6 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
     found: dict[str, Proposal | NotApplicable] = {"bootstrap": bootstrap(trace, missing)}
     if trace.proposal:
         found["user"] = _user(trace, missing)
-    if reason_why := undrawable(trace):
-        return found | dict.fromkeys(("bootstrap", "guided", "auxiliary"), reason_why)
     guided = _locally_optimal(trace, missing)
     if isinstance(guided, NotApplicable):
         affine_reason = guided
@@ -277,10 +267,6 @@ def _user(trace: Trace, missing: Missing) -> Proposal:
     if not missing.none:
         for s in named:
             measured = seen(s) if measured is None else apply("minimum", measured, seen(s))
-    for site in trace.transition.values():
-        if measured is not None and not site.distribution.drawable:
-            why = "where the measurements that @proposal names are missing, its draws are taken"
-            raise site.distribution.undrawable(why)
     draw = dict(base.draw)
     correction = constant(0.0)
     own: set[Expr] = set()

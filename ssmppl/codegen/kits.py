@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.moves import Proposal, drawn, nothing
+from ssmppl.analysis.moves import Proposal, drawn
 from ssmppl.analysis.structure import deterministic
 from ssmppl.codegen.module import (
     PARTICLE,
@@ -149,7 +149,7 @@ def observation_draws(trace: Trace) -> list[Expr]:
     out: list[Expr] = []
     for site in trace.observations.values():
         with attributed(trace.locations, site.distribution.location):
-            sample = (drawn if site.distribution.drawable else nothing)(site).ravel()
+            sample = drawn(site).ravel()
         by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
         out += [by_symbol[s] for s in site.components]
     return out

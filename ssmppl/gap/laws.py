@@ -180,8 +180,11 @@ def has_scale(d: Distribution) -> NotApplicable | None:
     if isinstance(inner, (Normal, MvNormal)) or type(inner) in _SCALE:
         return None
     kind = type(inner).__name__
-    reason = "it has no noise (Dirac)" if kind == "Dirac" else f"its law is {kind}, "
-    reason += "" if kind == "Dirac" else "whose variance follows from its mean"
+    reason = f"its law is {kind}, whose variance follows from its mean"
+    if isinstance(inner, Dirac):
+        reason = "it has no noise (Dirac)"
+    elif isinstance(inner, Written):
+        reason = f"its law is {kind}, of which no argument is known to be its spread"
     return NotApplicable(reason, d.location)
 
 

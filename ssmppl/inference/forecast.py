@@ -74,8 +74,7 @@ def forecast(
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     """
     traced, posterior = trace(model), posterior_of(idata, KNOWN)
-    for sites in (traced.transition, traced.observations):
-        check_samplers(sites)
+    check_samplers(traced)
     future, steps, labels = bind_inputs(traced, inputs, steps)
     mark, axis = _which(traced, posterior, experiment)
     theta = parameters_of(traced, posterior)

@@ -100,7 +100,7 @@ def predict(
                 _check_count(posterior, len(experiments))
         flat = all_draws(theta)
         if paths is not None:
-            check_samplers(traced.observations)
+            check_samplers(traced)
             drawn = _observed(program, e, flat, all_draws(paths), root, i)
         else:
             check_drawable(traced)

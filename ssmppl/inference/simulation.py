@@ -24,7 +24,7 @@ from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.ranges import out_of_range
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Site, Trace, trace
+from ssmppl.language.trace import Trace, trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
@@ -100,14 +100,13 @@ def simulate(
 
 
 def check_drawable(traced: Trace) -> None:
-    """Refuse a model whose x_1 has no proper law, and one of whose laws has no sampler.
+    """Refuse a model whose x_1 has no proper law, or an observation no sampler.
 
     Raises
     ------
     ModelError : naming the state or channel and its line.
     """
-    for sites in (traced.initial, traced.transition, traced.observations):
-        check_samplers(sites)
+    check_samplers(traced)
     for site in flat_start(traced):
         raise ModelError(
             f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
@@ -116,14 +115,14 @@ def check_drawable(traced: Trace) -> None:
         )
 
 
-def check_samplers(sites: Mapping[str, Site]) -> None:
-    """Refuse laws that nothing can be drawn from.
+def check_samplers(traced: Trace) -> None:
+    """Refuse a model of which an observation cannot be drawn.
 
     Raises
     ------
     ModelError : naming the law and its line.
     """
-    for site in sites.values():
+    for site in traced.observations.values():
         if not site.distribution.drawable:
             raise site.distribution.undrawable(f"{site.name!r} has to be drawn here")
 

@@ -82,6 +82,11 @@ class Written(Distribution):
     def drawable(self) -> bool:  # type: ignore[override]
         return self._has("draw") or self._has("quantile") or self.bounds.values is not None
 
+    @property
+    def has_cdf(self) -> bool:
+        """Whether its distribution function is known."""
+        return self._has("cdf") or self.bounds.values is not None
+
     def _has(self, part: str) -> bool:
         return all(part in forms for forms in self.forms.values())
 
@@ -219,7 +224,7 @@ class Written(Distribution):
 
     def inverts(self) -> bool:
         """Whether it has a distribution function and that function's inverse."""
-        return self.bounds.values is not None or (self._has("cdf") and self._has("quantile"))
+        return self.has_cdf and (self._has("quantile") or self.bounds.values is not None)
 
 
 @cache
