@@ -153,11 +153,11 @@ class DeclaredDistribution(Declared):
         names = _arguments(function, where, verb, least=1 if _FIRST[part] else 0)
         for name in names[1:] if _FIRST[part] else names:
             if name not in self.parameters:
-                first = f", behind {_FIRST[part]}" if _FIRST[part] else ""
+                first = f"behind {_FIRST[part]}, " if _FIRST[part] else ""
                 raise ModelError(
                     f"@{verb} {function.__name__} asks for {name!r}, which is no argument of "
                     f"{self.__name__}",
-                    fix=_known(name, self.parameters) + first,
+                    fix=first + _known(name, self.parameters),
                     where=where,
                 )
         self.functions[part] = function
@@ -183,6 +183,7 @@ class DeclaredDistribution(Declared):
         law.origin = Origin(self.__name__, self.location, self.__module__, self.__qualname__)
         for name in self.positive:
             law._require(name, 0.0)
+        self._check_bounds(law)
         law.patterns, law.forms = np.empty(law.shape, dtype=object), {}
         for i in np.ndindex(law.shape):
             own = [law.parameters[n][i] for n in self.parameters]
@@ -190,7 +191,6 @@ class DeclaredDistribution(Declared):
             law.patterns[i] = pattern
             if pattern not in law.forms:
                 law.forms[pattern] = self._forms(pattern)
-        self._check_bounds(law)
         return law
 
     def _forms(self, pattern: Pattern) -> Forms:
@@ -247,7 +247,8 @@ class DeclaredDistribution(Declared):
         symbolic = [n for n, a in law.parameters.items() for e in a.ravel() if e.op != "const"]
         if symbolic or law.shape:
             raise ModelError(
-                f"{self.__name__}.check takes one number for each argument; found {law!r}",
+                f"{self.__name__}.check takes one number for each argument; found {law!r}"
+                + (f" of shape {law.shape}" if law.shape else ""),
                 fix="call it outside of a model, with numbers",
                 where=law.location,
             )

@@ -44,7 +44,9 @@ def form(
             own[first] = Generator(Draws("draw"))
         elif part not in ("mean", "variance"):
             own[first] = VALUE
-        found.append(_expression(once(function, verb, own, {}), function, verb))
+        with np.errstate(all="ignore"):  # of what is no number the user is told below
+            value = once(function, verb, own, {})
+        found.append(_expression(value, function, verb))
     told = _fault(part, found, parameters, pattern)
     if told:
         raise ModelError(

@@ -101,6 +101,13 @@ class Written(Distribution):
         new._set(**parameters)
         new.location, new.ranges = self.location, self.ranges
         new.patterns = np.broadcast_to(self.patterns, new.shape)
+        for i in np.ndindex(new.shape):
+            own = [new.parameters[n][i] for n in self.parameters]
+            if any(
+                v is not None and not (e.op == "const" and e.data == v)
+                for v, e in zip(new.patterns[i], own, strict=True)
+            ):
+                raise ValueError(f"another number among the arguments of {self!r}")
         return new
 
     # -- what the user's functions give, component by component
