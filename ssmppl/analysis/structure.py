@@ -210,6 +210,26 @@ def check_start(trace: Trace) -> None:
         )
 
 
+def without_noise(trace: Trace) -> NotApplicable | None:
+    """None if every state follows from parameters, inputs and earlier observations, at t = 1 too;
+    else which one does not."""
+    for role, sites in (("initial law", trace.initial), ("transition", trace.transition)):
+        for site in sites.values():
+            if not isinstance(site.distribution, Dirac):
+                kind = type(site.distribution).__name__
+                return NotApplicable(
+                    f"the {role} of {site.name} is {kind}", site.distribution.location
+                )
+    return None
+
+
+def noisy_start(trace: Trace) -> list[Site]:
+    """The states whose initial law has noise, where no transition has any; else none."""
+    if any(not isinstance(s.distribution, Dirac) for s in trace.transition.values()):
+        return []
+    return [s for s in trace.initial.values() if not isinstance(s.distribution, Dirac)]
+
+
 def deterministic_memory(trace: Trace) -> int | None:
     """Steps after which the Dirac components have forgotten their past, given the noisy ones.
 

@@ -23,7 +23,8 @@ __all__ = [
 Decorator = Callable[..., Any]
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 PROPOSALS = (
-    "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted", "tempered",
+    "auto", "kalman", "forward", "deterministic", "bootstrap", "guided", "auxiliary", "twisted",
+    "tempered",
     "marginal", "marginal_guided", "marginal_auxiliary", "user",
 )  # fmt: skip
 

@@ -23,6 +23,7 @@ from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.interweaving import applicable, with_states
+from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.method_choice import (
     choose_maximiser,
@@ -99,10 +100,12 @@ class Plan:
         guided = self.proposals.get("guided")
         if isinstance(guided, NotApplicable) and tempered(t, Missing()):
             rows.append(("tempered", TEMPERED))
-        out.append(("Particle filter", rows))
-        out.append(("Trajectories", [("PGAS", self._trajectories())]))
+        noisy = not isinstance(exact_model(t), Deterministic)
+        if noisy:
+            out.append(("Particle filter", rows))
+            out.append(("Trajectories", [("PGAS", self._trajectories())]))
         out.append(("Chosen, unless a method is named", self._choices()))
-        if self.updates:
+        if self.updates and noisy:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
             out.append(("Interweaved with these, where parameters mix slowly", self._interweaved()))
             out.append(("Eliminated in PGAS, where asked for", self._eliminated()))
@@ -113,6 +116,9 @@ class Plan:
             return [("finite states", f"{len(self.finite.values)} combinations of values: the "
                      "likelihood is exact, by the forward algorithm; particles are used only where "
                      "they are asked for")]  # fmt: skip
+        if isinstance(exact_model(self.trace), Deterministic):
+            return [("no noise", "given the parameters the states are known: the likelihood is "
+                     "exact, by running them once")]  # fmt: skip
         if isinstance(self.structure, NotApplicable):
             found = [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
             if isinstance(self.conditional, ConditionallyLinear):

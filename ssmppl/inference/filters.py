@@ -111,10 +111,11 @@ def particle_filter(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, integrate=True
     )
     if settings.proposal in EXACT:
-        instead = "kalman_filter" if settings.proposal == "kalman" else "forward_filter"
+        instead = {"kalman": "call ssm.kalman_filter", "forward": "call ssm.forward_filter"}
+        otherwise = 'use particles=1 and proposal="bootstrap"'  # every particle is the same
         raise ArgumentError(
             f'particle_filter with proposal="{settings.proposal}"',
-            fix=f"call ssm.{instead} instead",
+            fix=f"{instead.get(settings.proposal, otherwise)} instead",
         )
     if history:
         rows, d = problem.rows, len(problem.trace.state_symbols)

@@ -106,6 +106,12 @@ def leave_future_out(
             fix="give one data set",
         )
     check_count("particles", particles, 1)
+    if set(problem.trace.parameters) <= set(fixed or {}):
+        raise ArgumentError(
+            "no parameter is free, so that there is nothing to integrate out",
+            fix="take the log-likelihood increments of ssm.particle_filter, or of "
+            "ssm.kalman_filter or ssm.forward_filter where they are exact",
+        )
     (whole,) = problem.experiments
     begin = max(2, whole.steps // 4 + 1) if first is None else first
     check_count("first", begin, 2)

@@ -13,9 +13,12 @@ from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.exact.hidden_markov import hidden_markov
-from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.exact.models import EXACT, exact_log_likelihood, exact_model, filter_of
+from ssmppl.inference.exact.models import (
+    EXACT,
+    NEEDED,
+    exact_log_likelihood,
+    form_of,
+)
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     estimates_task,
@@ -55,9 +58,10 @@ def log_likelihood(
     parameters : value of each parameter of the model, {} where it has none.
     particles : number N of particles.
     repeats : number of independent estimates.
-    proposal : "auto", "kalman", "forward", "bootstrap", "guided", "auxiliary", "twisted",
-        "tempered", or "user" where the model has a @proposal. "auto" is exact on linear Gaussian
-        models and on those of finitely many states (the forward algorithm), else the proposal with
+    proposal : "auto", "kalman", "forward", "deterministic", "bootstrap", "guided", "auxiliary",
+        "twisted", "tempered", or "user" where the model has a @proposal. "auto" is exact on linear
+        Gaussian models, on those of finitely many states ("forward", the forward algorithm) and on
+        those without noise in their states ("deterministic"), else the proposal with
         the least variance for its cost in a pilot; "twisted", which looks ahead to the end of the
         data, is tried where the others tell log Z to no better than 1.2 at 100 particles.
         "marginal", "marginal_guided" and "marginal_auxiliary" are Rao-Blackwellised: states that
@@ -141,12 +145,10 @@ def settle(
         chosen = choose(problem, theta, **flags).name
         return replace(settings, proposal=chosen)
     if proposal in EXACT:
-        found = exact_model(problem.trace)
-        if isinstance(found, NotApplicable) or filter_of(found) != proposal:
-            own = kalman_model if proposal == "kalman" else hidden_markov
-            kind = "linear Gaussian model" if proposal == "kalman" else "model of finite states"
+        found = form_of(proposal, problem.trace)
+        if isinstance(found, NotApplicable):
             raise ArgumentError(
-                f'proposal="{proposal}" needs a {kind}: {own(problem.trace)}',
+                f'proposal="{proposal}" needs a {NEEDED[proposal]}: {found}',
                 fix='use proposal="auto"',
             )
     else:

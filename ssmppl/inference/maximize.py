@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import noisy_start
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
@@ -24,7 +26,7 @@ from ssmppl.inference.maximum import (
     score_ascent,
 )
 from ssmppl.inference.maximum.ascent import Ascent, Setup
-from ssmppl.inference.method_choice import choose_maximiser
+from ssmppl.inference.method_choice import choose_maximiser, start_as_parameter
 from ssmppl.inference.methods import EM, IF2, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import (
@@ -153,7 +155,14 @@ def choose_method(setup: Setup) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
     exact = setup.exact
     kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
-    chosen, reason = choose_maximiser(kind, setup.problem.trace)
+    trace = setup.problem.trace
+    chosen, reason = choose_maximiser(kind, trace)
+    if isinstance(chosen, ScoreAscent) and noisy_start(trace):
+        warnings.warn(
+            f"{type(chosen).__name__} may take minutes for each hundred rows here: "
+            f"{start_as_parameter(trace)}",
+            stacklevel=3,
+        )
     return chosen, f"automatically: {reason}"
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ssmppl.analysis.smooth import smooth_filter_applies
-from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.analysis.structure import deterministic_memory, noisy_start
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.exact.deterministic import Deterministic
+from ssmppl.inference.exact.models import KIND
 from ssmppl.inference.methods import (
     PGAS,
     PMMH,
@@ -29,12 +31,12 @@ def choose_sampler(
 ) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
 
-    kind : "linear Gaussian" or "of finitely many states", whose states are drawn exactly, or why it
-    is neither. Gibbs then needs no tuning where every parameter has a closed-form conditional;
-    those that mix slowly given the states are moved with them integrated out besides. Where some
-    have none, slices given the states mix slowly and cost a pass over the data each, and a random
-    walk on the exact likelihood, which integrates the states out, is better as long as the
-    parameters are few.
+    kind : of an exact model (`KIND`), or why it is none. Where the states are drawn exactly, Gibbs
+    needs no tuning if every parameter has a closed-form conditional; those that mix slowly given
+    the states are moved with them integrated out besides. Where some have none, slices given the
+    states mix slowly and cost a pass over the data each, and a random walk on the exact likelihood,
+    which integrates the states out, is better as long as the parameters are few; where the states
+    have no noise there is nothing else.
     updates : where the states are drawn exactly. numbers : of the free parameters. stuck : as of
     `why_stuck`, for the others.
     """
@@ -50,6 +52,10 @@ def choose_sampler(
             f"{stuck}, but {numbers} numbers are too many for a random walk: conditional SMC "
             "without ancestor sampling; see the attribute trajectory_update_rate, and take more "
             "particles where it is low"
+        )
+    if kind == KIND[Deterministic]:
+        return MetropolisHastings(), (
+            f"the model is {kind}, so that its likelihood is exact: a random walk on it"
         )
     open_ = [c for u in updates if u.conditional is None for c in u.block]
     if not open_:
@@ -92,11 +98,14 @@ def why_stuck(trace: Trace, rows: int | None) -> str:
     """
     if deterministic_memory(trace) is not None:
         return ""
+    if noisy_start(trace):
+        return (
+            "every state follows from those before it, so that PGAS has no trajectory to move; "
+            + start_as_parameter(trace)
+        )
     random = [
         s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
     ]
-    if not random:
-        return "every state follows from those before it, so that PGAS has no trajectory to move"
     reason = (
         "a deterministic component never forgets its past, so that PGAS cannot join a trajectory "
         "to other ancestors"
@@ -106,6 +115,15 @@ def why_stuck(trace: Trace, rows: int | None) -> str:
     if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
         return f"{reason}, and over more than {ROWS_WITHOUT_ANCESTORS} rows hardly moves its start"
     return ""
+
+
+def start_as_parameter(trace: Trace) -> str:
+    """How a model whose states have noise in their first row only is made exact."""
+    name = noisy_start(trace)[0].name
+    return (
+        f"only the first row of the states has noise: with it as a parameter ({name}_1 in @prior, "
+        f"ssm.Dirac({name}_1) in @initial) the likelihood is exact, and everything faster"
+    )
 
 
 def choose_maximiser(
@@ -125,6 +143,7 @@ def choose_maximiser(
     return ScoreAscent(), (
         "Fisher's identity gives the score by particle smoothing; direct optimisation does not "
         f"apply: {obstacle.reason}"
+        + (f"; {start_as_parameter(trace)}" if noisy_start(trace) else "")
     )
 
 
@@ -134,5 +153,7 @@ def choose_smoother(
     """The method of `smooth` for a model of this kind, and the reason."""
     if isinstance(kind, NotApplicable):
         return FFBSi(), f"the model is not linear and Gaussian: {kind.reason}"
+    if kind == KIND[Deterministic]:
+        return FFBSi(kernel="genealogy"), f"the model is {kind}, and every trajectory is the same"
     chosen = KalmanSmoother() if kind == "linear Gaussian" else ForwardBackward()
     return chosen, f"the model is {kind}"

@@ -43,7 +43,15 @@ class Problem:
         """
         found = self.program.proposal(name)
         if found is None:
-            known = ["auto", "kalman", *self.program.proposals, *MARGINAL, "tempered"]
+            known = [
+                "auto",
+                "kalman",
+                "forward",
+                "deterministic",
+                *self.program.proposals,
+                *MARGINAL,
+                "tempered",
+            ]
             raise ArgumentError(
                 f"proposal={name!r} is not known for this model",
                 fix=f"use one of: {listing(name, known)}",

@@ -33,6 +33,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Score", "score"]
 
+# What the score of each exact filter is made of.
+SCORED = {
+    "kalman": "the sensitivities of the Kalman filter",
+    "forward": "Fisher's identity over the forward and backward algorithm",
+    "deterministic": "the sensitivities of the states",
+}
+
 
 @dataclass(frozen=True)
 class Score:
@@ -89,9 +96,9 @@ def score(
 ) -> Score:
     """Gradient of log p(y | parameters), and the observed information.
 
-    Exact on linear Gaussian models, by the sensitivities of the Kalman filter, and on those of
-    finitely many states; else by Fisher's and
-    Louis' identities over backward trajectories of a particle filter.
+    Exact on linear Gaussian models, by the sensitivities of the Kalman filter, on those of finitely
+    many states, and on those without noise in their states, by the sensitivities of these; else by
+    Fisher's and Louis' identities over backward trajectories of a particle filter.
 
     Parameters
     ----------
@@ -135,10 +142,7 @@ def score(
     if settings.proposal in EXACT and not isinstance(form, NotApplicable):
         exact = exact_score(form, problem.experiments, free, theta)
         found = _exact(exact, theta)
-        by = "the sensitivities of the Kalman filter"
-        if settings.proposal == "forward":
-            by = "Fisher's identity over the forward and backward algorithm"
-        attrs["method"] = f"exact, by {by}"
+        attrs["method"] = f"exact, by {SCORED[settings.proposal]}"
         if exact.differences:
             attrs["method"] = "differences of the exact likelihood"
             attrs["central_differences"] = exact.differences

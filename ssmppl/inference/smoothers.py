@@ -103,10 +103,10 @@ def _filter(call: Call, method: FFBSi | FixedLag, integrate: bool = False) -> Fi
     """The filter's settings, "auto" resolved among the particle proposals."""
     proposal = method.proposal
     if proposal in EXACT:
-        exact = "KalmanSmoother" if proposal == "kalman" else "ForwardBackward"
+        exact = {"kalman": "ssm.KalmanSmoother(), or ", "forward": "ssm.ForwardBackward(), or "}
         raise ArgumentError(
             f'{type(method).__name__}(proposal="{proposal}") has no particles',
-            fix=f"use ssm.{exact}(), or another proposal",
+            fix=f"use {exact.get(proposal, '')}another proposal",
         )
     if proposal == "auto":
         proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name

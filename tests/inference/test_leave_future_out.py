@@ -100,3 +100,13 @@ def test_what_is_out_of_range_is_refused(change, message, y):
 def test_several_data_sets_are_refused(y):
     with pytest.raises(ArgumentError, match="2 data sets"):
         ssm.leave_future_out(plain(), [{"y": y}, {"y": y}])
+
+
+def test_parameters_that_are_all_fixed_leave_nothing_to_integrate_out():
+    model = ssm.Model("walk")
+    model.prior(lambda: {"q": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.Normal(x, sd=q)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    with pytest.raises(ArgumentError, match="no parameter is free"):
+        ssm.leave_future_out(model, {"y": np.zeros(9)}, fixed={"q": 1.0})

@@ -27,6 +27,7 @@ from tests.language.written_laws import (
     OwnPoisson,
     Steps,
     Triangle,
+    Yule,
     mixed_model,
 )
 from tests.statistics.checks import seed_of
@@ -69,6 +70,37 @@ def test_what_was_declared_agrees_with_the_density(law, arguments, exact):
     if np.isfinite(exact.mean()):
         assert found.mean == pytest.approx(exact.mean(), rel=1e-5)
     assert str(found).startswith(repr(law(**arguments)))
+    if not law.bounds.discrete:
+        source = numpy_draws(np.random.default_rng(seed_of("check", law.__name__)), (10_000,))
+        drawn = evaluate(array(law(**arguments).sample(Draws("check")))[()], {}, source)
+        assert found.p_value == pytest.approx(stats.kstest(drawn, exact.cdf).pvalue, rel=1e-6)
+
+
+def test_densities_are_integrated_to_many_digits():
+    """With two peaks, the one far narrower than the other; and with a kink aside of the peak."""
+
+    @ssm.distribution
+    def Two(y, at, sd):
+        wide = -(y**2) / 2
+        return np.logaddexp(wide, -(((y - at) / sd) ** 2) / 2 - np.log(sd)) - np.log(8 * np.pi) / 2
+
+    assert Two.check(50.0, 0.05).total == pytest.approx(1.0, abs=1e-10)
+
+    @ssm.distribution(lower=0)
+    def Kink(y, at):
+        rate = np.where(y < at, 1.0, 3.0)
+        return np.log(rate) - np.where(y < at, y, at + 3 * (y - at))
+
+    assert Kink.check(0.7).total == pytest.approx(1.0, abs=1e-10)
+
+
+def test_sums_of_heavy_tails_are_allowed_for():
+    found = Yule.check(0.5)
+    assert 1e-4 < 1.0 - found.total < 1e-2
+    with pytest.raises(ModelError, match="not to 1"):
+        ssm.distribution(
+            lambda k: 0.01 + np.log(0.5) - np.log(k + 1) - np.log(k + 1.5), lower=0, discrete=True
+        ).check()
 
 
 def test_outside_of_the_support_the_density_is_zero():
@@ -114,9 +146,9 @@ def test_arguments_go_by_name_by_place_and_by_default():
 
 def test_arguments_that_have_to_be_positive():
     s = symbol("parameter", "s")
-    for law in (Lomax(s, 1.0), OwnPoisson(s)):
+    for law in (Lomax(s, 1.0), OwnGamma(s, 1.0), OwnPoisson(s)):
         with np.errstate(all="ignore"):
-            found = evaluate(law.log_density(Y), {Y: 1.0, s: np.array([-1.0, 2.0])})
+            found = evaluate(law.log_density(Y), {Y: 1.0, s: np.array([-1.5, 2.0])})
         np.testing.assert_array_equal(np.isnan(found), [True, False])
 
 

@@ -1,8 +1,8 @@
 """Metropolis-Hastings with an exact likelihood.
 
-Schön et al. (2015), algorithm 1 and section 3.2: the Kalman filter (or, where the states
-take few values, the forward algorithm) gives the likelihood; the states follow given each kept draw
-by backward sampling.
+Schön et al. (2015), algorithm 1 and section 3.2: the Kalman filter (where the states take few
+values, the forward algorithm; where they have no noise, one run of them) gives the likelihood; the
+states follow given each kept draw by backward sampling.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ssmppl.inference.chains.walk import (
     metropolis_block,
     start_chain,
 )
+from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.models import ExactModel, exact_model, filter_name, filter_of
 from ssmppl.inference.methods import MetropolisHastings
 from ssmppl.inference.particles.pilot import dispersed, find_mode
@@ -44,6 +45,14 @@ def needed_model(problem: Problem, method: str) -> ExactModel:
             f"{model.reason}",
             fix="use ssm.PGAS(...) or ssm.PMMH(...), or None, which picks by structure",
             where=model.where,
+        )
+    if method == "Gibbs" and isinstance(model, Deterministic):
+        site = next(iter(problem.trace.transition.values()))
+        raise ArgumentError(
+            "Gibbs draws the parameters given the states, which have no noise in this model, so "
+            "that they determine the parameters",
+            fix="use ssm.MetropolisHastings(), whose likelihood is exact, or None, which picks it",
+            where=site.distribution.location,
         )
     return model
 

@@ -1,37 +1,62 @@
-"""Models whose likelihood and smoothing distributions are exact, of either kind."""
+"""Models whose likelihood and smoothing distributions are exact, of each kind."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.exact.deterministic import Deterministic, deterministic_model
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.language.trace import Trace
 
-ExactModel = KalmanModel | HiddenMarkov
-EXACT = ("kalman", "forward")  # what their filters are called where a proposal is asked for
+ExactModel = KalmanModel | HiddenMarkov | Deterministic
 
-# The filter behind each, the kind of model, and what its smoother is.
-FILTER = {KalmanModel: "kalman", HiddenMarkov: "forward"}
-FILTER_NAME = {KalmanModel: "the Kalman filter", HiddenMarkov: "the forward algorithm"}
-KIND = {KalmanModel: "linear Gaussian", HiddenMarkov: "of finitely many states"}
+# What the filter behind each is called where a proposal is asked for, and in words; the kind of
+# model; and what finds it.
+FILTER = {KalmanModel: "kalman", HiddenMarkov: "forward", Deterministic: "deterministic"}
+FILTER_NAME = {
+    KalmanModel: "the Kalman filter",
+    HiddenMarkov: "the forward algorithm",
+    Deterministic: "running the states once",
+}
+KIND = {
+    KalmanModel: "linear Gaussian",
+    HiddenMarkov: "of finitely many states",
+    Deterministic: "without noise in its states",
+}
+NEEDED = {
+    "kalman": "linear Gaussian model",
+    "forward": "model of finite states",
+    "deterministic": "model without noise in its states",
+}
+EXACT = tuple(FILTER.values())
+_FORMS: dict[str, Callable[[Trace], ExactModel | NotApplicable]] = {
+    "kalman": kalman_model,
+    "forward": hidden_markov,
+    "deterministic": deterministic_model,
+}
 
 
 def exact_model(trace: Trace) -> ExactModel | NotApplicable:
     """The exact form of a traced model, or why it has none."""
-    found = kalman_model(trace)
-    if not isinstance(found, NotApplicable):
-        return found
-    finite = hidden_markov(trace)
-    return found if isinstance(finite, NotApplicable) else finite
+    first = kalman_model(trace)
+    if not isinstance(first, NotApplicable):
+        return first
+    others = (hidden_markov(trace), deterministic_model(trace))
+    return next((m for m in others if not isinstance(m, NotApplicable)), first)
+
+
+def form_of(proposal: str, trace: Trace) -> ExactModel | NotApplicable:
+    """The exact form that a filter of `EXACT` needs, or why the model does not have it."""
+    return _FORMS[proposal](trace)
 
 
 def filter_of(model: ExactModel) -> str:
-    """ "kalman" or "forward"."""
+    """ "kalman", "forward" or "deterministic"."""
     return FILTER[type(model)]
 
 
@@ -41,7 +66,7 @@ def filter_name(model: ExactModel) -> str:
 
 
 def kind_of(model: ExactModel) -> str:
-    """ "linear Gaussian" or "of finitely many states"."""
+    """ "linear Gaussian", "of finitely many states" or "without noise in its states"."""
     return KIND[type(model)]
 
 

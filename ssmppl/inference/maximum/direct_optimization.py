@@ -1,8 +1,9 @@
 """Direct optimisation: quasi-Newton ascent of the log-likelihood on the unconstrained scale.
 
-Schön et al. (2015), section on direct optimisation. On linear Gaussian models and on those of
-finitely many states the likelihood and its score are exact, and Newton steps with the observed
-information polish the result; for one scalar state see `smooth_likelihood.py`.
+Schön et al. (2015), section on direct optimisation. On linear Gaussian models, on those of
+finitely many states and on those without noise in their states the likelihood and its score are
+exact, and Newton steps with the observed information polish the result; for one scalar state see
+`smooth_likelihood.py`.
 """
 
 from __future__ import annotations

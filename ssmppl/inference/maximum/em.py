@@ -32,9 +32,10 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.kalman import KalmanModel
-from ssmppl.inference.exact.models import ExactModel, filter_name
+from ssmppl.inference.exact.models import filter_name
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.baum_welch import FiniteSteps
 from ssmppl.inference.maximum.expected_climb import climbed
@@ -63,6 +64,14 @@ def climb(setup: Setup, method: EM) -> Ascent:
             f"{setup.exact.reason}",
             fix="use ssm.ParticleEM() or ssm.PSAEM()",
             where=setup.exact.where,
+        )
+    if isinstance(setup.exact, Deterministic):
+        site = next(iter(setup.problem.trace.transition.values()))
+        raise ArgumentError(
+            "EM takes the states for missing data, and in this model they follow from the "
+            "parameters",
+            fix="use ssm.DirectOptimization(), whose likelihood and score are exact",
+            where=site.distribution.location,
         )
     return _Climb(setup, setup.exact, method).run()
 
@@ -179,7 +188,7 @@ def summed(
 class _Climb:
     """The iteration; `best` never has a smaller objective than what came before it."""
 
-    def __init__(self, setup: Setup, model: ExactModel, method: EM):
+    def __init__(self, setup: Setup, model: KalmanModel | HiddenMarkov, method: EM):
         self.setup, self.model, self.method = setup, model, method
         self.map = (
             FiniteSteps(setup, model)

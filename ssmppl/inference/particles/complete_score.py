@@ -37,6 +37,12 @@ class CompleteScores:
     def program(self) -> ScoreProgram:
         return compile_score(self.derived)
 
+    def of(self, problem: Problem) -> CompleteScores:
+        """The same derivatives for other data of the same model."""
+        other = CompleteScores(problem, self.derived)
+        other.program = self.program
+        return other
+
     def __getstate__(self) -> dict:  # another process finds the generated module in its cache
         return {k: v for k, v in self.__dict__.items() if k != "program"}
 
