@@ -230,7 +230,8 @@ class DeclaredDistribution(Declared):
 
         Parameters
         ----------
-        *args, **kwargs : the law's arguments, numbers.
+        *args, **kwargs : the law's arguments, numbers; those named as one of the following by their
+            place.
         draws : number of draws.
         level : of the test; a right sampler fails with at most this probability.
         seed : of the draws.

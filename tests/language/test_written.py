@@ -77,7 +77,7 @@ def test_what_was_declared_agrees_with_the_density(law, arguments, exact):
 
 
 def test_densities_are_integrated_to_many_digits():
-    """With two peaks, the one far narrower than the other; and with a kink aside of the peak."""
+    """With two peaks, the one far narrower than the other; and with a jump aside of the peak."""
 
     @ssm.distribution
     def Two(y, at, sd):
@@ -87,11 +87,11 @@ def test_densities_are_integrated_to_many_digits():
     assert Two.check(50.0, 0.05).total == pytest.approx(1.0, abs=1e-10)
 
     @ssm.distribution(lower=0)
-    def Kink(y, at):
-        rate = np.where(y < at, 1.0, 3.0)
-        return np.log(rate) - np.where(y < at, y, at + 3 * (y - at))
+    def Jump(y, at):
+        rate = np.where(y < at, 3.0, 1.0)
+        return np.log(rate) - np.where(y < at, 3 * y, 3 * at + (y - at))
 
-    assert Kink.check(0.7).total == pytest.approx(1.0, abs=1e-10)
+    assert Jump.check(0.7).total == pytest.approx(1.0, abs=1e-10)
 
 
 def test_sums_of_heavy_tails_are_allowed_for():
