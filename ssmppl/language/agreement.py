@@ -44,7 +44,7 @@ class Agreement:
     ----------
     total : integral, or sum, of the density over the support.
     p_value : of the draws; None where the law has no sampler.
-    mean, variance : by integration; nan where they were not declared.
+    mean, variance : by integration; without a meaning where the law has none.
     lines : what was compared, in words.
     """
 

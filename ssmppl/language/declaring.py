@@ -63,7 +63,7 @@ def distribution(
     ... def draw(rng, shape, scale):
     ...     return scale * (rng.uniform() ** (-1 / shape) - 1)
     >>> Lomax(2.5, scale=3)
-    Lomax(shape=2.5, scale=3.0)
+    Lomax(shape=2.5, scale=3)
     """
 
     def declare(function: Function) -> DeclaredDistribution:
