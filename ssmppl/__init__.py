@@ -43,6 +43,7 @@ from ssmppl.inference.score import score
 from ssmppl.inference.simulation import simulate
 from ssmppl.inference.smooth import smooth
 from ssmppl.inference.smoothing_methods import FFBSi, FixedLag, ForwardBackward, KalmanSmoother
+from ssmppl.language.declaring import distribution
 from ssmppl.language.distributions import (
     Bernoulli,
     Beta,
@@ -160,6 +161,7 @@ __all__ = [
     "Wishart",
     "compile",
     "diagnose",
+    "distribution",
     "effect",
     "effects",
     "evidence",

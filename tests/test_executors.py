@@ -152,6 +152,11 @@ kick = 0.01
 def wobble(v):
     return kick if v > 0.0 else -kick
 
+@ssm.distribution
+def Logistic(y, loc, scale):
+    z = np.abs(y - loc) / scale
+    return -z - 2 * np.log1p(np.exp(-z)) - np.log(scale)
+
 model = ssm.Model("of a script")
 
 @model.prior
@@ -168,12 +173,13 @@ def transition(x, tau):
 
 @model.observation
 def observation(x):
-    return {"y": ssm.Normal(x, sd=0.5)}
+    return {"y": ssm.Normal(x, sd=0.5), "z": Logistic(x, kick)}
 
 def run(executor):
+    data = {"y": np.sin(np.arange(30.0)), "z": np.zeros(30)}
     found = ssm.sample(
-        model, {"y": np.sin(np.arange(30.0))}, ssm.PMMH(particles=20), draws=20, warmup=10,
-        chains=2, seed=1, progress=False, executor=executor,
+        model, data, ssm.PMMH(particles=20), draws=20, warmup=10, chains=2, seed=1,
+        progress=False, executor=executor,
     )["posterior"]
     return found["x"].values
 
@@ -194,7 +200,7 @@ if __name__ == "__main__":
 
 
 def script(tmp_path, *arguments):
-    """What a script prints whose model calls a primitive of its own."""
+    """What a script prints whose model has a primitive and a law of its own."""
     path = tmp_path / "script.py"
     path.write_text(SPAWNED)
     done = subprocess.run(

@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.structure import GaussianBlock, gaussian_block
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
@@ -65,11 +67,14 @@ def draws_of(trace: Trace, sites: list[Site]) -> dict[Expr, Expr]:
 def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
     """A draw from a law, of its shape; NaN where a parameter is out of its range.
 
-    Of a flat law NaN, for code that is never run: no algorithm starts from it.
+    Of a flat law, and of an observation's without a sampler, NaN, for code that is never run: no
+    algorithm starts from the one, and what would draw the other refuses.
 
     draws : the random numbers that it is made of; None: its own.
     """
     law = site.distribution
+    if not law.drawable:
+        return array(np.full(site.shape, math.nan))
     sample = array(law.sample(draws or Draws(site.name)) if law.proper else law.mean())
     inside = law.in_range()
     return sample if inside is None else array(elementwise("where", inside, sample, math.nan))

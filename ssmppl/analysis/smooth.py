@@ -9,9 +9,12 @@ from __future__ import annotations
 from ssmppl.analysis.structure import deterministic
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import topological
+from ssmppl.expressions.expr import BOOLEAN, dependent, topological
 from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Trace
+from ssmppl.language.written import Written
+
+JUMPING = BOOLEAN | {"floor", "ceil", "sign", "mod"}
 
 
 def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
@@ -27,8 +30,13 @@ def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
             return NotApplicable(f"{site.name} is discrete", d.location)
         if deterministic([site]):
             continue
-        for node in topological(array(d.sample(Draws(site.name))).ravel()):
-            if node.op == "random" and node.data[0] not in ("normal", "uniform"):
+        draw = list(array(d.sample(Draws(site.name))).ravel())
+        random = [n for n in topological(draw) if n.op == "random"]
+        jumps = dependent(draw, random) if isinstance(d, Written) else set()
+        if any(n.op in JUMPING for n in jumps):
+            return NotApplicable(f"the sampler of {type(d).__name__} may jump", d.location)
+        for node in random:
+            if node.data[0] not in ("normal", "uniform"):
                 return NotApplicable(
                     f"draws of {type(d).__name__} come by rejection, and jump where the "
                     "parameters change",

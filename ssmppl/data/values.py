@@ -169,7 +169,8 @@ def outside(distribution: Distribution, values: np.ndarray, env: Values) -> Faul
     with np.errstate(invalid="ignore"):
         bad = (values < lower) | (values > upper)
         if not closed:
-            bad |= (values == lower) | ((values == upper) & isinstance(distribution, Beta))
+            above = distribution.open_above or isinstance(distribution, Beta)
+            bad |= (values == lower) | ((values == upper) & above)
         if support.kind == "integers":
             bad |= np.isfinite(values) & (values != np.floor(values))
     if not bad.any():

@@ -39,7 +39,9 @@ from ssmppl.gap.workshop import Workshop, proposal_of
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import pose
 from ssmppl.inference.progress import announced
+from ssmppl.inference.simulation import check_samplers
 from ssmppl.language.model import Model
+from ssmppl.language.written import Written
 
 SETS = {"fast": 100, "full": 200}  # simulated data sets
 PARTICLES = {"fast": 500, "full": 1000}
@@ -114,6 +116,7 @@ class _Diagnosis:
         self.began = time.perf_counter()
         self.problem = pose(model, data)
         self.trace = self.problem.trace
+        check_samplers(self.trace)
         self.experiments = self.problem.experiments
         self.fixed = check_values(self.trace, fixed, argument="fixed")
         self.effects, self.mode, self.alpha = effects, mode, alpha
@@ -128,7 +131,12 @@ class _Diagnosis:
         number = particles or (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)[mode]
         self.settings = Settings(number, proposal)
         self.workshop = Workshop(self.trace, missing, self.fixed, self.settings)
-        self.notes: list[str] = []
+        self.notes = [
+            f"The law of {n}, {type(s.distribution).__name__}, has no distribution function "
+            "(.cdf): its one-step predictions are not checked."
+            for n, s in self.trace.observations.items()
+            if isinstance(s.distribution, Written) and not s.distribution.has_cdf
+        ]
         described = {
             "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,
             "sets": SETS[mode],

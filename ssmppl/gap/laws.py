@@ -34,6 +34,7 @@ from ssmppl.language.distributions import (
     StudentT,
     Truncated,
 )
+from ssmppl.language.written import Written
 
 Index = tuple[int, ...]
 Changes = Mapping[Index, Expr]
@@ -65,6 +66,8 @@ def rebuilt(d: Distribution, parameters: Mapping[str, Any]) -> Distribution:
         new: Distribution = truncated(rebuilt(d.base, wide | inside), bounds)
     elif isinstance(d, Flat):
         return d
+    elif isinstance(d, Written):
+        return d.with_parameters({**d.parameters, **{n: array(v) for n, v in parameters.items()}})
     else:
         values = {**d.parameters, **parameters}
         new = type(d)(**{n.rstrip("_"): array(v) for n, v in values.items()})  # type: ignore[call-arg]
@@ -177,8 +180,11 @@ def has_scale(d: Distribution) -> NotApplicable | None:
     if isinstance(inner, (Normal, MvNormal)) or type(inner) in _SCALE:
         return None
     kind = type(inner).__name__
-    reason = "it has no noise (Dirac)" if kind == "Dirac" else f"its law is {kind}, "
-    reason += "" if kind == "Dirac" else "whose variance follows from its mean"
+    reason = f"its law is {kind}, whose variance follows from its mean"
+    if isinstance(inner, Dirac):
+        reason = "it has no noise (Dirac)"
+    elif isinstance(inner, Written):
+        reason = f"its law is {kind}, of which no argument is known to be its spread"
     return NotApplicable(reason, d.location)
 
 

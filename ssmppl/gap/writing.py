@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import linecache
+import sys
 import sysconfig
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.gap.candidate import Candidate
@@ -28,10 +29,13 @@ from ssmppl.language.distributions import Distribution, Flat, Truncated
 from ssmppl.language.model import Model
 from ssmppl.language.primitive import Primitive
 from ssmppl.language.trace import Site, Trace, symbols
+from ssmppl.language.written import Origin, Written
 
 LINE = 96
 _INSTALLED = [sysconfig.get_path(k) for k in ("stdlib", "purelib", "platlib")]
 INDENT = "    "
+_TAKEN = ("np", "ssm", "special", "sys", "model", "prior", "initial", "transition", "observation",
+          "proposal")  # fmt: skip
 
 
 def model_text(
@@ -50,8 +54,8 @@ def model_text(
 
     Raises
     ------
-    ArgumentError : the model calls a @ssm.primitive that no file can import, or an operation that
-        NumPy and scipy.special do not offer.
+    ArgumentError : the model has a @ssm.primitive or a @ssm.distribution that no file can import,
+        or an operation that NumPy and scipy.special do not offer.
     """
     return _Writer(trace, {c.strength: c for c in added}).file(title or trace.name, notes)
 
@@ -75,6 +79,7 @@ class _Writer:
     def __init__(self, trace: Trace, added: dict[str, Candidate]):
         self.trace, self.added = trace, added
         self.primitives: dict[str, Primitive] = {}
+        self.laws: dict[str, Origin] = {}
         self.special = False
         sites = [*trace.initial.items(), *trace.parameters.items(), *trace.observations.items()]
         self.quantities: dict[str, Any] = {n: s.value for n, s in sites}
@@ -187,6 +192,8 @@ class _Writer:
             for i, (k, v) in enumerate(bounds.items()):
                 inside.append(f"{k}={lines.array(v, scalar=not wide or i > 0)}")
             return _call(kind, inside, room)
+        if isinstance(d, Written):
+            return self._written(d, lines, room)
         by_name = {p.name for p in inspect.signature(type(d).__init__).parameters.values()
                    if p.kind is p.KEYWORD_ONLY}  # fmt: skip
         texts = []
@@ -200,6 +207,21 @@ class _Writer:
             named = plain in by_name or kind == "ssm.Exponential"
             texts.append(f"{plain}={text}" if named else text)
         return _call(kind, texts, room)
+
+    def _written(self, d: Written, lines: Lines, room: int) -> str:
+        """A law of the user's own, its arguments by name."""
+        name = d.origin.name
+        if self.laws.setdefault(name, d.origin) != d.origin or name in {*self.names, *_TAKEN}:
+            raise ArgumentError(
+                f"the model's file would have two things named {name!r}, one of them a law",
+                fix="rename the law",
+                where=d.origin.location,
+            )
+        texts = []
+        for i, (argument, values) in enumerate(d.parameters.items()):
+            wide = bool(d.shape) and i == 0 and all(map(_same, d.parameters.values()))
+            texts.append(f"{argument}={lines.array(values, scalar=not wide)}")
+        return _call(name, texts, room)
 
     # -- what is imported
     def _primitive(self, node: Expr) -> str:
@@ -218,8 +240,12 @@ class _Writer:
         lines += ["from scipy import special"] if self.special else []
         lines += ["", "import ssmppl as ssm"]
         own, folders = [], []
-        for name, primitive in self.primitives.items():
-            module, folder = _home(name, primitive)
+        homes = [(n, "primitive", p.location, p.function.__module__, p.function.__qualname__)
+                 for n, p in self.primitives.items()]  # fmt: skip
+        homes += [(n, "distribution", o.location, o.module, o.qualname)
+                  for n, o in self.laws.items()]  # fmt: skip
+        for name, kind, where, inside, path in homes:
+            module, folder = _home(name, kind, where, inside, path)
             own.append(f"from {module} import {name}")
             folders += [folder] if folder else []
         if folders:
@@ -229,21 +255,28 @@ class _Writer:
         return [*lines, *([""] if own else []), *own]
 
 
-def _home(name: str, primitive: Primitive) -> tuple[str, str]:
-    """(module, folder) to import a primitive from; the folder is empty where it is not needed.
+def _home(name: str, kind: str, where: Location, module: str, path: str) -> tuple[str, str]:
+    """(module, folder) to import a primitive or a distribution from, which has this path in the
+    module; the folder is empty where it is not needed.
 
     Raises
     ------
     ArgumentError : it stands in no file, or inside of a function.
     """
-    function = primitive.function
-    module, file = function.__module__, Path(inspect.getfile(function))
-    if function.__qualname__ != name or not file.exists():
+    file = Path(where.file)
+    held = getattr(sys.modules.get(module), name, None)
+    if path == name and file.exists() and inspect.isfunction(held):
+        raise ArgumentError(
+            f"the {kind} {name!r} does not stand under that name in its file",
+            fix="decorate its def, which gives it its name",
+            where=where,
+        )
+    if path != name or not file.exists():
         place = "inside of a function" if file.exists() else f"in {file}, which is no file"
         raise ArgumentError(
-            f"the primitive {name!r} is defined {place}: a model file cannot import it",
+            f"the {kind} {name!r} is defined {place}: a model file cannot import it",
             fix="define it at the top level of a Python file",
-            where=primitive.location,
+            where=where,
         )
     file = file.resolve()
     if any(file.is_relative_to(p) for p in _INSTALLED):

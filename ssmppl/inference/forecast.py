@@ -23,7 +23,7 @@ from ssmppl.inference.posterior_draws import (
     posterior_of,
     states_of,
 )
-from ssmppl.inference.simulation import check_finite, feeds_back
+from ssmppl.inference.simulation import check_finite, check_samplers, feeds_back
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
 from ssmppl.results import to_dataset
@@ -74,6 +74,7 @@ def forecast(
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     """
     traced, posterior = trace(model), posterior_of(idata, KNOWN)
+    check_samplers(traced)
     future, steps, labels = bind_inputs(traced, inputs, steps)
     mark, axis = _which(traced, posterior, experiment)
     theta = parameters_of(traced, posterior)

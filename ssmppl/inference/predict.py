@@ -22,7 +22,12 @@ from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.posterior_draws import all_draws, parameters_of, posterior_of, states_of
 from ssmppl.inference.prior import draw_prior
-from ssmppl.inference.simulation import check_drawable, check_finite, feeds_back
+from ssmppl.inference.simulation import (
+    check_drawable,
+    check_finite,
+    check_samplers,
+    feeds_back,
+)
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
 from ssmppl.results import to_inference_data
@@ -95,6 +100,7 @@ def predict(
                 _check_count(posterior, len(experiments))
         flat = all_draws(theta)
         if paths is not None:
+            check_samplers(traced)
             drawn = _observed(program, e, flat, all_draws(paths), root, i)
         else:
             check_drawable(traced)

@@ -38,6 +38,8 @@ def draw_prior(
                 "can be drawn from it",
                 fix=f"give {site.name!r} a proper prior, or its value by parameters=",
             )
+        if not d.drawable:
+            raise d.undrawable(f"the prior of {site.name!r} has to be drawn from here")
         sample = evaluate(array(d.sample(Draws(site.name))), values, source)
         flat = np.broadcast_to(
             sample.reshape(site.value.size, -1), (site.value.size, draws)

@@ -100,18 +100,31 @@ def simulate(
 
 
 def check_drawable(traced: Trace) -> None:
-    """Refuse a model whose x_1 has no proper law.
+    """Refuse a model whose x_1 has no proper law, or an observation no sampler.
 
     Raises
     ------
-    ModelError : naming the state and its line.
+    ModelError : naming the state or channel and its line.
     """
+    check_samplers(traced)
     for site in flat_start(traced):
         raise ModelError(
             f"the initial law of {site.name!r} is Flat, and cannot be drawn from",
             fix="give it a proper law in @initial to simulate",
             where=site.distribution.location,
         )
+
+
+def check_samplers(traced: Trace) -> None:
+    """Refuse a model of which an observation cannot be drawn.
+
+    Raises
+    ------
+    ModelError : naming the law and its line.
+    """
+    for site in traced.observations.values():
+        if not site.distribution.drawable:
+            raise site.distribution.undrawable(f"{site.name!r} has to be drawn here")
 
 
 def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) -> None:

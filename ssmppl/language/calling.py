@@ -80,19 +80,8 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
     It is called twice: a law that is not the same again draws random numbers or changes something,
     and what was drawn would be frozen into the model.
     """
-    try:
-        signature = inspect.signature(function)
-        bound = signature.bind_partial()
-        bound.arguments.update({n: arguments[n] for n in signature.parameters if n in arguments})
-        first = function(*bound.args, **bound.kwargs)
-        again = function(*bound.args, **bound.kwargs)
-    except SSMError as error:
-        told = _at_users_line(error, function)
-        if told is error:  # not its own cause: what packs errors follows causes to their end
-            raise
-        raise told from error
-    except Exception as error:
-        raise _wrapped(error, function, role, arguments, known) from error
+    first = once(function, role, arguments, known)
+    again = once(function, role, arguments, known)
     if not _same(first, again):
         raise ModelError(
             f"@{role} {function.__name__} gives another law when it is called again",
@@ -101,6 +90,22 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
             where=return_location(function),
         )
     return first
+
+
+def once(function: Law, role: str, arguments: dict[str, Any], known: Known) -> Any:
+    """What the function returns; its errors are told at the user's line."""
+    try:
+        signature = inspect.signature(function)
+        bound = signature.bind_partial()
+        bound.arguments.update({n: arguments[n] for n in signature.parameters if n in arguments})
+        return function(*bound.args, **bound.kwargs)
+    except SSMError as error:
+        told = _at_users_line(error, function)
+        if told is error:  # not its own cause: what packs errors follows causes to their end
+            raise
+        raise told from error
+    except Exception as error:
+        raise _wrapped(error, function, role, arguments, known) from error
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -113,8 +118,8 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _content(d: Distribution) -> list[tuple[str, str]]:
-    roots = [e for p in d.parameters.values() for e in p.ravel()]
-    return [(n.op, repr(n.data) if n.op in ("const", "symbol") else "") for n in topological(roots)]
+    nodes = topological(d.expressions())
+    return [(n.op, repr(n.data) if n.op in ("const", "symbol") else "") for n in nodes]
 
 
 def return_location(function: Law) -> Location:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ssmppl.errors import Location, ModelError, nearest_first
@@ -26,30 +26,42 @@ def checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
         try:
             signature.bind(self, *args, **kwargs)
         except TypeError as error:
-            name = type(self).__name__
-            given = f"{len(args)} without a name"
-            given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
-            found = f"{name}: {error}; given were {given}"
-            known = [f"{k}=" for k in by_name]
-            *most, last = known or [""]
-            options = f"{', '.join(most)} or {last}" if most else last
-            unknown = [k for k in kwargs if k not in (*positional, *by_name)]
-            if unknown:
-                nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
-                fix = f"the arguments of {name} are {nearest}"
-            elif by_name and len(args) > len(positional):
-                found = f"{name} takes its {self.by_name} by name: {options}"
-                own = [str(a) for a in args] if len(args) == len(positional) + 1 else []
-                if not own or kwargs or max(map(len, own)) > WIDEST:
-                    own = [*positional, "..."]
-                fix = f"write {name}({', '.join([*own[:-1], f'{by_name[0]}={own[-1]}'])})"
-                fix += f", or {' or '.join(known[1:])}" if known[1:] else ""
-            else:
-                fix = f"write {name}({', '.join([*positional, *known])})"
-            raise ModelError(found, fix=fix, where=user_location()) from None
+            raise misfit(
+                type(self).__name__, error, args, kwargs, positional, by_name, self.by_name
+            ) from None
         init(self, *args, **kwargs)
 
     return checked
+
+
+def misfit(
+    name: str, error: TypeError, args: tuple[Any, ...], kwargs: dict[str, Any],
+    positional: Sequence[str], by_name: Sequence[str] = (), called: str = "",
+) -> ModelError:  # fmt: skip
+    """What a law says whose arguments do not fit: Python's error, and how it is written.
+
+    positional, by_name : its arguments; the latter are called `called`.
+    """
+    given = f"{len(args)} without a name"
+    given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
+    found = f"{name}: {error}; given were {given}"
+    known = [f"{k}=" for k in by_name]
+    *most, last = known or [""]
+    options = f"{', '.join(most)} or {last}" if most else last
+    unknown = [k for k in kwargs if k not in (*positional, *by_name)]
+    if unknown:
+        nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
+        fix = f"the arguments of {name} are {nearest}"
+    elif by_name and len(args) > len(positional):
+        found = f"{name} takes its {called} by name: {options}"
+        own = [str(a) for a in args] if len(args) == len(positional) + 1 else []
+        if not own or kwargs or max(map(len, own)) > WIDEST:
+            own = [*positional, "..."]
+        fix = f"write {name}({', '.join([*own[:-1], f'{by_name[0]}={own[-1]}'])})"
+        fix += f", or {' or '.join(known[1:])}" if known[1:] else ""
+    else:
+        fix = f"write {name}({', '.join([*positional, *known])})"
+    return ModelError(found, fix=fix, where=user_location())
 
 
 def one_of(name: str, options: dict[str, Any], where: Location | None = None) -> tuple[str, Any]:

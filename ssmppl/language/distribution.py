@@ -50,6 +50,8 @@ class Distribution:
     discrete = False
     proper = True
     closed = False  # whether the lower bound itself belongs to the support
+    open_above = False  # whether the upper one does not
+    drawable = True  # whether it has a sampler
     by_name = "spread"  # what the keyword-only arguments are called in messages
     parameters: dict[str, ExprArray]
     ranges: dict[str, tuple[float, float, bool]]  # by parameter: low, high, without the ends
@@ -156,6 +158,16 @@ class Distribution:
 
         inside = ", ".join(f"{_plain_name(n)}={text(a)}" for n, a in self.parameters.items())
         return f"{type(self).__name__}({inside})"
+
+    def undrawable(self, why: str) -> ModelError:
+        """The error of a law that is not `drawable` where it has to be."""
+        raise AttributeError
+
+    def expressions(self) -> list[Expr]:
+        """All that the law is made of: its parameters, and what else it holds."""
+        own = [e for p in self.parameters.values() for e in p.ravel()]
+        base = self.__dict__.get("base")
+        return own if base is None else [*own, *base.expressions()]
 
     # -- to be defined by each distribution
     def log_densities(self, value: ExprArray) -> ExprArray:
@@ -287,7 +299,7 @@ class Distribution:
                 closed = self.discrete or self.closed
                 inside = apply("le" if closed else "lt", lower[i], v[i])
             if not (upper[i].op == "const" and upper[i].data == INFINITY):
-                below = apply("le", v[i], upper[i])
+                below = apply("lt" if self.open_above else "le", v[i], upper[i])
                 inside = below if inside.op == "const" else apply("and", inside, below)
             if self.discrete:
                 whole = apply("eq", v[i], apply("floor", v[i]))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ssmppl.expressions.expr import Expr, constant
+from ssmppl.errors import ModelError
+from ssmppl.expressions.expr import Expr, apply, constant, user_location
 
 
 class Draws:
@@ -36,6 +37,61 @@ class Draws:
 
     def binomial(self, n: Any, p: Any) -> Expr:
         return self._node("binomial", n, p)
+
+
+class Generator:
+    """What a user's sampler draws from: these methods of NumPy's `Generator`, with its arguments.
+
+    Every call is a draw of its own. A sampler that is called with NumPy's generator instead, and
+    numbers, does the same.
+    """
+
+    def __init__(self, draws: Draws):
+        self._draws = draws
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
+        """Uniform between low and high, neither of them ever drawn."""
+        u = self._draws.uniform()
+        return u if (low, high) == (0.0, 1.0) else low + (high - low) * u
+
+    def random(self) -> Any:
+        """Uniform between 0 and 1."""
+        return self._draws.uniform()
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0) -> Any:
+        """Normal of mean loc and standard deviation scale."""
+        return loc + scale * self._draws.normal()
+
+    def standard_normal(self) -> Any:
+        """Normal of mean 0 and standard deviation 1."""
+        return self._draws.normal()
+
+    def exponential(self, scale: Any = 1.0) -> Any:
+        """Exponential of mean scale."""
+        return -scale * apply("log", self._draws.uniform())
+
+    def gamma(self, shape: Any, scale: Any = 1.0) -> Any:
+        """Gamma of mean shape scale."""
+        return scale * self._draws.gamma(shape)
+
+    def poisson(self, lam: Any = 1.0) -> Any:
+        """Poisson of mean lam."""
+        return self._draws.poisson(lam)
+
+    def binomial(self, n: Any, p: Any) -> Any:
+        """Binomial: successes among n, each of probability p."""
+        return self._draws.binomial(n, p)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        known = [n for n in vars(Generator) if not n.startswith("_")]
+        raise ModelError(
+            f"a sampler asks for rng.{name}, which there is not",
+            fix=f"make the draw of those that there are: {', '.join(known)}; a beta variable is "
+            "a / (a + b) of two gamma ones",
+            where=user_location(),
+        )
 
 
 def _node(value: Any) -> Expr:

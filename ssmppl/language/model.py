@@ -26,6 +26,15 @@ _MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
 
 
+class Declared:
+    """What laws may read under a name and that can change without being another object.
+
+    signature : changes when it does.
+    """
+
+    signature: tuple
+
+
 class Model:
     """A state space model, declared by decorated functions.
 
@@ -197,7 +206,7 @@ class Model:
         """What traces of this model are cached by: changes when a function is declared, and when a
         variable that one reads from outside gets another value."""
         outer = tuple(
-            (name, _fingerprint(value))
+            (name, fingerprint(value))
             for functions in self.functions.values()
             for function in functions
             for name, value in outer_values(function).items()
@@ -287,8 +296,10 @@ def _global_names(code: CodeType) -> set[str]:
     return names
 
 
-def _fingerprint(value: Any) -> Any:
+def fingerprint(value: Any) -> Any:
     """Equal for equal numbers, texts, arrays and plain containers of them, else by identity."""
+    if isinstance(value, Declared):
+        return value.signature
     if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
         return value.shape, value.tobytes()
     if isinstance(value, (numbers.Number, str, list, tuple, dict)):

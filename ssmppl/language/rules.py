@@ -103,6 +103,8 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             + "; a vague law is one of large spread",
             where=where,
         )
+    if role in ("initial", "transition", "proposal") and not distribution.drawable:
+        raise distribution.undrawable(f"{name!r} is a state, which particles draw")
     if role == "observation" and isinstance(distribution, Dirac):
         raise ModelError(
             f"the observation {name!r} is Dirac: data would have likelihood zero",

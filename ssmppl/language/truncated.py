@@ -21,6 +21,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.positive import Exponential
 from ssmppl.language.symmetric import Laplace
+from ssmppl.language.written import Written
 
 MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
 
@@ -44,6 +45,13 @@ class Truncated(Distribution):
             raise ModelError(
                 f"Truncated: cannot truncate {name}",
                 fix="truncate a scalar distribution such as Normal, Gamma or Poisson",
+                where=user_location(),
+            )
+        if isinstance(dist, Written) and not dist.inverts():
+            raise ModelError(
+                f"Truncated: {dist.origin.name} has no distribution function, or no inverse of it",
+                fix=f"declare both, @{dist.origin.name}.cdf and @{dist.origin.name}.quantile; or "
+                "give the bounds to the law itself, with the density between them",
                 where=user_location(),
             )
         if lower is None and upper is None:

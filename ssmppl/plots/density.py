@@ -74,7 +74,8 @@ def priors_of(model: Model) -> dict[str, Prior]:
     traced = trace(model)
     ends = supports(traced)
     draws: np.ndarray | None = None
-    if all(s.distribution.proper for s in traced.parameters.values()):
+    laws = [s.distribution for s in traced.parameters.values()]
+    if all(d.proper and d.drawable for d in laws):
         draws = draw_prior(traced, np.random.default_rng(0), PRIOR_DRAWS)
     place = {s: k for k, s in enumerate(traced.parameter_symbols)}
     found: dict[str, Prior] = {}

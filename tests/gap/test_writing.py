@@ -9,11 +9,14 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError, ModelError
+from ssmppl.expressions.expr import symbol
 from ssmppl.gap.augment import augment
+from ssmppl.gap.laws import substituted
 from ssmppl.gap.writing import model_text, to_model
 from ssmppl.language.trace import trace
 from ssmppl.modelfile import load_model
 from tests.gap.harness import EVERY, differences, offered, traced
+from tests.language.written_laws import Gumbel
 
 
 def assert_round_trip(t):
@@ -214,3 +217,53 @@ def test_what_has_no_spelling_is_named():
 
     with pytest.raises((ArgumentError, ModelError), match="poisson_quantile"):
         model_text(trace(model))
+
+
+def lawful(law):
+    """A model with a law of one's own in every place."""
+    model = ssm.Model("lawful")
+    model.prior(lambda: {"a": law(0.5, scale=0.1)})
+    model.initial(lambda a: {"x": law(a, 2.0), "v": law(np.zeros(2), 2.0)})
+    model.transition(
+        lambda x, v, a: {"x": law(a * x, 0.3), "v": law(0.5 * v + a, scale=np.array([1.0, 2.0]))}
+    )
+    model.observation(
+        lambda x, v: {
+            "y": law(x, 0.2), "z": law(v, 0.3),
+            "w": ssm.Truncated(law(x, np.ones(2)), lower=-9),
+        }
+    )  # fmt: skip
+    return model
+
+
+def test_laws_of_ones_own_are_imported_from_the_users_file():
+    t = trace(lawful(Gumbel))
+    text = model_text(t)
+    assert "from tests.language.written_laws import Gumbel" in text
+    assert "Gumbel(loc=a*x, scale=0.3)" in text.replace(" * ", "*")
+    assert_round_trip(t)
+
+
+def test_a_law_that_no_file_can_import_is_refused():
+    @ssm.distribution
+    def Local(y, loc, scale):
+        return -np.abs(y - loc) / scale - np.log(2 * scale)
+
+    Local.quantile(lambda p, loc, scale: loc + scale * np.sign(p - 0.5) * np.log(2 * p))
+    Local.cdf(lambda y, loc, scale: 0.5 + 0.0 * y)
+    with pytest.raises(ArgumentError, match="the distribution 'Local' is defined inside of a f"):
+        model_text(trace(lawful(Local)))
+
+
+def test_effects_reach_the_arguments_of_a_law_of_ones_own():
+    """A parameter that breaks is another one in the law's arguments, and the law stays."""
+    t = trace(lawful(Gumbel))
+    a, other = symbol("parameter", "a"), symbol("parameter", "b")
+    d = t.transition["x"].distribution
+    new = substituted(d, {a: other})
+    assert repr(new) == "Gumbel(loc=b*x_prev, scale=0.3)"
+    assert new.location == d.location
+    assert substituted(new, {other: a}).log_density(other) is d.log_density(other)
+    bounded = substituted(t.observations["w"].distribution, {symbol("state", "x"): other})
+    assert bounded.base.shape == (2,)
+    assert "loc=b" in repr(bounded)

@@ -16,7 +16,6 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
-from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.primitive import Primitive
 from ssmppl.language.trace import Site, Trace
@@ -124,13 +123,7 @@ def _law(distribution: Any) -> str:
 
 
 def _roots(site: Site) -> list[Expr]:
-    out: list[Expr] = list(site.value.ravel())
-    law: Any = site.distribution
-    while law is not None:
-        for values in law.parameters.values():
-            out += list(array(values).ravel())
-        law = getattr(law, "base", None)
-    return out
+    return [*site.value.ravel(), *site.distribution.expressions()]
 
 
 @cache
