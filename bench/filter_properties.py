@@ -93,7 +93,7 @@ def filter_means() -> list[Row]:
             stream, squares = new_state(np.random.SeedSequence(n)), []
             for _ in range(60):
                 settings = FilterSettings(n, proposal)
-                run = full_run(problem, experiment, theta, settings, stream, np.empty(0))
+                run = full_run(problem, experiment, theta, settings, stream, np.empty(0), stream)
                 squares.append(np.mean((run.mean - exact) ** 2))
             rmse = float(np.sqrt(np.mean(squares)))
             error = float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2 * rmse))

@@ -248,9 +248,11 @@ def test_dates_become_datetime64(index):
 
 def test_a_column_of_dates_named_time():
     dates = pd.Series(pd.date_range("2020-01-01", periods=3, tz="Europe/Stockholm"))
-    for times in (dates, dates.dt.tz_localize(None)):
+    for times, zone in ((dates, "Europe/Stockholm"), (dates.dt.tz_localize(None), "")):
         e = one(scalar(), pd.DataFrame({"y": [1, 2, 3], "time": times}))
         assert e.time.dtype.kind == "M"
+        assert e.zone == zone
+        assert str(e.time[0])[:13] == ("2019-12-31T23" if zone else "2020-01-01T00")
 
 
 def test_embedded_series_bind_as_they_are():

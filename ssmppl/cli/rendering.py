@@ -109,7 +109,7 @@ def labelled_matrix(matrix: pd.DataFrame) -> dict[str, Any]:
 
 def columns_of(dataset: xr.Dataset) -> dict[str, Any]:
     """Time, and mean and standard deviation over it of each state component, and of what a filter
-    predicted of each observation."""
+    predicted of each observation, with the quantiles that it has of that."""
     found: dict[str, Any] = {"time": dataset["time"].values, "states": {}}
     predicted = [
         name
@@ -125,6 +125,13 @@ def columns_of(dataset: xr.Dataset) -> dict[str, Any]:
             name, _, what = str(column).rpartition(" ")
             name = name.replace("_predicted", "", 1) if part == "predicted" else name
             found.setdefault(part, {}).setdefault(name, {})[what] = table[column].to_numpy()
+    for name in predicted:
+        if f"{name}_quantile" in dataset:
+            told = dataset[f"{name}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
+            for *index, j in np.ndindex(*told.shape[1:]):
+                label = "_".join(map(str, (name.removesuffix("_predicted"), *index)))
+                level = f"{100 * float(told['quantile'][j]):.6g}"
+                found["predicted"][label][f"q{level.zfill(2)}"] = told.values[:, *index, j]
     return found
 
 

@@ -53,8 +53,8 @@ def particle_filter(
 
     Prints the log-likelihood, and means and standard deviations of the states and of the
     predicted observations; of several repeats the table is that of the first. Writes these,
-    covariances, quantiles, effective sample sizes, increments of the log-likelihood and PIT values
-    to a netCDF file, one for each of several DATA.
+    covariances, quantiles of both, effective sample sizes, increments of the log-likelihood and PIT
+    values to a netCDF file, one for each of several DATA.
 
     \b
         ssmppl particle-filter model.py data.csv -p phi=0.95 tau=47 --seed 1

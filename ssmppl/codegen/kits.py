@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ssmppl.analysis.channels import channel_draws, observation_draws
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.moves import Proposal, drawn
+from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.structure import deterministic
 from ssmppl.codegen.module import (
     PARTICLE,
@@ -21,7 +22,7 @@ from ssmppl.codegen.module import (
 from ssmppl.codegen.render import Names, Writer, depends
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import Expr, attributed, constant
+from ssmppl.expressions.expr import Expr, constant
 from ssmppl.language.distributions import Categorical, MvNormal, Normal
 from ssmppl.language.trace import Site, Trace
 from ssmppl.language.transforms import transforms
@@ -144,17 +145,6 @@ def backward_kit(
     return section
 
 
-def observation_draws(trace: Trace) -> list[Expr]:
-    """A draw of every observed component given x_t, in the trace's order."""
-    out: list[Expr] = []
-    for site in trace.observations.values():
-        with attributed(trace.locations, site.distribution.location):
-            sample = drawn(site).ravel()
-        by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
-        out += [by_symbol[s] for s in site.components]
-    return out
-
-
 def simulation_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
     """Functions that simulate states and observations."""
     section = Section(layout, "simulate")
@@ -164,8 +154,12 @@ def simulation_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
     return section
 
 
-def prediction_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
-    """Functions for one-step predictions of the observations."""
+def prediction_kit(trace: Trace, layout: Layout, plain: Proposal, drawn: bool = True) -> Section:
+    """Functions for one-step predictions of the observations.
+
+    drawn : whether these are drawn, too; the normals and uniforms that one draw takes are further
+        sizes of the section, as the moves have their own.
+    """
     section = Section(layout, "predict")
     moves(section, plain.initial_draw, plain.draw)
     targets = []
@@ -179,6 +173,15 @@ def prediction_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
         "moments", "Mean, variance and distribution function of y_t given x_t.",
         "theta, c, s, states, out", targets,
     )  # fmt: skip
+    if drawn:
+        draws = Section(layout, section.suffix, section.c, section.s)
+        draws.particle_pass(
+            "observe", "Draw each channel of y_t given x_t.", OBSERVE,
+            [Target(f"out[{k}, i]", e) for k, e in enumerate(channel_draws(trace))],
+        )  # fmt: skip
+        section.functions += draws.functions
+        section.roles["observe"] = OBSERVE
+        section.further = draws.normals, draws.uniforms
     return section
 
 

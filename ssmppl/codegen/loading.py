@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -20,7 +21,7 @@ from ssmppl.codegen import cache
 from ssmppl.codegen.kernels import backward, backward_pairs, guide, steering
 from ssmppl.codegen.module import Section
 from ssmppl.codegen.native.build import addresses
-from ssmppl.codegen.native.entries import entry
+from ssmppl.codegen.native.entries import Aside, entry
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.waiting import notice
@@ -75,12 +76,12 @@ class Loaded:
         if config.DISABLE_JIT:  # type: ignore[attr-defined]
             return numba_made
         helpers = tuple((HELPERS[n], n) for n in algorithm.bound.values() if n in HELPERS)
-        aside = self._out.algorithms["predict"] if "predict" in algorithm.bound else None
+        aside = None
+        if "predict" in algorithm.bound:
+            predicted = self._out.algorithms["predict"]
+            aside = Aside(predicted, partial(self._places, predicted.section), numba_made)
         try:
-            return entry(
-                algorithm, self._places(algorithm.section), helpers,
-                (aside, self._places(aside.section)) if aside else None,
-            )  # fmt: skip
+            return entry(algorithm, self._places(algorithm.section), helpers, aside)
         except Untranslatable as reason:
             self.why[name] = reason.found
             return numba_made

@@ -95,6 +95,7 @@ class Section:
     suffix : ends the name of each function.
     fits : what is computed once per particle and kept in the rows of `fits`.
     roles : the functions, and the arguments of each.
+    further : numbers that its kernel reads behind those that all have, see `ModuleText.algorithm`.
     """
 
     layout: Layout
@@ -106,6 +107,7 @@ class Section:
     roles: dict[str, str] = field(default_factory=lambda: dict(OUTER))
     normals: int = 0
     uniforms: int = 0
+    further: tuple[int, ...] = ()
 
     def name(self, role: str) -> str:
         """Name of the function of this role."""

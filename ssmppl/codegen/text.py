@@ -71,7 +71,7 @@ class ModuleText:
         """A kernel with the section's functions for its parameters of the same names."""
         counts = (
             len(section.c), len(section.s), self.n_states, section.normals, section.uniforms,
-            len(section.fits),
+            len(section.fits), *section.further,
         )  # fmt: skip
         self.algorithms[name] = Algorithm(function, section, decorator, counts, bound or {})
         parameters = inspect.signature(getattr(function, "py_func", function)).parameters

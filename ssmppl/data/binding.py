@@ -36,6 +36,7 @@ class Experiment:
     time : labels of the rows, None where the data have none.
     partial : names of channels that are partly measured in some row.
     observed, inputs : by name, in the user's shapes (T, ...), NaN for missing.
+    zone : name of the zone that the labels, in UTC, were given in; empty where there is none.
     """
 
     y: np.ndarray
@@ -46,6 +47,7 @@ class Experiment:
     partial: frozenset[str]
     observed: dict[str, np.ndarray]
     inputs: dict[str, np.ndarray]
+    zone: str = ""
 
 
 def bind(
@@ -152,6 +154,7 @@ def _bind(trace: Trace, source: Source, need: bool, steps: int | None) -> Experi
         partial=frozenset(partial),
         observed={n: observed[n] for n in trace.observations},
         inputs=inputs,
+        zone=source.zone,
     )
 
 

@@ -23,7 +23,8 @@ class Source:
     """One data set: its columns as the user holds them, and the labels of its rows.
 
     label : "data", or "data set 2" where there are several.
-    time : labels of the rows, None where the data have none.
+    time : labels of the rows, None where the data have none; of dates with a zone those of UTC.
+    zone : name of the zone that dates were given in; empty where they have none.
     """
 
     label: str
@@ -31,6 +32,7 @@ class Source:
     columns: dict[str, Any]
     time: np.ndarray | None = None
     time_name: str = "time"
+    zone: str = ""
     known: list[str] = field(default_factory=list)
 
     def place(
@@ -241,7 +243,7 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
     where = source.place()
     dates: Any = getattr(values, "dt", None) if hasattr(values, "iloc") else values
     if getattr(dates, "tz", None) is not None:
-        values = dates.tz_convert(None)
+        source.zone, values = str(dates.tz), dates.tz_convert(None)
     elif hasattr(dates, "to_timestamp"):
         values = dates.to_timestamp()
     labels = np.asarray(values)

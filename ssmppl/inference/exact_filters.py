@@ -35,7 +35,7 @@ def kalman_filter(
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
-    quantiles : levels of the quantiles of the states.
+    quantiles : levels of the quantiles of states and predictions.
 
     Returns
     -------
@@ -61,16 +61,27 @@ def kalman_filter(
 
 def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> FilterRun:
     """Exact moments in the form of a particle filter's."""
-    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
-    with np.errstate(invalid="ignore"):  # nothing is known yet of a flat component
-        quantiles = exact.mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
     variance = np.diagonal(exact.observation_covariance, axis1=1, axis2=2)
+    quantiles = [
+        _normal_quantiles(mean, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), levels)
+        for mean, covariance in (
+            (exact.mean, exact.covariance),
+            (exact.observation_mean, exact.observation_covariance),
+        )
+    ]
     below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
     prediction = np.stack([exact.observation_mean, variance, below, below], axis=1)
     return FilterRun(
-        exact.log_increments, np.full(e.steps, np.nan), exact.mean, exact.covariance, quantiles,
-        prediction,
+        exact.log_increments, np.full(e.steps, np.nan), exact.mean, exact.covariance,
+        quantiles[0], prediction, quantiles[1],
     )  # fmt: skip
+
+
+def _normal_quantiles(mean: np.ndarray, sd: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """(T, P, ...) at the levels (P,), by means and standard deviations (T, ...)."""
+    with np.errstate(invalid="ignore"):  # nothing is known yet of a flat component
+        found: np.ndarray = mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]
+    return found
 
 
 def forward_filter(
@@ -90,7 +101,7 @@ def forward_filter(
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
-    quantiles : levels of the quantiles of the states.
+    quantiles : levels of the quantiles of states and predictions.
     seed : for the PIT values of discrete channels, which are spread uniformly over their jump.
 
     Returns
@@ -98,7 +109,8 @@ def forward_filter(
     Dataset, or a list of them for several experiments
         As of `particle_filter`, with one `draw` and without `ess`, everything exact; and for each
         state x ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate
-        holds the values.
+        holds the values. ``y_predicted_quantile`` inverts the distribution function of the mixture;
+        it is NaN for Wishart laws, whose components have none in closed form.
 
     Raises
     ------
@@ -121,6 +133,7 @@ def forward_filter(
             found.log_increments, np.full(e.steps, np.nan), mean,
             square - mean[:, :, None] * mean[:, None, :], exact.quantiles(law, levels),
             exact.predicted_observations(e, theta, found.predicted),
+            exact.predicted_quantiles(e, theta, found.predicted, levels),
         )  # fmt: skip
         dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")
         datasets.append(dataset.assign(_probabilities(exact, law, dataset)))

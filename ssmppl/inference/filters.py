@@ -66,7 +66,7 @@ def particle_filter(
     particles : number N of particles.
     repeats : number of independent filters.
     proposal, resampling, ess_threshold, rescue : as in `log_likelihood`.
-    quantiles : levels of the quantiles of the states.
+    quantiles : levels of the quantiles of states and predictions.
     history : whether the result holds every particle with its weight and its ancestor, which
         `plot_ancestry` draws: T N (D + 2) numbers for each of the repeats. "auto" then leaves the
         Rao-Blackwellised proposals out.
@@ -83,6 +83,9 @@ def particle_filter(
         * ``x_quantile``: filter quantiles, last dim `quantile`;
         * ``covariance``: of the stacked state components, ``(draw, time, state, state_)``;
         * ``y_predicted``, ``y_predicted_sd``: moments of y_t given y_1:t-1;
+        * ``y_predicted_quantile``: quantiles of the same, last dim `quantile`, from one y_t drawn
+          of each particle that is predicted: of counts whole numbers, of few particles as rough as
+          any quantiles of so many draws; NaN where a law is not defined;
         * ``y_pit``: P(Y_t <= y_t given y_1:t-1), randomised for discrete channels; NaN where
           missing or undefined;
         * ``ess``: effective sample size (Kong, Liu and Wong 1994);
@@ -146,9 +149,11 @@ def _one_run(
 ) -> list[FilterRun]:  # fmt: skip
     """One run over every experiment; a function that another process can be sent."""
     run = marginal_run if is_marginal(settings.proposal) else partial(full_run, history=history)
+    streams = [(random_state(root, repeat, i), random_state(root, repeat, i, 0))
+               for i in range(len(problem.experiments))]  # fmt: skip
     return [
-        run(problem, e, theta, settings, random_state(root, repeat, i), levels)
-        for i, e in enumerate(problem.experiments)
+        run(problem, e, theta, settings, rng, levels, apart)
+        for e, (rng, apart) in zip(problem.experiments, streams, strict=True)
     ]
 
 
@@ -173,13 +178,16 @@ def filter_dataset(
     coords: dict[str, Any] = {"state": [repr(s) for s in trace.state_symbols]}
     coords["state_"] = coords["state"]
     if len(levels):
-        spread = np.moveaxis(np.stack([r.quantiles for r in runs]), 2, 0)
-        by_name = [unpack_states(trace, q) for q in spread]
-        for name in by_name[0]:
-            variables[f"{name}_quantile"] = np.stack([q[name] for q in by_name], axis=-1)
-            own = component_dims(name, by_name[0][name], 2)
-            dims[f"{name}_quantile"] = ["time", *own, "quantile"]
         coords["quantile"] = levels
+        for suffix, named, arrays in (
+            ("quantile", unpack_states, [r.quantiles for r in runs]),
+            ("predicted_quantile", unpack_observations, [r.predicted_quantiles for r in runs]),
+        ):
+            by_level = [named(trace, q) for q in np.moveaxis(np.stack(arrays), 2, 0)]
+            for name, values in by_level[0].items():
+                variables[f"{name}_{suffix}"] = np.stack([q[name] for q in by_level], axis=-1)
+                own = component_dims(name, values, 2)
+                dims[f"{name}_{suffix}"] = ["time", *own, "quantile"]
     prediction = np.stack([r.prediction for r in runs])
     for (name, what), values in _predictions(problem, experiment, prediction, root).items():
         variables[f"{name}_{what}"] = values

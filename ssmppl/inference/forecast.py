@@ -14,7 +14,7 @@ from ssmppl.counts import check_room
 from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.labels import observes
+from ssmppl.inference.labels import TIME_ZONES, observes, zone_of
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.posterior_draws import (
     all_draws,
@@ -67,7 +67,8 @@ def forecast(
     -------
     Dataset
         States and observations (draw, time, ...) and parameters (draw, ...); all chains one after
-        the other. Its time goes on from the data's where that is evenly spaced.
+        the other. Its time goes on from the data's where that is evenly spaced; where the data's
+        dates had a time zone, days and months are those of that zone. All dates are in UTC.
 
     Raises
     ------
@@ -101,28 +102,38 @@ def forecast(
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     states, observed = _continued(program, theta, paths, y, u, feedback, root)
     check_finite(traced, states, observed)
+    zone = zone_of(posterior.attrs, axis)
+    if labels is None:
+        labels = after(posterior[axis].values, steps, zone)
     over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
     return to_dataset(
         over_time | unpack_parameters(traced, theta),
         over_time=set(over_time),
-        time=labels if labels is not None else after(posterior[axis].values, steps),
+        time=labels,
         attrs={
             "model": traced.name,
             "seed": str(root.entropy),
             "after": int(rows),
             "experiment": experiment or 1,
             "observes": observes(traced),
-        },
+        }
+        | ({TIME_ZONES: {"time": zone}} if zone else {}),
     )
 
 
-def after(time: np.ndarray, steps: int) -> np.ndarray:
+def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
     """Labels of the rows that follow `time`: numbers and dates go on where they are evenly spaced
-    (dates also by months and the like), else there are row numbers."""
+    (dates also by months and the like), else there are row numbers.
+
+    zone : that dates, which are in UTC, were given in: steps of whole days and longer are those of
+        its calendar.
+    """
     count = np.arange(1, steps + 1)
     if np.issubdtype(time.dtype, np.datetime64):
         import pandas as pd
 
+        if zone and len(time) > 2 and (found := _by_calendar(time, steps, zone)) is not None:
+            return found
         spacing = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
         if spacing is not None:
             return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=spacing)[1:])
@@ -138,6 +149,24 @@ def after(time: np.ndarray, steps: int) -> np.ndarray:
         if np.allclose(gaps, gaps[0], rtol=1e-6):
             return np.asarray(time[-1] + gaps[0] * count)
     return len(time) + count
+
+
+def _by_calendar(time: np.ndarray, steps: int, zone: str) -> np.ndarray | None:
+    """The dates (UTC) that follow by whole days, weeks, months, ... of a zone's calendar, on the
+    clock of its days; None where the steps are others, or the zone is not known."""
+    import pandas as pd
+
+    try:
+        local = pd.DatetimeIndex(time).tz_localize("UTC").tz_convert(zone).tz_localize(None)
+    except (KeyError, ValueError):  # no such zone on this computer
+        return None
+    step = pd.DatetimeIndex(local, freq="infer").freq
+    if step is None or (local[-1] + step - local[-1]) % pd.Timedelta(days=1):
+        return None
+    dates = pd.date_range(local[-1], periods=steps + 1, freq=step)[1:]
+    # an hour that the clock leaves out is the next one, of one that comes twice it is the first
+    there = dates.tz_localize(zone, nonexistent="shift_forward", ambiguous=np.full(steps, True))
+    return np.asarray(there.tz_convert(None))
 
 
 def _continued(

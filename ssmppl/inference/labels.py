@@ -7,6 +7,7 @@ lengths differ.
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from ssmppl.language.trace import Trace
 
 if TYPE_CHECKING:
     import xarray as xr
+
+TIME_ZONES = "time_zones"  # the attribute
 
 
 def with_data(result: xr.Dataset, experiment: Experiment) -> xr.Dataset:
@@ -54,14 +57,23 @@ def observes(trace: Trace) -> dict[str, str]:
     return found
 
 
+def zone_of(attrs: Mapping[str, Any], axis: str) -> str:
+    """The zone that the labels of a dim were given in, by the attributes of a result."""
+    found = attrs.get(TIME_ZONES, {})
+    return str((json.loads(found) if isinstance(found, str) else found).get(axis, ""))
+
+
 class Labels:
-    """dims, coords : of the variables named so far, for `to_inference_data`."""
+    """dims, coords : of the variables named so far, for `to_inference_data`. attrs : the zones that
+    dates were given in, by the dim over time, where they have any; dates themselves are in UTC."""
 
     def __init__(self, experiments: Sequence[Experiment]):
         self.several = len(experiments) > 1
         self.time = None if self.several else experiments[0].time
         self.dims: dict[str, list[str]] = {}
         self.coords: dict[str, Any] = {}
+        zones = {self.axis(i): e.zone for i, e in enumerate(experiments) if e.zone}
+        self.attrs = {TIME_ZONES: zones} if zones else {}
         if self.several:
             self.coords = {
                 self.axis(i): np.arange(1, e.steps + 1) if e.time is None else e.time

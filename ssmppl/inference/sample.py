@@ -272,5 +272,5 @@ def _to_arviz(
         time=labels.time,
         dims=labels.dims,
         coords=labels.coords,
-        attrs=attrs,
+        attrs=attrs | labels.attrs,
     )

@@ -11,14 +11,15 @@ from ssmppl.inference.posterior_draws import group
 from ssmppl.plots.drawing import dots, fan, few, handed, key, only_below, panels, shown_time, styled
 from ssmppl.plots.filters import filtered, titles
 from ssmppl.plots.reading import (
-    LEVELS,
     Record,
     bands,
     components,
     data_of,
     is_inference_data,
+    is_prediction,
     over_time,
     pick,
+    quantiles_at_levels,
     wrong_kind,
 )
 from ssmppl.plots.style import FAINT, MAIN, bare
@@ -37,20 +38,18 @@ def plot_predictions(result: Any, *, var_names: Any = None, ax: Any = None) -> A
     """One-step predictions with 50% and 90% bands over the observations, and their PIT values.
 
     Left, the observations and what the filter expected of each row given the rows before it: bands
-    of the normal law with the predicted mean and standard deviation, which is exact for linear
-    Gaussian models; of others, and of counts above all, only a sketch, while the right side is
-    exact up to the particles. Right, a histogram of P(Y_t <= y_t given y_1:t-1) over all rows and
-    experiments: level if the model is right. The grey band is where nine in ten bars of as many
-    uniform values lie. A bar too high in the middle: predictions too wide; at both ends: too
-    narrow; at one end: biased.
+    between the quantiles ``y_predicted_quantile``. Right, a histogram of P(Y_t <= y_t given
+    y_1:t-1) over all rows and experiments: level if the model is right. The grey band is where
+    nine in ten bars of as many uniform values lie. A bar too high in the middle: predictions too
+    wide; at both ends: too narrow; at one end: biased.
 
     Of `predict`, the bands are quantiles of the draws, and there is no histogram, as those know the
     rows that they would be compared with.
 
     Parameters
     ----------
-    result : what `particle_filter`, `kalman_filter` or `forward_filter` returns (of several repeats
-        the first is drawn), or `predict`.
+    result : what `particle_filter`, `kalman_filter` or `forward_filter` returns, with the levels of
+        quantiles that they have by default (of several repeats the first is drawn), or `predict`.
     var_names : names of the channels that are drawn, or of components; None: all.
     ax : Matplotlib axes, one row of them for each channel; None: a new figure.
 
@@ -61,7 +60,8 @@ def plot_predictions(result: Any, *, var_names: Any = None, ax: Any = None) -> A
 
     Raises
     ------
-    ArgumentError : the result holds no predictions, or no such channel; `ax` are not as many.
+    ArgumentError : the result holds no predictions, not at these levels, or no such channel; `ax`
+        are not as many.
 
     References
     ----------
@@ -99,8 +99,6 @@ def plot_predictions(result: Any, *, var_names: Any = None, ax: Any = None) -> A
 
 def _of_filter(result: Any) -> tuple[list[Record], list[dict[str, np.ndarray]]]:
     """Bands and data, and PIT values, of each experiment."""
-    from scipy.special import ndtri
-
     found = filtered(result, "plot_predictions")
     records, pits = [], []
     for one, title in zip(found, titles(len(found)), strict=True):
@@ -110,12 +108,14 @@ def _of_filter(result: Any) -> tuple[list[Record], list[dict[str, np.ndarray]]]:
         pit: dict[str, np.ndarray] = {}
         for key_ in own.data_vars:
             name = str(key_).removesuffix("_predicted")
-            if name == str(key_) or f"{name}_predicted_sd" not in own:
+            if not is_prediction(own, str(key_)):
                 continue
-            mean, sd = own[f"{name}_predicted"].values, own[f"{name}_predicted_sd"].values
-            with np.errstate(invalid="ignore"):  # no band where the variance is infinite
-                spread = ndtri(np.array(LEVELS)).reshape(-1, *[1] * mean.ndim) * sd
-            states |= components(name, mean + spread, 2)
+            if f"{key_}_quantile" not in own:
+                raise ArgumentError(
+                    f"the result of the filter has no quantiles of the predictions of {name!r}",
+                    fix="run it again, without quantiles=",
+                )
+            states |= quantiles_at_levels(one, str(key_), name, "plot_predictions")
             if f"{name}_observed" in own:
                 data |= components(name, own[f"{name}_observed"].values, 1)
             pit |= components(name, own[f"{name}_pit"].values, 1)

@@ -26,9 +26,11 @@ __all__ = [
     "group_of",
     "is_dataset",
     "is_inference_data",
+    "is_prediction",
     "observed_states",
     "over_time",
     "pick",
+    "quantiles_at_levels",
     "records",
     "wrong_kind",
 ]
@@ -220,8 +222,8 @@ def _of_dataset(dataset: Any, name: str, verb: str) -> Record:
         label = str(key)
         if variable.dims[:2] == ("trajectory", "time"):
             states |= {k: bands(v) for k, v in components(label, variable.values, 2)}
-        elif f"{label}_quantile" in dataset:
-            states |= _quantiles(dataset, label, verb)
+        elif f"{label}_quantile" in dataset and not is_prediction(dataset, label):
+            states |= quantiles_at_levels(dataset, label, label, verb)
         elif variable.dims[:1] == ("time",):
             for suffix, into in (("_observed", data), ("_input", inputs)):
                 if label.endswith(suffix):
@@ -232,9 +234,20 @@ def _of_dataset(dataset: Any, name: str, verb: str) -> Record:
                   observed_states(dataset.attrs))  # fmt: skip
 
 
-def _quantiles(dataset: Any, name: str, verb: str) -> dict[str, np.ndarray]:
-    """Of the first draw, at `LEVELS`."""
-    variable = dataset[f"{name}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
+def is_prediction(dataset: Any, name: str) -> bool:
+    """Whether a variable of a filter's result is the predicted mean of a channel."""
+    channel = name.removesuffix("_predicted")
+    return channel != name and f"{channel}_pit" in dataset
+
+
+def quantiles_at_levels(dataset: Any, variable: str, name: str, verb: str) -> dict[str, np.ndarray]:
+    """Of the first draw of a variable, (5, T) at `LEVELS`, of each of its scalars, called by name.
+
+    Raises
+    ------
+    ArgumentError : the result has others.
+    """
+    told = dataset[f"{variable}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
     known = dataset["quantile"].values
     places = [np.flatnonzero(np.isclose(known, level)) for level in LEVELS]
     if not all(len(p) for p in places):
@@ -242,7 +255,7 @@ def _quantiles(dataset: Any, name: str, verb: str) -> dict[str, np.ndarray]:
             f"{verb} draws the quantiles {_texts(LEVELS)}, and the result has {_texts(known)}",
             fix="leave quantiles= out of the call that made it",
         )
-    values = np.moveaxis(variable.values[..., [p[0] for p in places]], -1, 0)  # (5, T, ...)
+    values = np.moveaxis(told.values[..., [p[0] for p in places]], -1, 0)  # (5, T, ...)
     return dict(components(name, values, 2))
 
 

@@ -113,6 +113,10 @@ def test_kalman_filter(series):
     assert one["states"]["x"]["sd"] == list(expected["x_sd"].values[0])
     assert one["predicted"]["y"]["mean"] == list(expected["y_predicted"].values[0])
     assert one["predicted"]["y"]["sd"] == list(expected["y_predicted_sd"].values[0])
+    assert set(one["predicted"]["y"]) == {"mean", "sd", "q10", "q90"}
+    quantiles = expected["y_predicted_quantile"].values[0]
+    assert one["predicted"]["y"]["q10"] == list(quantiles[:, 0])
+    assert one["predicted"]["y"]["q90"] == list(quantiles[:, 1])
     assert one["time"] == list(range(1, 21))
     total = float(expected["log_likelihood_increment"].sum())
     assert found["log_likelihood"] == pytest.approx([total])

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ssmppl.analysis.channels import channel_draws, observation_draws
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.moves import bootstrap
 from ssmppl.analysis.twisted import guided, jacobian
-from ssmppl.codegen.kits import filter_kit, observation_draws
+from ssmppl.codegen.kits import filter_kit
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.program import compile_trace
 from ssmppl.errors import NotApplicable
@@ -246,18 +247,23 @@ def test_simulation_and_prediction(case):
         role, draws = ("draw", plain_proposal.draw) if t else (
             "draw_initial", plain_proposal.initial_draw)  # fmt: skip
         check_draw(generated, role, draws, t, rng)
-        roots = observation_draws(traced)
-        normals, uniforms, noise = noise_of(roots, rng)
-        out = np.full((len(roots), PARTICLES), np.nan)
-        generated.pass_("observe", numbers.states[t], out, normals, uniforms, None)
-        for k, e in enumerate(evaluate(roots, {**numbers.values(t), **noise}, stand_in)):
-            close(out[k], e, f"observe {k} t={t}")
+        check_observe(generated, observation_draws(traced), t, rng)
         generated = Generated(program, numbers, "predict", t)
         check_draw(generated, role, draws, t, rng)
-        moments = np.full((4 * len(roots), PARTICLES), -7.0)
+        check_observe(generated, channel_draws(traced), t, rng)
+        moments = np.full((4 * len(traced.observation_symbols), PARTICLES), -7.0)
         generated.pass_("moments", numbers.states[t], moments)
         assert not (moments == -7.0).any()
         check_moments(moments, traced, numbers, t)
+
+
+def check_observe(generated, roots, t, rng):
+    numbers = generated.numbers
+    normals, uniforms, noise = noise_of(roots, rng)
+    out = np.full((len(roots), PARTICLES), np.nan)
+    generated.pass_("observe", numbers.states[t], out, normals, uniforms, None)
+    for k, e in enumerate(evaluate(roots, {**numbers.values(t), **noise}, stand_in)):
+        close(out[k], e, f"observe {k} t={t}")
 
 
 def check_moments(moments, traced, numbers, t):

@@ -7,13 +7,14 @@ import pytest
 from numba.core.errors import TypingError
 
 import ssmppl as ssm
-from ssmppl.codegen import folder
+from ssmppl.codegen import folder, loading
 from ssmppl.codegen.kernels.calls import address_of
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.codegen.loading import Loaded
 from ssmppl.codegen.metropolis import numbered_filter, scored_filter
 from ssmppl.codegen.native import build as native_build
+from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.library import HOMES
 from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.inference.problem import pose
@@ -176,15 +177,15 @@ def moments(model):
     problem = pose(model, {"y": np.random.default_rng(7).normal(size=25)})
     program, e, out = problem.program, problem.experiments[0], []
     for module in (program.loaded, program.module):
-        levels, predicted = np.array([0.1, 0.5]), np.empty((25, 4, 1))
-        written = np.empty((25, 1)), np.empty((25, 1, 1)), np.empty((25, 2, 1)), predicted
+        levels, predicted = np.array([0.1, 0.5]), (np.empty((25, 4, 1)), np.empty((25, 2, 1)))
+        written = np.empty((25, 1)), np.empty((25, 1, 1)), np.empty((25, 2, 1))
         increments, ess = np.empty(25), np.empty(25)
-        stream = new_state(np.random.SeedSequence(2))
+        stream, apart = (new_state(np.random.SeedSequence(k)) for k in (2, 3))
         module.filter_guided(
             np.zeros(0), e.y, e.seen, e.u, 40, 0, 0.5, stream, increments, ess,
-            (levels, *written), None,
+            (levels, *written, (predicted[0], levels, predicted[1], apart)), None,
         )  # fmt: skip
-        out.append((*written, increments, ess))
+        out.append((*written, *predicted, increments, ess))
     assert not program.loaded.why
     return out
 
@@ -225,6 +226,36 @@ def test_what_a_new_model_needs_no_numba_for():
     for made, name in ((numbered, "correlated_path"), *((s, "filter_with_score") for s in scored)):
         assert getattr(made.module, name) is not getattr(made.module.module, name)
         assert not made.module.why
+
+
+def test_predictions_are_compiled_when_they_are_asked_for(monkeypatch):
+    """A likelihood does not wait for them; where they have no address, Numba makes them."""
+    made, refused = [], False
+
+    def recorded(name, text):
+        made.append(name.rpartition("_")[2])
+        if refused and made[-1] == "predict":
+            raise Untranslatable("an invention", fix="")
+        return addresses(name, text)
+
+    monkeypatch.setattr(loading, "addresses", recorded)
+    y = {"y": np.random.default_rng(4).normal(size=6)}
+    model = walk(0.35)
+    ssm.log_likelihood(model, y, {}, particles=20, proposal="bootstrap", seed=1)
+    assert made == ["bootstrap"]
+    found = ssm.particle_filter(model, y, {}, particles=20, proposal="bootstrap", seed=1)
+    assert made == ["bootstrap", "predict"]
+    assert np.isfinite(found["y_predicted_quantile"]).all()
+    refused, instead = True, []
+    problem = pose(walk(0.35), y)
+    loaded, e = problem.program.loaded, problem.experiments[0]
+    monkeypatch.setattr(loaded.module, "filter_bootstrap", lambda *given: instead.append(given))
+    for moments in (None, ()):
+        loaded.filter_bootstrap(
+            np.zeros(0), e.y, e.seen, e.u, 20, 0, 1.0, new_state(np.random.SeedSequence(1)),
+            np.empty(6), np.empty(6), moments, None,
+        )  # fmt: skip
+        assert len(instead) == (moments is not None)
 
 
 def test_arrays_with_gaps_have_no_address():

@@ -43,6 +43,8 @@ def test_components_have_one_dim_whatever_is_told_of_them(run):
     for name, variables in OF.items():
         for variable in variables:
             assert variable not in found or found[variable].dims[-1] == f"{name}_dim_0"
+            spread = f"{variable}_quantile"
+            assert spread not in found or found[spread].dims[-2:] == (f"{name}_dim_0", "quantile")
     if "y_predicted" in found:
         errors = found["y_observed"] - found["y_predicted"]
         assert errors.size == DATA["y"].size

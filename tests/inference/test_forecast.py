@@ -1,5 +1,6 @@
 """Draws past the data: their exact law in a linear model, their inputs, their time."""
 
+import arviz as az
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,7 +9,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.forecast import after
-from ssmppl.results import to_inference_data
+from ssmppl.results import save, to_inference_data
 from tests.statistics.checks import LEVEL, seed_of
 
 A, B, Q, R = 0.8, 0.5, 0.5, 0.4
@@ -112,6 +113,63 @@ def test_time_goes_on():
     assert after(np.array([7]), 1).tolist() == [8]
     found = ssm.forecast(model(), made(time=np.arange(1990, 1990 + ROWS)), inputs={"u": FUTURE})
     assert found["time"].values.tolist() == list(range(1997, 2002))
+
+
+CLOCKS = {  # first date in Berlin, step, rows of the data: the clock is set between or after them
+    "days into summer": ("2024-03-28", "D", 3), "days of summer": ("2024-03-30", "D", 4),
+    "days into winter": ("2024-10-25", "D", 3), "weeks": ("2024-03-10 18:00", "W", 4),
+    "months": ("2024-01-01", "MS", 3), "ends of months": ("2024-08-31", "ME", 4),
+    "hours": ("2024-03-30 22:00", "h", 4), "half days": ("2024-03-30", "12h", 3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CLOCKS)
+def test_days_and_months_are_those_of_the_zone(case):
+    first, step, rows = CLOCKS[case]
+    dates = pd.date_range(first, periods=rows + 6, freq=step, tz="Europe/Berlin")
+    utc = dates.tz_convert(None).to_numpy()
+    np.testing.assert_array_equal(after(utc[:rows], 6, "Europe/Berlin"), utc[rows:])
+
+
+def test_an_hour_that_a_clock_leaves_out_or_has_twice():
+    def local(day, steps):
+        dates = pd.date_range(day, periods=3, freq="D", tz="Europe/Berlin").tz_convert(None)
+        found = after(dates.to_numpy(), steps, "Europe/Berlin")
+        there = pd.DatetimeIndex(found).tz_localize("UTC").tz_convert("Europe/Berlin")
+        return there.strftime("%d %H:%M %z").tolist()
+
+    assert local("2024-03-28 02:30", 2) == ["31 03:00 +0200", "01 02:30 +0200"]
+    assert local("2024-10-24 02:30", 2) == ["27 02:30 +0200", "28 02:30 +0100"]
+
+
+def test_a_zone_that_is_not_known_here_is_left_out():
+    days = pd.date_range("2024-03-28", periods=3, freq="D").to_numpy()
+    np.testing.assert_array_equal(after(days, 2, "Nowhere/Land"), after(days, 2))
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_the_zone_of_the_data_gets_to_the_forecast(several, tmp_path):
+    """Through a posterior that was written and read; without it the days would end at 22:00."""
+    level = ssm.Model("level")
+    level.prior(lambda: {"q": ssm.Gamma(2, rate=2)})
+    level.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    level.transition(lambda x, q: {"x": ssm.Normal(x, precision=q)})
+    level.observation(lambda x: {"y": ssm.Normal(x, sd=0.5)})
+    dates = pd.date_range("2024-03-29", periods=8, freq="D", tz="Europe/Berlin")
+    table = pd.DataFrame({"y": [0.1, 0.5, 0.2, 0.4]}, index=dates[:4])
+    plain = pd.DataFrame({"y": [0.1, 0.5, 0.2]})
+    idata = ssm.sample(
+        level, [plain, table] if several else table, draws=5, warmup=5, chains=1, seed=1,
+        progress=False,
+    )  # fmt: skip
+    idata = az.from_netcdf(save(idata, tmp_path / "p.nc"))
+    found = ssm.forecast(level, idata, 4, experiment=2 if several else None, seed=1)
+    np.testing.assert_array_equal(found["time"], dates[4:].tz_convert(None).to_numpy())
+    assert found.attrs["time_zones"] == '{"time": "Europe/Berlin"}'
+    if several:
+        found = ssm.forecast(level, idata, 2, experiment=1, seed=1)
+        assert found["time"].values.tolist() == [4, 5]
+        assert "time_zones" not in found.attrs
 
 
 def test_what_cannot_be_continued_is_said():

@@ -194,7 +194,7 @@ def test_ancestry_says_what_to_ask_for():
 
 
 # -- plot_predictions
-def test_bands_of_predictions_are_those_of_the_normal_law():
+def test_bands_of_predictions_are_those_of_the_exact_law():
     axes = ssm.plot_predictions(filtered())
     assert axes.shape == (2, 2)
     ((_, drawn),) = fans(axes[0, 0], None)
@@ -205,6 +205,31 @@ def test_bands_of_predictions_are_those_of_the_normal_law():
     assert [axes[k, 0].get_ylabel() for k in (0, 1)] == ["y", "z"]
     assert [axes[k, 0].get_xlabel() for k in (0, 1)] == ["", "time"]
     assert axes[1, 1].get_xlabel() == "PIT"
+
+
+def test_bands_of_counts_are_counts():
+    counts = ssm.Model("counts")
+    counts.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    counts.transition(lambda x: {"x": ssm.Normal(0.9 * x, sd=0.5)})
+    counts.observation(lambda x: {"n": ssm.Poisson(np.exp(x))})
+    rows = {"n": np.array([0.0, 2.0, np.nan, 1.0])}
+    found = ssm.particle_filter(counts, rows, {}, particles=200, repeats=2, seed=1)
+    left, _ = ssm.plot_predictions(found)
+    ((_, drawn),) = fans(left, None)
+    np.testing.assert_array_equal(drawn, found["n_predicted_quantile"].values[0].T)
+    assert drawn.min() == 0.0
+    assert np.all(drawn == np.floor(drawn))
+    states = np.ravel(ssm.plot_states(found))  # n has a panel of its data, but no bands there
+    assert [one.get_ylabel() for one in states] == ["x", "n"]
+
+
+def test_bands_need_their_levels():
+    others = ssm.kalman_filter(level, data(), TRUTH, quantiles=(0.1, 0.9))
+    with pytest.raises(ArgumentError, match=r"(?s)draws the quantiles 0\.05.*leave quantiles= out"):
+        ssm.plot_predictions(others)
+    none = ssm.kalman_filter(level, data(), TRUTH, quantiles=())
+    with pytest.raises(ArgumentError, match=r"(?s)no quantiles of the predictions of 'y'"):
+        ssm.plot_predictions(none)
 
 
 def test_the_histogram_counts_the_pit_values_and_its_band_is_binomial():

@@ -56,8 +56,9 @@ def test_error_of_filter_means_falls_as_one_over_the_root_of_n():
         squares = []
         for _ in range(60):
             run = full_run(
-                problem, experiment, theta, FilterSettings(n, "bootstrap"), stream, np.empty(0)
-            )
+                problem, experiment, theta, FilterSettings(n, "bootstrap"), stream, np.empty(0),
+                stream,
+            )  # fmt: skip
             squares.append(np.mean((run.mean - exact) ** 2))
         rows.append((np.mean(squares), np.std(squares, ddof=1) / np.sqrt(60)))
     exponent, error = slope(sizes, *np.transpose(rows))

@@ -142,7 +142,7 @@ def particle_filter(
     scheme : code of the resampling scheme; None: systematic, and no other one is compiled.
     log_increment, ess : (T,), written.
     moments : None, or what else is written, as a tuple: probabilities (P,), mean (T, D),
-        covariance (T, D, D), quantiles (T, P, D) and prediction (T, 4, K), see `predict_step`.
+        covariance (T, D, D), quantiles (T, P, D) and what `predict_step` writes.
     kept : None, or the whole particle system, written, as a tuple: particles (T, D, N), weights
         (T, N), normalised, and ancestors (T, N), row 0 without meaning.
     """

@@ -6,15 +6,21 @@ import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
-from ssmppl.codegen.kernels.summaries import weighted_mean
+from ssmppl.codegen.kernels.summaries import weighted_mean, weighted_quantiles
 
 
 @exact
 def predict_step(
-    prepare, step, draw_initial, draw, moments, sizes,
-    theta, y, seen, u, t, x_prev, w_prev, rng, prediction,
+    prepare, step, draw_initial, draw, moments, observe, sizes,
+    theta, y, seen, u, t, x_prev, w_prev, rng, told,
 ):  # fmt: skip
-    """Write prediction[t] : (4, K): mean, variance, P(Y <= y_t) and P(Y < y_t) of each channel."""
+    """Write what is predicted of y_t, K channels, at P levels.
+
+    told : prediction (T, 4, K), of which row t gets mean, variance, P(Y <= y_t) and P(Y < y_t) of
+        each channel; levels (P,), increasing; quantiles (T, P, K), of one y drawn for each
+        particle; stream, of these draws alone: `rng` goes on as if there were none.
+    """
+    prediction, levels, quantiles, stream = told
     n, n_channels = w_prev.size, y.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     x, out = np.empty((sizes[2], n)), np.empty((4 * n_channels, n))
@@ -40,3 +46,14 @@ def predict_step(
         for row in range(2, 4):
             below = weighted_mean(out[4 * k + row], w)
             prediction[t, row, k] = 1.0 if below > 1.0 else below  # weights sum to 1 + rounding
+    if levels.size > 0:
+        normals, uniforms = np.empty(sizes[6] * n), np.empty(sizes[7] * n)
+        fill_normal(stream, normals)
+        fill_uniform(stream, uniforms)
+        observe(theta, c, s, x, out, normals, uniforms, stream)
+        for k in range(n_channels):
+            weighted_quantiles(out[k], w, levels, quantiles[t, :, k])
+            for i in range(n):
+                if w[i] > 0.0 and out[k, i] != out[k, i]:  # a law whose parameter left its range
+                    quantiles[t, :, k] = np.nan
+                    break

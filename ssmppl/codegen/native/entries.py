@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache as once
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels import particle_filter
 from ssmppl.codegen.kernels.prediction import predict_step
-from ssmppl.codegen.native.translate import PLANES, WHOLE
+from ssmppl.codegen.native.translate import PLANES, WHOLE, Untranslatable
 from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.text import Algorithm
 
@@ -123,39 +124,62 @@ def _caller(k: int, name: str, arguments: str) -> str:
     return f"@exact\ndef {name}({arguments}):\n{body}\n"
 
 
+@dataclass(frozen=True)
+class Aside:
+    """What makes a filter's predictions: an algorithm, and what gives the addresses of its
+    section's functions, asked when predictions are wanted first. instead : the whole filter, for
+    predictions by functions that have no address."""
+
+    algorithm: Algorithm
+    places: Callable[[], Mapping[str, int]]
+    instead: Callable[..., Any]
+
+
 def entry(
     algorithm: Algorithm, places: Mapping[str, int], helpers: tuple[Any, ...] = (),
-    aside: tuple[Algorithm, Mapping[str, int]] | None = None,
+    aside: Aside | None = None,
 ) -> Any:  # fmt: skip
     """An algorithm for one model: `entry(theta, ...)`, as in the model's generated module.
 
     places : address of each of the section's functions, by role. helpers : as in `by_address`.
-    aside : the algorithm that makes predictions, and the addresses of its section's functions.
     """
     section, bound = algorithm.section, algorithm.bound
+    parameters = _parameters(algorithm.function)
+    if "predict" not in parameters:
+        aside = None
     named = {name for _, name in helpers}
     of_helpers = {p for h, _ in helpers for p in _parameters(h)}
     fixed = tuple(
         (n, text) for n, text in bound.items()
         if n in TEXTS or text in (*named, LEFT_OUT.get(n)) or (n in NUMBERS and n in of_helpers)
     )  # fmt: skip
-    predicted = aside[0].section.roles if aside else None
+    predicted = aside.algorithm.section.roles if aside else None
     run, own, beside = by_address(algorithm.function, section.roles, helpers, fixed, predicted)
-    found = [places.get(r, 0) for r in own]
-    more: tuple[Any, ...] = ()
-    if aside:
-        found += [aside[1][r] for r in beside]
-        more = (aside[0].sizes,)
-    codes = np.array(found, dtype=np.int64)
+    codes = np.zeros(len(own) + len(beside), dtype=np.int64)
+    codes[: len(own)] = [places.get(r, 0) for r in own]
     values: dict[str, Any] = {"sizes": algorithm.sizes}
     for n in NUMBERS:
         if n in bound and n not in of_helpers and n not in dict(fixed):
             text = bound[n]  # the name of a constant, or a number
             constant = text.isidentifier()
             values[n] = vars(particle_filter)[text] if constant else ast.literal_eval(text)
-    constants = [values[p] for p in _parameters(algorithm.function) if p in values]
+    constants = [values[p] for p in parameters if p in values]
+    if not aside:
+        return lambda theta, *rest: run(*constants, (codes, theta), *rest)
+
+    taken = {*own, *dict(fixed), *values, "predict", "theta"}
+    at = [p for p in parameters if p not in taken].index("moments")
+    sizes, waiting = aside.algorithm.sizes, True
 
     def call(theta: Any, *rest: Any) -> Any:
-        return run(*constants, (codes, theta, *more), *rest)
+        nonlocal waiting
+        if waiting and rest[at] is not None:
+            try:
+                found = aside.places()
+            except Untranslatable:
+                return aside.instead(theta, *rest)
+            codes[len(own) :] = [found[r] for r in beside]
+            waiting = False
+        return run(*constants, (codes, theta, sizes), *rest)
 
     return call

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ssmppl.analysis.channels import channels
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.codegen.exact import exact_entry
@@ -25,6 +26,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.inference.exact.kalman_matrices import values_of
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
+from ssmppl.inference.exact.mixtures import inverted
 from ssmppl.inference.exact.scored import Scored
 from ssmppl.language.trace import Trace, previous, seen
 
@@ -163,6 +165,32 @@ class HiddenMarkov(Scored):
                           for b in (below, strictly)]  # fmt: skip
                 out.append(np.stack([middle, square - middle**2, *shares], axis=1))
         return np.stack(out, axis=2)
+
+    def predicted_quantiles(
+        self, e: Experiment, theta: np.ndarray, law: np.ndarray, levels: np.ndarray
+    ) -> np.ndarray:
+        """(T, P, K) at the levels (P,), likewise: of the mixture of the laws given each value. NaN
+        where these have no distribution function."""
+        out = np.full((e.steps, len(levels), e.y.shape[1]), np.nan)
+        k = -1
+        for site in self.trace.observations.values():
+            for channel in channels(site):
+                k += 1
+                if channel is None:
+                    continue
+
+                def below(values: np.ndarray, k: int = k, f: Expr = channel.below) -> np.ndarray:
+                    y = e.y.copy()
+                    y[:, k] = values
+                    own = self._over_values(f, replace(e, y=y), theta, "observation")
+                    return np.sum(law * np.where(law > 0.0, own, 0.0), axis=1)
+
+                for j, level in enumerate(levels):
+                    own = self._over_values(channel.quantile(level), e, theta, "observation")
+                    low = np.min(np.where(law > 0.0, own, np.inf), axis=1)
+                    high = np.max(np.where(law > 0.0, own, -np.inf), axis=1)
+                    out[:, j, k] = inverted(below, level, low, high, channel.whole)
+        return out
 
     # -- derivatives
     def score(

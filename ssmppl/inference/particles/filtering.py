@@ -116,11 +116,12 @@ def random_state(root: np.random.SeedSequence, *path: int) -> np.ndarray:
 
 
 Arrays = tuple[np.ndarray, ...]
+Moments = tuple[np.ndarray | Arrays, ...]
 
 
 def run_filter(
     problem: Problem, theta: np.ndarray, settings: FilterSettings, experiment: Experiment,
-    rng: np.ndarray, log_increments: np.ndarray, ess: np.ndarray, moments: Arrays | None = None,
+    rng: np.ndarray, log_increments: np.ndarray, ess: np.ndarray, moments: Moments | None = None,
     kept: Arrays | None = None,
 ) -> tuple[int, int]:  # fmt: skip
     """Run the filter over one experiment; (status, t), t the step at which it stopped.
@@ -201,6 +202,7 @@ class FilterRun:
 
     log_increments, ess : (T,). mean : (T, D). covariance : (T, D, D). quantiles : (T, P, D).
     prediction : (T, 4, K): mean, variance, P(Y <= y) and P(Y < y) of the one-step prediction.
+    predicted_quantiles : (T, P, K), of the same, NaN where it has none.
     history : particles (T, D, N), weights (T, N) and ancestors (T, N), where they were asked for.
     """
 
@@ -210,6 +212,7 @@ class FilterRun:
     covariance: np.ndarray
     quantiles: np.ndarray
     prediction: np.ndarray
+    predicted_quantiles: np.ndarray
     history: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
@@ -220,10 +223,12 @@ def full_run(
     settings: FilterSettings,
     rng: np.ndarray,
     probabilities: np.ndarray,
+    stream: np.ndarray,
     history: bool = False,
 ) -> FilterRun:
     """Run the filter and keep its moments, quantiles and predictions.
 
+    stream : of the observations that are drawn for the quantiles of the predictions.
     history : whether to keep the particles, too, with their weights and ancestors.
 
     Raises
@@ -238,9 +243,10 @@ def full_run(
         kept = np.empty((steps, d, n)), np.empty((steps, n)), ancestors
     out = FilterRun(
         np.empty(steps), np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)),
-        np.empty((steps, p, d)), np.empty((steps, 4, k)), kept,
+        np.empty((steps, p, d)), np.empty((steps, 4, k)), np.empty((steps, p, k)), kept,
     )  # fmt: skip
-    moments = probabilities, out.mean, out.covariance, out.quantiles, out.prediction
+    told = out.prediction, probabilities, out.predicted_quantiles, stream
+    moments = probabilities, out.mean, out.covariance, out.quantiles, told
     status, t = run_filter(
         problem, theta, settings, experiment, rng, out.log_increments, out.ess, moments, kept
     )

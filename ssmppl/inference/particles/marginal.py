@@ -73,7 +73,7 @@ def columns_of(problem: Problem) -> Columns:
 
 def marginal_run(
     problem: Problem, experiment: Experiment, theta: np.ndarray, settings: FilterSettings,
-    rng: np.ndarray, probabilities: np.ndarray,
+    rng: np.ndarray, probabilities: np.ndarray, stream: np.ndarray,
 ) -> FilterRun:  # fmt: skip
     """As `full_run` of the other filters, with the means and covariances of z exact given x.
 
@@ -86,18 +86,19 @@ def marginal_run(
     steps, nothing = experiment.steps, np.empty(0)
     particles, weights = np.empty((steps, d, n)), np.empty((steps, n))
     increments, ess = np.empty(steps), np.empty(steps)
-    prediction = np.empty((steps, 4, k))
+    size, p = len(problem.trace.state_symbols), len(probabilities)
+    predicted = np.empty((steps, 4, k)), np.empty((steps, p, k))
+    told = predicted[0], probabilities, predicted[1], stream
     moments = nothing, np.empty((steps, d)), np.empty((steps, d, d)), np.empty((steps, 0, d))
     kept = particles, weights, np.zeros((steps, n), dtype=np.int32)
     status, t = run_filter(
-        problem, theta, settings, experiment, rng, increments, ess, (*moments, prediction), kept
+        problem, theta, settings, experiment, rng, increments, ess, (*moments, told), kept
     )
     if status != OK:
         raise failure(problem, theta, status, t, experiment)
-    size, p = len(problem.trace.state_symbols), len(probabilities)
     out = FilterRun(
         increments, ess, np.empty((steps, size)), np.empty((steps, size, size)),
-        np.empty((steps, p, size)), prediction,
+        np.empty((steps, p, size)), *predicted,
     )  # fmt: skip
     chunk = max(1, MOST_VALUES // n)
     for first in range(0, steps, chunk):

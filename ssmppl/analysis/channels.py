@@ -1,0 +1,84 @@
+"""The laws of single components of an observation, which predictions are made by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ssmppl.analysis.moves import drawn
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import Expr, attributed
+from ssmppl.language.distribution import Distribution
+from ssmppl.language.distributions import Beta, Categorical, Dirichlet, MvNormal, Normal
+from ssmppl.language.sequential import SequentialNormal
+from ssmppl.language.trace import Site, Trace
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One component given x_t. below : P(Y <= y), of its own symbol y. quantile : its inverse, of a
+    level. whole : whether its values are whole numbers."""
+
+    below: Expr
+    quantile: Callable[[float], Expr]
+    whole: bool
+
+
+def channels(site: Site) -> list[Channel | None]:
+    """Of every component; None where its law has no distribution function."""
+    law, y = alone(site.distribution), site.value
+    if isinstance(law, Dirichlet):
+        law = _shares(law)
+    if law.joint and not isinstance(law, Categorical):
+        return [None] * len(site.components)
+    first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}
+    places = [first[s] for s in site.components]
+
+    below = law.cdf(y)
+
+    def quantile(place: int, level: float) -> Expr:
+        return _at(law.quantile(array(level)), site, place)
+
+    return [Channel(_at(below, site, p), partial(quantile, p), law.discrete) for p in places]
+
+
+def _at(values: ExprArray, site: Site, place: int) -> Expr:
+    wide = array(np.broadcast_to(array(values).view(np.ndarray), site.shape))
+    found: Expr = wide.ravel()[place]
+    return found
+
+
+def channel_draws(trace: Trace) -> list[Expr]:
+    """A draw of every component of y_t given x_t, in the trace's order, by its own law: those of
+    one that is jointly Gaussian are independent, which takes no factor of its covariance."""
+    sites = [replace(s, distribution=alone(s.distribution)) for s in trace.observations.values()]
+    return observation_draws(replace(trace, observations={s.name: s for s in sites}))
+
+
+def observation_draws(trace: Trace) -> list[Expr]:
+    """A draw of every component of y_t given x_t, in the trace's order."""
+    out: list[Expr] = []
+    for site in trace.observations.values():
+        with attributed(trace.locations, site.distribution.location):
+            sample = drawn(site).ravel()
+        by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
+        out += [by_symbol[s] for s in site.components]
+    return out
+
+
+def alone(law: Distribution) -> Distribution:
+    """The laws of the components of one that is jointly Gaussian; any other as it is."""
+    if not isinstance(law, (MvNormal, SequentialNormal)):
+        return law
+    found = Normal(law.mean(), variance=law.variance())
+    found.location = law.location
+    return found
+
+
+def _shares(law: Dirichlet) -> Beta:
+    """The laws of single shares."""
+    a = law.concentration
+    return Beta(a, array(np.sum(a.view(np.ndarray), axis=-1, keepdims=True) - a.view(np.ndarray)))
