@@ -7,6 +7,7 @@ information polish the result; for one scalar state see `smooth_likelihood.py`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,14 @@ import scipy
 
 from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.counts import check_count
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import ExactModel, filter_name
+from ssmppl.inference.exact.vanishing import check_noises
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.edges import edges
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.progress import announced
 
@@ -35,6 +38,7 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
     Raises
     ------
     ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
+    SamplingError : the likelihood grows without bound.
     """
     check_count("particles", method.particles, 2)
     check_count("averages", method.averages, 2)
@@ -81,6 +85,7 @@ class ExactClimb:
                     rng = np.random.default_rng(self.setup.seed(k))
                     start = self.best + rng.standard_normal(len(start))
                 stopped = self._quasi_newton(start)
+                check_noises(self.model, self.experiments, self.setup.chart.at(self.best).theta)
             gap = self._polish()
         except KeyboardInterrupt:
             if not np.isfinite(self.best_value):
@@ -113,7 +118,11 @@ class ExactClimb:
         point = self.setup.chart.at(z)
         if point.log_prior == -np.inf:
             return nothing
-        value, gradient = self.exact.score(point.theta)
+        try:
+            value, gradient = self.exact.score(point.theta)
+        except SamplingError:
+            check_noises(self.model, self.experiments, point.theta)
+            raise
         slope = point.pull(gradient)
         if self.setup.with_prior:
             value, slope = value + point.log_prior, slope + point.d_log_prior
@@ -137,15 +146,26 @@ class ExactClimb:
         return str(found.message)
 
     def _polish(self) -> float:
-        """Newton's steps while they climb; how far the quadratic says that the top still is."""
+        """Newton's steps while they climb; how far the quadratic says that the top still is.
+
+        Parameters whose maximum is at an edge of their support stay where the climb left them.
+        """
         gap = np.inf
+        found = edges(self.setup, self.setup.chart.at(self.best).theta)
+        kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
+        free = self.exact.free.copy()
+        free[list(found.components) if found is not None else []] = False
+        if not kept.any():
+            return 0.0
+        exact = replace(self.exact, free=free)
         for _ in range(NEWTON_STEPS):
             value, slope = self.value(self.best)
-            curvature = self._curvature(self.best)
+            curvature = _curvature(self.setup, exact, self.best)[np.ix_(kept, kept)]
             if not np.all(np.isfinite(curvature)) or _lowest(curvature) <= 0.0:
                 return np.inf
-            step = np.linalg.solve(curvature, slope)
-            gap = float(np.sqrt(max(float(slope @ step), 0.0)))
+            slope, step = slope[kept], np.zeros(len(kept))
+            step[kept] = np.linalg.solve(curvature, slope)
+            gap = float(np.sqrt(max(float(slope @ step[kept]), 0.0)))
             if gap < GRADIENT:
                 break
             z, size = self.best, 1.0
@@ -167,9 +187,6 @@ class ExactClimb:
         self.iterates.append(self.setup.space.parameters(z)[0].copy())
         self.values.append(self.known.get(z.tobytes(), -np.inf))
         self.known.clear()
-
-    def _curvature(self, z: np.ndarray) -> np.ndarray:
-        return _curvature(self.setup, self.exact, z)
 
 
 def observed_information(setup: Setup, model: ExactModel, z: np.ndarray) -> np.ndarray:

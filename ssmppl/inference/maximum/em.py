@@ -35,6 +35,7 @@ from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.exact.models import ExactModel, filter_name
+from ssmppl.inference.exact.vanishing import check_noises
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.baum_welch import FiniteSteps
 from ssmppl.inference.maximum.expected_climb import climbed
@@ -207,12 +208,17 @@ class _Climb:
                 fix="give start={name: value} near plausible values",
             )
         interrupted, distance, calm = False, np.inf, 0
+        experiments = self.setup.problem.experiments
         try:
             while self.maps < self.method.iterations and calm < CALM:
                 distance = self._cycle()
                 calm = calm + 1 if distance < self.method.tolerance else 0
         except KeyboardInterrupt:
             interrupted = True
+        except SamplingError:
+            check_noises(self.model, experiments, self.theta)
+            raise
+        check_noises(self.model, experiments, self.theta)
         converged = calm >= CALM
         report = {
             "converged": converged,
@@ -225,7 +231,7 @@ class _Climb:
             else f"BFGS on the expected log density: {self.map.step.reason}",
             "likelihood": f"exact, by {filter_name(self.model)}",
         }
-        likelihood = self.model.log_likelihood(self.setup.problem.experiments, self.theta)
+        likelihood = self.model.log_likelihood(experiments, self.theta)
         return Ascent(
             self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted,
             figures={"objective": np.array(self.values)},

@@ -1,0 +1,56 @@
+"""Noises that vanish against the data: where a likelihood grows without bound.
+
+A linear Gaussian model that can follow the data exactly, as any level does a constant series, has
+no maximum of the likelihood: it grows with every step of the variances towards zero, until what
+the filter predicts differs from the data by rounding only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ssmppl.data import Experiment, spelled
+from ssmppl.errors import SamplingError
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import ExactModel
+
+VANISHED = 1e-12  # standard deviation of a prediction against the data's size, near rounding
+LEAST = 1e-100  # and where the data are all zero
+
+
+def check_noises(model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray) -> None:
+    """Refuse parameters (P,) to which a search ran because the likelihood has no maximum.
+
+    Raises
+    ------
+    SamplingError : the model predicts a channel to within rounding; names it, and says whether its
+        values are all the same.
+    """
+    if not isinstance(model, KalmanModel):
+        return
+    for e in experiments:
+        try:
+            covariance = model.filter(e, theta).observation_covariance
+        except SamplingError:
+            continue
+        for k, symbol in enumerate(model.trace.observation_symbols):
+            seen = e.seen[:, k] > 0.0
+            if not seen.any():
+                continue
+            y, variance = e.y[seen, k], covariance[seen, k, k]
+            least = max(VANISHED * float(np.max(np.abs(y))), LEAST)
+            if not np.sqrt(np.median(variance)) < least:
+                continue
+            how = (f"are constant ({y[0]:.6g} in every row)" if np.ptp(y) == 0.0
+                   else "can be followed exactly by the model")  # fmt: skip
+            raise SamplingError(
+                f"the likelihood has no maximum: the data of {symbol!r} {how}, so that it grows "
+                "without bound as the variances of the noises go to zero; parameters: "
+                f"{spelled(model.trace, theta)}",
+                fix="check this column; else hold a variance by fixed={...}, or give it a prior "
+                'that keeps it off zero, as ssm.InverseGamma does (with objective="posterior" in '
+                "maximize)",
+                where=model.trace.observations[symbol.data[1]].distribution.location,
+            )
