@@ -185,17 +185,23 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
     if not len(where):
         return nothing
     information = ascent.information
+    if ascent.report.get("without_maximum"):
+        attrs["covariance"] = "the likelihood has no maximum"
+        return nothing
     if information is None and ascent.interrupted:
         attrs["covariance"] = "none: interrupted before the observed information was known"
         return nothing
-    found = None if isinstance(setup.exact, NotApplicable) else edges(setup, ascent.theta)
+    if information is None:
+        information = _information(setup, ascent.theta, None)
+    found = None
+    if information is not None and not isinstance(setup.exact, NotApplicable):
+        found = edges(setup, ascent.theta, information)
     if found is not None:
         labels = [repr(s) for s in setup.problem.trace.parameter_symbols]
         attrs["held_at_edge"] = {labels[i]: edge for i, edge in found.components.items()}
         if not found.kept.any():
             attrs["covariance"] = "every parameter is at an edge of what it can be"
             return nothing
-    if information is None or found is not None:
         information = _information(setup, ascent.theta, found)
     if information is None:
         attrs["covariance"] = "none: no second derivatives of the log-likelihood"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import without_density
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
@@ -236,8 +237,10 @@ def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]
     exact = exact_model(problem.trace)
     numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
-    if isinstance(exact, NotApplicable):
-        return choose_sampler(exact, (), numbers, stuck)
+    singular = without_density(problem.trace)
+    if isinstance(exact, NotApplicable) or singular is not None:
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        return choose_sampler(kind, (), numbers, stuck, singular)
     return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers)
 
 

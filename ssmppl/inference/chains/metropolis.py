@@ -25,7 +25,7 @@ from ssmppl.inference.chains.walk import (
     start_chain,
 )
 from ssmppl.inference.exact.models import ExactModel, exact_model, filter_name, filter_of
-from ssmppl.inference.exact.vanishing import check_noises
+from ssmppl.inference.exact.vanishing import check_mode
 from ssmppl.inference.methods import MetropolisHastings
 from ssmppl.inference.particles.pilot import dispersed, find_mode
 from ssmppl.inference.problem import Problem
@@ -77,7 +77,7 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
-    check_noises(exact, problem.experiments, space.parameters(pilot.z)[0])
+    check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
     factor = walk_factor(setup, method, where, pilot, kind)
     d = len(where)
     target = method.target_acceptance or (0.44 if d <= 1 else 0.35 if d == 2 else 0.234)

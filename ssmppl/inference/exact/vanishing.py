@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ssmppl.data import Experiment, spelled
-from ssmppl.errors import SamplingError
+from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.exact.models import ExactModel
 
@@ -20,16 +20,13 @@ VANISHED = 1e-12  # standard deviation of a prediction against the data's size, 
 LEAST = 1e-100  # and where the data are all zero
 
 
-def check_noises(model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray) -> None:
-    """Refuse parameters (P,) to which a search ran because the likelihood has no maximum.
-
-    Raises
-    ------
-    SamplingError : the model predicts a channel to within rounding; names it, and says whether its
-        values are all the same.
-    """
+def without_maximum(
+    model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray
+) -> NotApplicable | None:
+    """Why the likelihood has no maximum, if that is where a search ran to theta (P,): the model
+    predicts a channel to within rounding there. None where it does not."""
     if not isinstance(model, KalmanModel):
-        return
+        return None
     for e in experiments:
         try:
             covariance = model.filter(e, theta).observation_covariance
@@ -45,12 +42,28 @@ def check_noises(model: ExactModel, experiments: Iterable[Experiment], theta: np
                 continue
             how = (f"are constant ({y[0]:.6g} in every row)" if np.ptp(y) == 0.0
                    else "can be followed exactly by the model")  # fmt: skip
-            raise SamplingError(
+            return NotApplicable(
                 f"the likelihood has no maximum: the data of {symbol!r} {how}, so that it grows "
-                "without bound as the variances of the noises go to zero; parameters: "
-                f"{spelled(model.trace, theta)}",
-                fix="check this column; else hold a variance by fixed={...}, or give it a prior "
-                'that keeps it off zero, as ssm.InverseGamma does (with objective="posterior" in '
-                "maximize)",
-                where=model.trace.observations[symbol.data[1]].distribution.location,
+                "without bound as the variances of the noises go to zero",
+                model.trace.observations[symbol.data[1]].distribution.location,
             )
+    return None
+
+
+def check_mode(model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray) -> None:
+    """Refuse to sample from a mode (P,) that is none.
+
+    Raises
+    ------
+    SamplingError : the likelihood has no maximum, and the prior sets no bound either; names the
+        channel, and says whether its values are all the same.
+    """
+    reason = without_maximum(model, experiments, theta)
+    if reason is not None:
+        raise SamplingError(
+            f"{reason.reason}, and the prior does not hold them; parameters: "
+            f"{spelled(model.trace, theta)}",
+            fix="check this column; else hold a variance by fixed={...}, or give it a prior that "
+            "keeps it off zero, as ssm.InverseGamma does",
+            where=reason.where,
+        )

@@ -19,7 +19,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import ExactModel, filter_name
-from ssmppl.inference.exact.vanishing import check_noises
+from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.edges import edges
@@ -38,7 +38,6 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
     Raises
     ------
     ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
-    SamplingError : the likelihood grows without bound.
     """
     check_count("particles", method.particles, 2)
     check_count("averages", method.averages, 2)
@@ -56,6 +55,10 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
         if isinstance(setup.exact, NotApplicable):
             return smooth_likelihood.climb(setup, method)
         return ExactClimb(setup, setup.exact, method).run()
+
+
+class _WithoutMaximum(Exception):
+    """The likelihood grows without bound, which ends the climb; says why."""
 
 
 class ExactClimb:
@@ -77,7 +80,7 @@ class ExactClimb:
         restarts = self.method.restarts
         restarts = EXACT_RESTARTS if restarts is None else restarts
         check_count("restarts", restarts, 0)
-        interrupted, stopped, gap = False, "", np.inf
+        interrupted, stopped, unbounded, gap = False, "", "", np.inf
         try:
             for k in range(restarts + 1):
                 start = self.setup.start
@@ -85,24 +88,28 @@ class ExactClimb:
                     rng = np.random.default_rng(self.setup.seed(k))
                     start = self.best + rng.standard_normal(len(start))
                 stopped = self._quasi_newton(start)
-                check_noises(self.model, self.experiments, self.setup.chart.at(self.best).theta)
+                self._check(self.setup.chart.at(self.best).theta)
             gap = self._polish()
         except KeyboardInterrupt:
             if not np.isfinite(self.best_value):
                 raise
             interrupted = True
+        except _WithoutMaximum as reason:
+            unbounded = stopped = str(reason)
         if not np.isfinite(self.best_value):
             raise ArgumentError(
                 "the likelihood is zero at every point that was tried",
                 fix="give start={name: value} near plausible values",
             )
-        if not np.isfinite(gap) and not interrupted:
+        if not np.isfinite(gap) and not (interrupted or unbounded):
             stopped = "the climb ran to the edge of what the parameters can be: no maximum inside"
         point = self.setup.chart.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
             "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
         }  # fmt: skip
+        if unbounded:
+            report["without_maximum"] = True
         if self.exact.differences:
             report["central_differences"] = self.exact.differences
         return Ascent(
@@ -121,7 +128,7 @@ class ExactClimb:
         try:
             value, gradient = self.exact.score(point.theta)
         except SamplingError:
-            check_noises(self.model, self.experiments, point.theta)
+            self._check(point.theta)
             raise
         slope = point.pull(gradient)
         if self.setup.with_prior:
@@ -132,6 +139,11 @@ class ExactClimb:
         if value > self.best_value:
             self.best, self.best_value = np.array(z), value
         return value, slope
+
+    def _check(self, theta: np.ndarray) -> None:
+        reason = without_maximum(self.model, self.experiments, theta)
+        if reason is not None:
+            raise _WithoutMaximum(reason.reason)
 
     def _quasi_newton(self, start: np.ndarray) -> str:
         def downhill(z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -151,7 +163,8 @@ class ExactClimb:
         Parameters whose maximum is at an edge of their support stay where the climb left them.
         """
         gap = np.inf
-        found = edges(self.setup, self.setup.chart.at(self.best).theta)
+        theta = self.setup.chart.at(self.best).theta
+        found = edges(self.setup, theta, self.exact.information(theta))
         kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
         free = self.exact.free.copy()
         free[list(found.components) if found is not None else []] = False

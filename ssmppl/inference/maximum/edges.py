@@ -29,6 +29,7 @@ INWARDS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 ROUNDING = 1e-9  # of the objective, relative
 AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb is not finished
 FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
+FLAT = 1e-2  # information in z below which an edge may be near: a standard error of 10
 INSIDE = 1e-12  # what takes the place of a share of exactly zero
 
 
@@ -68,9 +69,17 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
     return out
 
 
-def edges(setup: Setup, theta: np.ndarray) -> Edges | None:
-    """Which components of theta (P,) are at an edge; None where none is."""
+def edges(setup: Setup, theta: np.ndarray, information: np.ndarray) -> Edges | None:
+    """Which components of theta (P,) are at an edge; None where none is.
+
+    information : (P, P), NaN where it does not exist; where it is plain in all of z, nothing is
+    asked of the likelihood.
+    """
     z = _inside(setup, theta)
+    jacobian = setup.chart.at(z).jacobian
+    with np.errstate(all="ignore"):
+        if np.all(np.einsum("pf,pq,qf->f", jacobian, information, jacobian) > FLAT):
+            return None
     found = directions(setup.exact_objective, z)
     if not found.any():
         return None
@@ -107,8 +116,12 @@ def _reached(
                     break
         return out
     ends = _ends(t.site, known)
-    return [(i, _edge(*ends[i], found[i])) for i in np.flatnonzero(found)
-            if np.isfinite(ends[i]).any()]  # fmt: skip
+    out = []
+    for i in map(int, np.flatnonzero(found)):
+        lower, upper = map(float, ends[i])
+        if np.isfinite(lower) or np.isfinite(upper):
+            out.append((i, _edge(lower, upper, found[i])))
+    return out
 
 
 def _ends(site: Site, known: dict[Expr, float]) -> np.ndarray:

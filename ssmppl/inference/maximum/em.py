@@ -35,12 +35,13 @@ from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.exact.models import ExactModel, filter_name
-from ssmppl.inference.exact.vanishing import check_noises
+from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.baum_welch import FiniteSteps
 from ssmppl.inference.maximum.expected_climb import climbed
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods import EM
+from ssmppl.inference.singular import need_density
 from ssmppl.language.trace import Trace, previous, seen
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
@@ -65,6 +66,7 @@ def climb(setup: Setup, method: EM) -> Ascent:
             fix="use ssm.ParticleEM() or ssm.PSAEM()",
             where=setup.exact.where,
         )
+    need_density(setup.problem.trace, "EM", "maximize")
     return _Climb(setup, setup.exact, method).run()
 
 
@@ -216,10 +218,10 @@ class _Climb:
         except KeyboardInterrupt:
             interrupted = True
         except SamplingError:
-            check_noises(self.model, experiments, self.theta)
-            raise
-        check_noises(self.model, experiments, self.theta)
-        converged = calm >= CALM
+            if without_maximum(self.model, experiments, self.theta) is None:
+                raise
+        unbounded = without_maximum(self.model, experiments, self.theta)
+        converged = calm >= CALM and unbounded is None
         report = {
             "converged": converged,
             "stopped": f"the limit is about {distance:.2g} away on the unconstrained scale, after "
@@ -231,6 +233,8 @@ class _Climb:
             else f"BFGS on the expected log density: {self.map.step.reason}",
             "likelihood": f"exact, by {filter_name(self.model)}",
         }
+        if unbounded is not None:
+            report |= {"stopped": unbounded.reason, "without_maximum": True}
         likelihood = self.model.log_likelihood(experiments, self.theta)
         return Ascent(
             self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted,
