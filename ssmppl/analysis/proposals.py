@@ -15,7 +15,12 @@ import numpy as np
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
 from ssmppl.analysis.laplace import NEWTON_STEPS, gaussian_fit
 from ssmppl.analysis.moves import Proposal, Split, bootstrap, draws_of, resolved, split
-from ssmppl.analysis.structure import GaussianBlock, affine_observation, flat_start
+from ssmppl.analysis.structure import (
+    GaussianBlock,
+    affine_observation,
+    flat_start,
+    without_density,
+)
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
@@ -78,6 +83,9 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
+    singular = without_density(trace)
+    if singular is not None:
+        return singular
     move = split(trace, list(trace.transition.values()))
     if not len(move.gaussian):
         where = next(iter(trace.transition.values())).distribution.location
@@ -183,6 +191,9 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     total = constant(0.0)
     for t in smooth:
         total = total + t.guarded()
+    singular = without_density(trace)
+    if singular is not None:
+        return singular
     move = split(trace, list(trace.transition.values()))
     (total,) = substitute([total], move.following)
     where = sites[0].distribution.location

@@ -187,6 +187,22 @@ def _gaussian_law(
     return array(mean), array(covariance)
 
 
+def without_density(trace: Trace) -> NotApplicable | None:
+    """Why the states have no joint density beside their Dirac components: a covariance that is
+    singular whatever the parameters are."""
+    for role, sites in (("initial law", trace.initial), ("transition", trace.transition)):
+        for site in sites.values():
+            if isinstance(site.distribution, MvNormal) and site.distribution.root is not None:
+                rank = sum(any(e is not constant(0.0) for e in column)
+                           for column in site.distribution.root.view(np.ndarray).T)  # fmt: skip
+                return NotApplicable(
+                    f"the covariance in the {role} of {site.name} is singular (rank {rank} of "
+                    f"{site.shape[0]}), so that its density does not exist",
+                    site.distribution.location,
+                )
+    return None
+
+
 def flat_start(trace: Trace) -> list[Site]:
     """The states that have no proper initial law."""
     return [s for s in trace.initial.values() if isinstance(s.distribution, Flat)]

@@ -120,6 +120,9 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
         if not isinstance(d, (Normal, MvNormal, LogNormal)):
             reason = f"the law of {site.name} is {type(d).__name__}, not one of a Gaussian noise"
             return NotApplicable(reason, d.location)
+        if isinstance(d, MvNormal) and d.root is not None:
+            reason = f"the covariance of {site.name} is singular, so that its noises do not show"
+            return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new
         sample = drawn(site, given_draws(site.name, new)).ravel()

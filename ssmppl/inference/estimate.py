@@ -32,7 +32,8 @@ class Estimate:
         prior's shape.
     covariance : of the free components, labelled as `phi`, `A[0, 1]`: the inverse of the observed
         information. NaN where the information is not positive definite; `attrs["covariance"]` then
-        says so.
+        says so. NaN too for a component whose maximum is at an edge of its support
+        (`attrs["held_at_edge"]`, exact models only): the others' is that with it held there.
     standard_errors : roots of its diagonal, by name, as `parameters`; without the fixed ones.
     log_likelihood : at the estimate; with particles an estimate, whose standard error is
         `attrs["log_likelihood_error"]`.
@@ -127,6 +128,11 @@ class Estimate:
             f"{label} is within a standard error of {edge:g}, the edge of what it can be: no "
             "interval about it follows from that standard error"
             for label, edge in self.attrs.get("at_edge", {}).items()
+        ]
+        out += [
+            f"the maximum in {label} is at {edge:g}, the edge of what it can be, and has no "
+            "standard error; those of the others hold with it there"
+            for label, edge in self.attrs.get("held_at_edge", {}).items()
         ]
         how, _, reason = str(self.attrs.get("covariance", "")).partition(": ")
         return [*out, f"no standard errors: {reason}"] if how == "none" else out

@@ -16,7 +16,12 @@ from ssmppl.analysis.eliminable import Eliminable, eliminable
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.noises import Noises, noises
-from ssmppl.analysis.structure import LinearGaussian, deterministic_memory, linear_gaussian
+from ssmppl.analysis.structure import (
+    LinearGaussian,
+    deterministic_memory,
+    linear_gaussian,
+    without_density,
+)
 from ssmppl.analysis.tempered import tempered
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
@@ -105,7 +110,10 @@ class Plan:
             out.append(("Particle filter", rows))
             out.append(("Trajectories", [("PGAS", self._trajectories())]))
         out.append(("Chosen, unless a method is named", self._choices()))
-        if self.updates and noisy:
+        singular = without_density(t)
+        if singular is not None:
+            out.append(("Parameters given the states", [("none", _reason(singular))]))
+        elif self.updates and noisy:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
             out.append(("Interweaved with these, where parameters mix slowly", self._interweaved()))
             out.append(("Eliminated in PGAS, where asked for", self._eliminated()))
@@ -137,7 +145,11 @@ class Plan:
         kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
         choices: dict[str, tuple[Any, str]] = {
             "sample": choose_sampler(
-                kind, self.updates, self._numbers(), why_stuck(self.trace, self.rows)
+                kind,
+                self.updates,
+                self._numbers(),
+                why_stuck(self.trace, self.rows),
+                without_density(self.trace),
             )
         }
         if self.trace.parameters:
@@ -171,6 +183,9 @@ class Plan:
         return [*rows, *((repr(c), f"stays: {_reason(reason)}") for c, reason in why)]
 
     def _trajectories(self) -> str:
+        singular = without_density(self.trace)
+        if singular is not None:
+            return f"does not apply: {_reason(singular)}"
         flat = [s.name for s in self.trace.initial.values() if not s.distribution.proper]
         if flat:
             return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"

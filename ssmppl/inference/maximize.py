@@ -26,6 +26,7 @@ from ssmppl.inference.maximum import (
     score_ascent,
 )
 from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.edges import Edges, edges
 from ssmppl.inference.method_choice import choose_maximiser, start_as_parameter
 from ssmppl.inference.methods import EM, IF2, PSAEM, DirectOptimization, ParticleEM, ScoreAscent
 from ssmppl.inference.particles.complete_score import complete_scores
@@ -193,25 +194,41 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
     if not len(where):
         return nothing
     information = ascent.information
+    if ascent.report.get("without_maximum"):
+        attrs["covariance"] = "the likelihood has no maximum"
+        return nothing
     if information is None and ascent.interrupted:
         attrs["covariance"] = "none: interrupted before the observed information was known"
         return nothing
     if information is None:
-        information = _information(setup, ascent.theta)
+        information = _information(setup, ascent.theta, None)
+    found = None
+    if information is not None and not isinstance(setup.exact, NotApplicable):
+        found = edges(setup, ascent.theta, information)
+    if found is not None:
+        labels = [repr(s) for s in setup.problem.trace.parameter_symbols]
+        attrs["held_at_edge"] = {labels[i]: edge for i, edge in found.components.items()}
+        if not found.kept.any():
+            attrs["covariance"] = "every parameter is at an edge of what it can be"
+            return nothing
+        information = _information(setup, ascent.theta, found)
     if information is None:
         attrs["covariance"] = "none: no second derivatives of the log-likelihood"
         return nothing
-    covariance = natural_covariance(setup, ascent.theta, information)
+    covariance = natural_covariance(setup, ascent.theta, information, found)
     if isinstance(covariance, NotApplicable):
         attrs["covariance"] = f"none: {covariance.reason}"
         return nothing
     attrs["covariance"] = "inverse observed information"
+    if found is not None:
+        attrs["covariance"] += f", with {', '.join(attrs['held_at_edge'])} held at the edge"
     return covariance
 
 
-def _information(setup: Setup, theta: np.ndarray) -> np.ndarray | None:
+def _information(setup: Setup, theta: np.ndarray, found: Edges | None) -> np.ndarray | None:
     if not isinstance(setup.exact, NotApplicable):
         free = free_components(setup.problem.trace, setup.held)
+        free[[] if found is None else list(found.components)] = False
         return exact_score(
             setup.exact, setup.problem.experiments, free, setup.space.theta
         ).information(theta)
@@ -228,24 +245,28 @@ def _information(setup: Setup, theta: np.ndarray) -> np.ndarray | None:
 
 
 def natural_covariance(
-    setup: Setup, theta: np.ndarray, information: np.ndarray
+    setup: Setup, theta: np.ndarray, information: np.ndarray, found: Edges | None = None
 ) -> np.ndarray | NotApplicable:
     """The delta method: J (J' I J - d2 log prior)^-1 J' over all components of theta.
 
     At a maximum the gradient in theta vanishes, so that the second derivatives of theta(z) drop out
     of the likelihood's part. The prior counts for objective "posterior" only.
+
+    found : parameters at an edge, which are held there and have NaN.
     """
     try:
-        z = setup.space_at(theta)
+        z = setup.space_at(theta) if found is None else found.z
     except (ValueError, np.linalg.LinAlgError):
         return NotApplicable("the estimate lies on the edge of what the parameters can be")
+    kept = np.ones(len(z), dtype=bool) if found is None else found.kept
     point = setup.chart.at(z)
+    jacobian = point.jacobian[:, kept]
     with np.errstate(all="ignore"):
-        curvature = point.jacobian.T @ information @ point.jacobian
+        curvature = jacobian.T @ information @ jacobian
     if setup.with_prior:
         slope = np.linalg.pinv(point.jacobian).T @ point.d_log_prior
         second = setup.chart.curvature(z, slope)
-        curvature = curvature - second.log_prior + second.theta
+        curvature = curvature + (second.theta - second.log_prior)[np.ix_(kept, kept)]
     if not np.all(np.isfinite(curvature)):
         return NotApplicable("the observed information is not finite at the estimate")
     scale = np.sqrt(np.abs(np.diagonal(curvature)))
@@ -257,4 +278,7 @@ def natural_covariance(
             "the observed information is not positive definite: the estimate is no interior "
             "maximum, or some parameters are not identified"
         )
-    return point.jacobian @ np.linalg.solve(curvature, point.jacobian.T)
+    covariance = jacobian @ np.linalg.solve(curvature, jacobian.T)
+    at_edge = [] if found is None else list(found.components)
+    covariance[at_edge, :] = covariance[:, at_edge] = np.nan
+    return covariance

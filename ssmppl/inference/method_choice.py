@@ -27,7 +27,11 @@ FEW = 6  # numbers that a random walk moves at once without trouble
 
 
 def choose_sampler(
-    kind: str | NotApplicable, updates: Sequence[Update], numbers: int, stuck: str = ""
+    kind: str | NotApplicable,
+    updates: Sequence[Update],
+    numbers: int,
+    stuck: str = "",
+    singular: NotApplicable | None = None,
 ) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
 
@@ -38,8 +42,16 @@ def choose_sampler(
     which integrates the states out, is better as long as the parameters are few; where the states
     have no noise there is nothing else.
     updates : where the states are drawn exactly. numbers : of the free parameters. stuck : as of
-    `why_stuck`, for the others.
+    `why_stuck`, for the others. singular : why the states have no joint density, as Gibbs and PGAS
+    need it.
     """
+    if singular is not None:
+        if isinstance(kind, NotApplicable):
+            return PMMH(), f"{singular.reason}: a random walk on the particle filter's likelihood"
+        return MetropolisHastings(), (
+            f"{kind}, and {singular.reason}: a random walk on the exact likelihood, "
+            "which needs none"
+        )
     if isinstance(kind, NotApplicable):
         if not stuck:
             return PGAS(interweave="auto"), (

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.structure import without_density
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
+from ssmppl.inference import mixing
 from ssmppl.inference.chains import (
     elimination,
     gibbs,
@@ -32,6 +34,7 @@ from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
 from ssmppl.inference.draws import Block, ChainDraws, stack
+from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.models import exact_model, kind_of
 from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
@@ -128,7 +131,9 @@ def sample(
 
         Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS
         also trajectory_update_rate, the least share of draws between which a row of the trajectory
-        changed, and where rows hardly do trajectory_warning, which is given as a warning too.
+        changed, and where rows hardly do trajectory_warning, which is given as a warning too. So is
+        mixing_warning, where R-hat of some parameter is above 1.05 or its bulk ESS below 100; never
+        of one chain, of fewer than 100 draws of each, of SMC2 or of an interrupted run.
         Ctrl-C returns what was drawn, with the attribute `interrupted`.
 
     Raises
@@ -191,6 +196,11 @@ def sample(
     if isinstance(chosen, PGAS):
         attrs |= told(problem, result)
     whole = stack(result) if kept is None else kept.stack(result)
+    if not isinstance(chosen, SMC2):
+        free = free_components(problem.trace, held)
+        labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
+        theta = whole[0]["theta"][:, :, free]
+        attrs |= mixing.told(labels, theta, bool(attrs["interrupted"]), chosen, warmup)
     return _to_arviz(problem, whole, held, states, attrs)
 
 
@@ -236,8 +246,10 @@ def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]
     exact = exact_model(problem.trace)
     numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
-    if isinstance(exact, NotApplicable):
-        return choose_sampler(exact, (), numbers, stuck)
+    singular = without_density(problem.trace)
+    if isinstance(exact, NotApplicable) or singular is not None:
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        return choose_sampler(kind, (), numbers, stuck, singular)
     return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers)
 
 

@@ -29,6 +29,7 @@ from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.runner import run_chains
+from ssmppl.inference.singular import need_density
 from ssmppl.inference.smoothing_methods import (
     FFBSi,
     FixedLag,
@@ -132,6 +133,8 @@ def _check_draws(call: Call, draws: int) -> None:
 
 def by_ffbsi(call: Call, method: FFBSi) -> list[Found]:
     """Independent draws, given a particle filter's particles."""
+    if method.kernel != "genealogy":
+        need_density(call.problem.trace, f'FFBSi(kernel="{method.kernel}")', "smooth")
     settings = _filter(call, method, integrate=may_integrate(call.problem, method))
     check_count("moves", method.moves, 0)
     draws = TRAJECTORIES if call.trajectories is None else call.trajectories

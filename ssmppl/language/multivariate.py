@@ -70,8 +70,12 @@ class MvNormal(_Joint):
     ----------
     mean : shape (d,), or one number for all components.
     covariance, precision, cholesky : exactly one of them, (d, d): the covariance, its inverse, or
-        its lower factor L with L L' = covariance.
+        its lower factor L with L L' = covariance. As the law of states a covariance may be
+        singular for all values of its symbols, as q G G' is: methods that need no density of the
+        transition take it.
     """
+
+    root: ExprArray | None = None  # of a singular covariance, (d, d); see `covariances.py`
 
     def __init__(
         self, mean: Any, *, covariance: Any = None, precision: Any = None, cholesky: Any = None
@@ -130,6 +134,8 @@ class MvNormal(_Joint):
     def factor(self) -> ExprArray:
         """A matrix L, (d, d), with L L' = covariance."""
         m = self.parameters[self.spread]
+        if self.root is not None:
+            return self.root
         if self.spread == "cholesky":
             return m
         if self.spread == "covariance":

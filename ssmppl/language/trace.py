@@ -28,6 +28,7 @@ from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, recording, symbol
 from ssmppl.language.calling import call, check_outer_names, return_location
+from ssmppl.language.covariances import find_root, independent
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.model import Model, location_of
 from ssmppl.language.packing import Known, digest_of, packed, unpacked
@@ -208,6 +209,10 @@ class _Tracer:
             for name, distribution in laws.items():
                 check_name(name, role, line)
                 check_law(name, distribution, function_role)
+                if function_role != "prior":
+                    distribution = independent(distribution)
+                if function_role in ("initial", "transition"):
+                    find_root(distribution)
                 if name in sites:
                     raise ModelError(
                         f"{name!r} is given by two @{function_role} functions; the other is at "

@@ -25,8 +25,10 @@ from ssmppl.inference.chains.parameter_steps import (
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.draws import Block
 from ssmppl.inference.exact.models import ExactModel, filter_of
+from ssmppl.inference.exact.vanishing import check_mode
 from ssmppl.inference.methods import Gibbs
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.singular import need_density
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,15 @@ def prepare(setup: Setup, method: Gibbs) -> Sampler:
     Raises
     ------
     ArgumentError : the states cannot be drawn exactly; gives the reason and the line.
+    SamplingError : the likelihood grows without bound.
     """
     problem, space = setup.problem, setup.space
     model = needed_model(problem, "Gibbs")
+    need_density(problem.trace, "Gibbs", "sample")
     kind = filter_of(model)
     if space.where.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
+        check_mode(model, problem.experiments, space.parameters(pilot.z)[0])
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     further, interweaved = interweaving(setup, method.interweave, pilot, model)

@@ -31,6 +31,7 @@ from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import ExactModel, exact_model, filter_name, filter_of
+from ssmppl.inference.exact.vanishing import check_mode
 from ssmppl.inference.methods import MetropolisHastings
 from ssmppl.inference.particles.pilot import dispersed, find_mode
 from ssmppl.inference.problem import Problem
@@ -107,6 +108,7 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
+    check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
     factor = walk_factor(setup, method, where, pilot, kind)
     d = len(where)
     tuning: Any = factor

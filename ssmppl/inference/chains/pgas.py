@@ -31,6 +31,7 @@ from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.singular import need_density
 
 PARTICLES = 25
 PARTICLES_WITHOUT_ANCESTORS = 200
@@ -40,6 +41,7 @@ PREDICTIVE_PARTICLES = 500
 def prepare(setup: Setup, method: PGAS) -> Sampler:
     """Derive the updates, find a mode, and start the chains from particle filters."""
     problem, space = setup.problem, setup.space
+    need_density(problem.trace, "PGAS", "sample")
     memory = deterministic_memory(problem.trace)
     usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
     particles = usual if method.particles is None else method.particles

@@ -100,6 +100,13 @@ class Setup:
             return self.pilot.z
         return finite_point(z, self._exact, np.random.default_rng(self.root))
 
+    def exact_objective(self, z: np.ndarray) -> float:
+        """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""
+        value = self._exact(z)
+        if self.with_prior and value > -np.inf:
+            value += self.chart.at(z).log_prior
+        return value
+
     def space_at(self, theta: np.ndarray) -> np.ndarray:
         """(F,) the unconstrained place of theta (P,)."""
         moved = at(self.space, theta)

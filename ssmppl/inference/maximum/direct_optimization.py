@@ -8,6 +8,7 @@ exact, and Newton steps with the observed information polish the result; for one
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,14 @@ import scipy
 
 from ssmppl.analysis.smooth import smooth_filter_applies
 from ssmppl.counts import check_count
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import ExactModel, filter_name
+from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.edges import edges
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.progress import announced
 
@@ -55,6 +58,10 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
         return ExactClimb(setup, setup.exact, method).run()
 
 
+class _WithoutMaximum(Exception):
+    """The likelihood grows without bound, which ends the climb; says why."""
+
+
 class ExactClimb:
     """Ascent of an exact log-likelihood with its exact score."""
 
@@ -74,7 +81,7 @@ class ExactClimb:
         restarts = self.method.restarts
         restarts = EXACT_RESTARTS if restarts is None else restarts
         check_count("restarts", restarts, 0)
-        interrupted, stopped, gap = False, "", np.inf
+        interrupted, stopped, unbounded, gap = False, "", "", np.inf
         try:
             for k in range(restarts + 1):
                 start = self.setup.start
@@ -82,23 +89,28 @@ class ExactClimb:
                     rng = np.random.default_rng(self.setup.seed(k))
                     start = self.best + rng.standard_normal(len(start))
                 stopped = self._quasi_newton(start)
+                self._check(self.setup.chart.at(self.best).theta)
             gap = self._polish()
         except KeyboardInterrupt:
             if not np.isfinite(self.best_value):
                 raise
             interrupted = True
+        except _WithoutMaximum as reason:
+            unbounded = stopped = str(reason)
         if not np.isfinite(self.best_value):
             raise ArgumentError(
                 "the likelihood is zero at every point that was tried",
                 fix="give start={name: value} near plausible values",
             )
-        if not np.isfinite(gap) and not interrupted:
+        if not np.isfinite(gap) and not (interrupted or unbounded):
             stopped = "the climb ran to the edge of what the parameters can be: no maximum inside"
         point = self.setup.chart.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
             "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
         }  # fmt: skip
+        if unbounded:
+            report["without_maximum"] = True
         if self.exact.differences:
             report["central_differences"] = self.exact.differences
         return Ascent(
@@ -114,7 +126,11 @@ class ExactClimb:
         point = self.setup.chart.at(z)
         if point.log_prior == -np.inf:
             return nothing
-        value, gradient = self.exact.score(point.theta)
+        try:
+            value, gradient = self.exact.score(point.theta)
+        except SamplingError:
+            self._check(point.theta)
+            raise
         slope = point.pull(gradient)
         if self.setup.with_prior:
             value, slope = value + point.log_prior, slope + point.d_log_prior
@@ -124,6 +140,11 @@ class ExactClimb:
         if value > self.best_value:
             self.best, self.best_value = np.array(z), value
         return value, slope
+
+    def _check(self, theta: np.ndarray) -> None:
+        reason = without_maximum(self.model, self.experiments, theta)
+        if reason is not None:
+            raise _WithoutMaximum(reason.reason)
 
     def _quasi_newton(self, start: np.ndarray) -> str:
         def downhill(z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -138,15 +159,27 @@ class ExactClimb:
         return str(found.message)
 
     def _polish(self) -> float:
-        """Newton's steps while they climb; how far the quadratic says that the top still is."""
+        """Newton's steps while they climb; how far the quadratic says that the top still is.
+
+        Parameters whose maximum is at an edge of their support stay where the climb left them.
+        """
         gap = np.inf
+        theta = self.setup.chart.at(self.best).theta
+        found = edges(self.setup, theta, self.exact.information(theta))
+        kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
+        free = self.exact.free.copy()
+        free[list(found.components) if found is not None else []] = False
+        if not kept.any():
+            return 0.0
+        exact = replace(self.exact, free=free)
         for _ in range(NEWTON_STEPS):
             value, slope = self.value(self.best)
-            curvature = self._curvature(self.best)
+            curvature = _curvature(self.setup, exact, self.best)[np.ix_(kept, kept)]
             if not np.all(np.isfinite(curvature)) or _lowest(curvature) <= 0.0:
                 return np.inf
-            step = np.linalg.solve(curvature, slope)
-            gap = float(np.sqrt(max(float(slope @ step), 0.0)))
+            slope, step = slope[kept], np.zeros(len(kept))
+            step[kept] = np.linalg.solve(curvature, slope)
+            gap = float(np.sqrt(max(float(slope @ step[kept]), 0.0)))
             if gap < GRADIENT:
                 break
             z, size = self.best, 1.0
@@ -168,9 +201,6 @@ class ExactClimb:
         self.iterates.append(self.setup.space.parameters(z)[0].copy())
         self.values.append(self.known.get(z.tobytes(), -np.inf))
         self.known.clear()
-
-    def _curvature(self, z: np.ndarray) -> np.ndarray:
-        return _curvature(self.setup, self.exact, z)
 
 
 def observed_information(setup: Setup, model: ExactModel, z: np.ndarray) -> np.ndarray:

@@ -36,11 +36,13 @@ from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.exact.models import filter_name
+from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.baum_welch import FiniteSteps
 from ssmppl.inference.maximum.expected_climb import climbed
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods import EM
+from ssmppl.inference.singular import need_density
 from ssmppl.language.trace import Trace, previous, seen
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
@@ -73,6 +75,7 @@ def climb(setup: Setup, method: EM) -> Ascent:
             fix="use ssm.DirectOptimization(), whose likelihood and score are exact",
             where=site.distribution.location,
         )
+    need_density(setup.problem.trace, "EM", "maximize")
     return _Climb(setup, setup.exact, method).run()
 
 
@@ -216,13 +219,18 @@ class _Climb:
                 fix="give start={name: value} near plausible values",
             )
         interrupted, distance, calm = False, np.inf, 0
+        experiments = self.setup.problem.experiments
         try:
             while self.maps < self.method.iterations and calm < CALM:
                 distance = self._cycle()
                 calm = calm + 1 if distance < self.method.tolerance else 0
         except KeyboardInterrupt:
             interrupted = True
-        converged = calm >= CALM
+        except SamplingError:
+            if without_maximum(self.model, experiments, self.theta) is None:
+                raise
+        unbounded = without_maximum(self.model, experiments, self.theta)
+        converged = calm >= CALM and unbounded is None
         report = {
             "converged": converged,
             "stopped": f"the limit is about {distance:.2g} away on the unconstrained scale, after "
@@ -234,7 +242,9 @@ class _Climb:
             else f"BFGS on the expected log density: {self.map.step.reason}",
             "likelihood": f"exact, by {filter_name(self.model)}",
         }
-        likelihood = self.model.log_likelihood(self.setup.problem.experiments, self.theta)
+        if unbounded is not None:
+            report |= {"stopped": unbounded.reason, "without_maximum": True}
+        likelihood = self.model.log_likelihood(experiments, self.theta)
         return Ascent(
             self.theta, likelihood, np.array(self.iterates), report, interrupted=interrupted,
             figures={"objective": np.array(self.values)},

@@ -37,6 +37,7 @@ from ssmppl.inference.particles.backward import choose_kernel, draw_paths, parti
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.proposal_choice import choose
+from ssmppl.inference.singular import need_density
 
 
 def climb(setup: Setup, method: ParticleEM) -> Ascent:
@@ -52,6 +53,7 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
                         ("chains", 1)):  # fmt: skip
         check_count(name, getattr(method, name), least)
     check_count("iterations", method.iterations, method.burn_in + 1)
+    need_density(setup.problem.trace, "ParticleEM", "maximize")
     maximum, problem = maximiser(setup, "ParticleEM"), setup.problem
     theta = setup.space.parameters(setup.start)[0]
     proposal = method.proposal

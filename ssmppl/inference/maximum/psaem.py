@@ -39,6 +39,7 @@ from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import PSAEM
 from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state
+from ssmppl.inference.singular import need_density
 
 
 def climb(setup: Setup, method: PSAEM) -> Ascent:
@@ -49,6 +50,7 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
     ArgumentError : the densities do not separate in the parameters, or the states cannot be the
         missing data; names the line.
     """
+    need_density(setup.problem.trace, "PSAEM", "maximize")
     maximum = _checked(setup, method)
     settings = conditional_settings(setup, method)
     states = []

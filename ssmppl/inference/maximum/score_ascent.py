@@ -39,6 +39,7 @@ from ssmppl.inference.particles.particle_score import (
 )
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.progress import Progress
+from ssmppl.inference.singular import need_density
 from ssmppl.language.transforms import transforms
 
 STEPS = ("newton", "paper")
@@ -99,6 +100,7 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
         check_count(name, value, 2 if name == "runs" and not paper else 1)
     if not method.tolerance > 0.0:
         raise ArgumentError(f"tolerance={method.tolerance!r}", fix="give a positive number")
+    need_density(setup.problem.trace, "ScoreAscent", "maximize")
     scores = complete_scores(setup.problem, setup.held)
     start = setup.start
     theta, _ = setup.space.parameters(start)

@@ -11,6 +11,7 @@ from ssmppl.analysis.score import CompleteScore
 from ssmppl.codegen.score import ScoreProgram, compile_score
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.singular import need_density
 
 __all__ = ["CompleteScores", "complete_scores"]
 
@@ -135,6 +136,7 @@ def complete_scores(problem: Problem, held: Collection[str] = ()) -> CompleteSco
     ArgumentError : Fisher's identity does not hold in some parameter, as the support of a law, or
         the law by steps, depends on it; names the line.
     """
+    need_density(problem.trace, "the score by particles", "score")
     symbols = [s for s in problem.trace.parameter_symbols if s.data[1] not in held]
     derived = CompleteScore(problem.trace, symbols, problem.program.missing)
     for s in symbols:

@@ -1,0 +1,69 @@
+"""Noises that vanish against the data: where a likelihood grows without bound.
+
+A linear Gaussian model that can follow the data exactly, as any level does a constant series, has
+no maximum of the likelihood: it grows with every step of the variances towards zero, until what
+the filter predicts differs from the data by rounding only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ssmppl.data import Experiment, spelled
+from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.inference.exact.kalman import KalmanModel
+from ssmppl.inference.exact.models import ExactModel
+
+VANISHED = 1e-12  # standard deviation of a prediction against the data's size, near rounding
+LEAST = 1e-100  # and where the data are all zero
+
+
+def without_maximum(
+    model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray
+) -> NotApplicable | None:
+    """Why the likelihood has no maximum, if that is where a search ran to theta (P,): the model
+    predicts a channel to within rounding there. None where it does not."""
+    if not isinstance(model, KalmanModel):
+        return None
+    for e in experiments:
+        try:
+            covariance = model.filter(e, theta).observation_covariance
+        except SamplingError:
+            continue
+        for k, symbol in enumerate(model.trace.observation_symbols):
+            seen = e.seen[:, k] > 0.0
+            if not seen.any():
+                continue
+            y, variance = e.y[seen, k], covariance[seen, k, k]
+            least = max(VANISHED * float(np.max(np.abs(y))), LEAST)
+            if not np.sqrt(np.median(variance)) < least:
+                continue
+            how = (f"are constant ({y[0]:.6g} in every row)" if np.ptp(y) == 0.0
+                   else "can be followed exactly by the model")  # fmt: skip
+            return NotApplicable(
+                f"the likelihood has no maximum: the data of {symbol!r} {how}, so that it grows "
+                "without bound as the variances of the noises go to zero",
+                model.trace.observations[symbol.data[1]].distribution.location,
+            )
+    return None
+
+
+def check_mode(model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray) -> None:
+    """Refuse to sample from a mode (P,) that is none.
+
+    Raises
+    ------
+    SamplingError : the likelihood has no maximum, and the prior sets no bound either; names the
+        channel, and says whether its values are all the same.
+    """
+    reason = without_maximum(model, experiments, theta)
+    if reason is not None:
+        raise SamplingError(
+            f"{reason.reason}, and the prior does not hold them; parameters: "
+            f"{spelled(model.trace, theta)}",
+            fix="check this column; else hold a variance by fixed={...}, or give it a prior that "
+            "keeps it off zero, as ssm.InverseGamma does",
+            where=reason.where,
+        )

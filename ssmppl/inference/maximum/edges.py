@@ -1,0 +1,152 @@
+"""Parameters whose maximum is at an edge of their support: a variance at zero, a share at one.
+
+There the score need not vanish, nor is there an interval about the estimate; the other parameters
+have their usual law given that one (Self and Liang 1987, "Asymptotic properties of maximum
+likelihood estimators and likelihood ratio tests under nonstandard conditions", *JASA* 82). An edge
+lies at infinity on the unconstrained scale. So an estimate is taken to be there if the objective
+nowhere falls on the way out, is not much higher at its end, and falls inwards, which tells it from
+a parameter that is not identified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.data import unpack_parameters
+from ssmppl.errors import SamplingError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.language.trace import Site
+from ssmppl.language.transforms import Transform, transforms, unconstrain
+
+OUTWARDS = (1.0, 4.0, 30.0)  # steps on the unconstrained scale: at the last nothing is left inside
+INWARDS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+ROUNDING = 1e-9  # of the objective, relative
+AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb is not finished
+FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
+FLAT = 1e-2  # information in z below which an edge may be near: a standard error of 10
+INSIDE = 1e-12  # what takes the place of a share of exactly zero
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Which parameters are at an edge of their support.
+
+    z : (F,) an estimate inside the support. kept : (F,) bool, the numbers that are not held there.
+    components : index of each component of theta at an edge -> the value of that edge.
+    """
+
+    z: np.ndarray
+    kept: np.ndarray
+    components: dict[int, float]
+
+
+def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.ndarray:
+    """(F,) -1 or 1 where the edge below or above each of z is the place of the maximum, else 0."""
+    here, out = objective(z), np.zeros(len(z))
+
+    def moved(j: int, step: float) -> float:
+        there = z.copy()
+        there[j] += step
+        try:
+            return objective(there) - here
+        except SamplingError:
+            return -np.inf
+
+    loss = ROUNDING * (1.0 + abs(here))
+    for j in range(len(z)):
+        for sign in (-1.0, 1.0):
+            outwards = (moved(j, sign * s) for s in OUTWARDS)
+            if not all(-loss <= change <= AT_MOST for change in outwards):
+                continue
+            if any(not moved(j, -sign * s) > -FALL for s in INWARDS):
+                out[j] = sign
+    return out
+
+
+def edges(setup: Setup, theta: np.ndarray, information: np.ndarray) -> Edges | None:
+    """Which components of theta (P,) are at an edge; None where none is.
+
+    information : (P, P), NaN where it does not exist; where it is plain in all of z, nothing is
+    asked of the likelihood.
+    """
+    z = _inside(setup, theta)
+    jacobian = setup.chart.at(z).jacobian
+    with np.errstate(all="ignore"):
+        if np.all(np.einsum("pf,pq,qf->f", jacobian, information, jacobian) > FLAT):
+            return None
+    found = directions(setup.exact_objective, z)
+    if not found.any():
+        return None
+    place = {s: i for i, s in enumerate(setup.problem.trace.parameter_symbols)}
+    known = dict(zip(place, theta, strict=True))
+    kept, components, first = found == 0.0, {}, 0
+    for t in transforms(setup.problem.trace):
+        if t.site.name in setup.held:
+            continue
+        own = slice(first, first + len(t.free))
+        first += len(t.free)
+        for i, edge in _reached(t, found[own], kept[own], known):
+            components[place[t.components[i]]] = edge
+    return Edges(z, kept, components) if components else None
+
+
+def _reached(
+    t: Transform, found: np.ndarray, kept: np.ndarray, known: dict[Expr, float]
+) -> list[tuple[int, float]]:
+    """(component, edge) of one parameter; what is not identified beside it is no longer kept."""
+    support = t.site.distribution.support()
+    if support.kind == "positive definite":
+        return []
+    if support.kind == "simplex":
+        k, out = t.site.shape[-1], []
+        for row in range(len(found) // (k - 1)):
+            for i in range(k - 1):
+                at = row * (k - 1) + i
+                if found[at] < 0.0:
+                    out.append((row * k + i, 0.0))
+                elif found[at] > 0.0:  # nothing of the stick is left
+                    out += [(row * k + j, 0.0) for j in range(i + 1, k)]
+                    kept[at + 1 : (row + 1) * (k - 1)] = False
+                    break
+        return out
+    ends = _ends(t.site, known)
+    out = []
+    for i in map(int, np.flatnonzero(found)):
+        lower, upper = map(float, ends[i])
+        if np.isfinite(lower) or np.isfinite(upper):
+            out.append((i, _edge(lower, upper, found[i])))
+    return out
+
+
+def _ends(site: Site, known: dict[Expr, float]) -> np.ndarray:
+    """(components, 2) bounds of a site of numbers."""
+    support = site.distribution.support()
+    return np.array([
+        np.broadcast_to(np.array(evaluate(array(e), known), dtype=float), site.shape).ravel()
+        for e in (support.lower, support.upper)
+    ]).T  # fmt: skip
+
+
+def _edge(lower: float, upper: float, sign: float) -> float:
+    """Where z goes to; with an upper bound only, it is the log of the distance from that."""
+    if lower == -np.inf:
+        return upper if sign < 0.0 else lower
+    return lower if sign < 0.0 else upper
+
+
+def _inside(setup: Setup, theta: np.ndarray) -> np.ndarray:
+    """(F,) the place of theta; of shares of zero, of shares next to it."""
+    trace, values = setup.problem.trace, {}
+    for name, value in unpack_parameters(trace, theta).items():
+        value = np.asarray(value, dtype=float)
+        if trace.parameters[name].distribution.support().kind == "simplex":
+            value = np.maximum(value, INSIDE)
+            value = value / value.sum(axis=-1, keepdims=True)
+        values[name] = value
+    return unconstrain(trace, theta, values)[setup.space.where]

@@ -1,0 +1,211 @@
+"""Maxima at an edge of the support: the other parameters' errors are those of the smaller model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+
+
+def trend(slope: str | None) -> ssm.Model:
+    """A local linear trend; the slope's noise by this name of its spread, None: without noise."""
+    model = ssm.Model("local linear trend")
+    own = {} if slope is None else {"s": ssm.HalfFlat()}
+    model.prior(lambda: {"q": ssm.HalfFlat(), **own, "r": ssm.HalfFlat()})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=10.0), "v": ssm.Normal(0, sd=1.0)})
+    if slope is None:
+        model.transition(lambda x, v, q: {"x": ssm.Normal(x + v, variance=q), "v": ssm.Dirac(v)})
+    else:
+        model.transition(
+            lambda x, v, q, s: {
+                "x": ssm.Normal(x + v, variance=q), "v": ssm.Normal(v, **{slope: s})
+            }
+        )  # fmt: skip
+    model.observation(lambda x, r: {"y": ssm.Normal(x, variance=r)})
+    return model
+
+
+def steady(seed: int = 1, rows: int = 200) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.cumsum(0.1 + 0.5 * rng.standard_normal(rows)) + rng.standard_normal(rows)
+
+
+@pytest.mark.parametrize(("slope", "edge"), [("variance", 0.0), ("sd", 0.0), ("precision", np.inf)])
+def test_a_variance_at_zero_leaves_the_others_their_errors(slope: str, edge: float):
+    data = {"y": steady()}
+    found = ssm.maximize(trend(slope), data, seed=1, progress=False)
+    smaller = ssm.maximize(trend(None), data, seed=1, progress=False)
+    assert found.attrs["converged"]
+    assert found.attrs["held_at_edge"] == {"s": edge}
+    assert found.log_likelihood == pytest.approx(smaller.log_likelihood, abs=1e-5)
+    assert np.isnan(found.standard_errors["s"])
+    assert np.all(np.isnan(found.covariance.loc["s"]))
+    names = ["q", "r"]
+    assert found.covariance.loc[names, names].to_numpy() == pytest.approx(
+        smaller.covariance.loc[names, names].to_numpy(), rel=1e-4
+    )
+    (note,) = found.notes
+    assert note.startswith(f"the maximum in s is at {edge:g}, the edge of what it can be")
+
+
+def test_em_on_its_way_to_the_edge_has_the_errors_too():
+    data = {"y": steady()}
+    found = ssm.maximize(trend("variance"), data, ssm.EM(iterations=300), seed=1, progress=False)
+    smaller = ssm.maximize(trend(None), data, seed=1, progress=False)
+    assert found.attrs["held_at_edge"] == {"s": 0.0}
+    for name in ("q", "r"):
+        assert found.standard_errors[name] == pytest.approx(smaller.standard_errors[name], rel=0.02)
+
+
+def test_a_posterior_mode_at_the_edge():
+    """A half-normal prior of the variance has its mode at zero; those of the others count."""
+
+    def model(slope: bool) -> ssm.Model:
+        out = trend("variance" if slope else None)
+        out.functions["prior"].clear()
+        own = {"s": ssm.HalfNormal(sd=0.1)} if slope else {}
+        out.prior(lambda: {"q": ssm.HalfNormal(sd=0.05), **own, "r": ssm.HalfFlat()})
+        return out
+
+    data = {"y": steady()}
+    settings = {"seed": 1, "progress": False, "objective": "posterior"}
+    found, smaller = (ssm.maximize(model(slope), data, **settings) for slope in (True, False))
+    assert found.attrs["held_at_edge"] == {"s": 0.0}
+    for name in ("q", "r"):
+        assert found.standard_errors[name] == pytest.approx(smaller.standard_errors[name], rel=1e-4)
+
+
+def test_what_is_not_identified_is_at_no_edge():
+    model = trend("variance")
+    model.prior(lambda: {"idle": ssm.HalfFlat()})
+    found = ssm.maximize(model, {"y": steady()}, seed=1, progress=False)
+    assert list(found.attrs["held_at_edge"]) == ["s"]
+    assert np.isnan(found.standard_errors["q"])
+    assert any("not identified" in note for note in found.notes)
+
+
+def test_an_interior_maximum_is_at_no_edge():
+    rng = np.random.default_rng(3)
+    y = np.cumsum(np.cumsum(0.3 * rng.standard_normal(200)) + rng.standard_normal(200))
+    data = {"y": y + rng.standard_normal(200)}
+    found = ssm.maximize(trend("variance"), data, seed=1, progress=False)
+    assert "held_at_edge" not in found.attrs
+    assert not found.covariance.isna().any(axis=None)
+
+
+def switching(sticky: bool) -> ssm.Model:
+    """Three states, the first two never follow each other in the data of `switched`."""
+    model = ssm.Model("switching")
+    if sticky:
+        model.prior(lambda: {
+            "p": ssm.Dirichlet(np.ones((3, 3))), "m": ssm.Normal(np.zeros(3), sd=100.0)
+        })  # fmt: skip
+    else:
+        model.prior(lambda: {
+            "a": ssm.Uniform(0, 1), "b": ssm.Uniform(0, 1), "c": ssm.Dirichlet(np.ones(3)),
+            "m": ssm.Normal(np.zeros(3), sd=100.0),
+        })  # fmt: skip
+    model.initial(lambda: {"k": ssm.Categorical(np.ones(3) / 3)})
+    if sticky:
+        model.transition(lambda k, p: {"k": ssm.Categorical(p[k])})
+    else:
+        model.transition(lambda k, a, b, c: {"k": ssm.Categorical(
+            np.array([[a, 0.0, 1.0 - a], [0.0, b, 1.0 - b], [c[0], c[1], c[2]]])[k]
+        )})  # fmt: skip
+    model.observation(lambda k, m: {"y": ssm.Normal(m[k], sd=1.0)})
+    return model
+
+
+def switched(rows: int = 300) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    p = np.array([[0.8, 0.0, 0.2], [0.0, 0.7, 0.3], [0.2, 0.2, 0.6]])
+    k = np.zeros(rows, dtype=int)
+    for t in range(1, rows):
+        k[t] = rng.choice(3, p=p[k[t - 1]])
+    return np.array([-8.0, 0.0, 8.0])[k] + rng.standard_normal(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [None, ssm.EM()])
+def test_shares_at_zero(method):
+    data = {"y": switched()}
+    means = np.array([-8.0, 0.0, 8.0])
+    settings = {"seed": 1, "progress": False}
+    start = {"m": means, "p": np.full((3, 3), 1 / 3)}
+    found = ssm.maximize(switching(True), data, method, start=start, **settings)
+    start = {"m": means, "a": 0.5, "b": 0.5, "c": np.full(3, 1 / 3)}
+    smaller = ssm.maximize(switching(False), data, start=start, **settings)
+    assert found.attrs["held_at_edge"] == {"p[0, 1]": 0.0, "p[1, 0]": 0.0}
+    assert found.log_likelihood == pytest.approx(smaller.log_likelihood, abs=1e-3)
+    errors, own = found.standard_errors["p"], smaller.standard_errors
+    expected = np.array([[own["a"], np.nan, own["a"]], [np.nan, own["b"], own["b"]], own["c"]])
+    assert errors == pytest.approx(expected, rel=0.01, nan_ok=True)
+    assert found.standard_errors["m"] == pytest.approx(own["m"], rel=1e-3)
+
+
+# -- data that a model follows exactly
+def level(prior: type) -> ssm.Model:
+    model = ssm.Model("level")
+    law = prior() if prior is ssm.HalfFlat else prior(2.0, scale=1.0)
+    model.prior(lambda: {"q": law, "r": law})
+    model.initial(lambda: {"x": ssm.Flat()})
+    model.transition(lambda x, q: {"x": ssm.Normal(x, variance=q)})
+    model.observation(lambda x, r: {"y": ssm.Normal(x, variance=r)})
+    return model
+
+
+CONSTANT = {"y": np.full(20, 3.0)}
+
+
+def test_the_likelihood_of_constant_data():
+    """Differences of zero: (T-1) of them, with covariance q I + r D D' (D of differences)."""
+    q, r, n = 0.7, 0.2, 19
+    d = np.diff(np.eye(n + 1), axis=0)
+    covariance = q * np.eye(n) + r * d @ d.T
+    expected = -0.5 * (n * np.log(2.0 * np.pi) + np.linalg.slogdet(covariance)[1])
+    found = ssm.log_likelihood(level(ssm.HalfFlat), CONSTANT, {"q": q, "r": r})
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("value", [3.0, 0.0])
+@pytest.mark.parametrize("method", [None, ssm.EM(iterations=500)])
+def test_constant_data_have_no_maximum_and_are_blamed(method, value: float):
+    if method is not None and value == 0.0:
+        pytest.skip("EM has its own rate, and 500 steps do not take it to 1e-100")
+    data = {"y": np.full(20, value)}
+    found = ssm.maximize(level(ssm.HalfFlat), data, method, seed=1, progress=False)
+    assert not found.attrs["converged"]
+    assert np.isnan(found.standard_errors["q"])
+    (note,) = found.notes
+    assert f"no maximum: the data of y are constant ({value:g} in every row)" in note
+    assert "without bound as the variances of the noises go to zero" in note
+
+
+def test_constant_data_with_one_variance_held():
+    """With q = 1 there is a maximum, at r = 0: 19 differences of zero, each N(0, 1)."""
+    found = ssm.maximize(
+        level(ssm.HalfFlat), CONSTANT, fixed={"q": 1.0}, seed=1, progress=False
+    )  # fmt: skip
+    assert found.attrs["held_at_edge"] == {"r": 0.0}
+    assert found.attrs["converged"]
+    assert found.log_likelihood == pytest.approx(-9.5 * np.log(2.0 * np.pi), rel=1e-6)
+    assert len(found.notes) == 1
+
+
+def test_a_ramp_is_followed_exactly():
+    """A level that moves in steps of one: no constant, and no bound either."""
+    model = trend("variance")
+    data = {"y": np.arange(20.0)}
+    found = ssm.maximize(model, data, seed=1, progress=False)
+    assert not found.attrs["converged"]
+    assert "the data of y can be followed exactly by the model" in found.notes[0]
+
+
+def test_sampling_constant_data():
+    settings = {"seed": 1, "progress": False, "draws": 50, "warmup": 50, "chains": 2}
+    for method in (None, ssm.MetropolisHastings()):
+        with pytest.raises(ssm.SamplingError, match="the data of y are constant"):
+            ssm.sample(level(ssm.HalfFlat), CONSTANT, method, **settings)
+    idata = ssm.sample(level(ssm.InverseGamma), CONSTANT, **settings)
+    assert np.all(idata.posterior["r"].to_numpy() > 0.01)

@@ -1,0 +1,202 @@
+"""Covariances of too low a rank in the laws of states: white-noise acceleration, q G G'.
+
+Held against the joint normal law of all states and data, written out in NumPy.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
+
+import ssmppl as ssm
+from ssmppl.analysis.structure import without_density
+from ssmppl.language.trace import trace
+
+DT, ROWS = 0.5, 40
+F = np.array([[1.0, DT], [0.0, 1.0]])
+G = np.array([DT**2 / 2.0, DT])
+START = np.diag([2.0, 1.5])
+
+
+def acceleration(by_input: bool = False) -> ssm.Model:
+    model = ssm.Model("white-noise acceleration", inputs=("dt",) if by_input else ())
+    model.prior(lambda: {
+        "q": ssm.InverseGamma(2, scale=1), "r": ssm.InverseGamma(2, scale=1)
+    })  # fmt: skip
+    model.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=START)})
+    if by_input:
+
+        def transition(x, q, dt):
+            g = np.stack([dt**2 / 2, dt])
+            mean = np.stack([x[0] + dt * x[1], x[1]])
+            return {"x": ssm.MvNormal(mean, covariance=q * np.outer(g, g))}
+
+        model.transition(transition)
+    else:
+        model.transition(lambda x, q: {"x": ssm.MvNormal(F @ x, covariance=q * np.outer(G, G))})
+    model.observation(lambda x, r: {"y": ssm.Normal(x[0], variance=r)})
+    return model
+
+
+def data(by_input: bool = False) -> dict[str, np.ndarray]:
+    y = np.cumsum(np.random.default_rng(1).standard_normal(ROWS))
+    return {"y": y} | ({"dt": np.full(ROWS, DT)} if by_input else {})
+
+
+def joint(q: float, r: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Covariances of the states (2 ROWS, 2 ROWS), of the data, and between them."""
+    noise = np.kron(np.eye(ROWS), q * np.outer(G, G))
+    noise[:2, :2] = START
+    back = np.linalg.inv(np.eye(2 * ROWS) - np.kron(np.diag(np.ones(ROWS - 1), -1), F))
+    x = back @ noise @ back.T
+    c = np.kron(np.eye(ROWS), [[1.0, 0.0]])
+    return x, c @ x @ c.T + r * np.eye(ROWS), x @ c.T
+
+
+def log_density(q: float, r: float) -> float:
+    cov = joint(q, r)[1]
+    return float(scipy.stats.multivariate_normal(np.zeros(ROWS), cov).logpdf(data()["y"]))
+
+
+BOTH = pytest.mark.parametrize("by_input", [False, True])
+
+
+@BOTH
+def test_likelihoods(by_input: bool):
+    theta = {"q": 1.3, "r": 0.4}
+    model, known = acceleration(by_input), data(by_input)
+    expected = log_density(**theta)
+    assert ssm.log_likelihood(model, known, theta) == pytest.approx(expected, rel=1e-10)
+    log_z = ssm.log_likelihood(
+        model, known, theta, proposal="bootstrap", particles=2000, repeats=100, seed=1
+    )
+    ratio = np.exp(log_z - expected)
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std(ddof=1) / 10.0
+
+
+@BOTH
+def test_maximize(by_input: bool):
+    found = ssm.maximize(acceleration(by_input), data(by_input), seed=1, progress=False)
+    best = scipy.optimize.minimize(
+        lambda z: -log_density(*np.exp(z)), np.zeros(2), tol=1e-10, method="Nelder-Mead"
+    )
+    assert found.log_likelihood == pytest.approx(-best.fun, abs=1e-6)
+    assert [found.parameters["q"], found.parameters["r"]] == pytest.approx(np.exp(best.x), rel=1e-3)
+
+
+@BOTH
+def test_smooth(by_input: bool):
+    theta = {"q": 1.3, "r": 0.4}
+    x, y, cross = joint(**theta)
+    gain = np.linalg.solve(y, cross.T).T
+    found = ssm.smooth(acceleration(by_input), data(by_input), theta)
+    assert found["x"].to_numpy()[0] == pytest.approx(
+        (gain @ data()["y"]).reshape(ROWS, 2), abs=1e-8
+    )
+    variance = np.diagonal(x - gain @ cross.T).reshape(ROWS, 2)
+    assert found["x_sd"].to_numpy()[0] == pytest.approx(np.sqrt(variance), abs=1e-8)
+
+
+@BOTH
+def test_simulate(by_input: bool):
+    theta, n = {"q": 1.3, "r": 0.4}, 4000
+    inputs = {"dt": np.full(ROWS, DT)} if by_input else None
+    found = ssm.simulate(
+        acceleration(by_input), theta, steps=ROWS, inputs=inputs, draws=n, seed=1
+    )["x"].to_numpy()  # fmt: skip
+    w = found[:, 1:] - found[:, :-1] @ F.T
+    assert w[..., 0] == pytest.approx(DT / 2 * w[..., 1], abs=1e-9)
+    drawn = w[..., 1] / DT
+    assert abs(drawn.var() / 1.3 - 1.0) < 4.0 * np.sqrt(2.0 / drawn.size)
+
+
+@pytest.mark.slow
+def test_sample():
+    """Posterior means by MetropolisHastings, and by sums over a grid of log q and log r."""
+    axis_q, axis_r = np.linspace(-4, 4, 81), np.linspace(-4, 2, 81)
+    prior = scipy.stats.invgamma(2.0, scale=1.0)
+
+    def log_posterior(a: float, b: float) -> float:
+        q, r = np.exp(a), np.exp(b)
+        return log_density(q, r) + prior.logpdf(q) + prior.logpdf(r) + a + b
+
+    log_p = np.array([[log_posterior(a, b) for b in axis_r] for a in axis_q])
+    p = np.exp(log_p - log_p.max())
+    p /= p.sum()
+    expected = np.array([p.sum(axis=1) @ axis_q, p.sum(axis=0) @ axis_r])
+    idata = ssm.sample(acceleration(), data(), draws=4000, warmup=1000, seed=1, progress=False)
+    assert idata.posterior.attrs["method"] == "MetropolisHastings"
+    assert "singular (rank 1 of 2)" in idata.posterior.attrs["method_reason"]
+    logs = np.log(np.stack([idata.posterior[n].to_numpy() for n in ("q", "r")]))
+    ess = ssm.summary(idata, ["q", "r"])["ess_bulk"].to_numpy()
+    error = logs.std(axis=(1, 2)) / np.sqrt(ess)
+    assert np.all(np.abs(logs.mean(axis=(1, 2)) - expected) < 4.0 * error)
+    x = idata.posterior["x"].to_numpy()
+    w = x[:, :, 1:] - x[:, :, :-1] @ F.T
+    assert w[..., 0] == pytest.approx(DT / 2 * w[..., 1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("method", "instead"),
+    [(ssm.Gibbs(), "MetropolisHastings"), (ssm.PGAS(), "MetropolisHastings"),
+     (ssm.EM(), "DirectOptimization"), (ssm.ParticleEM(), "DirectOptimization"),
+     (ssm.PSAEM(), "DirectOptimization"), (ssm.ScoreAscent(), "DirectOptimization"),
+     (ssm.FFBSi(), "KalmanSmoother")],
+)  # fmt: skip
+def test_methods_that_need_a_density_are_refused_at_once(method, instead: str):
+    model = acceleration()
+    if isinstance(method, (ssm.Gibbs, ssm.PGAS)):
+        run = partial(ssm.sample, model, data(), method, progress=False)
+    elif isinstance(method, ssm.FFBSi):
+        run = partial(ssm.smooth, model, data(), {"q": 1.0, "r": 1.0}, method)
+    else:
+        run = partial(ssm.maximize, model, data(), method, progress=False)
+    with pytest.raises(ssm.ArgumentError, match=r"singular \(rank 1 of 2\)") as error:
+        run()
+    assert f"use ssm.{instead}()" in str(error.value)
+    assert "ssm.Dirac" in str(error.value)
+
+
+def test_explain_says_why():
+    text = " ".join(str(ssm.explain(acceleration(), data())).split())
+    assert "MetropolisHastings: linear Gaussian, and the covariance in the transition" in text
+    assert "none the covariance in the transition of x is singular (rank 1 of 2)" in text
+
+
+def test_ranks():
+    """Noises that drive several states, in any order; a full rank is none of these."""
+
+    def rank(matrix) -> str:
+        model = ssm.Model("rank")
+        model.prior(lambda: {"q": ssm.HalfFlat(), "s": ssm.HalfFlat()})
+        model.initial(lambda: {"x": ssm.Normal(np.zeros(3), sd=1)})
+        model.transition(lambda x, q, s: {"x": ssm.MvNormal(x, covariance=matrix(q, s))})
+        model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
+        found = without_density(trace(model))
+        return "" if found is None else found.reason
+
+    a, b = np.array([0.0, 1.0, 2.0]), np.array([0.0, -1.0, 1.0])
+    assert "rank 1 of 3" in rank(lambda q, s: q * np.outer(a, a) + s * np.outer(2 * a, a))
+    assert "rank 2 of 3" in rank(lambda q, s: q * np.outer(a, a) + s * np.outer(b, b))
+    assert not rank(lambda q, s: q * np.outer(a, a) + s * np.eye(3))
+    assert not rank(lambda q, s: q * np.outer(a, a) + s * 1e-6 * np.eye(3))
+
+
+def test_a_root_of_rank_two():
+    rng = np.random.default_rng(2)
+    g = rng.standard_normal((4, 2))
+    g[1] = 2 * g[0]  # a pivot of zero between two others
+    model = ssm.Model("two noises")
+    model.prior(lambda: {"q": ssm.HalfFlat()})
+    model.initial(lambda: {"x": ssm.Dirac(np.zeros(4))})
+    model.transition(lambda x, q: {"x": ssm.MvNormal(np.zeros(4), covariance=q * (g @ g.T))})
+    model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
+    drawn = ssm.simulate(model, {"q": 2.0}, steps=2, draws=20_000, seed=1)["x"].to_numpy()[:, 1]
+    expected = 2.0 * g @ g.T
+    d = np.diagonal(expected)
+    error = np.sqrt((expected**2 + np.outer(d, d)) / len(drawn))
+    assert np.all(np.abs(drawn.T @ drawn / len(drawn) - expected) < 4.5 * error)
