@@ -66,8 +66,9 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
             'kernel="genealogy" gives paths that meet in one', fix='use "exact", or "auto"'
         )
     if isinstance(maximum.step, NotApplicable):
-        m_step = f"BFGS on the mean over trajectories: {maximum.step.reason}"
-        complete_scores(problem, maximum.fixed)  # refuses what has none before anything runs
+        scores = complete_scores(problem, maximum.fixed)  # refuses what has none, before any run
+        how = "Newton's method" if scores.twice else "BFGS"
+        m_step = f"{how} on the mean over trajectories: {maximum.step.reason}"
     else:
         m_step = str(maximum.step)
     states = [
