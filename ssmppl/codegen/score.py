@@ -23,7 +23,8 @@ class ScoreProgram:
     Both are functions (theta, y, seen, u, paths, wide, each) of M trajectories (M, T, D). In `wide`
     (T, the width given here) the deterministic components of each and their sensitivities are set.
     To `each` `score` adds F derivatives and the log density, (M, F + 1), and `curvature` the lower
-    half of its second derivatives, (M, F (F + 1) / 2). missing : why there is no closed form, by function.
+    half of its second derivatives, (M, F (F + 1) / 2). missing : why there is no closed form, by
+    function.
     """
 
     module: ModuleType

@@ -91,7 +91,9 @@ class Maximiser:
             weights = [np.repeat(ratio_weights(row) / m, m) for row in log_z]
             return self.step.maximise(self.statistics(theta, paths, weights), theta)
         w = np.repeat(ratio_weights(log_z.sum(axis=0)) / m, m)
-        return climbed(self.chart, self.scores, paths, w, self._unconstrained(theta), self.posterior)
+        return climbed(
+            self.chart, self.scores, paths, w, self._unconstrained(theta), self.posterior
+        )
 
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
         moved = at(self.space, theta)

@@ -3,8 +3,8 @@
 Wei and Tanner (1990); Schön, Wills and Ninness (2011), "System identification of nonlinear
 state-space models"; Schön et al. (2015), section on EM for nonlinear models. Each iteration runs R
 filters at theta_k, draws M trajectories from them backwards, and maximises the mean of log p(x, y |
-theta) over them: through its statistics where it separates, else by Newton with the complete-data
-score. Deterministic states that depend on a parameter then follow from the noisy ones, which alone
+theta) over them: through its statistics where it separates, else by Newton's method
+(`path_climb.py`). Deterministic states that depend on a parameter then follow from the noisy ones, which alone
 are the missing data.
 
 EM magnifies what is wrong with its expectations as much as it is slow, so that the smoother's bias

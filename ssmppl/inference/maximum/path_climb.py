@@ -19,8 +19,8 @@ from ssmppl.inference.maximum.chart import Chart, Point
 from ssmppl.inference.particles.complete_score import CompleteScores
 
 STEPS, HALVINGS, BFGS_STEPS = 30, 20, 50
-LAST_STEP = 1e-8  # squared length, in standard errors of the complete data: what is left is its
-# square, and the noise of M trajectories is of order 1 / M
+LAST_STEP = 1e-6  # squared length, in standard errors of the complete data; what is left after it
+# is about the step's square, where the noise of M trajectories is 1 / sqrt(M)
 
 
 @dataclass(frozen=True)
