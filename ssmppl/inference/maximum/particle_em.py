@@ -4,8 +4,8 @@ Wei and Tanner (1990); Schön, Wills and Ninness (2011), "System identification 
 state-space models"; Schön et al. (2015), section on EM for nonlinear models. Each iteration runs R
 filters at theta_k, draws M trajectories from them backwards, and maximises the mean of log p(x, y |
 theta) over them: through its statistics where it separates, else by Newton's method
-(`path_climb.py`). Deterministic states that depend on a parameter then follow from the noisy ones, which alone
-are the missing data.
+(`path_climb.py`). Deterministic states that depend on a parameter then follow from the noisy ones,
+which alone are the missing data.
 
 EM magnifies what is wrong with its expectations as much as it is slow, so that the smoother's bias
 of order 1 / N matters. It is that of a ratio: the mean of Z S over independent runs, with Z the
