@@ -91,15 +91,22 @@ class _Mean:
             if float(here.slope @ step) < LAST_STEP:
                 return z + step
             step *= min(1.0, LONGEST_STEP / float(np.linalg.norm(step)))
-            for _ in range(HALVINGS):
-                there = self.at(z + step)
-                if there is not None and there.value > here.value:
-                    break
-                step *= 0.5
-            else:
+            higher = self._higher(z, step, here.value)
+            if higher is None:
                 break
-            z, here = z + step, there
+            z, here = higher
         return z
+
+    def _higher(
+        self, z: np.ndarray, step: np.ndarray, value: float
+    ) -> tuple[np.ndarray, _Height] | None:
+        """The first point above `value` at z + step, z + step / 2, ...; None where none is."""
+        for k in range(HALVINGS):
+            point = z + 0.5**k * step
+            there = self.at(point)
+            if there is not None and there.value > value:
+                return point, there
+        return None
 
     def bfgs(self, z: np.ndarray) -> np.ndarray:
         """The top by BFGS."""
