@@ -135,10 +135,7 @@ class Climber:
             slope = np.array(here[1 : n + 1])
             curvature = np.zeros((n, n))
             curvature[lower] = here[n + 1 :]
-            values, vectors = np.linalg.eigh(curvature, UPLO="L")
-            size = np.abs(values)
-            floor = max(LEAST_CURVATURE * size.max(), 1e-300)
-            step = vectors @ ((vectors.T @ slope) / np.maximum(size, floor))
+            step = uphill(slope, curvature)
             promised = float(slope @ step)
             length = float(np.linalg.norm(step))
             if not math.isfinite(length) or length == 0.0:
@@ -177,6 +174,14 @@ class Climber:
             options = {"maxfev": 400 * n, "xatol": 1e-9, "fatol": 1e-12}
             found = scipy.optimize.minimize(negative, z, method="Nelder-Mead", options=options)
         return found.x if -found.fun >= self._at(z, rest)[0] else z
+
+
+def uphill(slope: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """Newton's step from a gradient (F,) and a Hessian (F, F), its lower half; see the module."""
+    values, vectors = np.linalg.eigh(curvature, UPLO="L")
+    size = np.abs(values)
+    floor = max(LEAST_CURVATURE * size.max(), 1e-300)
+    return vectors @ ((vectors.T @ slope) / np.maximum(size, floor))
 
 
 def _free(value: Expr, lower: Expr, upper: Expr) -> Expr:

@@ -142,7 +142,9 @@ def test_first_and_second_derivatives(name):
     problem, theta, paths = posed(MODELS[name], seed_of("complete score", name))
     scores = complete_scores(problem)
     assert not scores.differences
-    gradient = scores.gradient(theta, paths)
+    value, gradient = scores.value_and_gradient(theta, paths)
+    np.testing.assert_allclose(value, scores.log_density(theta, paths), rtol=1e-10)
+    np.testing.assert_array_equal(gradient, scores.gradient(theta, paths))
     expected = slopes(lambda v: scores.log_density(v, paths), theta, 1e-3)
     size = np.abs(scores.log_density(theta, paths)).max() + np.abs(expected).max()
     np.testing.assert_allclose(gradient, expected, atol=1e-8 * size)

@@ -1,6 +1,8 @@
-"""Weighted means of statistics over trajectories."""
+"""Statistics of many trajectories: each one's own, and their weighted means."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
 
@@ -22,3 +24,19 @@ def weighted_statistics(
             total[i] += weights[m] * part[i]
             if each is not None:
                 each[m, i] = part[i]
+
+
+@exact
+def sums_of_paths(sums, theta, y, seen, u, paths, wide, each):
+    """Add sums(paths[m]) to each[m].
+
+    paths : (M, T, D). wide : (T, D + sensitivities), room to work in. each : (M, S).
+    """
+    part = np.empty(each.shape[1])
+    for m in range(paths.shape[0]):
+        for t in range(paths.shape[1]):
+            for d in range(paths.shape[2]):
+                wide[t, d] = paths[m, t, d]
+        sums(theta, y, seen, u, wide, part)
+        for i in range(each.shape[1]):
+            each[m, i] += part[i]

@@ -11,7 +11,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import scipy
 
 from ssmppl.analysis.climber import Unconstrained
 from ssmppl.analysis.expectation import unsuited
@@ -22,6 +21,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.draws import Block, stack
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.chart import Chart
+from ssmppl.inference.maximum.path_climb import climbed
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
 from ssmppl.inference.particles.pilot import Space, at, dispersed
 from ssmppl.inference.problem import Problem
@@ -29,7 +29,6 @@ from ssmppl.inference.runner import run_chains
 
 __all__ = ["Chains", "Maximiser", "Pooled", "maximiser", "pool", "run_to_estimate", "starts"]
 
-BFGS_STEPS = 50  # of an M-step without statistics
 DRIFT = 5.0  # standard errors that the halves of the iterates may differ by
 
 
@@ -92,24 +91,9 @@ class Maximiser:
             weights = [np.repeat(ratio_weights(row) / m, m) for row in log_z]
             return self.step.maximise(self.statistics(theta, paths, weights), theta)
         w = np.repeat(ratio_weights(log_z.sum(axis=0)) / m, m)
-        z = self._unconstrained(theta)
-
-        def negative(z: np.ndarray) -> tuple[float, np.ndarray]:
-            point = self.chart.at(z)
-            if point.log_prior == -np.inf:
-                return np.inf, np.zeros(len(z))
-            value = float(w @ self.scores.log_density(point.theta, paths))
-            slope = point.pull(w @ self.scores.gradient(point.theta, paths))
-            if self.posterior:
-                value, slope = value + point.log_prior, slope + point.d_log_prior
-            if not np.isfinite(value) or not np.all(np.isfinite(slope)):
-                return np.inf, np.zeros(len(z))
-            return -value, -slope
-
-        found = scipy.optimize.minimize(
-            negative, z, jac=True, method="BFGS", options={"maxiter": BFGS_STEPS}
+        return climbed(
+            self.chart, self.scores, paths, w, self._unconstrained(theta), self.posterior
         )
-        return self.chart.at(found.x).theta if found.fun <= negative(z)[0] else theta
 
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
         moved = at(self.space, theta)

@@ -3,9 +3,9 @@
 Wei and Tanner (1990); Schön, Wills and Ninness (2011), "System identification of nonlinear
 state-space models"; Schön et al. (2015), section on EM for nonlinear models. Each iteration runs R
 filters at theta_k, draws M trajectories from them backwards, and maximises the mean of log p(x, y |
-theta) over them: through its statistics where it separates, else by BFGS with the complete-data
-score. Deterministic states that depend on a parameter then follow from the noisy ones, which alone
-are the missing data.
+theta) over them: through its statistics where it separates, else by Newton's method
+(`path_climb.py`). Deterministic states that depend on a parameter then follow from the noisy ones,
+which alone are the missing data.
 
 EM magnifies what is wrong with its expectations as much as it is slow, so that the smoother's bias
 of order 1 / N matters. It is that of a ratio: the mean of Z S over independent runs, with Z the
@@ -68,8 +68,9 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
             'kernel="genealogy" gives paths that meet in one', fix='use "exact", or "auto"'
         )
     if isinstance(maximum.step, NotApplicable):
-        m_step = f"BFGS on the mean over trajectories: {maximum.step.reason}"
-        complete_scores(problem, maximum.fixed)  # refuses what has none before anything runs
+        scores = complete_scores(problem, maximum.fixed)  # refuses what has none, before any run
+        how = "Newton's method" if scores.twice else "BFGS"
+        m_step = f"{how} on the mean over trajectories: {maximum.step.reason}"
     else:
         m_step = str(maximum.step)
     states = [

@@ -48,6 +48,11 @@ class CompleteScores:
         return {k: v for k, v in self.__dict__.items() if k != "program"}
 
     @property
+    def twice(self) -> bool:
+        """Whether second derivatives have a closed form."""
+        return "curvature" in self.program.widths
+
+    @property
     def differences(self) -> dict[str, str]:
         """What is computed by central differences ("score", "curvature"), with the reason."""
         return self.program.missing
@@ -57,16 +62,25 @@ class CompleteScores:
 
         paths : for each experiment (M, T, D). Zero in parameters that were left out.
         """
-        f, p = len(self.where), len(theta)
+        if not len(self.where) or "score" in self.program.widths:
+            return self.value_and_gradient(theta, paths)[1]
+        gradient = np.zeros((len(paths[0]), len(theta)))
+        gradient[:, self.where] = self._slopes(self.log_density, theta, paths, FIRST)
+        return gradient
+
+    def value_and_gradient(
+        self, theta: np.ndarray, paths: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`log_density` (M,) and `gradient` (M, P), in one pass where the score is compiled."""
+        f = len(self.where)
+        if f and "score" not in self.program.widths:
+            return self.log_density(theta, paths), self.gradient(theta, paths)
+        gradient = np.zeros((len(paths[0]), len(theta)))
         if not f:
-            return np.zeros((len(paths[0]), p))
-        if "score" in self.program.widths:
-            values = self._sums("score", f, theta, paths)
-        else:
-            values = self._slopes(self.log_density, theta, paths, FIRST)
-        out = np.zeros((len(values), p))
-        out[:, self.where] = values
-        return out
+            return self.log_density(theta, paths), gradient
+        sums = self._sums("score", f + 1, theta, paths)
+        gradient[:, self.where] = sums[:, :f]
+        return sums[:, f], gradient
 
     def hessian(self, theta: np.ndarray, paths: Sequence[np.ndarray]) -> np.ndarray:
         """(M, P, P) second derivatives, as `gradient`."""
@@ -102,15 +116,12 @@ class CompleteScores:
         self, name: str, size: int, theta: np.ndarray, paths: Sequence[np.ndarray]
     ) -> np.ndarray:
         """(M, size) totals of a generated function, over experiments."""
-        run, part = getattr(self.program.module, name), np.empty(size)
+        run = getattr(self.program.module, name)
         total = np.zeros((len(paths[0]), size))
         theta = np.ascontiguousarray(theta, dtype=float)
         for e, group in zip(self.problem.experiments, paths, strict=True):
             wide = np.zeros((e.steps, self.program.widths[name]))
-            for m, path in enumerate(group):
-                wide[:, : path.shape[1]] = path
-                run(theta, e.y, e.seen, e.u, wide, part)
-                total[m] += part
+            run(theta, e.y, e.seen, e.u, np.ascontiguousarray(group), wide, total)
         return total
 
     def _slopes(
