@@ -334,10 +334,9 @@ def test_the_top_is_found_from_beside_it(objective):
     shares = [np.trace(np.linalg.solve(inner, f.error)) for f in found]
     assert np.mean(shares) < 0.2**2 * 2
     assert np.mean([f.moved for f in found]) > 1.5
-    if objective == "likelihood":
-        information = np.mean([f.information for f in found], axis=0)
-        ratio = np.linalg.eigvals(inner @ information)
-        assert np.all(np.abs(ratio - 1.0) < 0.3)
+    if objective == "likelihood":  # the curvature over a region, not at a point: to a fifth
+        told = [np.sqrt(np.diagonal(np.linalg.inv(f.information))) for f in found]
+        np.testing.assert_allclose(np.median(told, axis=0), np.sqrt(np.diagonal(inner)), rtol=0.2)
 
 
 def test_an_exact_likelihood_has_its_top_to_many_digits():

@@ -25,10 +25,10 @@ from ssmppl.inference.particles.pilot import Space, scale_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.tasks import run_tasks
 
-REACH = 0.8  # standard deviations by which points are scattered
+REACH = 0.9  # standard deviations by which points are scattered
 EXACT_REACH = 0.1  # where the likelihood has no noise
-NOISE = 0.5  # squared relative error of the likelihood at a point that is aimed at
-MOST_RUNS, MOST_GROWTH = 8, 4.0  # filters at a point, and how many times more in a round
+NOISE = 0.3  # squared relative error of the likelihood at a point that is aimed at
+MOST_RUNS, MOST_GROWTH = 16, 4.0  # filters at a point, and how many times more in a round
 SCALE_RUNS = 2  # filters at the points that tell how far to scatter those, which is a guess
 ROUNDS, FINAL_ROUNDS = 12, 4
 APPROACH, POINTS = 6, 24  # points of a round, and of the last one, for each coefficient
@@ -42,6 +42,7 @@ ALIKE = 0.4  # share of the information by which the shape may still change
 LEAST, MOST = 1.0 / 9.0, 16.0  # change of the information in a round
 SURELY = 3.0  # standard errors that the information of a direction is above zero at a top
 FLAT = 0.05  # information of a direction, in that of the round before, without a top
+GROUPS = 10  # of the jackknife
 TOGETHER = 8  # points of a task
 
 
@@ -77,6 +78,7 @@ class _Search:
     reach: float = REACH
     misfit: float = 0.0
     hopeless: int = 0
+    seen: tuple[np.ndarray, ...] = ()
 
     def look(self, n: int, skew: bool) -> Fit | None:
         """A fit to n points round the centre."""
@@ -88,6 +90,8 @@ class _Search:
             self.setup, self.settings, self.centre + u @ self.factor.T, self.runs, (8, self.done)
         )
         inside = ~np.isnan(log_z)
+        pair = np.tile(np.arange(len(half)), 2)
+        self.seen = u[inside], log_z[inside], pair[inside]
         fit = fitted(u[inside], log_z[inside], skew)
         if fit is not None and self.settings is not None:
             self.misfit = fit.misfit
@@ -116,6 +120,24 @@ class _Search:
         root = vectors / np.sqrt(usable)
         self.factor = np.linalg.cholesky(self.factor @ root @ root.T @ self.factor.T)
         return bool(distance < NEAR and usable.min() > ALIKE and usable.max() < 1.0 / ALIKE)
+
+    def error(self, fit: Fit, u: np.ndarray) -> np.ndarray | None:
+        """(F, F) Monte Carlo covariance of the top u: the larger of the delta method's and of the
+        jackknife's over groups of pairs, which knows what noise in the curvature does to a top.
+        None where the fit without a group has no top."""
+        points, log_z, pair = self.seen
+        tops = []
+        for g in range(GROUPS):
+            rest = pair % GROUPS != g
+            without = fitted(points[rest], log_z[rest], True)
+            top = None if without is None else self.top(without)
+            if top is None:
+                return None
+            tops.append(top)
+        off = np.array(tops) - np.mean(tops, axis=0)
+        jackknife = off.T @ off * (GROUPS - 1) / GROUPS
+        delta = fit.error(u)
+        return jackknife if np.trace(jackknife) > np.trace(delta) else delta
 
     def top(self, fit: Fit) -> np.ndarray | None:
         """(F,) where the fit has its top, in its own coordinates; None where it has none near."""
@@ -168,7 +190,7 @@ def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop |
             method.particles, choose(setup.problem, theta.copy(), exact=False).name
         )
     scale = scales(setup, settings, z)
-    runs = int(np.clip(np.ceil(noise**2 / NOISE), 1, MOST_RUNS)) if settings else 1
+    runs = int(np.clip(np.ceil(noise**2 / NOISE), 2, MOST_RUNS)) if settings else 1
     search = _Search(setup, settings, np.array(z), np.diag(scale), runs)
     few = max(APPROACH * count(len(z), skew=False), FEWEST)
     for _ in range(ROUNDS):
@@ -190,7 +212,9 @@ def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop |
         if fit is None:
             search.factor = 0.5 * search.factor
             continue
-        if u is None or np.linalg.norm(u) > CENTRED * search.reach:
+        far = u is None or np.linalg.norm(u) > CENTRED * search.reach
+        error = None if far or u is None else search.error(fit, u)
+        if u is None or error is None:
             search.move(fit)
             continue
         f, inverse = search.factor, np.linalg.inv(search.factor)
@@ -200,7 +224,7 @@ def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop |
             nothing = np.zeros(len(setup.space.theta))
             information = information + setup.chart.curvature(top, nothing).log_prior
         moved = float(np.linalg.norm(np.linalg.solve(f, top - z)))
-        return Hilltop(top, f @ fit.error(u) @ f.T, information, points, runs, moved)
+        return Hilltop(top, f @ error @ f.T, information, points, runs, moved)
     return NotApplicable("the likelihood has no top within reach of the points round the end")
 
 
