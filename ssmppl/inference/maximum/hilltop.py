@@ -130,7 +130,7 @@ class _Search:
         for g in range(GROUPS):
             rest = pair % GROUPS != g
             without = fitted(points[rest], log_z[rest], True)
-            top = None if without is None else self.top(without)
+            top = None if without is None else self.top(without, surely=0.0)
             if top is None:
                 return None
             tops.append(top)
@@ -139,11 +139,12 @@ class _Search:
         delta = fit.error(u)
         return jackknife if np.trace(jackknife) > np.trace(delta) else delta
 
-    def top(self, fit: Fit) -> np.ndarray | None:
-        """(F,) where the fit has its top, in its own coordinates; None where it has none near."""
+    def top(self, fit: Fit, surely: float = SURELY) -> np.ndarray | None:
+        """(F,) where the fit has its top, in its own coordinates; None where it has none near, or
+        where its information is not so many standard errors above zero in every direction."""
         u = np.zeros(len(self.centre))
         values, errors, _ = fit.shape()
-        if np.any(values < SURELY * errors):
+        if np.any(values < surely * errors):
             return None
         for _ in range(50):
             information = fit.information(u)
