@@ -200,6 +200,9 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
     if information is None and ascent.interrupted:
         attrs["covariance"] = "none: interrupted before the observed information was known"
         return nothing
+    if ascent.no_information:
+        attrs["covariance"] = f"none: {ascent.no_information}"
+        return nothing
     if information is None:
         information = _information(setup, ascent.theta, None)
     found = None

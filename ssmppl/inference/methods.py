@@ -287,10 +287,16 @@ class IF2:
         not named have 0.02. A parameter of the initial law alone has the root of the number of rows
         times as much, at most ten times, unless it is named.
     starts : number of swarms, the first at the start, the others dispersed round it; or a list of
-        their parameter values. The end of highest log-likelihood is the estimate, or the mean of
-        those that agree with it where that is higher still.
-    averaged : last iterations that the estimate is the mean of, on the unconstrained scale.
+        their parameter values. The top is looked for from the end of highest log-likelihood, or
+        from the mean of those that agree with it where that is higher still.
+    averaged : last iterations that an end is the mean of, on the unconstrained scale.
     evaluations : estimates of the likelihood at each end.
+    points : places at which the likelihood is estimated round where the swarms ended, to find the
+        top there. The estimate is the top of a quadratic fitted to them, its curvature gives the
+        standard errors, and the noise of the estimates its Monte Carlo error (Ionides, Bretó, Park,
+        Smith and King 2017). None: 24 for each coefficient of the quadratic, at least 160. 0: none
+        of this; the estimate is where the swarms ended, how far that is off is not known, and only
+        an exact likelihood gives standard errors.
     """
 
     particles: int = 2000
@@ -300,6 +306,7 @@ class IF2:
     starts: int | Sequence[Mapping[str, Any]] = 4
     averaged: int = 25
     evaluations: int = 10
+    points: int | None = None
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,8 @@ class Ascent:
     `converged` above all. information : (P, P), minus the second derivatives of the log-likelihood
     in theta, where the method has them. error : (P, P), the Monte Carlo covariance of theta itself.
     Of several starts the iterates are (starts, K, P); figures : what else is known of each iterate,
-    (K,) or (starts, K), by name.
+    (K,) or (starts, K), by name. no_information : why no information is to be looked for, where
+    that is so.
     """
 
     theta: np.ndarray
@@ -42,6 +43,7 @@ class Ascent:
     error: np.ndarray | None = None
     interrupted: bool = False
     figures: dict[str, np.ndarray] = field(default_factory=dict)
+    no_information: str = ""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class Setup:
             return z
         if isinstance(self.exact, NotApplicable):
             return self.pilot.z
-        return finite_point(z, self._exact, np.random.default_rng(self.root))
+        return finite_point(z, self.exact_at, np.random.default_rng(self.root))
 
     def exact_objective(self, z: np.ndarray) -> float:
         """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""
@@ -124,7 +126,8 @@ class Setup:
             information = information + self.chart.curvature(z, slope).theta
         return inverse.T @ information @ inverse
 
-    def _exact(self, z: np.ndarray) -> float:
+    def exact_at(self, z: np.ndarray) -> float:
+        """The exact log-likelihood at z (F,); -inf off the support, and where there is none."""
         theta, log_prior = self.space.parameters(z)
         if log_prior == -np.inf or isinstance(self.exact, NotApplicable):
             return -np.inf

@@ -17,6 +17,10 @@ At the end of a pass the swarm leans to the last rows. Averaged over all rows of
 to first order: the filtered mean of a random walk is a weighted mean of what the rows say whose
 weights, over a whole period, are the same for each row. So the iterates are means over rows; those
 of the initial law's numbers are the swarm's means at the end.
+
+What is left, all swarms may share: steps that have not vanished, a ridge not yet climbed. How the
+ends differ does not tell it. So from the ends the top itself is looked for, by estimates of the
+likelihood round it (`hilltop.py`); their noise is the error of the estimate.
 """
 
 from __future__ import annotations
@@ -31,19 +35,22 @@ import numpy as np
 from ssmppl.analysis.perturbed import Perturbed
 from ssmppl.counts import check_count
 from ssmppl.data import check_values, unpack_parameters
-from ssmppl.errors import ArgumentError, NotApplicable, listing
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.draws import stack
 from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.hilltop import Hilltop, check_points, hilltop
 from ssmppl.inference.maximum.m_step import starts
-from ssmppl.inference.maximum.summit import Summit, fitted_curvature, summit
+from ssmppl.inference.maximum.summit import HALF_INTERVAL, Summit, evaluate, summit
 from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swarm_block
 from ssmppl.inference.methods import IF2
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.progress import announced
 from ssmppl.inference.runner import run_chains
 
 USUAL = 0.02  # standard deviation of a step
 MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row
+SWITCHED_OFF = "IF2(points=0) asks for none, nor for the Monte Carlo error"
 
 
 def climb(setup: Setup, method: IF2) -> Ascent:
@@ -62,6 +69,7 @@ def climb(setup: Setup, method: IF2) -> Ascent:
             f"cooling={method.cooling!r}",
             fix="give what is left of the steps after 50 iterations: above 0, at most 1",
         )
+    check_points(method, len(setup.space.where))
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
     swarms = Swarms(setup.space, setup.with_prior, scales, model.moving, method.cooling)
@@ -79,23 +87,69 @@ def climb(setup: Setup, method: IF2) -> Ascent:
     ends = drawn["z"][:, -averaged:].mean(axis=1)
     interrupted = any(c.interrupted for c in chains)
     top = summit(setup, method, ends)
+    found, interrupted = _beyond(setup, method, top, len(ends), interrupted)
     report = _report(setup, model, scales, ends, top, averaged)
     if stats["impossible"][top.best, -averaged:].any():
         report["impossible_rows"] = int(stats["impossible"][top.best, -averaged:].sum())
-    information = None
-    if isinstance(setup.exact, NotApplicable) and not interrupted:
-        report["information"] = "from a quadratic fitted to estimates of the log-likelihood"
-        information = fitted_curvature(setup, method, top.z)
-    point, error = setup.chart.at(top.z), None
-    if top.spread is not None:
-        error = point.jacobian @ top.spread @ point.jacobian.T
+    z, error, information, none = top.z, None, None, ""
+    by_particles = isinstance(setup.exact, NotApplicable)
+    if isinstance(found, Hilltop):
+        z = found.z
+        jacobian = setup.chart.at(z).jacobian
+        error = jacobian @ found.error @ jacobian.T
+        report |= {"beyond_the_swarms": found.moved, "estimate": f"{found}, the search for which "
+                   f"began at the {report['estimate']}"}  # fmt: skip
+        if by_particles:
+            report["information"] = "from a quadratic fitted to estimates of the log-likelihood"
+            information = setup.natural(z, found.information)
+    else:
+        report["monte_carlo_error"] = f"none: {found.reason}"
+        none = found.reason if by_particles else ""
+        if method.points != 0 and not interrupted:
+            report |= {"converged": False, "stopped": f"{found.reason}: give more particles"}
     way = np.concatenate([np.array(points)[:, None], drawn["z"]], axis=1)
     log_p = stats["perturbed_log_likelihood"]
     return Ascent(
-        point.theta, None, np.array([[setup.space.parameters(z)[0] for z in c] for c in way]),
+        setup.chart.at(z).theta, None,
+        np.array([[setup.space.parameters(z)[0] for z in c] for c in way]),
         report, information, error, interrupted,
-        {"perturbed_log_likelihood": np.hstack([np.full((len(log_p), 1), np.nan), log_p])},
+        {"perturbed_log_likelihood": np.hstack([np.full((len(log_p), 1), np.nan), log_p])}, none,
     )  # fmt: skip
+
+
+def _beyond(
+    setup: Setup, method: IF2, top: Summit, number: int, interrupted: bool
+) -> tuple[Hilltop | NotApplicable, bool]:
+    """The top beyond the ends of `number` swarms, and whether Ctrl-C was pressed by now."""
+    if method.points == 0:
+        return NotApplicable(SWITCHED_OFF), interrupted
+    if not interrupted:
+        try:
+            return highest(setup, method, top, number), False
+        except KeyboardInterrupt:
+            pass
+    return NotApplicable("interrupted before the top was looked for"), True
+
+
+def highest(setup: Setup, method: IF2, ends: Summit, number: int) -> Hilltop | NotApplicable:
+    """The top near where `number` swarms ended, unless the likelihood there is below theirs."""
+    if not ends.value > -np.inf:
+        return NotApplicable("the likelihood is zero where the swarms ended")
+    noise = ends.noise * np.sqrt(method.evaluations)
+    with announced("IF2", "looking for the top", shown=setup.progress):
+        found = hilltop(setup, method, ends.z, noise)
+    if isinstance(found, NotApplicable):
+        return found
+    try:
+        (value,), (error,) = evaluate(setup, method, found.z[None], number + 1)
+    except SamplingError:
+        value, error = -np.inf, 0.0
+    gain = value - ends.value
+    if setup.with_prior:
+        gain += setup.chart.at(found.z).log_prior - setup.chart.at(ends.z).log_prior
+    if not gain > -HALF_INTERVAL - 2.0 * np.hypot(error, ends.noise):
+        return NotApplicable("where the fitted quadratic has its top, the likelihood is low")
+    return found
 
 
 def _describe(recent: Sequence[Mapping[str, np.ndarray]]) -> str:

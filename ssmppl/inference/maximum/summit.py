@@ -1,4 +1,4 @@
-"""The ends of several noisy climbs: which is the highest, which agree with it, how curved it is."""
+"""The ends of several noisy climbs: which is the highest, and which agree with it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.inference.chains.curvature import fitted_information
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.methods import IF2
 from ssmppl.inference.particles.filtering import (
@@ -16,14 +15,11 @@ from ssmppl.inference.particles.filtering import (
     log_of_mean,
     repeated_estimates,
 )
-from ssmppl.inference.particles.pilot import scale_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.tasks import run_tasks
 
 HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
-INFORMATION_RUNS = 16  # filters behind each point of the quadratic
-SCALE_RUNS = 2  # and behind the points that tell how far to scatter those, which is a guess
 
 
 @dataclass(frozen=True)
@@ -32,7 +28,6 @@ class Summit:
 
     z : (F,) the estimate. value, noise : log-likelihood there and its standard error. values,
     errors : (S,) those of the ends. near : (S,) which ends agree. pooled : whether z is their mean.
-    spread : (F, F) Monte Carlo covariance of z, from how the ends that agree differ.
     """
 
     z: np.ndarray
@@ -43,7 +38,6 @@ class Summit:
     best: int
     near: np.ndarray
     pooled: bool
-    spread: np.ndarray | None
 
 
 def summit(setup: Setup, method: IF2, ends: np.ndarray) -> Summit:
@@ -61,15 +55,13 @@ def summit(setup: Setup, method: IF2, ends: np.ndarray) -> Summit:
     best = int(np.argmax(heights))
     with np.errstate(invalid="ignore"):  # none is near where all likelihoods are zero
         near = heights[best] - heights <= HALF_INTERVAL + 2.0 * np.hypot(errors, errors[best])
-    z, value, noise, spread, pooled = ends[best], values[best], errors[best], None, False
+    z, value, noise, pooled = ends[best], values[best], errors[best], False
     if near.sum() > 1:
-        spread = np.atleast_2d(np.cov(ends[near].T))
         middle = ends[near].mean(axis=0)
         (own,), (own_noise,) = evaluate(setup, method, middle[None], len(ends))
         if own + prior(middle) >= heights[best]:
             z, value, noise, pooled = middle, own, own_noise, True
-            spread = spread / near.sum()
-    return Summit(z, float(value), float(noise), values, errors, best, near, pooled, spread)
+    return Summit(z, float(value), float(noise), values, errors, best, near, pooled)
 
 
 def evaluate(
@@ -102,26 +94,3 @@ def _estimates(
         return repeated_estimates(problem, theta, settings, seed, range(repeats))
     except SamplingError as error:
         return error
-
-
-def fitted_curvature(setup: Setup, method: IF2, z: np.ndarray) -> np.ndarray:
-    """(P, P) observed information by what iterated filtering itself needs, no density of the
-    transition: minus the curvature of a quadratic fitted to estimates of the log-likelihood round
-    z (F,), as in Monte Carlo profiles (Ionides, Bretó, Park, Smith and King 2017)."""
-    problem, seed = setup.problem, setup.seed(8)
-    theta, _ = setup.space.parameters(z)
-    settings = FilterSettings(method.particles, choose(problem, theta.copy(), exact=False).name)
-
-    def log_likelihood(z: np.ndarray, runs: int = INFORMATION_RUNS) -> float:
-        theta, log_prior = setup.space.parameters(z)
-        if log_prior == -np.inf:
-            return -np.inf
-        try:
-            log_z = repeated_estimates(problem, theta, settings, seed, range(runs))
-        except SamplingError:
-            return -np.inf
-        return log_of_mean(log_z)[0]
-
-    scale = scale_of(z, partial(log_likelihood, runs=SCALE_RUNS))
-    inner = fitted_information(log_likelihood, z, np.diag(scale), np.random.default_rng(seed))
-    return setup.natural(z, inner / np.outer(scale, scale))
