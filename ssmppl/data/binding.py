@@ -25,6 +25,8 @@ from ssmppl.expressions.expr import Expr, symbol, symbols_of
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.trace import Site, Trace
 
+Needed = tuple[tuple[Expr, Site], ...]  # as of `_needed`
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -68,7 +70,8 @@ def bind(
     if data is None and not need_observations:
         data = {}
     named = [*trace.observations, *trace.inputs]
-    return [_bind(trace, s, need_observations, steps) for s in sources(data, named)]
+    needed = tuple(_needed(trace))
+    return [_bind(trace, s, need_observations, steps, needed) for s in sources(data, named)]
 
 
 def unread(trace: Trace, data: Any) -> list[str]:
@@ -121,7 +124,9 @@ def bind_inputs(
     return _input_array(trace, values, rows), rows, source.time
 
 
-def _bind(trace: Trace, source: Source, need: bool, steps: int | None) -> Experiment:
+def _bind(
+    trace: Trace, source: Source, need: bool, steps: int | None, needed: Needed
+) -> Experiment:
     inputs = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
     observed = {}
     for name, site in trace.observations.items():
@@ -142,7 +147,7 @@ def _bind(trace: Trace, source: Source, need: bool, steps: int | None) -> Experi
     packed = pack(trace.observations.values(), observed).reshape(rows, -1)
     missing = np.isnan(packed)
     if need:
-        _check_needed(trace, source, missing)
+        _check_needed(trace, source, missing, needed)
     return Experiment(
         y=np.ascontiguousarray(np.where(missing, 0.0, packed)),
         seen=np.ascontiguousarray(np.where(missing, 0.0, 1.0)),
@@ -258,9 +263,9 @@ def _needed(trace: Trace) -> Iterator[tuple[Expr, Site]]:
                     yield symbol("observation", *s.data[1:]), site
 
 
-def _check_needed(trace: Trace, source: Source, missing: np.ndarray) -> None:
+def _check_needed(trace: Trace, source: Source, missing: np.ndarray, needed: Needed) -> None:
     order = {s: k for k, s in enumerate(trace.observation_symbols)}
-    for s, site in _needed(trace):
+    for s, site in needed:
         gaps = missing[:-1, order[s]]
         if gaps.any():
             name, component = s.data[1:]

@@ -202,8 +202,11 @@ def _bound(bounds: np.ndarray, env: Values, rows: int, none: float) -> np.ndarra
     """(rows, *shape) of the bounds that can be computed from `env`, `none` elsewhere."""
     out = np.full((rows, *bounds.shape), none)
     for index in np.ndindex(bounds.shape):
-        if all(s in env for s in symbols_of(bounds[index])):
-            value = evaluate(bounds[index], env)
+        bound: Any = bounds[index]
+        if bound.op == "const":
+            out[(slice(None), *index)] = none if np.isnan(bound.data) else bound.data
+        elif all(s in env for s in symbols_of(bound)):
+            value = evaluate(bound, env)
             out[(slice(None), *index)] = np.where(np.isnan(value), none, value)
     return out
 

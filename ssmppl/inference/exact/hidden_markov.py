@@ -1,35 +1,29 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
-Laws may depend on parameters, inputs, time and observations before. The densities are evaluated by
-the interpreter, over all values, rows and data sets of one shape at once (`histories.py`), and
-handed to the compiled passes of `codegen/kernels/hidden_markov.py`.
+The laws (`finite_laws.py`) of data sets of one shape (`histories.py`) are handed all at once to the
+compiled passes of `codegen/kernels/hidden_markov.py`.
 """
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
-from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kits import predictive
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.expressions.calculus import differentiate
-from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, constant
-from ssmppl.inference.exact.histories import Histories, histories
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.exact.finite_laws import FiniteLaws
+from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
-from ssmppl.inference.exact.scored import Scored
-from ssmppl.language.trace import Trace, previous
-
-ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
+from ssmppl.language.trace import Trace
 
 
 @dataclass(frozen=True)
@@ -54,21 +48,14 @@ class Filtered:
 
 
 @dataclass(frozen=True)
-class HiddenMarkov(Scored):
+class HiddenMarkov(FiniteLaws):
     """A traced model as one of finitely many values (K, D), and its exact passes."""
-
-    form: FiniteStates
-    _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
-
-    @property
-    def values(self) -> np.ndarray:
-        return self.form.values
 
     # -- likelihood and laws
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
         """log p(y | theta), summed over experiments; -inf where it does not exist at theta."""
         total = 0.0
-        for h in self._histories(experiments):
+        for h in self.histories_of(experiments):
             found, stopped = self._forward(h, theta)
             if np.any(stopped >= 0):
                 return -np.inf
@@ -204,14 +191,14 @@ class HiddenMarkov(Scored):
         """(T, 4, K) of each experiment: mean, variance, P(Y <= y) and P(Y < y) of each channel, by
         the laws (T, K) of the combinations that are predicted."""
         each = []
-        for h in self._histories(experiments):
+        for h in self.histories_of(experiments):
             first = h.members[np.searchsorted(h.which, np.arange(h.size))]
             law = np.stack([laws[i] for i in first])
             out = []
             for site in self.trace.observations.values():
                 for figures in predictive(site):
                     mean, variance, below, strictly = (
-                        self._over_values(f, h, theta, "observation") for f in figures
+                        self.over_values(f, h, theta, "observation") for f in figures
                     )
                     middle = np.sum(law * mean, axis=2)
                     square = np.sum(law * (variance + mean**2), axis=2)
@@ -233,7 +220,7 @@ class HiddenMarkov(Scored):
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
         symbols = [s for s, w in zip(self.trace.parameter_symbols, wanted, strict=True) if w]
         total, gradient = 0.0, np.zeros(len(theta))
-        for h in self._histories(experiments):
+        for h in self.histories_of(experiments):
             found, stopped = self._forward(h, theta)
             if np.any(stopped >= 0):
                 return -np.inf, np.where(wanted, np.nan, 0.0)
@@ -246,16 +233,12 @@ class HiddenMarkov(Scored):
         return total, gradient
 
     # -- the pieces
-    def _histories(self, experiments: Iterable[Experiment]) -> tuple[Histories, ...]:
-        entries = max(1, ENTRIES // len(self.values) ** 2)
-        return histories(self.trace, tuple(experiments), entries)
-
     def _forward(self, h: Histories, theta: np.ndarray) -> tuple[Filtered, np.ndarray]:
         """The forward pass, and (S,) the row at which it came to an end, -1 if at none."""
         shape = h.size, h.steps, len(self.values)
-        start = np.exp(self._over_values(self.density("initial", h), h, theta, "initial")[:, 0])
-        move = np.exp(self._over_values(self.density("transition", h), h, theta, "transition"))
-        log_g = self._over_values(self.density("observation", h), h, theta, "observation")
+        start = np.exp(self.over_values(self.density("initial", h), h, theta, "initial")[:, 0])
+        move = np.exp(self.over_values(self.density("transition", h), h, theta, "transition"))
+        log_g = self.over_values(self.density("observation", h), h, theta, "observation")
         log_g = np.ascontiguousarray(np.broadcast_to(log_g, shape))
         out = Filtered(np.empty(shape[:2]), np.empty(shape), np.empty(shape), move)
         stopped = np.empty(h.size, dtype=np.int64)
@@ -268,7 +251,7 @@ class HiddenMarkov(Scored):
         self, experiments: Sequence[Experiment], theta: np.ndarray
     ) -> Iterator[tuple[Histories, Filtered]]:
         """The forward passes; an error where one comes to an end."""
-        for h in self._histories(experiments):
+        for h in self.histories_of(experiments):
             found, stopped = self._forward(h, theta)
             ends = stopped[h.which]
             if np.any(ends >= 0):
@@ -289,73 +272,6 @@ class HiddenMarkov(Scored):
         law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
         exact_entry("finite_backward")(found.move, found.predicted, found.filtered, law, both)
         return law, both
-
-    def density(self, role: str, h: Histories, by: Expr | None = None) -> Expr:
-        """The log density of a role, or its derivative by a parameter."""
-        missing = Missing(partial=h.partial)
-        key = f"{role} {sorted(h.partial)}"
-        if key not in self._densities:
-            total = constant(0.0)
-            for t in terms(self.trace, role, missing):
-                total = total + t.guarded()
-            self._densities[key] = total
-        if by is None:
-            return self._densities[key]
-        slope = f"{key} by {by!r}"
-        if slope not in self._densities:
-            self._densities[slope] = differentiate([self._densities[key]], by)[0]
-        return self._densities[slope]
-
-    def expected(
-        self, h: Histories, theta: np.ndarray, role: str, expressions: Sequence[Expr],
-        law: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """Sums over data sets, rows and values of each expression, weighed by a law of `laws`: of
-        pairs for "transition". What has no weight does not count, be it infinite."""
-        out = np.zeros(len(expressions))
-        law = law * h.weights.reshape(-1, *(1,) * (law.ndim - 1))
-        for rows, found in self._by_rows(expressions, h, theta, role):
-            own = law[:, rows]
-            out += [np.sum(own * np.where(own > 0.0, values, 0.0)) for values in found]
-        return out
-
-    def _over_values(
-        self, expression: Expr, h: Histories, theta: np.ndarray, role: str
-    ) -> np.ndarray:
-        """(Q, R, K), or (Q, R, K, K) over x_{t-1} and x_t for "transition"; Q is S, or 1 where it
-        is the same for all histories, and R is T, or 1 where it is the same in all rows (and for
-        "initial")."""
-        parts = []
-        for _, (found,) in self._by_rows([expression], h, theta, role):
-            parts.append(found)
-            if found.shape[1] == 1:
-                break
-        return np.ascontiguousarray(np.concatenate(parts, axis=1) if parts[1:] else parts[0])
-
-    def _by_rows(
-        self, expressions: Sequence[Expr], h: Histories, theta: np.ndarray, role: str
-    ) -> Iterator[tuple[slice, list[np.ndarray]]]:
-        """The rows of a role, and each expression over them as of `_over_values`, as many rows at a
-        time as memory allows."""
-        size, pair = len(self.values), role == "transition"
-        given: dict[Expr, np.ndarray] = dict(zip(self.trace.parameter_symbols, theta, strict=True))
-        for s, column in zip(self.trace.state_symbols, self.values.T, strict=True):
-            given[s] = column
-            if pair:
-                given[previous(s)] = column[:, None]
-        shape = (size, size) if pair else (size,)
-        last = 1 if role == "initial" else h.steps
-        step = max(2, ENTRIES // (h.size * int(np.prod(shape)) * max(1, len(expressions))))
-        for a in range(0, last, step):
-            rows = slice(a, min(a + step, last))
-            own = {s: v[:, rows].reshape(len(v), -1, *(1,) * len(shape))
-                   for s, v in h.rows.items()}  # fmt: skip
-            found = []
-            for values in evaluate(expressions, {**given, **own}):
-                values = np.asarray(values, dtype=float)
-                values = values.reshape((1,) * (2 + len(shape) - values.ndim) + values.shape)
-                found.append(np.broadcast_to(values, (*values.shape[:2], *shape)))
-            yield rows, found
 
 
 T = TypeVar("T")
