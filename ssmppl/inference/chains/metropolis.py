@@ -63,10 +63,8 @@ class ExactLikelihood:
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
         if not self.states:
             return {}
-        model, experiments = (
-            needed_model(self.problem, "MetropolisHastings"),
-            self.problem.experiments,
-        )
+        model = needed_model(self.problem, "MetropolisHastings")
+        experiments = self.problem.experiments
         drawn = model.draw_each(experiments, point.theta, [stream] * len(experiments))
         return {f"path_{i}": d[0] for i, d in enumerate(drawn)}
 

@@ -8,7 +8,7 @@ and the sampler are in `kalman_moments.py`.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -174,14 +174,6 @@ class KalmanModel(Scored):
             raise kalman_matrices.failure(self.trace, theta, stop.status, stop.t) from None
         check_agreement(self.trace, start, log_given)
         return out
-
-    def draw_each(
-        self, experiments: Sequence[Experiment], theta: np.ndarray, streams: Sequence[np.ndarray],
-        draws: int = 1,
-    ) -> list[np.ndarray]:  # fmt: skip
-        """As `draw`, of each experiment with its own stream, or one and the same."""
-        pairs = zip(experiments, streams, strict=True)
-        return [self.draw(e, theta, stream, draws) for e, stream in pairs]
 
     def score(
         self, experiments: Iterable[Experiment], theta: np.ndarray, free: np.ndarray | None = None
