@@ -20,6 +20,7 @@ SCRIPTS = (
     "interweaving.py",
     "updates.py",
     "kalman.py",
+    "histories.py",
     "scaling.py",
     "cores.py",
 )

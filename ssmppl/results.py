@@ -12,6 +12,7 @@ import os
 import platform
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -215,6 +216,7 @@ def _provenance() -> dict[str, str]:
     return found | {f"{name}_version": _version(name) for name in ("numpy", "numba", "arviz")}
 
 
+@cache  # read from disk: a list of many data sets has as many results
 def _version(distribution: str) -> str:
     try:
         return version(distribution)

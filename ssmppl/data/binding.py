@@ -9,7 +9,7 @@ Columns that the model does not name are ignored, so that a whole table or the D
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from ssmppl.data.sources import Source, sources
 from ssmppl.data.values import name_of, number, outside
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
+from ssmppl.language.distribution import Support
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.trace import Site, Trace
 
@@ -70,7 +71,11 @@ def bind(
     if data is None and not need_observations:
         data = {}
     named = [*trace.observations, *trace.inputs]
-    return [_bind(trace, s, need_observations, steps) for s in sources(data, named)]
+    once = _Once(
+        {n: site.distribution.support() for n, site in trace.observations.items()},
+        tuple(_needed(trace)),
+    )
+    return [_bind(trace, s, need_observations, steps, once) for s in sources(data, named)]
 
 
 def unread(trace: Trace, data: Any) -> list[str]:
@@ -123,7 +128,15 @@ def bind_inputs(
     return _input_array(trace, values, rows), rows, source.time
 
 
-def _bind(trace: Trace, source: Source, need: bool, steps: int | None) -> Experiment:
+@dataclass(frozen=True)
+class _Once:
+    """What is the same for all data sets: the channels' supports, and what `_needed` gives."""
+
+    supports: dict[str, Support]
+    needed: tuple[tuple[Expr, Site], ...]
+
+
+def _bind(trace: Trace, source: Source, need: bool, steps: int | None, once: _Once) -> Experiment:
     inputs = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
     observed = {}
     for name, site in trace.observations.items():
@@ -139,12 +152,12 @@ def _bind(trace: Trace, source: Source, need: bool, steps: int | None) -> Experi
     partial = {
         name
         for name, site in trace.observations.items()
-        if _check_observation(source, site, observed[name], env)
+        if _check_observation(source, site, observed[name], env, once.supports[name])
     }
     packed = pack(trace.observations.values(), observed).reshape(rows, -1)
     missing = np.isnan(packed)
     if need:
-        _check_needed(trace, source, missing)
+        _check_needed(trace, source, missing, once.needed)
     return Experiment(
         y=np.ascontiguousarray(np.where(missing, 0.0, packed)),
         seen=np.ascontiguousarray(np.where(missing, 0.0, 1.0)),
@@ -218,7 +231,7 @@ def _input_array(trace: Trace, inputs: dict[str, np.ndarray], rows: int) -> np.n
 
 
 def _check_observation(
-    source: Source, site: Site, values: np.ndarray, env: dict[Expr, np.ndarray]
+    source: Source, site: Site, values: np.ndarray, env: dict[Expr, np.ndarray], support: Support
 ) -> bool:
     """Whether some row holds a part of the channel only; an error for values it cannot have."""
     infinite = np.isinf(values)
@@ -229,7 +242,7 @@ def _check_observation(
             fix="write NaN where nothing was measured",
             where=source.place(site.name, index),
         )
-    fault = outside(site.distribution, values, env)
+    fault = outside(site.distribution, values, env, support)
     if fault is not None:
         raise DataError(
             f"the observation {fault.found} (declared at {site.distribution.location})",
@@ -261,9 +274,11 @@ def _needed(trace: Trace) -> Iterator[tuple[Expr, Site]]:
                     yield symbol("observation", *s.data[1:]), site
 
 
-def _check_needed(trace: Trace, source: Source, missing: np.ndarray) -> None:
+def _check_needed(
+    trace: Trace, source: Source, missing: np.ndarray, needed: Iterable[tuple[Expr, Site]]
+) -> None:
     order = {s: k for k, s in enumerate(trace.observation_symbols)}
-    for s, site in _needed(trace):
+    for s, site in needed:
         gaps = missing[:-1, order[s]]
         if gaps.any():
             name, component = s.data[1:]

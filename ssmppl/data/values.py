@@ -13,6 +13,7 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.language.distribution import Support
 from ssmppl.language.distributions import Beta, Distribution, Truncated
 
 Values = Mapping[Expr, np.ndarray]
@@ -150,13 +151,17 @@ def number(value: float) -> str:
     return f"{value:.10g}"
 
 
-def outside(distribution: Distribution, values: np.ndarray, env: Values) -> Fault | None:
+def outside(
+    distribution: Distribution, values: np.ndarray, env: Values, support: Support | None = None
+) -> Fault | None:
     """The first of `values` (T, *shape) that `distribution` gives no density; NaN pass.
+
+    support : that of `distribution`, where the caller has it.
 
     Bounds are numbers, or expressions of the symbols in `env` (each (T,) or scalar); bounds that
     depend on anything else are not looked at. The index of the fault starts with the row.
     """
-    support = distribution.support()
+    support = distribution.support() if support is None else support
     if support.kind == "simplex":
         return _outside_simplex(distribution, values)
     if support.kind == "positive definite":
@@ -203,8 +208,11 @@ def _bound(bounds: np.ndarray, env: Values, rows: int, none: float) -> np.ndarra
     """(rows, *shape) of the bounds that can be computed from `env`, `none` elsewhere."""
     out = np.full((rows, *bounds.shape), none)
     for index in np.ndindex(bounds.shape):
-        if all(s in env for s in symbols_of(bounds[index])):
-            value = evaluate(bounds[index], env)
+        bound: Any = bounds[index]
+        if bound.op == "const":
+            out[(slice(None), *index)] = none if np.isnan(bound.data) else bound.data
+        elif all(s in env for s in symbols_of(bound)):
+            value = evaluate(bound, env)
             out[(slice(None), *index)] = np.where(np.isnan(value), none, value)
     return out
 

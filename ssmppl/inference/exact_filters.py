@@ -125,14 +125,17 @@ def forward_filter(
     levels, root = quantile_levels(quantiles), seed_sequence(seed)
     attrs = {"model": problem.trace.name, "proposal": "forward", "seed": str(root.entropy)}
     datasets = []
-    for e in problem.experiments:
-        found = exact.filter(e, theta)
+    each = exact.filter_each(problem.experiments, theta)
+    predictions = exact.predicted_observations(
+        problem.experiments, theta, [f.predicted for f in each]
+    )
+    for e, found, prediction in zip(problem.experiments, each, predictions, strict=True):
         x, law = exact.values, found.filtered
         mean, square = law @ x, np.einsum("tk,ki,kj->tij", law, x, x)
         run = FilterRun(
             found.log_increments, np.full(e.steps, np.nan), mean,
             square - mean[:, :, None] * mean[:, None, :], exact.quantiles(law, levels),
-            exact.predicted_observations(e, theta, found.predicted),
+            prediction,
             exact.predicted_quantiles(e, theta, found.predicted, levels),
         )  # fmt: skip
         dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")

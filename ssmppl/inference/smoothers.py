@@ -81,23 +81,30 @@ def by_exact_passes(
     model = kalman_model(trace) if isinstance(chosen, KalmanSmoother) else hidden_markov(trace)
     assert not isinstance(model, NotApplicable)
     _check_draws(call, call.trajectories or 0)
-    out = []
-    for i, e in enumerate(call.problem.experiments):
-        if call.trajectories is not None:
-            stream = random_state(call.root, i)
-            paths = model.draw(e, call.theta, stream, call.trajectories)
-            exact = model.log_likelihood([e], call.theta)
-            out.append(Found({"log_likelihood": exact}, paths=paths))
-            continue
-        m = model.smooth(e, call.theta)
+    experiments, theta = call.problem.experiments, call.theta
+    if call.trajectories is not None:
+        streams = [random_state(call.root, i) for i in range(len(experiments))]
+        drawn = model.draw_each(experiments, theta, streams, call.trajectories)
         if isinstance(model, HiddenMarkov):
-            spread = model.quantiles(model.probabilities(e, call.theta), call.levels)
+            values = [float(f.log_increments.sum()) for f in model.filter_each(experiments, theta)]
         else:
+            values = [model.log_likelihood([e], theta) for e in experiments]
+        pairs = zip(drawn, values, strict=True)
+        return [Found({"log_likelihood": v}, paths=paths) for paths, v in pairs]
+    if isinstance(model, HiddenMarkov):
+        smoothed = model.smooth_each(experiments, theta)
+        spreads = [model.quantiles(law, call.levels) for _, law in smoothed]
+        moments = [m for m, _ in smoothed]
+    else:
+        moments = [model.smooth(e, theta) for e in experiments]
+        spreads = []
+        for m in moments:
             sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
-            spread = m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :]
-        moments = m.mean, m.covariance, m.cross, spread
-        out.append(Found({"log_likelihood": m.log_likelihood}, moments=moments))
-    return out
+            spreads.append(m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :])
+    return [
+        Found({"log_likelihood": m.log_likelihood}, moments=(m.mean, m.covariance, m.cross, s))
+        for m, s in zip(moments, spreads, strict=True)
+    ]
 
 
 def _filter(call: Call, method: FFBSi | FixedLag, integrate: bool = False) -> FilterSettings:

@@ -123,8 +123,8 @@ def draw_paths(
     steps: ParameterSteps, model: ExactModel, theta: np.ndarray, stream: np.ndarray
 ) -> list[np.ndarray]:
     """Independent trajectories (T, D), one per experiment, from p(x_{1:T} | y_{1:T}, theta)."""
-    paths = [
-        np.ascontiguousarray(model.draw(e, theta, stream, 1)[0]) for e in steps.problem.experiments
-    ]
+    experiments = steps.problem.experiments
+    drawn = model.draw_each(experiments, theta, [stream] * len(experiments))
+    paths = [np.ascontiguousarray(d[0]) for d in drawn]
     log_joint(steps, theta, paths)  # sets deterministic components to the last digit
     return paths

@@ -83,12 +83,12 @@ class ExactLikelihood:
         return Run(value, score=slope) if value > -np.inf else None
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+        if not self.states:
+            return {}
         model = needed_model(self.problem, "MetropolisHastings")
-        return {
-            f"path_{i}": model.draw(e, point.theta, stream, 1)[0]
-            for i, e in enumerate(self.problem.experiments)
-            if self.states
-        }
+        experiments = self.problem.experiments
+        drawn = model.draw_each(experiments, point.theta, [stream] * len(experiments))
+        return {f"path_{i}": d[0] for i, d in enumerate(drawn)}
 
 
 def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:

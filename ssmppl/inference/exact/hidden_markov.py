@@ -1,36 +1,31 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
-Laws may depend on parameters, inputs, time and observations before. The densities are evaluated by
-the interpreter, over all values and rows at once, and handed to the compiled passes of
-`codegen/kernels/hidden_markov.py`.
+The laws (`finite_laws.py`) of data sets of one shape (`histories.py`) are handed all at once to the
+compiled passes of `codegen/kernels/hidden_markov.py`.
 """
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from ssmppl.analysis.channels import channels
-from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kits import predictive
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.expressions.calculus import differentiate
-from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, constant
-from ssmppl.inference.exact.kalman_matrices import values_of
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.exact.finite_laws import FiniteLaws
+from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.mixtures import inverted
-from ssmppl.inference.exact.scored import Scored
-from ssmppl.language.trace import Trace, previous, seen
-
-ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
+from ssmppl.language.trace import Trace
 
 
 @dataclass(frozen=True)
@@ -39,6 +34,8 @@ class Filtered:
 
     log_increments : (T,) log p(y_t | y_{1:t-1}). predicted, filtered : (T, K) laws of x_t given
     y_{1:t-1} and y_{1:t}. move : (T or 1, K, K) as of the kernels.
+
+    Of S histories at once every array has one axis more, the first.
     """
 
     log_increments: np.ndarray
@@ -46,27 +43,25 @@ class Filtered:
     filtered: np.ndarray
     move: np.ndarray
 
+    def of(self, s: int) -> Filtered:
+        """What it tells of history s."""
+        move = self.move[s if len(self.move) > 1 else 0]
+        return Filtered(self.log_increments[s], self.predicted[s], self.filtered[s], move)
+
 
 @dataclass(frozen=True)
-class HiddenMarkov(Scored):
+class HiddenMarkov(FiniteLaws):
     """A traced model as one of finitely many values (K, D), and its exact passes."""
-
-    form: FiniteStates
-    _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
-
-    @property
-    def values(self) -> np.ndarray:
-        return self.form.values
 
     # -- likelihood and laws
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
         """log p(y | theta), summed over experiments; -inf where it does not exist at theta."""
         total = 0.0
-        for e in experiments:
-            found = self._forward(e, theta)
-            if isinstance(found, int):
+        for h in self.histories_of(experiments):
+            found, stopped = self._forward(h, theta)
+            if np.any(stopped >= 0):
                 return -np.inf
-            total += float(found.log_increments.sum())
+            total += float(h.weights @ found.log_increments.sum(axis=1))
         return total
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> Filtered:
@@ -76,29 +71,35 @@ class HiddenMarkov(Scored):
         ------
         SamplingError : no value is possible at some row; names it and the parameters.
         """
-        found = self._forward(experiment, theta)
-        if isinstance(found, int):
-            site = next(iter(self.trace.observations.values()))
-            raise SamplingError(
-                f"no value of the states is possible at t={found + 1}; parameters: "
-                f"{spelled(self.trace, theta)}",
-                fix="check this row of the data, and whether the laws leave each value a chance",
-                where=site.distribution.location,
-            )
-        return found
+        return self.filter_each([experiment], theta)[0]
 
-    def probabilities(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
-        """(T, K) of each combination of values given all data."""
-        return self._smoothed(self.filter(experiment, theta), pairs=False)[0]
-
-    def laws(self, experiment: Experiment, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(T, K) of x_t, and (T, K, K) of (x_{t-1}, x_t), row 0 zero, given all data.
+    def filter_each(self, experiments: Sequence[Experiment], theta: np.ndarray) -> list[Filtered]:
+        """As `filter`, of each experiment.
 
         Raises
         ------
-        SamplingError : as of `filter`.
+        SamplingError : as of `filter`; names the data set too where there are several.
         """
-        return self._smoothed(self.filter(experiment, theta), pairs=True)
+        passes = self._passes(experiments, theta)
+        return _in_order([(h, [f.of(s) for s in range(h.size)]) for h, f in passes])
+
+    def probabilities(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
+        """(T, K) of each combination of values given all data."""
+        _, found = next(self._passes([experiment], theta))
+        return self._smoothed(found, pairs=False)[0][0]
+
+    def laws(
+        self, experiments: Sequence[Experiment], theta: np.ndarray
+    ) -> list[tuple[Histories, np.ndarray, np.ndarray]]:
+        """Of all experiments, by histories: (S, T, K) of x_t, and (S, T, K, K) of (x_{t-1}, x_t),
+        row 0 zero, given all data.
+
+        Raises
+        ------
+        SamplingError : as of `filter_each`.
+        """
+        passes = self._passes(experiments, theta)
+        return [(h, *self._smoothed(found, pairs=True)) for h, found in passes]
 
     def smooth(self, experiment: Experiment, theta: np.ndarray) -> SmoothedMoments:
         """Moments of the states given all data.
@@ -107,8 +108,28 @@ class HiddenMarkov(Scored):
         ------
         SamplingError : as of `filter`.
         """
-        found = self.filter(experiment, theta)
-        law, pairs = self._smoothed(found, pairs=True)
+        return self.smooth_each([experiment], theta)[0][0]
+
+    def smooth_each(
+        self, experiments: Sequence[Experiment], theta: np.ndarray
+    ) -> list[tuple[SmoothedMoments, np.ndarray]]:
+        """As `smooth`, of each experiment; and the laws (T, K) of the combinations of values.
+
+        Raises
+        ------
+        SamplingError : as of `filter_each`.
+        """
+        out = []
+        for h, found in self._passes(experiments, theta):
+            law, pairs = self._smoothed(found, pairs=True)
+            value = found.log_increments.sum(axis=1)
+            each = [
+                (self._moments(law[s], pairs[s], float(value[s])), law[s]) for s in range(h.size)
+            ]
+            out.append((h, each))
+        return _in_order(out)
+
+    def _moments(self, law: np.ndarray, pairs: np.ndarray, value: float) -> SmoothedMoments:
         x = self.values
         mean = law @ x
         square = np.einsum("tk,ki,kj->tij", law, x, x)
@@ -117,8 +138,7 @@ class HiddenMarkov(Scored):
         cross = product - mean[:, :, None] * before[:, None, :]
         cross[0] = 0.0
         return SmoothedMoments(
-            mean, square - mean[:, :, None] * mean[:, None, :], cross,
-            float(found.log_increments.sum()),
+            mean, square - mean[:, :, None] * mean[:, None, :], cross, value
         )  # fmt: skip
 
     def draw(
@@ -130,12 +150,31 @@ class HiddenMarkov(Scored):
         ------
         SamplingError : as of `filter`.
         """
-        found = self.filter(experiment, theta)
-        uniforms = np.empty(draws * experiment.steps)
-        fill_uniform(stream, uniforms)
-        paths = np.empty((draws, experiment.steps), dtype=np.int64)
-        exact_entry("finite_draw")(found.move, found.filtered, uniforms.reshape(paths.shape), paths)
-        return self.values[paths]
+        return self.draw_each([experiment], theta, [stream], draws)[0]
+
+    def draw_each(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, streams: Sequence[np.ndarray],
+        draws: int = 1,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """As `draw`, of each experiment with its own stream, or one and the same.
+
+        Raises
+        ------
+        SamplingError : as of `filter_each`.
+        """
+        uniforms = []
+        for e, stream in zip(experiments, streams, strict=True):
+            uniforms.append(np.empty(draws * e.steps))
+            fill_uniform(stream, uniforms[-1])
+        out: list[np.ndarray] = [np.empty(0)] * len(experiments)
+        for h, found in self._passes(experiments, theta):
+            own = np.concatenate([uniforms[i] for i in h.members]).reshape(-1, h.steps)
+            paths, which = np.empty(own.shape, dtype=np.int64), np.repeat(h.which, draws)
+            exact_entry("finite_draw")(found.move, found.filtered, which, own, paths)
+            drawn = self.values[paths.reshape(-1, draws, h.steps)]
+            for i, x in zip(h.members, drawn, strict=True):
+                out[i] = x
+        return out
 
     def quantiles(self, law: np.ndarray, levels: np.ndarray) -> np.ndarray:
         """(T, P, D) smallest values of each component whose distribution function, by the laws
@@ -149,22 +188,26 @@ class HiddenMarkov(Scored):
         return out
 
     def predicted_observations(
-        self, e: Experiment, theta: np.ndarray, law: np.ndarray
-    ) -> np.ndarray:
-        """(T, 4, K): mean, variance, P(Y <= y) and P(Y < y) of each channel, by the laws (T, K)
-        of the combinations that are predicted."""
-        out = []
-        for site in self.trace.observations.values():
-            for figures in predictive(site):
-                mean, variance, below, strictly = (
-                    self._over_values(f, e, theta, "observation") for f in figures
-                )
-                middle = np.sum(law * mean, axis=1)
-                square = np.sum(law * (variance + mean**2), axis=1)
-                shares = [np.sum(law * np.broadcast_to(b, law.shape), axis=1)
-                          for b in (below, strictly)]  # fmt: skip
-                out.append(np.stack([middle, square - middle**2, *shares], axis=1))
-        return np.stack(out, axis=2)
+        self, experiments: Sequence[Experiment], theta: np.ndarray, laws: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """(T, 4, K) of each experiment: mean, variance, P(Y <= y) and P(Y < y) of each channel, by
+        the laws (T, K) of the combinations that are predicted."""
+        each = []
+        for h in self.histories_of(experiments):
+            first = h.members[np.searchsorted(h.which, np.arange(h.size))]
+            law = np.stack([laws[i] for i in first])
+            out = []
+            for site in self.trace.observations.values():
+                for figures in predictive(site):
+                    mean, variance, below, strictly = (
+                        self.over_values(f, h, theta, "observation") for f in figures
+                    )
+                    middle = np.sum(law * mean, axis=2)
+                    square = np.sum(law * (variance + mean**2), axis=2)
+                    shares = [np.sum(law * b, axis=2) for b in (below, strictly)]
+                    out.append(np.stack([middle, square - middle**2, *shares], axis=2))
+            each.append((h, list(np.stack(out, axis=3))))
+        return _in_order(each)
 
     def predicted_quantiles(
         self, e: Experiment, theta: np.ndarray, law: np.ndarray, levels: np.ndarray
@@ -182,15 +225,20 @@ class HiddenMarkov(Scored):
                 def below(values: np.ndarray, k: int = k, f: Expr = channel.below) -> np.ndarray:
                     y = e.y.copy()
                     y[:, k] = values
-                    own = self._over_values(f, replace(e, y=y), theta, "observation")
+                    own = self._observed(f, replace(e, y=y), theta)
                     return np.sum(law * np.where(law > 0.0, own, 0.0), axis=1)
 
                 for j, level in enumerate(levels):
-                    own = self._over_values(channel.quantile(level), e, theta, "observation")
+                    own = self._observed(channel.quantile(level), e, theta)
                     low = np.min(np.where(law > 0.0, own, np.inf), axis=1)
                     high = np.max(np.where(law > 0.0, own, -np.inf), axis=1)
                     out[:, j, k] = inverted(below, level, low, high, channel.whole)
         return out
+
+    def _observed(self, expression: Expr, e: Experiment, theta: np.ndarray) -> np.ndarray:
+        """(T or 1, K) an expression of the observation's law, of one experiment."""
+        (h,) = self.histories_of([e])
+        return self.over_values(expression, h, theta, "observation")[0]
 
     # -- derivatives
     def score(
@@ -205,101 +253,69 @@ class HiddenMarkov(Scored):
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
         symbols = [s for s, w in zip(self.trace.parameter_symbols, wanted, strict=True) if w]
         total, gradient = 0.0, np.zeros(len(theta))
-        for e in experiments:
-            found = self._forward(e, theta)
-            if isinstance(found, int):
+        for h in self.histories_of(experiments):
+            found, stopped = self._forward(h, theta)
+            if np.any(stopped >= 0):
                 return -np.inf, np.where(wanted, np.nan, 0.0)
             law, pairs = self._smoothed(found, pairs=True)
-            total += float(found.log_increments.sum())
+            total += float(h.weights @ found.log_increments.sum(axis=1))
             for role in ("initial", "transition", "observation"):
                 own = pairs if role == "transition" else law
-                slopes = [self.density(role, e, s) for s in symbols]
-                gradient[wanted] += self.expected(e, theta, role, slopes, own)
+                slopes = [self.density(role, h, s) for s in symbols]
+                gradient[wanted] += self.expected(h, theta, role, slopes, own)
         return total, gradient
 
     # -- the pieces
-    def _forward(self, e: Experiment, theta: np.ndarray) -> Filtered | int:
-        """The forward pass, or the row at which it came to an end."""
-        size = len(self.values)
-        start = np.exp(self._over_values(self.density("initial", e), e, theta, "initial")[0])
-        move = np.exp(self._over_values(self.density("transition", e), e, theta, "transition"))
-        log_g = self._over_values(self.density("observation", e), e, theta, "observation")
-        log_g = np.ascontiguousarray(np.broadcast_to(log_g, (e.steps, size)))
-        out = Filtered(
-            np.empty(e.steps), np.empty((e.steps, size)), np.empty((e.steps, size)), move
+    def _forward(self, h: Histories, theta: np.ndarray) -> tuple[Filtered, np.ndarray]:
+        """The forward pass, and (S,) the row at which it came to an end, -1 if at none."""
+        shape = h.size, h.steps, len(self.values)
+        start = np.exp(self.over_values(self.density("initial", h), h, theta, "initial")[:, 0])
+        move = np.exp(self.over_values(self.density("transition", h), h, theta, "transition"))
+        log_g = self.over_values(self.density("observation", h), h, theta, "observation")
+        log_g = np.ascontiguousarray(np.broadcast_to(log_g, shape))
+        out = Filtered(np.empty(shape[:2]), np.empty(shape), np.empty(shape), move)
+        stopped = np.empty(h.size, dtype=np.int64)
+        exact_entry("finite_forward")(
+            start, move, log_g, out.log_increments, out.predicted, out.filtered, stopped
         )
-        stopped = exact_entry("finite_forward")(
-            start, move, log_g, out.log_increments, out.predicted, out.filtered
-        )
-        return out if stopped < 0 else int(stopped)
+        return out, stopped
+
+    def _passes(
+        self, experiments: Sequence[Experiment], theta: np.ndarray
+    ) -> Iterator[tuple[Histories, Filtered]]:
+        """The forward passes; an error where one comes to an end."""
+        for h in self.histories_of(experiments):
+            found, stopped = self._forward(h, theta)
+            ends = stopped[h.which]
+            if np.any(ends >= 0):
+                i, t = min(zip(h.members[ends >= 0], ends[ends >= 0], strict=True))
+                of = f" of data set {i + 1}" if len(experiments) > 1 else ""
+                site = next(iter(self.trace.observations.values()))
+                raise SamplingError(
+                    f"no value of the states is possible at t={t + 1}{of}; parameters: "
+                    f"{spelled(self.trace, theta)}",
+                    fix="check this row of the data, and whether the laws leave each value a "
+                    "chance",
+                    where=site.distribution.location,
+                )
+            yield h, found
 
     def _smoothed(self, found: Filtered, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
-        steps, size = found.filtered.shape
-        law, both = np.empty((steps, size)), np.empty((steps if pairs else 0, size, size))
+        shape = found.filtered.shape
+        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
         exact_entry("finite_backward")(found.move, found.predicted, found.filtered, law, both)
         return law, both
 
-    def density(self, role: str, e: Experiment, by: Expr | None = None) -> Expr:
-        """The log density of a role, or its derivative by a parameter."""
-        missing = Missing(partial=e.partial)
-        key = f"{role} {sorted(e.partial)}"
-        if key not in self._densities:
-            total = constant(0.0)
-            for t in terms(self.trace, role, missing):
-                total = total + t.guarded()
-            self._densities[key] = total
-        if by is None:
-            return self._densities[key]
-        slope = f"{key} by {by!r}"
-        if slope not in self._densities:
-            self._densities[slope] = differentiate([self._densities[key]], by)[0]
-        return self._densities[slope]
 
-    def expected(
-        self, e: Experiment, theta: np.ndarray, role: str, expressions: Sequence[Expr],
-        law: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """Sums over rows and values of each expression, weighed by a law of `laws`: of pairs for
-        "transition". What has no weight does not count, be it infinite."""
-        law = law[:1] if role == "initial" else law
-        out = np.empty(len(expressions))
-        for k, expression in enumerate(expressions):
-            values = self._over_values(expression, e, theta, role)
-            out[k] = np.sum(law * np.where(law > 0.0, values, 0.0))
-        return out
+T = TypeVar("T")
 
-    def _over_values(
-        self, expression: Expr, e: Experiment, theta: np.ndarray, role: str
-    ) -> np.ndarray:
-        """(R, K), or (R, K, K) over x_{t-1} and x_t for "transition"; R is T, or 1 where it is the
-        same in all rows (and for "initial")."""
-        given = values_of(self.trace, e, theta)
-        rows = {s: v for s, v in given.items() if np.ndim(v)}
-        for s, y, known in zip(self.trace.observation_symbols, e.y.T, e.seen.T, strict=True):
-            rows[s], rows[seen(s)] = y, known
-        numbers = {s: v for s, v in given.items() if not np.ndim(v)}
-        size, pair = len(self.values), role == "transition"
-        states: dict[Expr, np.ndarray] = {}
-        for s, column in zip(self.trace.state_symbols, self.values.T, strict=True):
-            states[s] = column[None, None, :] if pair else column[None, :]
-            if pair:
-                states[previous(s)] = column[None, :, None]
-        shape = (size, size) if pair else (size,)
 
-        def over(first: int, last: int) -> np.ndarray:
-            own = {s: v[first:last].reshape(-1, *(1,) * len(shape)) for s, v in rows.items()}
-            found = np.asarray(evaluate(expression, {**numbers, **own, **states}), dtype=float)
-            found = found.reshape((1,) * (1 + len(shape) - found.ndim) + found.shape)
-            return np.broadcast_to(found, (found.shape[0], *shape))
-
-        if role == "initial":
-            return np.array(over(0, 1))
-        step = max(2, ENTRIES // int(np.prod(shape)))
-        first = over(0, min(step, e.steps))
-        if first.shape[0] == 1:
-            return np.array(first)
-        parts = [over(a, min(a + step, e.steps)) for a in range(step, e.steps, step)]
-        return np.ascontiguousarray(np.concatenate([first, *parts]))
+def _in_order(each: Sequence[tuple[Histories, Sequence[T]]]) -> list[T]:
+    """What is known of each history, in the order of the data sets."""
+    places = {
+        int(i): found[s] for h, found in each for i, s in zip(h.members, h.which, strict=True)
+    }
+    return [places[i] for i in range(len(places))]
 
 
 Densities = dict[str, Expr]

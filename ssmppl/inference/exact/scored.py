@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,20 @@ class Scored(ABC):
     """An exact model with the gradient of its log-likelihood."""
 
     trace: Trace
+
+    @abstractmethod
+    def draw(
+        self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
+    ) -> np.ndarray:
+        """Independent draws of x_{1:T} given y_{1:T}, (draws, T, D)."""
+
+    def draw_each(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, streams: Sequence[np.ndarray],
+        draws: int = 1,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """As `draw`, of each experiment with its own stream, or one and the same."""
+        pairs = zip(experiments, streams, strict=True)
+        return [self.draw(e, theta, stream, draws) for e, stream in pairs]
 
     @abstractmethod
     def score(

@@ -104,7 +104,7 @@ class Setup:
 
     def exact_objective(self, z: np.ndarray) -> float:
         """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""
-        value = self._exact(z)
+        value = self.exact_at(z)
         if self.with_prior and value > -np.inf:
             value += self.chart.at(z).log_prior
         return value

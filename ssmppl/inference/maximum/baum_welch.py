@@ -12,11 +12,11 @@ import numpy as np
 from ssmppl.analysis.density import terms
 from ssmppl.analysis.expectation import IN_TIME
 from ssmppl.analysis.mstep import MStep
-from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.calculus import gradient as gradient_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
+from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.expected_climb import climbed
 from ssmppl.inference.maximum.m_step import maximiser
@@ -33,30 +33,30 @@ class FiniteSteps:
         ]
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
-        laws = [(e, *self.model.laws(e, theta)) for e in self.setup.problem.experiments]
+        laws = self.model.laws(self.setup.problem.experiments, theta)
         if not isinstance(self.step, MStep):
             return climbed(self.setup, theta, lambda at: self._density(laws, at), True)
         total = np.array(self.step.prior(theta.tolist()), dtype=float)
         for role, summands in self.step.update.coefficients.items():
             if role in IN_TIME:
-                for e, law, pairs in laws:
+                for h, law, pairs in laws:
                     own = pairs if role == "transition" else law
-                    total += self.model.expected(e, theta, role, summands, own)
+                    total += self.model.expected(h, theta, role, summands, own)
         return self.step.maximise(total, theta)
 
     def _density(
-        self, laws: list[tuple[Experiment, np.ndarray, np.ndarray]], at: np.ndarray
+        self, laws: list[tuple[Histories, np.ndarray, np.ndarray]], at: np.ndarray
     ) -> tuple[float, np.ndarray]:
         """(Q, its derivatives) at theta' of the laws of the states at another theta."""
         trace = self.setup.problem.trace
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         total, gradient = 0.0, np.zeros(len(place))
-        for e, law, pairs in laws:
+        for h, law, pairs in laws:
             for role in IN_TIME:
                 own = pairs if role == "transition" else law
-                both = [self.model.density(role, e),
-                        *(self.model.density(role, e, s) for s in self.free)]  # fmt: skip
-                found = self.model.expected(e, at, role, both, own)
+                both = [self.model.density(role, h),
+                        *(self.model.density(role, h, s) for s in self.free)]  # fmt: skip
+                found = self.model.expected(h, at, role, both, own)
                 total += found[0]
                 gradient[[place[s] for s in self.free]] += found[1:]
         if self.setup.with_prior:
