@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import Beta, Distribution, Truncated
+from ssmppl.language.distributions import Beta, Distribution, Mixture, Truncated
 
 Values = Mapping[Expr, np.ndarray]
 
@@ -169,7 +169,7 @@ def outside(distribution: Distribution, values: np.ndarray, env: Values) -> Faul
     with np.errstate(invalid="ignore"):
         bad = (values < lower) | (values > upper)
         if not closed:
-            bad |= (values == lower) | ((values == upper) & isinstance(distribution, Beta))
+            bad |= (values == lower) | ((values == upper) & _open_above(distribution))
         if support.kind == "integers":
             bad |= np.isfinite(values) & (values != np.floor(values))
     if not bad.any():
@@ -189,6 +189,13 @@ def outside(distribution: Distribution, values: np.ndarray, env: Values) -> Faul
         f"{number(values[index])} is outside the support of {name_of(distribution)}, {bounds}",
         f"a value in {bounds}" if support.kind == "interval" else f"one of {bounds}",
     )
+
+
+def _open_above(distribution: Distribution) -> bool:
+    """Whether an upper bound that is a number has no density: of Beta, alone or in a mixture."""
+    if isinstance(distribution, Mixture):
+        return any(map(_open_above, distribution.components))
+    return isinstance(distribution, Beta)
 
 
 def name_of(distribution: Distribution) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import Binomial, Distribution
+from ssmppl.language.distributions import BetaBinomial, Binomial, Distribution, Truncated
 
 __all__ = ["DOMAIN", "out_of_range"]
 
@@ -21,17 +21,42 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
     values : of the symbols, as far as they are known. An argument whose value they tell is named
         with it, where it lies outside; else the arguments that might are named with their ranges.
     """
-    law = getattr(law, "base", law)  # of a truncated law
-    name, might = type(law).__name__, []
+    might: list[tuple[str, str]] = []
+    for inner in _laws_in(law):
+        found = _of_one(inner, values, might)
+        if found is not None:
+            return found
+    return might[0] if might else None
+
+
+def _laws_in(law: Distribution) -> list[Distribution]:
+    """The law, and those that it is made of: of a truncated one the base alone."""
+    base = getattr(law, "base", None)
+    inside = [*getattr(law, "components", ()), *([] if base is None else [base])]
+    own = [] if isinstance(law, Truncated) else [law]
+    return own + [one for part in inside for one in _laws_in(part)]
+
+
+def _of_one(
+    law: Distribution, values: Mapping[Expr, float], might: list[tuple[str, str]]
+) -> tuple[str, str] | None:
+    """As `out_of_range`, without the laws inside; `might` gets what may be at fault."""
+    name = type(law).__name__
     for argument, (low, high, strict) in law.ranges.items():
-        called = argument.rstrip("_")
+        called = argument.rstrip("_").replace("weight_", "weight ")
         brackets = "()" if strict else "[]"
         allowed = f"{brackets[0]}{low:g}, {high:g}{brackets[1] if np.isfinite(high) else ')'}"
         for e in law.parameters[argument].ravel():
             needed = symbols_of(e)
             if not needed:
                 continue
-            fix = _fix(called, e, low, high, count=isinstance(law, Binomial) and called == "n")
+            fix = _fix(
+                called,
+                e,
+                low,
+                high,
+                count=isinstance(law, (Binomial, BetaBinomial)) and called == "n",
+            )
             if needed <= set(values):
                 value = float(evaluate(e, values))
                 if np.isnan(value):
@@ -44,7 +69,7 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
             else:
                 demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
                 might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
-    return might[0] if might else None
+    return None
 
 
 def _fix(called: str, e: Expr, low: float, high: float, count: bool = False) -> str:

@@ -7,6 +7,7 @@ generated code. A sampler is an expression over the "random" nodes of `draws.py`
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -156,6 +157,19 @@ class Distribution:
 
         inside = ", ".join(f"{_plain_name(n)}={text(a)}" for n, a in self.parameters.items())
         return f"{type(self).__name__}({inside})"
+
+    def rebuilt(self, parameters: Mapping[str, Any]) -> Distribution:
+        """The law of this family with these for its own `parameters`, at its place in the file."""
+        values = {**self.parameters, **parameters}
+        return self._at_place(type(self)(**{n.rstrip("_"): array(v) for n, v in values.items()}))  # type: ignore[call-arg]
+
+    def _at_place(self, new: Distribution) -> Distribution:
+        new.location = self.location
+        return new
+
+    def element(self, index: tuple[int, ...]) -> Distribution:
+        """The law of one element of an elementwise law."""
+        return self.rebuilt({n: a[index] for n, a in self.parameters.items()})
 
     # -- to be defined by each distribution
     def log_densities(self, value: ExprArray) -> ExprArray:
