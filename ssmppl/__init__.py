@@ -75,6 +75,7 @@ from ssmppl.language.distributions import (
     Wishart,
     ZeroInflated,
 )
+from ssmppl.language.elsewhere import advice
 from ssmppl.language.model import Model
 from ssmppl.language.primitive import primitive
 from ssmppl.tables import summary
@@ -202,7 +203,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name != "plots" and name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        told = "" if name.startswith("__") else advice(name, __all__)
+        raise AttributeError(
+            f"module {__name__!r} has no attribute {name!r}" + (f": {told}" if told else "")
+        )
     plots = importlib.import_module(f"{__name__}.plots")  # a report has to know who draws it
     if name == "plots":
         return plots

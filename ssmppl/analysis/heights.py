@@ -141,8 +141,8 @@ def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApp
 
 
 def _zero_inflated(site: Site, d: laws.ZeroInflated, prev: Sequence[Expr]) -> Expr | NotApplicable:
-    """That of the law inside, and at most 1 at zero; a share that depends on the state is at most 1
-    there, and what it leaves is elsewhere."""
+    """At most 1 at zero; elsewhere that of the law inside, times 1 - p where p is free of the
+    state."""
     total = constant(0.0)
     for i in np.ndindex(site.shape):
         part = _height(_element(site, d.base, i), prev)

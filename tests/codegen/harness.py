@@ -194,7 +194,7 @@ def noise_of(roots, rng):
 
 
 def stand_in(kind, args):
-    """A number in place of a gamma, Poisson, von Mises or binomial draw, a function of its parameters."""
+    """A number in place of a gamma, Poisson, von Mises or binomial draw, from its parameters."""
     if kind == "gamma":
         return 0.7 * args[0] + 0.1
     if kind == "poisson":
