@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import BetaBinomial, Binomial, Distribution, Truncated
+from ssmppl.language.distributions import BetaBinomial, Binomial, Distribution, Mixture, Truncated
+from ssmppl.language.mixtures import SUM_ROUNDING
 
 __all__ = ["DOMAIN", "out_of_range"]
 
+_WEIGHTS = (
+    "write weights that are shares of 1 whatever the state, such as [1 - p, p] with "
+    "p = 1 / (1 + np.exp(-z)), or w / np.sum(w) of positive w"
+)
 DOMAIN = "some parameter, state or input leads outside the domain of an operation"
 
 
@@ -43,7 +49,7 @@ def _of_one(
     """As `out_of_range`, without the laws inside; `might` gets what may be at fault."""
     name = type(law).__name__
     for argument, (low, high, strict) in law.ranges.items():
-        called = argument.rstrip("_").replace("weight_", "weight ")
+        called = re.sub(r"^weight_(\d+)$", r"weights[\1]", argument.rstrip("_"))
         brackets = "()" if strict else "[]"
         allowed = f"{brackets[0]}{low:g}, {high:g}{brackets[1] if np.isfinite(high) else ')'}"
         for e in law.parameters[argument].ravel():
@@ -69,6 +75,18 @@ def _of_one(
             else:
                 demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
                 might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
+    return _sums(law, values) if isinstance(law, Mixture) else None
+
+
+def _sums(law: Mixture, values: Mapping[Expr, float]) -> tuple[str, str] | None:
+    """Weights that do not sum to 1, where their symbols have values."""
+    for index in np.ndindex(law.shape):
+        weights = [w[index] for w in law.weights]
+        if symbols_of(weights) and symbols_of(weights) <= set(values):
+            total = float(np.sum(evaluate(weights, values)))
+            if not abs(total - 1.0) <= SUM_ROUNDING:
+                text = ", ".join(map(repr, weights))
+                return f"the weights of Mixture, [{text}], sum to {total:.6g} there", _WEIGHTS
     return None
 
 
@@ -79,6 +97,8 @@ def _fix(called: str, e: Expr, low: float, high: float, count: bool = False) -> 
             f"write a {called} that is never below 0, np.maximum({e!r}, 0); where several flows "
             "empty one compartment, draw each out of what the others have left"
         )
+    if called.startswith("weights["):
+        return _WEIGHTS
     if (low, high) == (0.0, 1.0):
         logistic = f"1 / (1 + np.exp(-({e!r})))"
         return f"write a {called} between 0 and 1 whatever the state, such as {logistic}"

@@ -1,4 +1,4 @@
-"""Names that do not exist: what is written for them, and that asking whether they do still works."""
+"""Names that do not exist: what is written for them; asking whether they do still works."""
 
 import re
 
@@ -31,7 +31,7 @@ def test_a_name_that_is_not_there(name):
 
 
 def test_nothing_near_is_left_out():
-    with pytest.raises(AttributeError, match="no attribute 'qqqq'$"):
+    with pytest.raises(AttributeError, match=r"no attribute 'qqqq'$"):
         ssm.qqqq  # noqa: B018
     assert advice("qqqq", ssm.__all__) == ""
 

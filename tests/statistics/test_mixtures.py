@@ -193,7 +193,7 @@ def test_posterior(name, method):
 
 
 def test_what_is_explained():
-    """Slices for what is inside of a mixture, conjugate draws for what is not; nothing is Gaussian."""
+    """Slices for what is inside of a mixture; nothing is linear and Gaussian."""
     sections = dict(ssm.explain(outliers).sections())
     parameters = dict(sections["Parameters given the states"])
     assert "slice step" in parameters["p"]
