@@ -46,8 +46,8 @@ def initial(p0, p1, p2):
     share = 0.5 * (1 / (1 + np.exp(-(np.log(p0)))))
     first = (np.where(p0 > -0.558, p0, -0.558)) / (np.where(p2 > p1, p2, p1))
     mean = np.stack([first, (np.sin(0.909)) ** 3, np.arctan(np.maximum(p1, p0))])
-    return {'x0': ssm.Binomial(6, p0), 'x1': ssm.Categorical(np.stack([share, share, 1 - 2 * share])),
-            'x2': ssm.Normal(mean, sd=1.95)}
+    p = np.stack([share, share, 1 - 2 * share])
+    return {'x0': ssm.Binomial(6, p0), 'x1': ssm.Categorical(p), 'x2': ssm.Normal(mean, sd=1.95)}
 
 
 @model.transition

@@ -1,12 +1,10 @@
 """Mixture and ZeroInflated: density, moments, tails, samplers, ranges, and what is refused."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
 import scipy.stats as st
-from scipy.integrate import quad
 from scipy.special import logsumexp
 
 import ssmppl.language.distributions as D
@@ -134,11 +132,12 @@ def test_distribution_function_moments_and_sampler(name):
     else:
         edges = [-200.0, *np.linspace(-20.0, 40.0, 25), *cuts, 200.0, 3000.0]
         edges = sorted(set(edges))
+        nodes, weights = np.polynomial.legendre.leggauss(80)
+        half = 0.5 * np.diff(edges)[:, None]
+        v = (0.5 * (np.array(edges[1:]) + edges[:-1])[:, None] + half * nodes).ravel()
+        mass = (half * weights).ravel() * np.exp(at(law.log_density(X), v))
         for j, expected in enumerate([1.0, mean, variance + mean**2]):
-            total = sum(
-                quad(lambda v, j=j: v**j * math.exp(at(law.log_density(X), [v])[0]), a, b)[0]
-                for a, b in itertools.pairwise(edges)
-            )
+            total = mass @ v**j
             # a Student's t with 5 degrees has lost moments of 1e-5 beyond 200
             assert total == pytest.approx(expected, rel=2e-4 if name == "three" else 1e-7)
     drawn = draws_of(law, 40_000, 3)
