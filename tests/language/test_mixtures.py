@@ -163,13 +163,15 @@ def test_elements_of_an_array_choose_by_themselves():
     """Also with scalar components, and where they need unlike numbers of draws."""
     law = D.Mixture(
         [0.5, 0.5],
-        [D.StudentT(3, np.array([0.0, 0.0, 0.0]), scale=1.0), D.Normal(100.0, sd=1.0)],
+        [D.StudentT(3, np.array([0.0, 4.0, -7.0]), scale=1.0), D.Normal(100.0, sd=1.0)],
     )
     x = draws_of(law, 20_000, 4)
     assert x.shape == (3, 20_000)
     chosen = x > 50
     for i in range(3):
         assert st.binomtest(int(chosen[i].sum()), 20_000, 0.5).pvalue > LEVEL
+        assert st.kstest(x[i, ~chosen[i]], st.t(3, [0.0, 4.0, -7.0][i]).cdf).pvalue > LEVEL
+        assert st.kstest(x[i, chosen[i]], st.norm(100.0).cdf).pvalue > LEVEL
         for j in range(i):
             # of those that chose alike, the values are independent too
             for own in (chosen[i] & chosen[j], ~chosen[i] & ~chosen[j], chosen[i] & ~chosen[j]):
@@ -316,6 +318,14 @@ def test_no_density_where_a_parameter_is_out_of_range(name):
         found = evaluate(law.log_density(X), {X: values, **inside, changed: v})
         assert not np.isfinite(found).any()
         assert not bool(evaluate(allowed[()], {**inside, changed: v}))
+
+
+def test_the_formula_by_itself_has_no_number_there():
+    """As slice steps take it, without the support: counts above zero are no exception."""
+    law = D.ZeroInflated(D.Poisson(2.0), P)
+    for v in (-0.1, 1.1):
+        for count in (0.0, 3.0):
+            assert math.isnan(evaluate(law.log_density(count, guard=False), {P: v}))
 
 
 REFUSED = {
