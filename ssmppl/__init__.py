@@ -47,6 +47,7 @@ from ssmppl.language.declaring import distribution
 from ssmppl.language.distributions import (
     Bernoulli,
     Beta,
+    BetaBinomial,
     Binomial,
     Categorical,
     Cauchy,
@@ -62,6 +63,7 @@ from ssmppl.language.distributions import (
     InverseWishart,
     Laplace,
     LogNormal,
+    Mixture,
     MvNormal,
     NegativeBinomial,
     Normal,
@@ -69,8 +71,12 @@ from ssmppl.language.distributions import (
     StudentT,
     Truncated,
     Uniform,
+    VonMises,
+    Weibull,
     Wishart,
+    ZeroInflated,
 )
+from ssmppl.language.elsewhere import advice
 from ssmppl.language.model import Model
 from ssmppl.language.primitive import primitive
 from ssmppl.tables import summary
@@ -119,6 +125,7 @@ __all__ = [
     "ArgumentError",
     "Bernoulli",
     "Beta",
+    "BetaBinomial",
     "Binomial",
     "Categorical",
     "Cauchy",
@@ -145,6 +152,7 @@ __all__ = [
     "Laplace",
     "LogNormal",
     "MetropolisHastings",
+    "Mixture",
     "Model",
     "ModelError",
     "MvNormal",
@@ -158,7 +166,10 @@ __all__ = [
     "StudentT",
     "Truncated",
     "Uniform",
+    "VonMises",
+    "Weibull",
     "Wishart",
+    "ZeroInflated",
     "compile",
     "diagnose",
     "distribution",
@@ -194,7 +205,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name != "plots" and name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        told = "" if name.startswith("__") else advice(name, __all__)
+        raise AttributeError(
+            f"module {__name__!r} has no attribute {name!r}" + (f": {told}" if told else "")
+        )
     plots = importlib.import_module(f"{__name__}.plots")  # a report has to know who draws it
     if name == "plots":
         return plots

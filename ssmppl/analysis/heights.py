@@ -19,7 +19,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.expressions.expr import Expr, attributed, constant, depends_on
+from ssmppl.expressions.expr import Expr, apply, attributed, constant, depends_on
 from ssmppl.language import distributions as laws
 from ssmppl.language.distribution import Distribution
 from ssmppl.language.trace import Site, Trace
@@ -43,6 +43,8 @@ _MAXIMISERS: dict[type, dict[str, Estimate]] = {
     laws.Exponential: {"rate": lambda d, v: 1.0 / v, "scale": lambda d, v: v},
     laws.Gamma: {"rate": lambda d, v: d.shape_ / v, "scale": lambda d, v: v / d.shape_},
     laws.InverseGamma: {"scale": lambda d, v: d.shape_ * v},
+    laws.Weibull: {"scale": lambda d, v: v},
+    laws.VonMises: {"mean_": lambda d, v: v},
     laws.Poisson: {"rate": lambda d, v: ew("maximum", v, TINY)},
     laws.NegativeBinomial: {"mean_": lambda d, v: ew("maximum", v, TINY)},
     laws.Binomial: {
@@ -84,7 +86,11 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     if not free:
         return d.log_density(site.value, guard=False)
     kind = type(d)
-    if isinstance(d, (laws.Bernoulli, laws.Categorical)):
+    if isinstance(d, laws.Mixture):
+        return _mixture(site, d, prev)
+    if isinstance(d, laws.ZeroInflated):
+        return _zero_inflated(site, d, prev)
+    if isinstance(d, (laws.Bernoulli, laws.Categorical, laws.BetaBinomial)):
         return constant(0.0)  # no probability is above 1
     if isinstance(d, laws.Uniform):
         return _uniform(site, prev)
@@ -102,6 +108,50 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
             return NotApplicable(reason, where)
         changed[name] = best if d.joint else _replaced(d.parameters[name], best, prev)
     return _with(d, changed).log_density(site.value, guard=False)
+
+
+def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
+    value = array(site.value[index])
+    return Site(site.name, site.role, law.element(index), value, site.where)
+
+
+def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    """The sum of the components' own heights; a weight that depends on the state is at most 1."""
+    whole, total = d.support(), constant(0.0)
+    for law in d.components:
+        own = law.support()
+        ends = [(own.lower, whole.lower), (own.upper, whole.upper)]
+        if any(
+            a is not b for pair in ends for a, b in zip(*(p.ravel() for p in pair), strict=True)
+        ):
+            return NotApplicable(
+                f"the components of {site.name} (Mixture) have different supports", d.location
+            )
+    for i in np.ndindex(site.shape):
+        height = None
+        for law, weight in zip(d.components, d.weights, strict=True):
+            part = _height(_element(site, law, i), prev)
+            if isinstance(part, NotApplicable):
+                return part
+            if not depends_on(weight[i], prev):
+                part = apply("log", weight[i]) + part
+            height = part if height is None else apply("logaddexp", height, part)
+        total = total + height
+    return total
+
+
+def _zero_inflated(site: Site, d: laws.ZeroInflated, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    """At most 1 at zero; elsewhere that of the law inside, times 1 - p where p is free of the
+    state."""
+    total = constant(0.0)
+    for i in np.ndindex(site.shape):
+        part = _height(_element(site, d.base, i), prev)
+        if isinstance(part, NotApplicable):
+            return part
+        if not depends_on(d.p[i], prev):
+            part = apply("log1p", -d.p[i]) + part
+        total = total + apply("where", apply("eq", site.value[i], 0.0), 0.0, part)
+    return total
 
 
 def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
@@ -145,8 +195,7 @@ def _replaced(old: ExprArray, best: ExprArray, prev: Sequence[Expr]) -> ExprArra
 
 def _with(d: Distribution, changed: dict[str, ExprArray]) -> Distribution:
     """The same law with other values for some parameters."""
-    given = {_plain(n): changed.get(n, p) for n, p in d.parameters.items()}
-    return type(d)(**given)
+    return d.rebuilt(changed)
 
 
 def _plain(name: str) -> str:

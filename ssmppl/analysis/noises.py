@@ -36,6 +36,7 @@ from ssmppl.language.distributions import (
     Normal,
     StudentT,
     Uniform,
+    Weibull,
 )
 from ssmppl.language.trace import Site, Trace
 
@@ -153,7 +154,7 @@ def _location_and_scale(d: Distribution) -> tuple[ExprArray, ExprArray] | None:
     zero = array(np.zeros(d.shape))
     if isinstance(d, (StudentT, Laplace, Cauchy)):
         return d.loc, d.scale
-    if isinstance(d, (HalfCauchy, InverseGamma)):
+    if isinstance(d, (HalfCauchy, InverseGamma, Weibull)):
         return zero, d.scale
     if isinstance(d, HalfNormal):
         return zero, d.sd

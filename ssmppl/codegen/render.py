@@ -37,6 +37,9 @@ CALLS = {
     "arctanh": "arctanh", "abs": "abs", "sign": "sign", "floor": "floor", "ceil": "ceil",
     "gammaln": "lgamma", "digamma": "digamma", "trigamma": "trigamma", "ndtr": "ndtr",
     "log_ndtr": "log_ndtr", "ndtri": "ndtri", "erf": "erf", "erfc": "erfc",
+    "i0e": "i0e", "i1e": "i1e", "vonmises_cdf": "vonmises_cdf",
+    "vonmises_quantile": "vonmises_quantile", "betabinomial_cdf": "betabinomial_cdf",
+    "betabinomial_quantile": "betabinomial_quantile",
     "maximum": "maximum", "minimum": "minimum", "arctan2": "arctan2", "logaddexp": "logaddexp",
     "gammainc": "gammainc", "gammaincinv": "gammaincinv", "betainc": "betainc",
     "gammaincc": "gammaincc", "gammainccinv": "gammainccinv",
@@ -47,7 +50,7 @@ CALLS = {
 MATRIX_CALLS = {"cholesky": "cholesky", "inverse": "inverse", "logdet": "logdet", "det": "det"}
 # Scalar sources of randomness; normals and uniforms come from buffers filled in bulk.
 DRAWS = {"normal": "normal", "uniform": "uniform", "gamma": "gamma", "poisson": "poisson",
-         "binomial": "binomial", "gamma_by": "gamma_by"}  # fmt: skip
+         "binomial": "binomial", "vonmises": "vonmises", "gamma_by": "gamma_by"}  # fmt: skip
 _OWN_NAMES = """theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng
     log_w out inf nan reference look trajectory total entry kernel np prev noise kept"""
 RESERVED = frozenset([

@@ -14,7 +14,7 @@ import numpy as np
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distribution import Support
-from ssmppl.language.distributions import Beta, Distribution, Truncated
+from ssmppl.language.distributions import Beta, Distribution, Mixture, Truncated
 
 Values = Mapping[Expr, np.ndarray]
 
@@ -174,8 +174,7 @@ def outside(
     with np.errstate(invalid="ignore"):
         bad = (values < lower) | (values > upper)
         if not closed:
-            above = distribution.open_above or isinstance(distribution, Beta)
-            bad |= (values == lower) | ((values == upper) & above)
+            bad |= (values == lower) | ((values == upper) & _open_above(distribution))
         if support.kind == "integers":
             bad |= np.isfinite(values) & (values != np.floor(values))
     if not bad.any():
@@ -195,6 +194,14 @@ def outside(
         f"{number(values[index])} is outside the support of {name_of(distribution)}, {bounds}",
         f"a value in {bounds}" if support.kind == "interval" else f"one of {bounds}",
     )
+
+
+def _open_above(distribution: Distribution) -> bool:
+    """Whether an upper bound that is a number has no density: of Beta, alone or in a mixture, and
+    of a law that says so."""
+    if isinstance(distribution, Mixture):
+        return any(map(_open_above, distribution.components))
+    return distribution.open_above or isinstance(distribution, Beta)
 
 
 def name_of(distribution: Distribution) -> str:

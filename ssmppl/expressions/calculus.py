@@ -30,9 +30,19 @@ def _gamma_density(a: Expr, x: Expr) -> Expr:
     return _f("exp", (a - 1.0) * _f("log", x) - x - _f("gammaln", a))
 
 
+def _over(top: Expr, below: Expr, limit: float) -> Expr:
+    """top / below, with its limit where both are 0."""
+    at_zero = _f("eq", below, 0.0)
+    return _f("where", at_zero, limit, top / _f("where", at_zero, 1.0, below))
+
+
 def _beta_density(a: Expr, b: Expr, x: Expr) -> Expr:
     norm = _f("gammaln", a) + _f("gammaln", b) - _f("gammaln", a + b)
     return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - norm)
+
+
+def _vonmises_density(k: Expr, x: Expr) -> Expr:
+    return _f("exp", k * (_f("cos", x) - 1.0)) / (2.0 * math.pi * _f("i0e", k))
 
 
 PARTIALS: dict[str, Partial] = {
@@ -62,6 +72,9 @@ PARTIALS: dict[str, Partial] = {
     "ndtri": lambda d, a: [_ROOT_2PI * _f("exp", 0.5 * d**2)],
     "erf": lambda d, a: [2.0 / math.sqrt(math.pi) * _f("exp", -(a**2))],
     "erfc": lambda d, a: [-2.0 / math.sqrt(math.pi) * _f("exp", -(a**2))],
+    "i0e": lambda d, a: [_f("i1e", a) - _f("sign", a) * d],
+    # I1' = I0 - I1 / a, and I1(a) / a is 1/2 at 0
+    "i1e": lambda d, a: [_f("i0e", a) - _over(d, a, 0.5) - _f("sign", a) * d],
     "add": lambda d, a, b: [1.0, 1.0],
     "sub": lambda d, a, b: [1.0, -1.0],
     "mul": lambda d, a, b: [b, a],
@@ -77,6 +90,8 @@ PARTIALS: dict[str, Partial] = {
     "gammaincinv": lambda d, a, p: [None, 1.0 / _gamma_density(a, d)],
     "gammainccinv": lambda d, a, p: [None, -1.0 / _gamma_density(a, d)],
     "betainc": lambda d, a, b, x: [None, None, _beta_density(a, b, x)],
+    "vonmises_cdf": lambda d, k, x: [None, _vonmises_density(k, x)],
+    "vonmises_quantile": lambda d, k, p: [None, 1.0 / _vonmises_density(k, d)],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
 }
 # Piecewise constant: derivative zero wherever there is one.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.special as sp
 
+from ssmppl.expressions import special
 from ssmppl.expressions.expr import BINARY, MATRIX_OPS, TERNARY, UNARY, Expr, constant, topological
 
 Draw = Callable[[str, tuple[np.ndarray, ...]], np.ndarray]
@@ -19,10 +20,12 @@ Draw = Callable[[str, tuple[np.ndarray, ...]], np.ndarray]
 _NUMPY = """exp log log1p expm1 sqrt sin cos tan sinh cosh tanh arcsin arccos arctan arcsinh arccosh
     arctanh abs sign floor ceil maximum minimum arctan2 logaddexp"""
 _SCIPY = """gammaln digamma ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
-    betainc betaincinv"""
+    betainc betaincinv i0e i1e"""
+_OWN = "betabinomial_cdf betabinomial_quantile vonmises_cdf vonmises_quantile"
 MEANING: dict[str, Callable[..., Any]] = {
     **{n: getattr(np, n) for n in UNARY + BINARY if n in _NUMPY.split()},
     **{n: getattr(sp, n) for n in UNARY + BINARY + TERNARY if n in _SCIPY.split()},
+    **{n: getattr(special, n) for n in _OWN.split()},
     "trigamma": lambda a: sp.polygamma(1, a),
     # smallest k with cdf(k) >= q; scipy's inverses are continuous in k
     "poisson_quantile": lambda rate, q: _round_up(
@@ -151,6 +154,8 @@ def numpy_draws(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> Draw:
             out = rng.poisson(safe[0], size).astype(float)
         elif kind == "binomial":
             out = rng.binomial(np.asarray(safe[0], dtype=np.int64), safe[1], size).astype(float)
+        elif kind == "vonmises":
+            out = rng.vonmises(0.0, safe[0], size)
         else:
             raise KeyError(f"unknown source of randomness {kind!r}")
         return np.where(bad, np.nan, out)

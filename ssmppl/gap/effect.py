@@ -21,8 +21,9 @@ kind           bound to           what the function returns
 =============  =================  ================================================================
 
 Increments act on the mean of Normal, MvNormal, StudentT, Laplace, Cauchy and Dirac laws, on the
-mean of the log of LogNormal, on the log of the mean of Poisson, NegativeBinomial, Gamma and
-Exponential and on the logit of that of Bernoulli and Binomial laws; of the law inside Truncated.
+mean of the log of LogNormal, on the log of the mean of Poisson, NegativeBinomial, Gamma,
+Exponential and Weibull and on the logit of that of Bernoulli and Binomial laws; of the law inside
+Truncated and ZeroInflated.
 
 ==================  ===========================================================================
 `on`                which equations it is offered for

@@ -23,7 +23,6 @@ from ssmppl.language.distributions import (
     Dirac,
     Distribution,
     Exponential,
-    Flat,
     Gamma,
     Laplace,
     LogNormal,
@@ -33,6 +32,9 @@ from ssmppl.language.distributions import (
     Poisson,
     StudentT,
     Truncated,
+    VonMises,
+    Weibull,
+    ZeroInflated,
 )
 from ssmppl.language.written import Written
 
@@ -45,7 +47,8 @@ _MEAN: dict[type[Distribution], tuple[str, str]] = {
     Laplace: ("loc", "identity"), Cauchy: ("loc", "identity"), Dirac: ("value", "identity"),
     LogNormal: ("mean_", "mean of the log"), Poisson: ("rate", "log"),
     NegativeBinomial: ("mean_", "log"), Gamma: ("spread", "log"), Exponential: ("spread", "log"),
-    Bernoulli: ("p", "logit"), Binomial: ("p", "logit"),
+    Bernoulli: ("p", "logit"), Binomial: ("p", "logit"), Weibull: ("scale", "log"),
+    VonMises: ("mean_", "identity"),
 }  # fmt: skip
 # 1 / df of the Student's t that stands for a normal law: small enough that the log density is off
 # by 1e-5 (e^4 - 2 e^2 - 1) / 4, large enough that derivatives in 1 / df survive the rounding of
@@ -54,25 +57,15 @@ NORMAL = 1e-5
 
 
 def rebuilt(d: Distribution, parameters: Mapping[str, Any]) -> Distribution:
-    """A law of the same family with these parameters for its own (of a truncated one: the base's).
+    """A law of the same family with these parameters for its own, of a truncated or zero-inflated
+    one for those of the law inside."""
+    inside = isinstance(d, (Truncated, ZeroInflated))
+    return d.rebuilt({f"like_{k}" if inside else k: v for k, v in parameters.items()})
 
-    Bounds of a truncated law are named "lower" and "upper".
-    """
-    if isinstance(d, Truncated):
-        wide = {n: np.broadcast_to(a.view(np.ndarray), d.shape)
-                for n, a in d.base.parameters.items()}  # fmt: skip
-        inside = {k: v for k, v in parameters.items() if k not in ("lower", "upper")}
-        bounds = bounds_of(d) | {k: v for k, v in parameters.items() if k in ("lower", "upper")}
-        new: Distribution = truncated(rebuilt(d.base, wide | inside), bounds)
-    elif isinstance(d, Flat):
-        return d
-    elif isinstance(d, Written):
-        return d.with_parameters({**d.parameters, **{n: array(v) for n, v in parameters.items()}})
-    else:
-        values = {**d.parameters, **parameters}
-        new = type(d)(**{n.rstrip("_"): array(v) for n, v in values.items()})  # type: ignore[call-arg]
-    new.location = d.location
-    return new
+
+def _inner(d: Distribution) -> Distribution:
+    """The law inside a truncated or zero-inflated one."""
+    return d.base if isinstance(d, (Truncated, ZeroInflated)) else d
 
 
 def truncated(base: Distribution, bounds: Mapping[str, ExprArray]) -> Truncated:
@@ -97,9 +90,7 @@ def bounds_of(d: Truncated) -> dict[str, ExprArray]:
 
 def substituted(d: Distribution, replacement: Mapping[Expr, Expr]) -> Distribution:
     """The law with symbols replaced; the law itself where it holds none of them."""
-    own = dict(d.parameters)
-    if isinstance(d, Truncated):
-        own = {**d.base.parameters, **bounds_of(d)}
+    own = d.parameters
     names, nodes = list(own), [e for a in own.values() for e in a.ravel()]
     new = substitute(nodes, dict(replacement))
     if all(a is b for a, b in zip(nodes, new, strict=True)):
@@ -109,18 +100,13 @@ def substituted(d: Distribution, replacement: Mapping[Expr, Expr]) -> Distributi
         size = own[name].size
         out[name] = array(array(new[at : at + size]).reshape(own[name].shape))
         at += size
-    if isinstance(d, Truncated):
-        base = rebuilt(d.base, {n: out[n] for n in d.base.parameters})
-        made = truncated(base, {n: out[n] for n in ("lower", "upper")})
-        made.location = d.location
-        return made
-    return rebuilt(d, out)
+    return d.rebuilt(out)
 
 
 # -- means
 def scale_of_mean(d: Distribution) -> str | NotApplicable:
     """The scale on which increments of the mean act, or why there is none."""
-    inner = d.base if isinstance(d, Truncated) else d
+    inner = _inner(d)
     if type(inner) in _MEAN:
         return _MEAN[type(inner)][1]
     kind = type(inner).__name__
@@ -130,8 +116,8 @@ def scale_of_mean(d: Distribution) -> str | NotApplicable:
 
 def noise_free(d: Distribution, index: Index) -> Expr:
     """The value without noise, on the scale of the quantity itself (truncation left out)."""
-    inner = d.base if isinstance(d, Truncated) else d
-    if isinstance(inner, (Gamma, Exponential, Binomial)):
+    inner = _inner(d)
+    if isinstance(inner, (Gamma, Exponential, Binomial, Weibull)):
         return _entry(inner.mean(), index)
     value = _entry(inner.parameters[_MEAN[type(inner)][0]], index)
     return apply("exp", value) if isinstance(inner, LogNormal) else value
@@ -145,7 +131,7 @@ def _entry(values: Any, index: Index) -> Expr:
 
 def shifted(d: Distribution, changes: Changes) -> Distribution:
     """With the mean of the components at these indices moved, on the scale of `scale_of_mean`."""
-    inner = d.base if isinstance(d, Truncated) else d
+    inner = _inner(d)
     name, scale = _MEAN[type(inner)]
     sign = 1.0
     if name == "spread":
@@ -171,12 +157,13 @@ def _changed(d: Distribution, values: ExprArray, changes: Changes, change: Any) 
 
 
 # -- variances
-_SCALE = {LogNormal: "sd", StudentT: "scale", Laplace: "scale", Cauchy: "scale"}
+_SCALE = {LogNormal: "sd", StudentT: "scale", Laplace: "scale", Cauchy: "scale",
+          VonMises: "concentration"}  # fmt: skip
 
 
 def has_scale(d: Distribution) -> NotApplicable | None:
     """Why the law has no variance of its own that could be scaled; None where it has."""
-    inner = d.base if isinstance(d, Truncated) else d
+    inner = _inner(d)
     if isinstance(inner, (Normal, MvNormal)) or type(inner) in _SCALE:
         return None
     kind = type(inner).__name__
@@ -190,7 +177,7 @@ def has_scale(d: Distribution) -> NotApplicable | None:
 
 def scaled(d: Distribution, changes: Changes) -> Distribution:
     """With increments of the log variance of the components at these indices."""
-    inner = d.base if isinstance(d, Truncated) else d
+    inner = _inner(d)
     if isinstance(inner, MvNormal):
         name = inner.spread
         half = -0.5 if name == "precision" else 0.5
@@ -202,7 +189,7 @@ def scaled(d: Distribution, changes: Changes) -> Distribution:
                 matrix[:, i] = [factor * e for e in matrix[:, i]]
         return rebuilt(d, {name: array(matrix)})
     name = inner.spread if isinstance(inner, Normal) else _SCALE[type(inner)]
-    power = {"variance": 1.0, "precision": -1.0}.get(name, 0.5)
+    power = {"variance": 1.0, "precision": -1.0, "concentration": -1.0}.get(name, 0.5)
     return rebuilt(d, {name: _changed(d, inner.parameters[name], changes,
                                       lambda s, by: s * apply("exp", power * by))})  # fmt: skip
 
@@ -210,7 +197,7 @@ def scaled(d: Distribution, changes: Changes) -> Distribution:
 # -- tails
 def has_tail(d: Distribution) -> NotApplicable | None:
     """Why Student's t cannot stand for the law; None where it can."""
-    inner = d.base if isinstance(d, Truncated) else d
+    inner = _inner(d)
     if isinstance(inner, Normal):
         return None
     kind = type(inner).__name__
@@ -219,7 +206,7 @@ def has_tail(d: Distribution) -> NotApplicable | None:
 
 def heavier(d: Distribution, changes: Changes) -> Distribution:
     """Student's t with 1 / df = `NORMAL` + the changes at these indices, for a normal law."""
-    inner = d.base if isinstance(d, Truncated) else d
+    inner = _inner(d)
     if isinstance(inner, StudentT):  # a second effect of the kind
         inverse = _changed(d, inner.df, changes, lambda df, by: 1.0 / df + by)
         return rebuilt(d, {"df": ew("div", 1.0, inverse)})

@@ -25,7 +25,7 @@ from ssmppl.gap.candidates import slug
 from ssmppl.gap.laws import bounds_of, infinite
 from ssmppl.gap.spelling import Lines
 from ssmppl.gap.terms import parts_of, terms_with
-from ssmppl.language.distributions import Distribution, Flat, Truncated
+from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
 from ssmppl.language.model import Model
 from ssmppl.language.primitive import Primitive
 from ssmppl.language.trace import Site, Trace, symbols
@@ -185,6 +185,14 @@ class _Writer:
         kind = f"ssm.{type(d).__name__}"
         if isinstance(d, Flat):
             return f"{kind}({d.shape})" if d.shape else f"{kind}()"
+        if isinstance(d, Mixture):
+            weights = [lines.array(w, scalar=_same(w)) for w in d.weights]
+            inside = [self._distribution(law, lines, room - 16) for law in d.components]
+            parts = [f"[{', '.join(weights)}]", f"[{', '.join(inside)}]"]
+            return _call(kind, parts, room)
+        if isinstance(d, ZeroInflated):
+            law = self._distribution(d.base, lines, room - 20)
+            return _call(kind, [law, lines.array(d.p, scalar=_same(d.p))], room)
         if isinstance(d, Truncated):
             bounds = {k: v for k, v in bounds_of(d).items() if not infinite(v)}
             wide = d.base.shape != d.shape
@@ -290,6 +298,11 @@ def _home(name: str, kind: str, where: Location, module: str, path: str) -> tupl
 def _nodes(d: Distribution) -> list[Expr]:
     if isinstance(d, Flat):
         return []
+    if isinstance(d, Mixture):
+        own = [e for w in d.weights for e in w.ravel()]
+        return [*own, *(e for law in d.components for e in _nodes(law))]
+    if isinstance(d, ZeroInflated):
+        return [*_nodes(d.base), *d.p.ravel()]
     if isinstance(d, Truncated):
         return [*_nodes(d.base), *(e for a in bounds_of(d).values() for e in a.ravel())]
     return [e for a in d.parameters.values() for e in array(a).ravel()]

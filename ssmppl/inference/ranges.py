@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import Binomial, Distribution
+from ssmppl.language.distributions import BetaBinomial, Binomial, Distribution, Mixture, Truncated
+from ssmppl.language.mixtures import SUM_ROUNDING
 
 __all__ = ["DOMAIN", "out_of_range"]
 
+_WEIGHTS = (
+    "write weights that are shares of 1 whatever the state, such as [1 - p, p] with "
+    "p = 1 / (1 + np.exp(-z)), or w / np.sum(w) of positive w"
+)
 DOMAIN = "some parameter, state or input leads outside the domain of an operation"
 
 
@@ -21,17 +27,42 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
     values : of the symbols, as far as they are known. An argument whose value they tell is named
         with it, where it lies outside; else the arguments that might are named with their ranges.
     """
-    law = getattr(law, "base", law)  # of a truncated law
-    name, might = type(law).__name__, []
+    might: list[tuple[str, str]] = []
+    for inner in _laws_in(law):
+        found = _of_one(inner, values, might)
+        if found is not None:
+            return found
+    return might[0] if might else None
+
+
+def _laws_in(law: Distribution) -> list[Distribution]:
+    """The law, and those that it is made of: of a truncated one the base alone."""
+    base = getattr(law, "base", None)
+    inside = [*getattr(law, "components", ()), *([] if base is None else [base])]
+    own = [] if isinstance(law, Truncated) else [law]
+    return own + [one for part in inside for one in _laws_in(part)]
+
+
+def _of_one(
+    law: Distribution, values: Mapping[Expr, float], might: list[tuple[str, str]]
+) -> tuple[str, str] | None:
+    """As `out_of_range`, without the laws inside; `might` gets what may be at fault."""
+    name = type(law).__name__
     for argument, (low, high, strict) in law.ranges.items():
-        called = argument.rstrip("_")
+        called = re.sub(r"^weight_(\d+)$", r"weights[\1]", argument.rstrip("_"))
         brackets = "()" if strict else "[]"
         allowed = f"{brackets[0]}{low:g}, {high:g}{brackets[1] if np.isfinite(high) else ')'}"
         for e in law.parameters[argument].ravel():
             needed = symbols_of(e)
             if not needed:
                 continue
-            fix = _fix(called, e, low, high, count=isinstance(law, Binomial) and called == "n")
+            fix = _fix(
+                called,
+                e,
+                low,
+                high,
+                count=isinstance(law, (Binomial, BetaBinomial)) and called == "n",
+            )
             if needed <= set(values):
                 value = float(evaluate(e, values))
                 if np.isnan(value):
@@ -44,7 +75,19 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
             else:
                 demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
                 might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
-    return might[0] if might else None
+    return _sums(law, values) if isinstance(law, Mixture) else None
+
+
+def _sums(law: Mixture, values: Mapping[Expr, float]) -> tuple[str, str] | None:
+    """Weights that do not sum to 1, where their symbols have values."""
+    for index in np.ndindex(law.shape):
+        weights = [w[index] for w in law.weights]
+        if symbols_of(weights) and symbols_of(weights) <= set(values):
+            total = float(np.sum(evaluate(weights, values)))
+            if not abs(total - 1.0) <= SUM_ROUNDING:
+                text = ", ".join(map(repr, weights))
+                return f"the weights of Mixture, [{text}], sum to {total:.6g} there", _WEIGHTS
+    return None
 
 
 def _fix(called: str, e: Expr, low: float, high: float, count: bool = False) -> str:
@@ -54,6 +97,8 @@ def _fix(called: str, e: Expr, low: float, high: float, count: bool = False) -> 
             f"write a {called} that is never below 0, np.maximum({e!r}, 0); where several flows "
             "empty one compartment, draw each out of what the others have left"
         )
+    if called.startswith("weights["):
+        return _WEIGHTS
     if (low, high) == (0.0, 1.0):
         logistic = f"1 / (1 + np.exp(-({e!r})))"
         return f"write a {called} between 0 and 1 whatever the state, such as {logistic}"

@@ -16,6 +16,7 @@ import numpy as np
 from ssmppl.errors import Location, ModelError, SSMError
 from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
+from ssmppl.language.elsewhere import advice
 from ssmppl.language.model import location_of, outer_values, plain_function
 
 Law = Callable[..., Any]
@@ -218,6 +219,7 @@ def _wrapped(
     elif isinstance(error, IndexError) and "only integers, slices" in str(error):
         fix = f"if the index is a symbol: {INDEX_BY_SYMBOL}"
     elif isinstance(error, AttributeError) and (attribute := _ssm_attribute(error)):
+        found = f"@{role} {function.__name__} asks for ssm.{error.name}, which does not exist"
         fix = attribute
     return ModelError(found, fix=fix, where=where)
 
@@ -234,6 +236,6 @@ def _of_a_symbol(error: Exception) -> tuple[str, str] | None:
 
 def _ssm_attribute(error: AttributeError) -> str:
     if inspect.ismodule(error.obj) and error.obj.__name__.startswith("ssmppl"):
-        from_names = sorted(DISTRIBUTIONS, key=lambda n: n.lower() != str(error.name).lower())
-        return f"the distributions are: {', '.join(from_names)}"
+        told = advice(str(error.name), DISTRIBUTIONS)
+        return f"{told}{'; ' if told else ''}the distributions are: {', '.join(DISTRIBUTIONS)}"
     return ""

@@ -307,6 +307,9 @@ class Flat(Distribution):
     def __init__(self, shape: tuple[int, ...] = ()):
         self._set(zero=np.zeros(shape))
 
+    def rebuilt(self, parameters):
+        return self
+
     def log_densities(self, value):
         return self._full(0.0)
 

@@ -7,6 +7,7 @@ generated code. A sampler is an expression over the "random" nodes of `draws.py`
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -159,15 +160,32 @@ class Distribution:
         inside = ", ".join(f"{_plain_name(n)}={text(a)}" for n, a in self.parameters.items())
         return f"{type(self).__name__}({inside})"
 
+    def inside(self) -> tuple[Distribution, ...]:
+        """The laws that this one is made of."""
+        base = self.__dict__.get("base")
+        return () if base is None else (base,)
+
     def undrawable(self, why: str) -> ModelError:
         """The error of a law that is not `drawable` where it has to be."""
-        raise AttributeError
+        return next(law for law in self.inside() if not law.drawable).undrawable(why)
 
     def expressions(self) -> list[Expr]:
         """All that the law is made of: its parameters, and what else it holds."""
         own = [e for p in self.parameters.values() for e in p.ravel()]
-        base = self.__dict__.get("base")
-        return own if base is None else [*own, *base.expressions()]
+        return [*own, *(e for law in self.inside() for e in law.expressions())]
+
+    def rebuilt(self, parameters: Mapping[str, Any]) -> Distribution:
+        """The law of this family with these for its own `parameters`, at its place in the file."""
+        values = {**self.parameters, **parameters}
+        return self._at_place(type(self)(**{n.rstrip("_"): array(v) for n, v in values.items()}))  # type: ignore[call-arg]
+
+    def _at_place(self, new: Distribution) -> Distribution:
+        new.location = self.location
+        return new
+
+    def element(self, index: tuple[int, ...]) -> Distribution:
+        """The law of one element of an elementwise law."""
+        return self.rebuilt({n: a[index] for n, a in self.parameters.items()})
 
     # -- to be defined by each distribution
     def log_densities(self, value: ExprArray) -> ExprArray:

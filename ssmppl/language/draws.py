@@ -1,4 +1,5 @@
-"""Random draws as nodes of expressions: standard normal, uniform, gamma, Poisson, binomial ones."""
+"""Random draws as nodes of expressions: standard normal, uniform, gamma, Poisson, binomial, von
+Mises ones."""
 
 from __future__ import annotations
 
@@ -37,6 +38,10 @@ class Draws:
 
     def binomial(self, n: Any, p: Any) -> Expr:
         return self._node("binomial", n, p)
+
+    def vonmises(self, concentration: Any) -> Expr:
+        """Von Mises round 0, on [-pi, pi]."""
+        return self._node("vonmises", concentration)
 
 
 class Generator:

@@ -1,4 +1,4 @@
-"""Exponential, Gamma, InverseGamma and Beta, elementwise of arrays.
+"""Exponential, Weibull, Gamma, InverseGamma and Beta, elementwise of arrays.
 
 Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 1995),
 "Continuous univariate distributions", volumes 1 and 2, in the parametrisations named in each class.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from typing import Any
+
+import numpy as np
 
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
@@ -81,6 +83,67 @@ class Exponential(_Positive):
 
     def quantile_between(self, p, q, lower, upper):
         return lower + cut_exponential(p, q, self._rate() * (upper - lower)) / self._rate()
+
+
+class Weibull(_Positive):
+    """Weibull(shape, scale=): P(X > x) = ``exp(-(x / scale)^shape)``.
+
+    Times until an event whose rate grows (shape > 1) or falls (shape < 1) with the time waited.
+
+    Parameters
+    ----------
+    shape : positive; 1 is the exponential law.
+    scale : positive; 63% lie below it.
+    """
+
+    def __init__(self, shape: Any, *, scale: Any):
+        self._set(shape_=shape, scale=scale)
+        self._require("shape_", 0.0)
+        self._require("scale", 0.0)
+        self._hazard = Exponential(rate=np.ones(self.shape))  # the law of (X / scale)^shape
+
+    def _used(self, value: Any) -> ExprArray:
+        """(x / scale)^shape, the hazard gone through."""
+        return array(ew("pow", array(ew("maximum", value, 0.0)) / self.scale, self.shape_))
+
+    def _back(self, used: Any) -> ExprArray:
+        return self.scale * ew("pow", used, 1.0 / self.shape_)
+
+    def log_densities(self, value):
+        k, log_z = self.shape_, array(ew("log", value)) - ew("log", self.scale)
+        return ew("log", k) - ew("log", value) + k * log_z - ew("exp", k * log_z)
+
+    def sample(self, draws):
+        return self._back(self._hazard.sample(draws))
+
+    def mean(self):
+        return self.scale * ew("exp", ew("gammaln", 1.0 + 1.0 / self.shape_))
+
+    def variance(self):
+        first, second = (array(ew("gammaln", 1.0 + power / self.shape_)) for power in (1.0, 2.0))
+        return self.mean() ** 2 * ew("expm1", second - 2.0 * first)
+
+    def cdf(self, value):
+        return self._hazard.cdf(self._used(value))
+
+    def survival(self, value):
+        return self._hazard.survival(self._used(value))
+
+    def log_survival(self, value):
+        return self._hazard.log_survival(self._used(value))
+
+    def quantile(self, p):
+        return self._back(self._hazard.quantile(p))
+
+    def survival_quantile(self, p):
+        return self._back(self._hazard.survival_quantile(p))
+
+    def log_mass(self, lower, upper):
+        return self._hazard.log_mass(self._used(lower), self._used(upper))
+
+    def quantile_between(self, p, q, lower, upper):
+        bounds = self._used(lower), self._used(upper)
+        return self._back(self._hazard.quantile_between(p, q, *bounds))
 
 
 class Gamma(_Positive):

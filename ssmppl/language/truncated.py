@@ -16,9 +16,11 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
+from ssmppl.language.circular import VonMises
 from ssmppl.language.continuous import LOG_2PI, Flat, Normal, Uniform, _each, _where
 from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
+from ssmppl.language.mixtures import Mixture
 from ssmppl.language.positive import Exponential
 from ssmppl.language.symmetric import Laplace
 from ssmppl.language.written import Written
@@ -40,11 +42,15 @@ class Truncated(Distribution):
     base: Distribution
 
     def __init__(self, dist: Distribution, *, lower: Any = None, upper: Any = None):
-        if not isinstance(dist, Distribution) or dist.joint or isinstance(dist, (Dirac, Flat)):
-            name = type(dist).__name__
+        name, mixed = type(dist).__name__, isinstance(dist, Mixture)
+        refused = isinstance(dist, (Dirac, Flat, Mixture, VonMises))
+        if not isinstance(dist, Distribution) or dist.joint or refused:
             raise ModelError(
                 f"Truncated: cannot truncate {name}",
-                fix="truncate a scalar distribution such as Normal, Gamma or Poisson",
+                fix="truncate each component, with weights in proportion to how much of it lies "
+                "between the bounds"
+                if mixed
+                else "truncate a scalar distribution such as Normal, Gamma or Poisson",
                 where=user_location(),
             )
         if isinstance(dist, Written) and not dist.inverts():
@@ -83,6 +89,13 @@ class Truncated(Distribution):
                     where=self.location,
                 )
         self._refuse_empty()
+
+    def rebuilt(self, parameters):
+        values = {**self.parameters, **parameters}
+        base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
+        bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
+        kept = {n: b for n, b in bounds.items() if not _is_infinite(b)}
+        return self._at_place(Truncated(base, **kept))
 
     def _refuse_empty(self) -> None:
         """Numbers that leave (nearly) nothing of the base."""
@@ -269,6 +282,14 @@ def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[fl
 
 def _is_infinite(bound: Any) -> bool:
     return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
+
+
+def _as_given(bound: Any, discrete: bool) -> ExprArray:
+    """Without the whole number that was taken of it where the law is discrete."""
+    given = [
+        e.args[0] if discrete and e.op in ("ceil", "floor") else e for e in array(bound).ravel()
+    ]
+    return array(array(given).reshape(array(bound).shape))
 
 
 def _tighter(op: str, a: ExprArray, b: ExprArray) -> ExprArray:

@@ -9,7 +9,7 @@ travels to other processes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -100,15 +100,28 @@ class Written(Distribution):
         new.__dict__.update(self.__dict__)
         new._set(**parameters)
         new.location, new.ranges = self.location, self.ranges
-        new.patterns = np.broadcast_to(self.patterns, new.shape)
+        new.patterns = np.empty(new.shape, dtype=object)
         for i in np.ndindex(new.shape):
-            own = [new.parameters[n][i] for n in self.parameters]
-            if any(
-                v is not None and not (e.op == "const" and e.data == v)
-                for v, e in zip(new.patterns[i], own, strict=True)
-            ):
-                raise ValueError(f"another number among the arguments of {self!r}")
+            new.patterns[i] = self._pattern([new.parameters[n][i] for n in self.parameters])
         return new
+
+    def _pattern(self, arguments: Sequence[Expr]) -> Pattern:
+        """Of the forms that there are, the one of most numbers that these arguments have."""
+
+        def fits(pattern: Pattern) -> bool:
+            return all(
+                v is None or (e.op == "const" and e.data == v)
+                for v, e in zip(pattern, arguments, strict=True)
+            )
+
+        fitting = [p for p in self.forms if fits(p)]
+        if not fitting:
+            raise ValueError(f"another number among the arguments of {self!r}")
+        return max(fitting, key=lambda p: sum(v is not None for v in p))
+
+    def rebuilt(self, parameters):
+        own = {n: array(v) for n, v in parameters.items()}
+        return self._at_place(self.with_parameters({**self.parameters, **own}))
 
     # -- what the user's functions give, component by component
     def _each(self, make: Any) -> ExprArray:

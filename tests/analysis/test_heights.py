@@ -41,6 +41,16 @@ LAWS = {
     "negative binomial": (lambda x: ssm.NegativeBinomial(np.exp(x), dispersion=2), COUNTS, True),
     "binomial": (lambda x: ssm.Binomial(5, 1 / (1 + np.exp(-3 * x))), COUNTS, True),
     "bernoulli": (lambda x: ssm.Bernoulli(1 / (1 + np.exp(-5 * x))), COUNTS[:2], True),
+    "weibull": (lambda x: ssm.Weibull(1.5, scale=np.exp(x)), POSITIVE, True),
+    "von mises": (lambda x: ssm.VonMises(0.3 * x, concentration=2.0), REAL, True),
+    "beta-binomial": (lambda x: ssm.BetaBinomial(5, np.exp(x), 2.0), COUNTS, False),
+    "mixture at one place": (lambda x: ssm.Mixture([0.8, 0.2], [
+        ssm.Normal(x, sd=0.4), ssm.Normal(x, sd=4)]), REAL, True),
+    "mixture": (lambda x: ssm.Mixture([1 / (1 + x**2), 1 - 1 / (1 + x**2)], [
+        ssm.Normal(x, sd=0.4), ssm.Laplace(np.sin(x), scale=1)]), REAL, False),
+    "zero-inflated": (lambda x: ssm.ZeroInflated(ssm.Poisson(np.exp(x)), 0.2), COUNTS[1:], True),
+    "zero-inflated by the state": (lambda x: ssm.ZeroInflated(
+        ssm.Poisson(np.exp(x)), 1 / (1 + np.exp(x))), COUNTS, False),
     "free of the state": (lambda x: ssm.Gamma(2, rate=3), POSITIVE, True),
 }  # fmt: skip
 
@@ -48,6 +58,14 @@ UNBOUNDED = {
     "spread without a floor": (lambda x: ssm.Normal(0, sd=np.exp(x)), "sd of x"),
     "shape": (lambda x: ssm.Gamma(np.exp(x), rate=1.0), "shape of x"),
     "truncated": (lambda x: ssm.Truncated(ssm.Normal(x, sd=1), lower=0), "of x (Truncated)"),
+    "mixed supports": (
+        lambda x: ssm.Mixture([0.5, 0.5], [ssm.Normal(x, sd=1), ssm.Exponential(np.exp(x))]),
+        "different supports",
+    ),
+    "a component": (
+        lambda x: ssm.Mixture([0.5, 0.5], [ssm.Normal(x, sd=1), ssm.Normal(x, sd=np.exp(x))]),
+        "sd of x",
+    ),
     "width": (lambda x: ssm.Uniform(0, np.exp(x)), "width of x"),
 }
 

@@ -194,16 +194,19 @@ def noise_of(roots, rng):
 
 
 def stand_in(kind, args):
-    """A number in place of a gamma, Poisson or binomial draw, a function of its parameters."""
+    """A number in place of a gamma, Poisson, von Mises or binomial draw, from its parameters."""
     if kind == "gamma":
         return 0.7 * args[0] + 0.1
     if kind == "poisson":
         return np.floor(args[0] + 0.5)
+    if kind == "vonmises":
+        return 1.0 / (1.0 + args[0])
     return np.floor(args[0] * args[1] + 0.5)
 
 
 STAND_INS = {
     "gamma": lambda rng, a: stand_in("gamma", (a,)),
     "poisson": lambda rng, a: stand_in("poisson", (a,)),
+    "vonmises": lambda rng, k: stand_in("vonmises", (k,)),
     "binomial": lambda rng, n, p: stand_in("binomial", (n, p)),
 }

@@ -393,3 +393,74 @@ def awkward_names():
 
     return declare("awkward names", prior=prior, initial=initial, transition=transition,
                    observation=observation, inputs=("s", "seen", "range"))  # fmt: skip
+
+
+@register
+def outliers():
+    """Mixtures as prior, transition and observation, of scalars and arrays, one inside another."""
+
+    def prior():
+        return {
+            "p": D.Beta(2, 8),
+            "w": D.Dirichlet([2.0, 2.0, 1.0]),
+            "r": D.HalfNormal(sd=1),
+            "m": D.Mixture([0.3, 0.7], [D.Normal(-1, sd=0.5), D.StudentT(4, 1, scale=0.5)]),
+            "s": D.Mixture([0.5, 0.5], [D.Gamma(2, rate=2), D.LogNormal(0, sd=0.5)]),
+        }
+
+    def initial(m):
+        return {"x": D.Normal(m, sd=1), "z": D.Normal(np.zeros(2), sd=1)}
+
+    def transition(x, z, p, s):
+        jump = 1 / (1 + np.exp(-x))
+        return {
+            "x": D.Mixture([1 - p, p], [D.Normal(0.9 * x, sd=0.2), D.Normal(x, sd=2 * s)]),
+            "z": D.Mixture([jump, 1 - jump], [D.Normal(0.5 * z, sd=0.3), D.Laplace(z[0], scale=s)]),
+        }
+
+    def observation(x, z, w, r):
+        late = D.Mixture([0.5, 0.5], [D.Exponential(scale=r), D.HalfNormal(sd=2)])
+        return {
+            "y": D.Mixture(w, [D.Normal(x, sd=r), D.Normal(x, sd=5), D.Cauchy(x, scale=1)]),
+            "late": D.Mixture([0.8, 0.2], [D.Normal(x, sd=r), late]),
+            "v": D.Mixture([0.9, 0.1], [D.Normal(z, sd=r), D.Normal(0, sd=10)]),
+        }
+
+    return declare(
+        "outliers", prior=prior, initial=initial, transition=transition, observation=observation
+    )
+
+
+@register
+def surveys():
+    """Counts with zeros of their own and more scatter; lifetimes and headings."""
+
+    def prior():
+        return {"zero": D.Beta(2, 2), "k": D.HalfNormal(sd=2), "kappa": D.Gamma(3, rate=1)}
+
+    def initial(kappa):
+        return {
+            "n": D.ZeroInflated(D.Poisson(4.0), 0.2),
+            "age": D.Weibull(2.0, scale=3.0),
+            "angle": D.VonMises(0.0, concentration=kappa),
+        }
+
+    def transition(n, age, angle, k, kappa):
+        return {
+            "n": D.ZeroInflated(D.NegativeBinomial(2.0 + 0.5 * n, dispersion=3.0), 0.1),
+            "age": D.Weibull(1.0 + k, scale=0.5 + 0.5 * age),
+            "angle": D.VonMises(angle + 0.5, concentration=kappa),
+        }
+
+    def observation(n, age, angle, zero, k, kappa):
+        return {
+            "seen": D.ZeroInflated(D.Binomial(n, 0.4), zero),
+            "many": D.ZeroInflated(D.Truncated(D.Poisson(1.0 + n), lower=1), zero),
+            "shares": D.BetaBinomial(n, 1.0 + k, age * np.array([1.0, 2.0])),
+            "kinds": D.Mixture([zero, 1 - zero], [D.Poisson(1.0), D.BetaBinomial(9, k, 2)]),
+            "heading": D.VonMises(angle, concentration=3.0 + kappa),
+        }
+
+    return declare(
+        "surveys", prior=prior, initial=initial, transition=transition, observation=observation
+    )

@@ -236,6 +236,7 @@ ENTRY = {
     "uniform": (D.Cauchy, (0.0,), {"scale": 2.0}, st.cauchy(0, 2), False),
     "gamma": (D.Gamma, (2.5,), {"rate": 2.0}, st.gamma(2.5, scale=0.5), False),
     "poisson": (D.Poisson, (7.0,), {}, st.poisson(7), True),
+    "vonmises": (D.VonMises, (0.0,), {"concentration": 3.0}, st.vonmises(3.0), False),
     "binomial": (D.Binomial, (9.0, 0.3), {}, st.binom(9, 0.3), True),
 }
 

@@ -11,13 +11,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ssmppl.language.distributions as D
-from ssmppl.codegen.kernels import elementary, incomplete, scalars, special
+from ssmppl.codegen.kernels import elementary, incomplete, laws, scalars, special
 from ssmppl.codegen.kernels.flags import exact, kernel
 from ssmppl.codegen.module import Layout, Section, Target, scalar_function
 from ssmppl.codegen.render import CALLS, INFIX, MATRIX_CALLS
 from ssmppl.expressions import evaluate as interpreter
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import BINARY, MATRIX_OPS, TERNARY, UNARY, apply, item, matrix_op
+from ssmppl.expressions.expr import (
+    BINARY,
+    MATRIX_OPS,
+    QUATERNARY,
+    TERNARY,
+    UNARY,
+    apply,
+    item,
+    matrix_op,
+)
 from ssmppl.language.model import Model
 from ssmppl.language.trace import trace
 from tests.codegen.harness import plain, run_plainly
@@ -52,14 +61,14 @@ NAMESPACE = {
     "maximum": scalars.maximum, "abs": abs,
 }  # fmt: skip
 for _name in {*CALLS.values(), *MATRIX_CALLS.values()} - {"abs"}:
-    for _module in (elementary, special, incomplete, scalars):
+    for _module in (elementary, special, incomplete, laws, scalars):
         if hasattr(_module, _name):
             NAMESPACE[_name] = getattr(_module, _name)
 
 
 def test_every_operation_has_a_spelling():
     spelled = {*INFIX, *CALLS, *MATRIX_CALLS, "neg", "not", "where"}
-    assert set(UNARY + BINARY + TERNARY) | set(MATRIX_OPS) == spelled
+    assert set(UNARY + BINARY + TERNARY + QUATERNARY) | set(MATRIX_OPS) == spelled
     assert {*CALLS.values(), *MATRIX_CALLS.values()} <= set(NAMESPACE)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.special as sp
 from hypothesis import strategies as some
 
+from ssmppl.expressions import special as interpreted
 from ssmppl.expressions.expr import Expr, apply, symbol
 
 X, Y, Z = (symbol("state", n) for n in "xyz")
@@ -30,7 +31,8 @@ SMOOTH = {
     "add": (np.add, REAL, REAL), "sub": (np.subtract, REAL, REAL),
     "mul": (np.multiply, REAL, REAL), "div": (np.divide, REAL, POSITIVE),
     "pow": (np.power, POSITIVE, (-2, 2)), "arctan2": (np.arctan2, REAL, POSITIVE),
-    "logaddexp": (np.logaddexp, REAL, REAL),
+    "logaddexp": (np.logaddexp, REAL, REAL), "i0e": (sp.i0e, POSITIVE),
+    "i1e": (sp.i1e, POSITIVE),
 }  # fmt: skip
 # Derivatives in the last argument only.
 HALF_SMOOTH = {
@@ -40,6 +42,8 @@ HALF_SMOOTH = {
     "gammainccinv": (sp.gammainccinv, POSITIVE, UNIT),
     "betainc": (sp.betainc, POSITIVE, POSITIVE, UNIT),
     "betaincinv": (sp.betaincinv, POSITIVE, POSITIVE, UNIT),
+    "vonmises_cdf": (interpreted.vonmises_cdf, POSITIVE, (-2, 2)),
+    "vonmises_quantile": (interpreted.vonmises_quantile, POSITIVE, UNIT),
 }
 KINKED = {
     "abs": (np.abs, REAL), "sign": (np.sign, REAL), "floor": (np.floor, REAL),

@@ -1,5 +1,6 @@
 """Derivatives against finite differences, with tolerances that come from the step size."""
 
+import mpmath as mp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -20,7 +21,10 @@ from ssmppl.expressions.expr import MATRIX_OPS, Expr, apply, constant, symbol
 from tests.expressions.graphs import HALF_SMOOTH, KINKED, SMOOTH, X, Y, Z, programs, run
 
 SYMBOLS = [X, Y, Z]
-NO_DERIVATIVE = {"poisson_quantile", "binomial_quantile", "negbinomial_quantile", "trigamma"}
+NO_DERIVATIVE = {
+    "poisson_quantile", "binomial_quantile", "negbinomial_quantile", "trigamma",
+    "betabinomial_cdf", "betabinomial_quantile",
+}  # fmt: skip
 
 
 def richardson(f, at, h):
@@ -78,6 +82,23 @@ def test_derivatives_in_shape_parameters_are_refused(name):
     node = apply(name, *SYMBOLS[: len(domains)])
     with pytest.raises(NotDifferentiable, match=f"{name}.*has no derivative in x"):
         gradient(node, [X])
+
+
+@pytest.mark.parametrize("x", [-3.0, -1e-5, 1e-5, 0.4, 30.0, 1e4])
+def test_derivatives_of_bessel_functions_are_mpmaths(x):
+    scaled = [lambda v, k=k: mp.besseli(k, v) * mp.exp(-abs(v)) for k in (0, 1)]
+    with mp.workdps(40):
+        for name, function in zip(("i0e", "i1e"), scaled, strict=True):
+            (first,) = differentiate([apply(name, X)], X)
+            (second,) = differentiate([first], X)
+            for order, derivative in ((1, first), (2, second)):
+                expected = float(mp.diff(function, mp.mpf(x), order, h=mp.mpf(10) ** -12))
+                # terms of the size of the function cancel to its derivatives
+                size = float(function(mp.mpf(x)))
+                found = float(evaluate(derivative, {X: x}))
+                assert found == pytest.approx(expected, rel=1e-10, abs=1e-14 * abs(size) + 1e-16)
+    (at_zero,) = differentiate([apply("i1e", X)], X)
+    assert evaluate(at_zero, {X: 0.0}) == 0.5
 
 
 @pytest.mark.parametrize("name", sorted(set(KINKED) - NO_DERIVATIVE))

@@ -10,7 +10,10 @@ from ssmppl.expressions.evaluate import MEANING, evaluate, numpy_draws
 from ssmppl.expressions.expr import MATRIX_OPS, OPS, Expr, apply, constant, symbol
 from tests.expressions.graphs import TABLE, X, Y, Z, programs, run
 
-OTHERS = {"eq", "ne", "poisson_quantile", "binomial_quantile", "negbinomial_quantile"}
+OTHERS = {
+    "eq", "ne", "poisson_quantile", "binomial_quantile", "negbinomial_quantile",
+    "betabinomial_cdf", "betabinomial_quantile",
+}  # fmt: skip
 
 
 def test_every_operation_has_a_meaning_and_is_tested():

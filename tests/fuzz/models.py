@@ -90,6 +90,7 @@ class Writer:
                 laws[name] = self.pick(
                     "ssm.Normal(0.0, sd=1.0)", "ssm.Uniform(-1, 1)", "ssm.StudentT(4, 0, scale=1)",
                     "ssm.Laplace(0.0, scale=0.5)", "ssm.Truncated(ssm.Normal(0, sd=1), lower=-1)",
+                    "ssm.Mixture([0.3, 0.7], [ssm.Normal(-1, sd=0.5), ssm.Normal(1, sd=0.5)])",
                 )  # fmt: skip
                 if laws[name].startswith("ssm.Normal") and self.rng.random() < 0.2:
                     shape = (2,)
@@ -98,7 +99,7 @@ class Writer:
                 laws[name] = self.pick(
                     "ssm.Gamma(2, rate=2)", "ssm.InverseGamma(3, scale=1)", "ssm.HalfNormal(sd=1)",
                     "ssm.HalfCauchy(scale=1)", "ssm.Exponential(rate=1)",
-                    "ssm.LogNormal(0, sd=0.5)",
+                    "ssm.LogNormal(0, sd=0.5)", "ssm.Weibull(2, scale=1)",
                 )  # fmt: skip
             else:
                 laws[name] = self.pick("ssm.Beta(2, 2)", "ssm.Uniform(0, 1)")
@@ -165,6 +166,7 @@ class Writer:
                     f"ssm.Cauchy({mean}, scale={spread})",
                     f"ssm.Truncated(ssm.Normal({mean}, sd={spread}), lower=-3, upper=4)",
                     f"ssm.Uniform({mean} - {spread}, {mean} + {spread})",
+                    self._mixture(f"ssm.Normal({mean}, sd={spread})", "ssm.Normal(0, sd=5)"),
                 )
             if shape and self.rng.random() < 0.03:
                 return f"ssm.MvNormal({mean}, covariance={self._covariance(shape[0])})"
@@ -175,6 +177,8 @@ class Writer:
                 f"ssm.Gamma({p}, rate={q})", f"ssm.InverseGamma({p}, scale={q})",
                 f"ssm.LogNormal({self._real()}, sd={self._spread()})", f"ssm.Exponential(rate={q})",
                 f"ssm.HalfNormal(sd={q})", f"ssm.HalfCauchy(scale={q})",
+                f"ssm.Weibull({p}, scale={q})",
+                self._mixture(f"ssm.Gamma({p}, rate={q})", "ssm.Exponential(rate=1)"),
             )  # fmt: skip
         if kind == UNIT:
             return f"ssm.Beta({self._positive()}, {self._positive()})"
@@ -182,11 +186,18 @@ class Writer:
             return self.pick(
                 f"ssm.Poisson({self._positive()})", f"ssm.Binomial(6, {self._unit()})",
                 f"ssm.NegativeBinomial({self._positive()}, dispersion={self._positive()})",
+                f"ssm.BetaBinomial(6, {self._positive()}, {self._positive()})",
+                f"ssm.ZeroInflated(ssm.Poisson({self._positive()}), {self._unit()})",
+                self._mixture("ssm.Poisson(1)", f"ssm.Binomial(6, {self._unit()})"),
             )  # fmt: skip
         if kind == BINARY:
             return f"ssm.Bernoulli({self._unit()})"
         p = self._unit()
         return f"ssm.Categorical(np.stack([0.5 * {p}, 0.5 * {p}, 1 - {p}]))"
+
+    def _mixture(self, one, other):
+        p = self._unit()
+        return f"ssm.Mixture([1 - {p}, {p}], [{one}, {other}])"
 
     def _covariance(self, n):
         a = self.rng.normal(size=(n, n)).round(1)

@@ -55,7 +55,25 @@ def second_order():
     return model
 
 
+def nests():
+    """Counts of few values with zeros of their own and a mixture of two laws; all observations are
+    laws that are made of others, or have more scatter."""
+    model = ssm.Model("nests")
+    model.prior(lambda: {"zero": ssm.Beta(2, 2), "far": ssm.Beta(1, 4), "a": ssm.Gamma(2, rate=1)})
+    model.initial(lambda zero: {"n": ssm.ZeroInflated(ssm.Binomial(2, 0.6), zero)})
+    model.transition(lambda n, far, a: {
+        "n": ssm.Mixture([1 - far, far], [ssm.BetaBinomial(2, 1.0 + n, a), ssm.Binomial(2, 0.5)])
+    })  # fmt: skip
+    model.observation(lambda n, zero, a, far: {
+        "eggs": ssm.ZeroInflated(ssm.Poisson(1.0 + 2.0 * n), zero),
+        "of": ssm.BetaBinomial(5, 1.0 + n, a),
+        "y": ssm.Mixture([1 - far, far], [ssm.Normal(n, sd=0.5), ssm.Normal(0, sd=5)]),
+    })  # fmt: skip
+    return model
+
+
 MODELS = {
+    "nests": (nests, [0.3, 0.2, 1.7]),
     "weather": (weather, [0.9, 0.2, 1.4]),
     "patches": (patches, [0.7, 1.3]),
     "second order": (second_order, [0.8, 0.15]),
@@ -68,6 +86,11 @@ def data_of(name, steps=5):
         y = rng.normal(0.5, 1.0, steps)
         y[2] = np.nan
         return {"y": y}
+    if name == "nests":
+        eggs, of = rng.poisson(2.0, steps).astype(float), rng.integers(0, 6, steps).astype(float)
+        y = rng.normal(1.0, 2.0, steps)
+        eggs[0], eggs[1], of[2], y[3] = 0.0, np.nan, np.nan, np.nan
+        return {"eggs": eggs, "of": of, "y": y}
     if name == "patches":
         y, n = rng.normal(0.0, 1.5, (steps, 2)), rng.poisson(2.0, steps).astype(float)
         y[1, 0] = y[3] = n[0] = np.nan

@@ -310,6 +310,21 @@ LAWS_OF_A_STATE = {  # law of y, the argument that the state leads out of its ra
     "Poisson": (lambda x: ssm.Poisson(x), "the rate of Poisson, x,", "np.exp(x)"),
     "Binomial": (lambda x: ssm.Binomial(5, x), " of Binomial, x,", "1 / (1 + np.exp(-(x)))"),
     "Gamma": (lambda x: ssm.Gamma(x, rate=1), "the shape of Gamma, x,", "np.exp(x)"),
+    "in a mixture": (
+        lambda x: ssm.Mixture([0.5, 0.5], [ssm.Normal(0, sd=1), ssm.Exponential(x)]),
+        "the rate of Exponential, x,",
+        "np.exp(x)",
+    ),
+    "of a mixture": (
+        lambda x: ssm.Mixture([x, 1 - x], [ssm.Normal(0, sd=1), ssm.Normal(0, sd=2)]),
+        "the weights[0] of Mixture, x,",
+        "such as [1 - p, p] with p = 1 / (1 + np.exp(-z))",
+    ),
+    "with zeros": (
+        lambda x: ssm.ZeroInflated(ssm.Poisson(x), 0.2),
+        "the rate of Poisson, x,",
+        "np.exp(x)",
+    ),
     "trials": (
         lambda x: ssm.Binomial(10 * x, 0.5),
         "the n of Binomial, 10*x,",
@@ -334,6 +349,16 @@ def test_simulate_names_the_argument_out_of_range_with_its_value_and_a_fix(name)
         ssm.simulate(negative(law), steps=20, seed=1)
     assert re.search(re.escape(argument) + r" is -[.0-9]+ there, outside", str(simulated.value))
     assert fix in str(simulated.value)
+
+
+def test_simulate_names_weights_that_do_not_sum_to_one():
+    law = negative(
+        lambda x: ssm.Mixture([0.3, 0.5 / (1 + x**2)], [ssm.Normal(0, sd=1), ssm.Normal(x, sd=2)])
+    )
+    with pytest.raises(ssm.SamplingError) as simulated:
+        ssm.simulate(law, steps=20, seed=1)
+    assert re.search(r"the weights of Mixture, \[.*\], sum to 0\.\d+ there", str(simulated.value))
+    assert "w / np.sum(w)" in str(simulated.value)
 
 
 @pytest.mark.parametrize("name", LAWS_OF_A_STATE)

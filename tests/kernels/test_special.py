@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy import special as scipy_special
 
-from ssmppl.codegen.kernels import incomplete, special
+from ssmppl.codegen.kernels import incomplete, laws, special
+from ssmppl.expressions import special as interpreted
 
 RNG = np.random.default_rng(3)
 N = 150
@@ -37,6 +38,8 @@ CASES = [
     (special.lgamma, lambda x: mp.log(abs(mp.gamma(x))), (REAL,), 1e-14, 1e-15),
     (special.digamma, mp.digamma, (REAL,), 1e-12, 1e-14),
     (special.trigamma, lambda x: mp.psi(1, x), (REAL,), 1e-12, 0.0),
+    (special.i0e, lambda x: mp.besseli(0, x) * mp.exp(-abs(x)), (REAL,), 1e-14, 0.0),
+    (special.i1e, lambda x: mp.besseli(1, x) * mp.exp(-abs(x)), (REAL,), 1e-14, 0.0),
     (special.ndtr, mp.ncdf, (NORMAL,), 1e-12, 0.0),
     (special.log_ndtr, lambda x: mp.log(mp.ncdf(x)), (np.r_[NORMAL, -GAMMA_X],), 1e-12, 0.0),
     (special.ndtri, lambda p: scipy_special.ndtri(float(p)), (UNIT,), 1e-13, 1e-15),
@@ -82,7 +85,60 @@ def test_beta_quantile():
             assert x == pytest.approx(expected, rel=1e-9, abs=1e-290)
 
 
+TRIALS = RNG.integers(1, 60, N)
+KAPPA = 10 ** RNG.uniform(-3, 4, N)
+ANGLE = np.where(RNG.uniform(size=N) < 0.5, 1.0, KAPPA**-0.5) * RNG.uniform(-np.pi, np.pi, N)
+ANGLE = np.clip(ANGLE, -3.14, 3.14)
+
+
+def betabinomial_masses(n, a, b):
+    return [
+        mp.binomial(n, k) * mp.beta(k + a, n - k + b) / mp.beta(a, b) for k in range(int(n) + 1)
+    ]
+
+
+@pytest.mark.parametrize("home", [laws, interpreted])
+def test_beta_binomial_sums(home):
+    with mp.workdps(40):
+        for n, a, b, share in zip(TRIALS, ALPHA, BETA, RNG.uniform(0, 1, N), strict=True):
+            masses = betabinomial_masses(*map(mp.mpf, (int(n), float(a), float(b))))
+            k = int(share * n)
+            expected = float(mp.fsum(masses[: k + 1]))
+            found = float(home.betabinomial_cdf(float(k), float(n), a, b))
+            assert found == pytest.approx(expected, rel=1e-11, abs=1e-300)
+            between = float(mp.fsum(masses[:k]) + masses[k] / 2)
+            if masses[k] > 1e-9 * between:
+                assert home.betabinomial_quantile(float(n), a, b, between) == k
+
+
+@pytest.mark.parametrize("home", [laws, interpreted])
+def test_von_mises_integrals(home):
+    """Below the mean to full relative accuracy; above it one less that."""
+    with mp.workdps(30):
+        for kappa, x in zip(KAPPA[:60], ANGLE[:60], strict=True):
+            k, edge = mp.mpf(float(kappa)), -abs(mp.mpf(float(x)))
+            cuts = [edge - (edge + mp.pi) * mp.mpf(2) ** -j for j in range(16)]
+            at_edge = mp.cos(edge)  # out of the integrand: quad's errors are absolute
+            lower = mp.quad(lambda t, k=k, c=at_edge: mp.exp(k * (mp.cos(t) - c)), [*cuts, edge])
+            lower *= mp.exp(k * (at_edge - 1)) / (2 * mp.pi * mp.besseli(0, k) * mp.exp(-k))
+            expected = float(lower if x <= 0 else 1 - lower)
+            found = float(home.vonmises_cdf(kappa, x))
+            assert found == pytest.approx(expected, rel=1e-12, abs=1e-290), (kappa, x)
+            if 1e-280 < expected < 0.9:
+                back = float(home.vonmises_quantile(kappa, expected))
+                assert home.vonmises_cdf(kappa, back) == pytest.approx(expected, rel=1e-11)
+
+
 def test_limits():
+    assert special.i0e(0.0) == 1.0
+    assert special.i1e(0.0) == 0.0
+    assert special.i0e(np.inf) == 0.0
+    assert laws.betabinomial_cdf(-1.0, 5.0, 1.0, 2.0) == 0.0
+    assert laws.betabinomial_cdf(5.0, 5.0, 1.0, 2.0) == 1.0
+    assert laws.betabinomial_quantile(5.0, 1.0, 2.0, 1.0) == 5.0
+    assert laws.vonmises_cdf(2.0, -np.pi) == 0.0
+    assert laws.vonmises_cdf(2.0, np.pi) == 1.0
+    assert laws.vonmises_quantile(2.0, 1.0) == pytest.approx(np.pi)
     assert special.lgamma(0.0) == np.inf
     assert special.lgamma(-3.0) == np.inf
     assert special.ndtri(0.0) == -np.inf
@@ -111,6 +167,13 @@ def test_outside_the_domain_is_nan():
         incomplete.gammainc(-1.0, 1.0),
         incomplete.gammaincc(1.0, -1.0),
         incomplete.gammaincinv(1.0, np.nan),
+        laws.betabinomial_cdf(1.0, 2.5, 1.0, 1.0),
+        laws.betabinomial_cdf(1.0, 2.0, -1.0, 1.0),
+        laws.betabinomial_quantile(2.0, 1.0, 1.0, 1.5),
+        laws.vonmises_cdf(-1.0, 0.5),
+        laws.vonmises_cdf(1.0, 3.5),
+        laws.vonmises_quantile(1.0, -0.5),
+        special.i0e(np.nan),
         incomplete.betainc(1.0, 0.0, 0.5),
         incomplete.betaincinv(1.0, 1.0, 1.5),
     ]

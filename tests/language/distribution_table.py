@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import scipy.stats as st
+from scipy import special
 
 import ssmppl.language.distributions as D
 from ssmppl.expressions.arrays import ExprArray, array
@@ -83,6 +84,108 @@ def _categorical(p):
     return st.rv_discrete(values=(np.arange(len(p)), p))
 
 
+def _weibull(shape, scale):
+    return st.weibull_min(shape, scale=scale)
+
+
+class Counted:
+    """A law of counts by its masses at 0, 1, ..., both tails summed from their own ends."""
+
+    def __init__(self, log_masses):
+        self.log_masses = np.asarray(log_masses, dtype=float)
+        masses = np.exp(self.log_masses)
+        self._below = np.concatenate([[0.0], np.minimum(np.cumsum(masses), 1.0)])
+        self._below[-1] = 1.0
+        self._above = np.concatenate([np.cumsum(masses[::-1])[::-1], [0.0]])
+        k = np.arange(len(masses))
+        self._mean = float(k @ masses)
+        self._var = float((k - self._mean) ** 2 @ masses)
+
+    def support(self):
+        return 0.0, float(len(self.log_masses) - 1)
+
+    def _at(self, x):
+        return np.clip(np.floor(x), -1, len(self.log_masses) - 1).astype(int)
+
+    def logpmf(self, x):
+        inside = (x >= 0) & (x < len(self.log_masses)) & (x == np.floor(x))
+        return np.where(inside, self.log_masses[np.maximum(self._at(x), 0)], -np.inf)
+
+    def pmf(self, x):
+        return np.exp(self.logpmf(np.asarray(x)))
+
+    def cdf(self, x):
+        return self._below[self._at(x) + 1]
+
+    def sf(self, x):
+        return self._above[self._at(x) + 1]
+
+    def ppf(self, p):
+        return np.minimum(np.searchsorted(self._below[1:], p), len(self.log_masses) - 1) * 1.0
+
+    def isf(self, p):
+        below = np.searchsorted(-self._above[1:], -np.asarray(p))
+        return np.minimum(below, len(self.log_masses) - 1) * 1.0
+
+    def mean(self):
+        return self._mean
+
+    def var(self):
+        return self._var
+
+
+def _beta_binomial(n, a, b):
+    return Counted(st.betabinom(int(n), a, b).logpmf(np.arange(n + 1)))
+
+
+class Circle:
+    """Von Mises by quadrature round its mean; its moments are the circular ones."""
+
+    def __init__(self, mean, concentration):
+        self.m, self.k = mean, concentration
+        self._norm = math.log(2 * math.pi * special.i0e(concentration))
+        nodes, weights = np.polynomial.legendre.leggauss(100)
+        self._nodes, self._weights = 0.5 * (nodes + 1.0), 0.5 * weights
+
+    def support(self):
+        return -math.pi, math.pi
+
+    def logpdf(self, x):
+        return self.k * (np.cos(x - self.m) - 1.0) - self._norm
+
+    def _between(self, a, b):
+        t = a + (b - a) * self._nodes
+        return (b - a) * self._weights @ np.exp(self.logpdf(t))
+
+    def cdf(self, x):
+        x = np.clip(x, -np.pi, np.pi)
+        return np.vectorize(lambda v: self._between(-np.pi, v), otypes=[float])(x)
+
+    def sf(self, x):
+        x = np.clip(x, -np.pi, np.pi)
+        return np.vectorize(lambda v: self._between(v, np.pi), otypes=[float])(x)
+
+    def ppf(self, p):
+        return self._root(lambda x: self.cdf(x) < p, p)
+
+    def isf(self, p):
+        return self._root(lambda x: self.sf(x) > p, p)
+
+    def _root(self, left, p):
+        low, high = np.full(np.shape(p), -np.pi), np.full(np.shape(p), np.pi)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            below = left(middle)
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return high
+
+    def mean(self):
+        return self.m
+
+    def var(self):
+        return 1.0 - special.i1e(self.k) / special.i0e(self.k)
+
+
 CASES = [
     Case(D.Normal, {"mean": 0.0, "sd": 1.0}, _normal(0, 1)),
     Case(D.Normal, {"mean": -3.5, "variance": 1e-8}, _normal(-3.5, 1e-4)),
@@ -114,6 +217,12 @@ CASES = [
     Case(D.Exponential, {"rate": 1.0}, st.expon()),
     Case(D.Exponential, {"rate": 250.0}, st.expon(scale=1 / 250.0)),
     Case(D.Exponential, {"scale": 40.0}, st.expon(scale=40.0)),
+    Case(D.Weibull, {"shape": 1.7, "scale": 3.0}, _weibull(1.7, 3.0)),
+    Case(D.Weibull, {"shape": 0.6, "scale": 0.02}, _weibull(0.6, 0.02)),
+    Case(D.Weibull, {"shape": 25.0, "scale": 400.0}, _weibull(25.0, 400.0)),
+    Case(D.VonMises, {"mean": 0.0, "concentration": 2.0}, Circle(0.0, 2.0)),
+    Case(D.VonMises, {"mean": 0.4, "concentration": 0.1}, Circle(0.4, 0.1)),
+    Case(D.VonMises, {"mean": -2.8, "concentration": 1.5}, Circle(-2.8, 1.5)),
     Case(D.Gamma, {"shape": 2.5, "rate": 1.0}, _gamma(2.5, 1.0)),
     Case(D.Gamma, {"shape": 0.2, "rate": 3.0}, _gamma(0.2, 3.0)),
     Case(D.Gamma, {"shape": 6.25, "scale": 4.0}, _gamma(6.25, 0.25)),
@@ -135,6 +244,9 @@ CASES = [
     Case(D.Binomial, {"n": 10.0, "p": 0.3}, st.binom(10, 0.3)),
     Case(D.Binomial, {"n": 1.0, "p": 0.999}, st.binom(1, 0.999)),
     Case(D.Binomial, {"n": 5000.0, "p": 0.01}, st.binom(5000, 0.01)),
+    Case(D.BetaBinomial, {"n": 12.0, "a": 2.0, "b": 3.0}, _beta_binomial(12, 2.0, 3.0)),
+    Case(D.BetaBinomial, {"n": 40.0, "a": 0.3, "b": 0.5}, _beta_binomial(40, 0.3, 0.5)),
+    Case(D.BetaBinomial, {"n": 300.0, "a": 80.0, "b": 900.0}, _beta_binomial(300, 80.0, 900.0)),
     Case(D.Bernoulli, {"p": 0.5}, st.bernoulli(0.5)),
     Case(D.Bernoulli, {"p": 1e-4}, st.bernoulli(1e-4)),
     Case(D.Bernoulli, {"p": 0.97}, st.bernoulli(0.97)),
@@ -231,6 +343,8 @@ TRUNCATED_CASES = [
                 (-_INF, 0.01), (150.0, _INF), (3.0, 4.0), (200.0, 210.0)),
     *_truncated(D.Exponential, {"rate": 2.0}, st.expon(scale=0.5), (1.0, _INF), (-_INF, 0.3),
                 (600.0, _INF), (600.0, 600.2), (-1.0, 1.0)),
+    *_truncated(D.Weibull, {"shape": 1.7, "scale": 3.0}, _weibull(1.7, 3.0), (2.0, _INF),
+                (-_INF, 0.01), (60.0, _INF), (1.0, 1.5), (60.0, 61.0)),
     *_truncated(D.Beta, {"a": 2.0, "b": 5.0}, st.beta(2, 5), (0.5, _INF), (-_INF, 1e-6),
                 (0.999, _INF), (0.2, 0.3), (0.99, 0.995)),
     *_truncated(D.Cauchy, {"loc": 0.0, "scale": 1.0}, st.cauchy(), (0.0, _INF), (1e6, _INF),
@@ -253,7 +367,7 @@ TRUNCATED_CASES = [
                 (1.0, _INF), (150.0, _INF), (-_INF, 3.0), (2.0, 20.0)),
 ]  # fmt: skip
 
-NOT_IN_SCIPY = {"Truncated", "Dirac", "Flat", "HalfFlat"}
+NOT_IN_SCIPY = {"Truncated", "Mixture", "ZeroInflated", "Dirac", "Flat", "HalfFlat"}
 
 
 def scalars(values: Any) -> ExprArray:

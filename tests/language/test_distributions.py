@@ -79,6 +79,10 @@ def test_cdf_and_survival_keep_both_tails(case):
     x, d, law = case.points(), case.build(), case.reference
     if d.discrete:
         x = np.unique(np.concatenate([x, x + 0.5, [-1.0]]))
+    if case.cls is D.VonMises:  # a circle has no tails where it is cut
+        np.testing.assert_allclose(at(d.cdf(array(X)), x), law.cdf(x), rtol=0, atol=2e-15)
+        np.testing.assert_allclose(at(d.survival(array(X)), x), law.sf(x), rtol=0, atol=2e-15)
+        return
     np.testing.assert_allclose(at(d.cdf(array(X)), x), law.cdf(x), rtol=1e-9, atol=1e-290)
     if case.cls is D.Categorical:
         np.testing.assert_allclose(at(d.survival(array(X)), x), law.sf(x), atol=1e-15)

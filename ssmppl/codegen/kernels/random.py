@@ -291,6 +291,30 @@ def binomial(state, n, p):
 
 
 @exact
+def vonmises(state, concentration):
+    """A von Mises variate round 0, on [-pi, pi]: D. J. Best and N. I. Fisher, *Applied Statistics*
+    28 (1979), by rejection from a wrapped Cauchy law. NaN unless 0 <= concentration < inf."""
+    if not (0.0 <= concentration < np.inf):
+        return np.nan
+    if concentration < 1e-8:
+        return np.pi * (2.0 * uniform(state) - 1.0)
+    if concentration > 1e8:  # normal but for one part in the concentration
+        return normal(state) / np.sqrt(concentration)
+    # (1 + rho^2) / (2 rho) of their rho, in a form that keeps its digits
+    tau = 1.0 + np.sqrt(1.0 + 4.0 * concentration * concentration)
+    rho = 2.0 * concentration / (tau + np.sqrt(2.0 * tau))
+    r = (1.0 + rho * rho) / (2.0 * rho)
+    while True:
+        z = np.cos(np.pi * uniform(state))
+        f = (1.0 + r * z) / (r + z)
+        c = concentration * (r - f)
+        u = uniform(state)
+        if c * (2.0 - c) > u or log(c / u) + 1.0 - c >= 0.0:
+            angle = np.arccos(min(max(f, -1.0), 1.0))
+            return angle if uniform(state) < 0.5 else -angle
+
+
+@exact
 def categorical(state, p):
     """An index, as float64, with probabilities in proportion to p, shape (n,).
 

@@ -83,6 +83,44 @@ def trigamma_positive(x):
 
 
 @exact
+def _bessel_i(order, x):
+    """exp(-x) I_order(x) for x >= 0 and order 0 or 1: the power series A&S 9.6.10, whose terms are
+    all positive, up to 25; above it the asymptotic series A&S 9.7.1 to its rounding."""
+    if not x >= 0.0:
+        return np.nan
+    if x <= 25.0:
+        half = 0.5 * x
+        term = total = 1.0 if order == 0 else half
+        for k in range(1, 200):
+            term *= half * half / (k * (k + order))
+            total += term
+            if term < 1e-17 * total:
+                break
+        return exp(-x) * total
+    if x == _INF:
+        return 0.0
+    term = total = 1.0
+    for k in range(1, 40):
+        term *= -(4.0 * order * order - (2.0 * k - 1.0) ** 2) / (8.0 * k * x)
+        total += term
+        if abs(term) < 1e-17:
+            break
+    return total / math.sqrt(2.0 * np.pi * x)
+
+
+@exact
+def i0e(x):
+    """exp(-|x|) I_0(x), the modified Bessel function."""
+    return _bessel_i(0, abs(x))
+
+
+@exact
+def i1e(x):
+    """exp(-|x|) I_1(x)."""
+    return math.copysign(_bessel_i(1, abs(x)), x)
+
+
+@exact
 def logaddexp(a, b):
     """log(e^a + e^b)."""
     if a == b:

@@ -1,0 +1,87 @@
+"""Functions of probability that SciPy has not as ufuncs, for the interpreter: arrays in, array out.
+
+The compiled kernels (`codegen/kernels/laws.py`) compute the same by other ways.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.special as sp
+
+BISECTIONS = 80
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
+PIECES = 6
+FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
+
+
+def _wide(*values: Any) -> list[np.ndarray]:
+    return [np.array(v, dtype=float) for v in np.broadcast_arrays(*values)]
+
+
+def _log_mass(k: int, n: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    choose = sp.gammaln(n + 1.0) - sp.gammaln(k + 1.0) - sp.gammaln(n - k + 1.0)
+    mass: np.ndarray = choose + sp.betaln(k + a, n - k + b) - sp.betaln(a, b)
+    return mass
+
+
+def _trials(n: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, int]:
+    """Where the law exists, and the most trials there."""
+    sound = (n >= 0) & (n < np.inf) & (n == np.floor(n))
+    sound &= (a > 0) & (a < np.inf) & (b > 0) & (b < np.inf)
+    return sound, int(np.max(n[sound], initial=0.0))
+
+
+def betabinomial_cdf(k: Any, n: Any, a: Any, b: Any) -> np.ndarray:
+    """P(X <= k) for X successes of n whose probability is Beta(a, b): the sum."""
+    k, n, a, b = _wide(k, n, a, b)
+    sound, most = _trials(n, a, b)
+    total = np.zeros(k.shape)
+    for j in range(most + 1):
+        total += np.where((j <= k) & (j <= n), np.exp(_log_mass(j, n, a, b)), 0.0)
+    total = np.where(k >= n, 1.0, np.minimum(total, 1.0))
+    return np.where(sound & ~np.isnan(k), total, np.nan)
+
+
+def betabinomial_quantile(n: Any, a: Any, b: Any, q: Any) -> np.ndarray:
+    """The smallest k with P(X <= k) >= q: how many sums before the last are below q."""
+    n, a, b, q = _wide(n, a, b, q)
+    sound, most = _trials(n, a, b)
+    total, k = np.zeros(n.shape), np.zeros(n.shape)
+    for j in range(most):
+        total += np.exp(_log_mass(j, n, a, b))
+        k += (j < n) & (total < q)
+    return np.where(sound & (q >= 0) & (q <= 1), k, np.nan)
+
+
+def vonmises_cdf(concentration: Any, x: Any) -> np.ndarray:
+    """P(X <= x), -pi <= x <= pi, for a von Mises law round 0, by Gauss-Legendre."""
+    kappa, x = _wide(concentration, x)
+    edge = -np.abs(x)
+    most = 2.0 * np.sin(0.5 * edge) ** 2  # 1 - cos
+    first = np.minimum(2.0, most + FARTHEST / np.where(kappa > 0, kappa, 1e-300))
+    start = -2.0 * np.arcsin(np.sqrt(0.5 * first))
+    total = np.zeros(x.shape)
+    for piece in range(PIECES):
+        width = (edge - start) / PIECES
+        for node, weight in zip(NODES, WEIGHTS, strict=True):
+            back = (edge - start) - width * (piece + 0.5 * (1.0 + node))  # from the edge
+            less = 2.0 * np.sin(edge - 0.5 * back) * np.sin(0.5 * back)
+            total += 0.5 * width * weight * np.exp(kappa * less)
+    total *= np.exp(-kappa * most) / (2.0 * np.pi * sp.i0e(kappa))
+    sound = (kappa >= 0) & (kappa < np.inf) & (np.abs(x) <= 3.141592653589794)
+    return np.where(sound, np.where(x <= 0, total, 1.0 - total), np.nan)
+
+
+def vonmises_quantile(concentration: Any, q: Any) -> np.ndarray:
+    """x with P(X <= x) = q, by bisection."""
+    kappa, q = _wide(concentration, q)
+    p = np.minimum(q, 1.0 - q)
+    low, high = np.full(q.shape, -np.pi), np.zeros(q.shape)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        below = vonmises_cdf(kappa, middle) < p
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    sound = (kappa >= 0) & (kappa < np.inf) & (q >= 0) & (q <= 1)
+    return np.where(sound, np.where(q <= 0.5, high, -high), np.nan)

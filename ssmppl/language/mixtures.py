@@ -1,0 +1,268 @@
+"""Mixture: one of several laws by a hidden choice, which is summed out.
+
+McLachlan and Peel (2000), "Finite mixture models". The logarithm of the sum is taken from its
+larger term (`logaddexp`), so that no component is lost to underflow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import ModelError
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import Expr, user_location
+from ssmppl.language.continuous import _NAN, Flat, _each, _where
+from ssmppl.language.discrete import Dirac
+from ssmppl.language.distribution import INFINITY, Distribution, Support
+from ssmppl.language.draws import Draws
+from ssmppl.language.nested import cut, exists, holding
+
+SUM_ROUNDING = 1e-6  # by which weights that are expressions may miss the sum 1
+
+
+class Mixture(Distribution):
+    """Mixture(weights, components): one of the components, chosen with probability weights.
+
+    Independent over the elements of an array: each has a choice of its own.
+
+    Parameters
+    ----------
+    weights : (K,), not negative, of sum 1: numbers, ``[1 - p, p]``, or a parameter of law
+        Dirichlet; they may depend on states. (K, ...) gives each element its own.
+    components : K distributions of numbers, all continuous or all of whole numbers, of one shape or
+        scalars.
+
+    Notes
+    -----
+    The choice is summed out: its density is ``log(sum_k weights[k] * density_k(x))``. Where each
+    choice is wanted, or conjugate draws of the components' parameters, make it a state.
+    """
+
+    components: tuple[Distribution, ...]
+
+    def __init__(self, weights: Any, components: Sequence[Distribution]):
+        self.components = _checked(components)
+        given = array(_stacked(weights))
+        if given.ndim < 1 or len(given) != len(self.components):
+            raise ModelError(
+                f"Mixture: weights of shape {given.shape} for {len(self.components)} components",
+                fix="give one weight for each component, such as [1 - p, p] for two",
+                where=user_location(),
+            )
+        own = {f"weight_{k}": w for k, w in enumerate(given.view(np.ndarray))}
+        for k, law in enumerate(self.components):
+            own |= {f"of_{k}_{n}": a for n, a in law.parameters.items()}
+        self._set(**own)
+        self.components = tuple(
+            law.rebuilt({n: self.parameters[f"of_{k}_{n}"] for n in law.parameters})
+            for k, law in enumerate(self.components)
+        )
+        self.discrete = self.components[0].discrete
+        self.closed = any(law.closed for law in self.components)
+        self.open_above = all(law.open_above for law in self.components)
+        self.drawable = all(law.drawable for law in self.components)
+        for k in range(len(self.components)):
+            self._require(f"weight_{k}", 0.0, 1.0, strict=False)
+        self._refuse_sum()
+
+    @property
+    def weights(self) -> list[ExprArray]:
+        """One for each component, of the distribution's shape."""
+        return [self.parameters[f"weight_{k}"] for k in range(len(self.components))]
+
+    def inside(self):
+        return self.components
+
+    def rebuilt(self, parameters):
+        values = {**self.parameters, **parameters}
+        laws = [
+            law.rebuilt({n: values[f"of_{k}_{n}"] for n in law.parameters})
+            for k, law in enumerate(self.components)
+        ]
+        weights = [values[f"weight_{k}"] for k in range(len(laws))]
+        return self._at_place(Mixture(weights, laws))
+
+    def _sums(self) -> ExprArray:
+        total = self.weights[0]
+        for w in self.weights[1:]:
+            total = total + w
+        return array(total)
+
+    def _refuse_sum(self) -> None:
+        for total in self._sums().ravel():
+            if total.op == "const" and abs(total.data - 1.0) > 1e-8:
+                raise ModelError(
+                    f"Mixture: weights sum to {total.data:.9g}",
+                    fix="divide the weights by their sum",
+                    where=self.location,
+                )
+
+    def __repr__(self) -> str:
+        weights = ", ".join(repr(w.ravel()[0]) if w.size else "" for w in self.weights)
+        return f"Mixture([{weights}], [{', '.join(map(repr, self.components))}])"
+
+    def support(self):
+        parts = [law.support() for law in self.components]
+        lower = self._hull("minimum", -INFINITY, [p.lower for p in parts])
+        upper = self._hull("maximum", INFINITY, [p.upper for p in parts])
+        if self.discrete:
+            return Support("integers", lower, upper)
+        real = any(p.kind == "real" for p in parts)
+        return Support("real" if real else "interval", lower, upper)
+
+    def _hull(self, op: str, end: float, bounds: Iterable[ExprArray]) -> ExprArray:
+        """The outermost of some bounds; an infinite one is it, whatever the others are."""
+        wide = [array(b).view(np.ndarray) for b in bounds]
+        out = np.empty(self.shape, dtype=object)
+        for i in np.ndindex(self.shape):
+            each: list[Any] = list(dict.fromkeys(b[i] for b in wide))
+            endless = [e for e in each if e.op == "const" and e.data == end]
+            out[i] = (endless or each)[0]
+            for e in [] if endless else each[1:]:
+                out[i] = ew(op, out[i], e)
+        return array(out)
+
+    def in_range(self) -> ExprArray | None:
+        """As of any law, for all components at once: what is never chosen has to exist too."""
+        gap = array(self._sums() - 1.0)
+        sums = None
+        if any(e.op != "const" for e in gap.ravel()):
+            sums = array(ew("le", ew("abs", gap), SUM_ROUNDING))
+        return holding([super().in_range(), sums, *map(exists, self.components)])
+
+    def _parts(self, value: ExprArray) -> list[ExprArray]:
+        """Log density of each component, -inf where the mixture has a value and it has none."""
+        whole, out = self.support(), []
+        for law in self.components:
+            own = law.support()
+            pairs = [*zip(own.lower.ravel(), whole.lower.ravel(), strict=True),
+                     *zip(own.upper.ravel(), whole.upper.ravel(), strict=True)]  # fmt: skip
+            ends = law.closed == self.closed and law.open_above == self.open_above
+            same = ends and all(a is b for a, b in pairs)
+            out.append(array(law.log_densities(value)) if same else cut(law, value))
+        return out
+
+    def log_densities(self, value):
+        total = None
+        for weight, part in zip(self.weights, self._parts(array(value)), strict=True):
+            term = array(ew("log", weight)) + part
+            total = term if total is None else array(ew("logaddexp", total, term))
+        return total
+
+    def guarded_log_densities(self, value):
+        density = super().guarded_log_densities(value)
+        allowed = None if self.discrete else self.in_range()  # of discrete ones it has been asked
+        return density if allowed is None else _where(allowed, density, _NAN)
+
+    def sample(self, draws):
+        def draw(i):
+            u, shared, out, below = draws.uniform(), _Shared(draws), None, 1.0
+            for law, weight in reversed([*zip(self.components, self.weights, strict=True)]):
+                drawn = array(law.element(i).sample(shared.again()))[()]
+                out = drawn if out is None else ew("where", ew("lt", u, below), drawn, out)
+                below = below - weight[i]
+            return out
+
+        return _each(self, draw)
+
+    def _weighted_sum(self, parts: Iterable[Any]) -> ExprArray:
+        total = array(0.0)
+        for weight, part in zip(self.weights, parts, strict=True):
+            total = total + weight * array(part)
+        return array(total)
+
+    def mean(self):
+        return self._weighted_sum(law.mean() for law in self.components)
+
+    def variance(self):
+        mean = self.mean()
+        return self._weighted_sum(
+            law.variance() + (law.mean() - mean) ** 2 for law in self.components
+        )
+
+    def cdf(self, value):
+        return self._weighted_sum(law.cdf(value) for law in self.components)
+
+    def survival(self, value):
+        return self._weighted_sum(law.survival(value) for law in self.components)
+
+    def quantile(self, p):
+        raise ModelError(
+            "Mixture: its quantiles have no formula",
+            fix="take those of draws from it",
+            where=self.location,
+        )
+
+
+class _Shared(Draws):
+    """Draws that every component is made of: only one of them is kept, so they may be the same."""
+
+    def __init__(self, draws: Draws):
+        self.draws = draws
+        self.made: dict[str, list[Expr]] = {"normal": [], "uniform": []}
+        self.used: dict[str, int] = {}
+
+    def again(self) -> _Shared:
+        """From the first draw on, for the next component."""
+        self.used = dict.fromkeys(self.made, 0)
+        return self
+
+    def _node(self, kind: str, *args: Any) -> Expr:
+        if kind not in self.made:
+            return self.draws._node(kind, *args)
+        own, at = self.made[kind], self.used[kind]
+        self.used[kind] = at + 1
+        if at == len(own):
+            own.append(self.draws._node(kind))
+        return own[at]
+
+
+def _checked(components: Any) -> tuple[Distribution, ...]:
+    """The components, if they can be mixed."""
+    where = user_location()
+    known = isinstance(components, (list, tuple)) and all(
+        isinstance(c, Distribution) for c in components
+    )
+    if not known or len(components) < 2:
+        raise ModelError(
+            f"Mixture: components are {components!r}",
+            fix="give a list of at least two distributions: "
+            "ssm.Mixture([1 - p, p], [ssm.Normal(x, sd=1), ssm.Normal(x, sd=10)])",
+            where=where,
+        )
+    for law in components:
+        name = type(law).__name__
+        if law.joint or isinstance(law, (Dirac, Flat)):
+            fix = {
+                "Categorical": "mix the probabilities: ssm.Categorical(w * p + (1 - w) * q)",
+                "Dirac": "a law with an atom has no density; zeros among counts are "
+                "ssm.ZeroInflated(law, p)",
+            }.get(name, "make the choice a state, ssm.Bernoulli(p) drawn in every row, and select "
+                  "the arguments by np.where")  # fmt: skip
+            raise ModelError(f"Mixture: cannot mix {name}", fix=fix, where=where)
+    if len({law.discrete for law in components}) > 1:
+        kinds = ", ".join(
+            f"{type(law).__name__} ({'discrete' if law.discrete else 'continuous'})"
+            for law in components
+        )
+        raise ModelError(
+            f"Mixture: components of two kinds: {kinds}",
+            fix="mix continuous laws with each other, laws of whole numbers with each other",
+            where=where,
+        )
+    return tuple(components)
+
+
+def _stacked(weights: Any) -> Any:
+    """Weights as one array, scalars of a list widened to the others' shape."""
+    if not isinstance(weights, (list, tuple)):
+        return weights
+    try:
+        wide = np.broadcast_arrays(*(array(w).view(np.ndarray) for w in weights))
+    except ValueError:
+        return weights
+    return np.stack(wide) if wide else np.empty(0)
