@@ -10,7 +10,6 @@ observations along the one trajectory. Its gradient goes along with it, by the s
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -26,7 +25,7 @@ from ssmppl.inference.exact.scored import Scored
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
 from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state, run_filter
 from ssmppl.inference.problem import Problem, missing_of
-from ssmppl.language.trace import Trace
+from ssmppl.language.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
@@ -141,14 +140,13 @@ class Deterministic(Scored):
         return self._scores[key].of(problem)
 
 
-_forms: dict[int, tuple[weakref.ref[Trace], NotApplicable | None, dict]] = {}
+@once_per_trace
+def _form(trace: Trace) -> tuple[NotApplicable | None, dict[tuple, CompleteScores]]:
+    """Which state has noise, and where the scores are kept."""
+    return without_noise(trace), {}
 
 
 def deterministic_model(trace: Trace) -> Deterministic | NotApplicable:
     """The traced model as one without noise in its states; or the reason why it has some."""
-    key = id(trace)
-    if key not in _forms:
-        reference = weakref.ref(trace, lambda _: _forms.pop(key, None))
-        _forms[key] = reference, without_noise(trace), {}
-    _, reason, scores = _forms[key]
+    reason, scores = _form(trace)
     return Deterministic(trace, scores) if reason is None else reason
