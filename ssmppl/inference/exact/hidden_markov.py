@@ -228,9 +228,9 @@ class HiddenMarkov(FiniteLaws):
                     return np.sum(law * np.where(law > 0.0, own, 0.0), axis=1)
 
                 for j, level in enumerate(levels):
-                    own = self._observed(channel.quantile(level), e, theta)
-                    low = np.min(np.where(law > 0.0, own, np.inf), axis=1)
-                    high = np.max(np.where(law > 0.0, own, -np.inf), axis=1)
+                    own = [self._observed(f, e, theta) for f in channel.ends(level)]
+                    low = np.min([np.where(law > 0.0, q, np.inf) for q in own], axis=(0, 2))
+                    high = np.max([np.where(law > 0.0, q, -np.inf) for q in own], axis=(0, 2))
                     out[:, j, k] = inverted(below, level, low, high, channel.whole)
         return out
 
