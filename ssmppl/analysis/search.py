@@ -234,7 +234,7 @@ class Search:
         )
 
     def _left_alone(self, component: Expr) -> list[Factor]:
-        unit = next(u for u in self.single if component in u)
+        unit = next(u for u in self.single if any(component is c for c in u))
         single = self.single[unit]
         return [factor for factor, _ in single.form.left] if isinstance(single, Found) else []
 

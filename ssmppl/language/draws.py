@@ -56,8 +56,7 @@ class Generator:
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
         """Uniform between low and high, neither of them ever drawn."""
-        u = self._draws.uniform()
-        return u if (low, high) == (0.0, 1.0) else low + (high - low) * u
+        return low + (high - low) * self._draws.uniform()
 
     def random(self) -> Any:
         """Uniform between 0 and 1."""

@@ -17,15 +17,18 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
 from ssmppl.language.circular import VonMises
-from ssmppl.language.continuous import LOG_2PI, Flat, Normal, Uniform, _each, _where
+from ssmppl.language.continuous import Flat, Normal, Uniform, _each, _where
 from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
+from ssmppl.language.inflated import ZeroInflated
 from ssmppl.language.mixtures import Mixture
 from ssmppl.language.positive import Exponential
 from ssmppl.language.symmetric import Laplace
+from ssmppl.language.truncated_moments import exponential_moments, is_infinite, normal_moments
 from ssmppl.language.written import Written
 
 MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
+MOST_SUMMED = 256  # and that its moments are summed over, where they have no formula
 
 
 class Truncated(Distribution):
@@ -72,9 +75,13 @@ class Truncated(Distribution):
             **{f"like_{n}": a for n, a in dist.parameters.items()},
         )
         if isinstance(dist, Truncated):  # of the innermost, by the tighter bounds
-            self.parameters["lower"] = _tighter("maximum", self.lower, self.like_lower)
-            self.parameters["upper"] = _tighter("minimum", self.upper, self.like_upper)
+            own = {f"like_{n}": self.parameters[f"like_like_{n}"] for n in dist.base.parameters}
+            lower = _tighter("maximum", self.lower, self.like_lower)
+            upper = _tighter("minimum", self.upper, self.like_upper)
+            self.parameters = {"lower": lower, "upper": upper, **own}
             dist = dist.base
+        if dist.shape != self.shape:  # bounds for each element of what is one law
+            dist = dist.rebuilt({n: self.parameters[f"like_{n}"] for n in dist.parameters})
         if dist.discrete:
             self.parameters["lower"] = array(ew("ceil", self.lower))
             self.parameters["upper"] = array(ew("floor", self.upper))
@@ -94,7 +101,7 @@ class Truncated(Distribution):
         values = {**self.parameters, **parameters}
         base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
         bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
-        kept = {n: b for n, b in bounds.items() if not _is_infinite(b)}
+        kept = {n: b for n, b in bounds.items() if not is_infinite(b)}
         return self._at_place(Truncated(base, **kept))
 
     def _refuse_empty(self) -> None:
@@ -113,7 +120,7 @@ class Truncated(Distribution):
         bounds = [
             f"{name}={self.parameters[name].ravel()[0]!r}"
             for name in ("lower", "upper")
-            if not _is_infinite(self.parameters[name])
+            if not is_infinite(self.parameters[name])
         ]
         return f"Truncated({', '.join([repr(self.base), *bounds])})"
 
@@ -190,14 +197,14 @@ class Truncated(Distribution):
             out = out + _where(ew("lt", below, p * total), 1.0, 0.0)
         return array(out)
 
-    def _width(self) -> int | None:
+    def _width(self, most: int = MOST_COUNTED) -> int | None:
         """upper - lower for a discrete law between a few numbers, else None."""
         bounds = [a.ravel() for a in self._bounds()]
         if not self.discrete or any(e.op != "const" for a in bounds for e in a):
             return None
         widths = {b.data - a.data for a, b in zip(*bounds, strict=True)}
         width = widths.pop()
-        return int(width) if not widths and width <= MOST_COUNTED else None
+        return int(width) if not widths and width <= most else None
 
     def survival_quantile(self, p):
         return self._quantile(1.0 - array(p), array(p))
@@ -221,15 +228,19 @@ class Truncated(Distribution):
         """Mean and variance: in closed form, else by quadrature; infinite where they diverge."""
         lower, upper = self._bounds()
         if isinstance(self.base, Normal):
-            return _normal_moments(self.base, lower, upper)
+            return normal_moments(self.base, lower, upper)
         if isinstance(self.base, Uniform):
             return 0.5 * (lower + upper), (upper - lower) ** 2 / 12.0
         if isinstance(self.base, Exponential):
-            return _exponential_moments(self.base, lower, upper)
+            return exponential_moments(self.base, lower, upper)
         if self.base.weighted(1) is not None:
             return self._weighted_moments(lower, upper)
+        if isinstance(self.base, ZeroInflated):
+            return self._inflated_moments(self.base, lower, upper)
+        if self.discrete:
+            return self._summed_moments()
         mean, variance = self._quadrature()
-        infinite = [_is_infinite(b) for b in (lower, upper)]
+        infinite = [is_infinite(b) for b in (lower, upper)]
         if any(infinite):
             limit = math.inf if infinite[1] else -math.inf
             finite = self.base.has_moment(1)
@@ -249,6 +260,26 @@ class Truncated(Distribution):
             moments.append(factor * ew("exp", law.log_mass(lower - shift, upper - shift) - mass))
         mean, second = moments
         return mean, second - mean * (mean - 1.0 if self.discrete else mean)
+
+    def _inflated_moments(
+        self, base: ZeroInflated, lower: ExprArray, upper: ExprArray
+    ) -> tuple[ExprArray, ExprArray]:
+        """From those of the law that zeros were added to, cut likewise."""
+        inner = Truncated(base.base, lower=lower, upper=upper)
+        mass = base.base.log_mass(*inner._bounds()) - base.log_mass(lower, upper)
+        share, mean = (1.0 - base.p) * ew("exp", mass), inner.mean()
+        return share * mean, share * (inner.variance() + (1.0 - share) * mean**2)
+
+    def _summed_moments(self) -> tuple[ExprArray, ExprArray]:
+        """Sums over the values of a discrete law between a few numbers; else NaN."""
+        width = self._width(MOST_SUMMED)
+        if width is None:
+            return self._full(math.nan), self._full(math.nan)
+        values = [self._bounds()[0] + float(k) for k in range(width + 1)]
+        shares = [array(ew("exp", self.log_densities(k))) for k in values]
+        mean = array(sum(p * k for p, k in zip(shares, values, strict=True)))
+        parts = (p * (k - mean) ** 2 for p, k in zip(shares, values, strict=True))
+        return mean, array(sum(parts))
 
     def _quadrature(self) -> tuple[ExprArray, ExprArray]:
         """Moments as integrals of the quantile function over (0, 1).
@@ -280,10 +311,6 @@ def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[fl
     return out
 
 
-def _is_infinite(bound: Any) -> bool:
-    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
-
-
 def _as_given(bound: Any, discrete: bool) -> ExprArray:
     """Without the whole number that was taken of it where the law is discrete."""
     given = [
@@ -300,53 +327,3 @@ def _tighter(op: str, a: ExprArray, b: ExprArray) -> ExprArray:
         plain = [e for e in (a[i], b[i]) if not (e.op == "const" and e.data == neutral)]
         out[i] = ew(op, *plain) if len(plain) == 2 else (plain or [a[i]])[0]
     return array(out)
-
-
-def _normal_moments(
-    base: Normal, lower: ExprArray, upper: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """Johnson, Kotz and Balakrishnan (1994), section 13.10.1, with ratios taken of logs."""
-    sd, mass = base.sd(), base.log_mass(lower, upper)
-    a, b = ((bound - base.mean()) / sd for bound in (lower, upper))
-
-    def ratio(z: ExprArray) -> ExprArray:
-        return array(ew("exp", -0.5 * z**2 - 0.5 * LOG_2PI - mass))
-
-    first = second = array(0.0)
-    if not _is_infinite(lower):
-        first, second = first + ratio(a), second + a * ratio(a)
-    if not _is_infinite(upper):
-        first, second = first - ratio(b), second - b * ratio(b)
-    mean, variance = first, 1.0 + second - first**2
-    if not _is_infinite(lower) and not _is_infinite(upper):
-        # Narrow, where the differences above cancel: Gauss-Legendre over the interval.
-        width, middle = array(b - a), array(0.5 * (a + b))
-        steepness = width * array(ew("maximum", 1.0, ew("abs", middle)))
-        nodes, weights = np.polynomial.legendre.leggauss(12)
-        total = first_sum = second_sum = array(0.0)
-        for node, weight in zip(nodes, weights, strict=True):
-            d = 0.5 * width * node
-            mass_at = weight * array(ew("exp", -d * (middle + 0.5 * d)))
-            total = total + mass_at
-            first_sum = first_sum + mass_at * node
-            second_sum = second_sum + mass_at * node**2
-        offset = first_sum / total
-        spread = (0.5 * width) ** 2 * (second_sum / total - offset**2)
-        offset = 0.5 * width * offset
-        narrow = array(ew("lt", steepness, 1.0))
-        mean = _where(narrow, middle + offset, mean)
-        variance = _where(narrow, spread, variance)
-    return base.mean() + sd * mean, sd**2 * variance
-
-
-def _exponential_moments(
-    base: Exponential, lower: ExprArray, upper: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """Without memory: those of an exponential cut off at upper - lower, moved by lower."""
-    scale = base.mean()
-    if _is_infinite(upper):
-        return lower + scale, array(scale**2 + 0.0 * lower)
-    width = (upper - lower) / scale
-    lost = width / ew("expm1", width)
-    variance = 1.0 - lost**2 * array(ew("exp", width))
-    return lower + scale * (1.0 - lost), scale**2 * variance

@@ -103,3 +103,43 @@ def test_parts_are_rebuilt():
     assert np.exp(zero) == pytest.approx(0.1 + 0.9 * 0.4)
     with pytest.raises(ValueError, match="another number"):  # its function is not kept
         law.rebuilt({"like_p": 0.5})
+
+
+@Geometric.cdf
+def cdf(k, p):
+    return 1 - (1 - p) ** (k + 1)
+
+
+@Geometric.quantile
+def quantile(u, p):
+    return np.maximum(0, np.ceil(np.log1p(-u) / np.log1p(-p) - 1))
+
+
+@pytest.mark.parametrize("bounds", [{"upper": 3}, {"lower": 2, "upper": 30}, {"upper": 200}])
+@pytest.mark.parametrize("zeros", [0.0, 0.2])
+def test_moments_of_truncated_counts_are_sums(bounds, zeros):
+    law, k = Geometric(0.3), np.arange(1000)
+    p = (1 - zeros) * stats.geom(0.3, loc=-1).pmf(k) + zeros * (k == 0)
+    assert_moments(ssm.ZeroInflated(law, zeros) if zeros else law, p, bounds)
+
+
+@pytest.mark.parametrize("bounds", [{"upper": 3}, {"lower": 2}, {"lower": 0, "upper": 500}])
+def test_moments_of_a_truncated_hurdle(bounds):
+    k = np.arange(1000)
+    p = 0.7 * (k > 0) * stats.poisson(2).pmf(k) / stats.poisson(2).sf(0) + 0.3 * (k == 0)
+    hurdle = ssm.ZeroInflated(ssm.Truncated(ssm.Poisson(2.0), lower=1), 0.3)
+    assert_moments(hurdle, p, bounds)
+
+
+def assert_moments(law, p, bounds):
+    k = np.arange(1000)
+    p = p * (k >= bounds.get("lower", 0)) * (k <= bounds.get("upper", 1000))
+    mean = p @ k / p.sum()
+    found = ssm.Truncated(law, **bounds)
+    assert evaluate(array(found.mean())[()]) == pytest.approx(mean)
+    variance = p @ (k - mean) ** 2 / p.sum()
+    assert evaluate(array(found.variance())[()]) == pytest.approx(variance)
+
+
+def test_moments_of_endless_counts_without_a_formula_are_not_told():
+    assert np.isnan(evaluate(array(ssm.Truncated(Geometric(0.3), lower=1).mean())[()]))

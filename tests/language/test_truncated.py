@@ -198,3 +198,19 @@ def test_a_symbolic_mean_far_outside_the_bounds():
     assert np.all((x > 0) & np.isfinite(x))
     # the tail is exponential with rate |mean| / variance
     assert st.kstest(x, st.expon(scale=1e-4 / 20.0).cdf).pvalue > 1e-6
+
+
+def test_what_was_truncated_twice_is_rebuilt_and_goes_into_mixtures():
+    twice = D.Truncated(D.Truncated(D.Normal(X, sd=1), lower=0), upper=2)
+    assert twice.rebuilt({}).log_density(1.0) is twice.log_density(1.0)
+    mixed = D.Mixture([0.5, 0.5], [twice, D.Uniform(0, 2)])
+    drawn = 0.5 * np.exp(evaluate(twice.log_density(1.0), {X: 0.3})) + 0.25
+    assert evaluate(mixed.log_density(1.0), {X: 0.3}) == pytest.approx(np.log(drawn))
+
+
+def test_one_law_between_bounds_for_each_element():
+    d = D.Truncated(D.Poisson(3.0), lower=[0, 1, 2], upper=9)
+    each = [D.Truncated(D.Poisson(3.0), lower=k, upper=9) for k in range(3)]
+    expected = sum(evaluate(one.log_density(4.0)) for one in each)
+    assert evaluate(d.log_density([4.0, 4.0, 4.0])) == pytest.approx(expected)
+    assert evaluate(array(d.mean())) == pytest.approx([value(one.mean()) for one in each])

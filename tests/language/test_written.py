@@ -486,3 +486,24 @@ def test_a_right_sampler_fails_the_check_as_often_as_its_level_says():
         except ModelError:
             failed += 1
     assert stats.binomtest(failed, 400, 0.1).pvalue > 1e-3
+
+
+@ssm.distribution(lower="low", upper="high")
+def Between(y, low, high):
+    return -np.log(high - low) + 0.0 * y
+
+
+@Between.sampler
+def between(rng, low, high):
+    return rng.uniform(low, high)
+
+
+def test_a_sampler_draws_uniform_numbers_between_arguments():
+    model = ssm.Model("between")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(lambda x, a: {"y": Between(a, a + 2.0)})
+    y = ssm.simulate(model, {"a": 5.0}, steps=2000, seed=1)["y"].values[0]
+    assert stats.kstest(y, "uniform", args=(5.0, 2.0)).pvalue > 1e-4
+    assert Between.check(0.0, 1.0).p_value > 1e-4
