@@ -243,3 +243,28 @@ def test_sampling_constant_data():
             ssm.sample(level(ssm.HalfFlat), CONSTANT, method, **settings)
     idata = ssm.sample(level(ssm.InverseGamma), CONSTANT, **settings)
     assert np.all(idata.posterior["r"].to_numpy() > 0.01)
+
+
+def test_constant_data_of_states_without_noise():
+    """Beside counts, which are certain at the end of their support, and not without a bound."""
+    model = ssm.Model("steady", inputs=("u",))
+    model.prior(lambda: {"s": ssm.HalfNormal(sd=1), "p": ssm.Uniform(0, 1)})
+    model.initial(lambda: {"x": ssm.Dirac(1.0)})
+    model.transition(lambda x, u: {"x": ssm.Dirac(x**2 + u)})
+    model.observation(lambda x, s, p, u: {
+        "y": ssm.Normal(x + u, sd=s), "c": ssm.Bernoulli(p)
+    })  # fmt: skip
+    data = {"u": np.zeros(20), "c": np.ones(20), "y": np.ones(20)}
+    settings = {"seed": 1, "progress": False}
+    found = ssm.maximize(model, data, **settings)
+    assert not found.attrs["converged"]
+    assert "no maximum: the data of y are constant (1 in every row)" in found.notes[0]
+    with pytest.raises(ssm.SamplingError, match="the data of y are constant"):
+        ssm.sample(model, data, draws=50, warmup=50, chains=2, **settings)
+    data["y"] = data["y"] + 0.1 * np.random.default_rng(1).standard_normal(20)
+    found = ssm.maximize(model, data, **settings)
+    assert found.attrs["converged"]
+    assert found.attrs["held_at_edge"] == {"p": 1.0}
+    assert found.parameters["s"] == pytest.approx(
+        np.sqrt(np.mean((data["y"] - 1.0) ** 2)), rel=1e-5
+    )

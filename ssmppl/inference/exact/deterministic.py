@@ -17,9 +17,13 @@ import numpy as np
 
 from ssmppl.analysis.structure import without_noise
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.codegen.kits import predictive
 from ssmppl.codegen.program import compile_trace
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.scored import Scored
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
@@ -84,6 +88,18 @@ class Deterministic(Scored):
         run = self.filter(experiment, theta)
         none = np.zeros((experiment.steps, run.path.shape[1], run.path.shape[1]))
         return SmoothedMoments(run.path, none, none.copy(), float(run.log_increments.sum()))
+
+    def observation_variances(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
+        """(T, K) of each component of y_t given the states; NaN where there is none."""
+        (h,) = histories(self.trace, [experiment], experiment.steps)
+        given: dict[Expr, np.ndarray] = {s: values[0] for s, values in h.rows.items()}
+        given |= dict(zip(self.trace.parameter_symbols, theta, strict=True))
+        states = self.path(experiment, theta).T
+        given |= dict(zip(self.trace.state_symbols, states, strict=True))
+        wanted = [v for site in self.trace.observations.values() for _, v, *_ in predictive(site)]
+        with np.errstate(all="ignore"):
+            found = evaluate(wanted, given)
+        return np.stack([np.broadcast_to(v, experiment.steps) for v in found], axis=1)
 
     def draw(
         self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
