@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.expressions.expr import Expr, apply
+from ssmppl.expressions.expr import Expr, apply, constant
 from ssmppl.expressions.signs import never_negative
 from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import _NAN, _each, _where
@@ -103,8 +103,20 @@ class Weibull(_Positive):
         self._hazard = Exponential(rate=np.ones(self.shape))  # the law of (X / scale)^shape
 
     def _used(self, value: Any) -> ExprArray:
-        """(x / scale)^shape, the hazard gone through."""
-        return array(ew("pow", array(ew("maximum", value, 0.0)) / self.scale, self.shape_))
+        """(x / scale)^shape, the hazard gone through; 0 and infinity are themselves, as a power of
+        them has no derivative by the shape."""
+
+        def used(v: Expr, i: tuple[int, ...]) -> Expr:
+            if v.op == "const" and (v.data <= 0.0 or v.data == math.inf):
+                return constant(max(v.data, 0.0))
+            return apply("pow", apply("maximum", v, 0.0) / self.scale[i], self.shape_[i])
+
+        given = array(value).view(np.ndarray)
+        shape = np.broadcast_shapes(given.shape, self.shape)
+        wide, out = np.broadcast_to(given, shape), np.empty(shape, dtype=object)
+        for i in np.ndindex(shape):
+            out[i] = used(wide[i], i)
+        return array(out)
 
     def _back(self, used: Any) -> ExprArray:
         return self.scale * ew("pow", used, 1.0 / self.shape_)

@@ -116,3 +116,17 @@ def test_a_parameter_that_no_law_reads_is_told_to_keep_its_prior():
     assert "/ H" not in told["b",]
     assert "its posterior is its prior, moved by a slice step" in told["u",]
     assert "its posterior, given m, is its prior" in told["c",]
+
+
+def test_blocks_are_compared_component_by_component_beside_vectors():
+    """(phi, mu, r) jointly, with a factor left over that phi and mu alone leave too."""
+    model = Model("beside")
+    model.prior(lambda: {"a": ssm.Uniform(0, 0.5), "w": ssm.Gamma(np.ones(2), rate=1)})
+    model.prior(lambda: {"r": ssm.LogNormal(0, sd=1)})
+    model.prior(lambda a: {"phi": ssm.Uniform(a, 1), "mu": ssm.StudentT(3, a, scale=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=0.5)})
+    model.transition(lambda x, phi, mu, r: {"x": ssm.Normal(phi * x + mu, sd=r)})
+    model.observation(
+        lambda x, w: {"y": ssm.Normal(x, sd=w[0]), "z": ssm.StudentT(4, x, scale=w[1])}
+    )
+    assert ("phi", "mu", "r") in {u.block for u in derive_updates(trace(model))}

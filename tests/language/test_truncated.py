@@ -9,6 +9,7 @@ import scipy.stats as st
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
+from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.draws import Draws
@@ -214,3 +215,12 @@ def test_one_law_between_bounds_for_each_element():
     expected = sum(evaluate(one.log_density(4.0)) for one in each)
     assert evaluate(d.log_density([4.0, 4.0, 4.0])) == pytest.approx(expected)
     assert evaluate(array(d.mean())) == pytest.approx([value(one.mean()) for one in each])
+
+
+@pytest.mark.parametrize("bounds", [{"upper": 2.0}, {"lower": 0.5}, {"lower": 0.5, "upper": 2.0}])
+def test_slopes_of_a_truncated_weibull_by_its_shape(bounds):
+    """Also where a bound is the end of the support, of which a power has none."""
+    density = D.Truncated(D.Weibull(X, scale=1.5), **bounds).log_density(1.0)
+    slope = float(evaluate(differentiate([density], X)[0], {X: 2.0}))
+    below, above = (float(evaluate(density, {X: 2.0 + h})) for h in (-1e-5, 1e-5))
+    assert slope == pytest.approx((above - below) / 2e-5, rel=1e-6)
