@@ -127,17 +127,18 @@ def forward_filter(
     attrs = {"model": problem.trace.name, "proposal": "forward", "seed": str(root.entropy)}
     datasets = []
     each = exact.filter_each(problem.experiments, theta)
-    predictions = exact.predicted_observations(
-        problem.experiments, theta, [f.predicted for f in each]
-    )
-    for e, found, prediction in zip(problem.experiments, each, predictions, strict=True):
+    laws = [f.predicted for f in each]
+    predictions = exact.predicted_observations(problem.experiments, theta, laws)
+    inverted = exact.predicted_quantiles(problem.experiments, theta, laws, levels)
+    for e, found, prediction, q in zip(
+        problem.experiments, each, predictions, inverted, strict=True
+    ):
         x, law = exact.values, found.filtered
         mean, square = law @ x, np.einsum("tk,ki,kj->tij", law, x, x)
         run = FilterRun(
             found.log_increments, np.full(e.steps, np.nan), mean,
             square - mean[:, :, None] * mean[:, None, :], exact.quantiles(law, levels),
-            prediction,
-            exact.predicted_quantiles(e, theta, found.predicted, levels),
+            prediction, q,
         )  # fmt: skip
         dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")
         datasets.append(dataset.assign(_probabilities(exact, law, dataset)))

@@ -115,7 +115,8 @@ def particle_filter(
     )
     if settings.proposal in EXACT:
         instead = {"kalman": "call ssm.kalman_filter", "forward": "call ssm.forward_filter"}
-        otherwise = 'use particles=1 and proposal="bootstrap"'  # every particle is the same
+        # every particle has the same states; quantiles of predictions are of draws from each
+        otherwise = 'use proposal="bootstrap"'
         raise ArgumentError(
             f'particle_filter with proposal="{settings.proposal}"',
             fix=f"{instead.get(settings.proposal, otherwise)} instead",

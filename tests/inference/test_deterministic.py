@@ -301,8 +301,10 @@ def test_the_name_of_the_exact_run(tank):
     noisy.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     with pytest.raises(ssm.ArgumentError, match="the transition of x is Normal"):
         ssm.log_likelihood(noisy, {"y": [0.0]}, {}, proposal="deterministic")
-    with pytest.raises(ssm.ArgumentError, match='particles=1 and proposal="bootstrap"'):
+    with pytest.raises(ssm.ArgumentError, match='Fix: use proposal="bootstrap"'):
         ssm.particle_filter(tank, rows, TANK, proposal="deterministic")
+    filtered = ssm.particle_filter(tank, rows, TANK, proposal="bootstrap", seed=1)
+    assert np.all(np.diff(filtered["y_predicted_quantile"].values, axis=-1) > 0.0)
 
 
 def test_noise_in_the_first_row_only_is_told_how_to_be_exact():

@@ -82,6 +82,26 @@ def test_the_forward_filter_inverts_the_exact_distribution_function():
                 np.testing.assert_allclose(below, LEVELS[j], rtol=1e-10)
 
 
+def test_quantiles_of_many_data_sets_are_those_of_each():
+    """Of two shapes, in turn, one data set twice; one made by inputs of its own."""
+    model = ssm.Model("many", inputs=("u",))
+    model.initial(lambda: {"z": ssm.Bernoulli(0.4)})
+    model.transition(lambda z: {"z": ssm.Bernoulli(np.where(z, 0.8, 0.3))})
+    model.observation(lambda z, u: {
+        "n": ssm.Poisson(1.0 + 6.0 * z), "y": ssm.Normal(u * z, sd=1.0)
+    })  # fmt: skip
+    rng, sets = np.random.default_rng(3), []
+    for rows in (5, 3, 5, 3):
+        sets.append({"n": rng.poisson(3.0, rows), "y": rng.normal(size=rows), "u": np.ones(rows)})
+    sets += [sets[0], {**sets[1], "u": np.array([4.0, 1.0, 9.0])}]
+    together = ssm.forward_filter(model, sets, {}, seed=1)
+    for one, found in zip(sets, together, strict=True):
+        alone = ssm.forward_filter(model, one, {}, seed=1)
+        for name in ("n", "y"):
+            q = f"{name}_predicted_quantile"
+            np.testing.assert_allclose(found[q].values, alone[q].values, rtol=1e-12)
+
+
 def test_quantiles_of_particles_against_enumeration():
     """P(Y < q) <= level <= P(Y <= q), by as much as the draws and the particles may be off."""
     data, n, m = data_of_wards(), 1500, 40

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ssmppl.analysis.channels import channels
+from ssmppl.analysis.channels import Channel, channels
 from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.random import fill_uniform
@@ -192,9 +192,7 @@ class HiddenMarkov(FiniteLaws):
         """(T, 4, K) of each experiment: mean, variance, P(Y <= y) and P(Y < y) of each channel, by
         the laws (T, K) of the combinations that are predicted."""
         each = []
-        for h in self.histories_of(experiments):
-            first = h.members[np.searchsorted(h.which, np.arange(h.size))]
-            law = np.stack([laws[i] for i in first])
+        for h, law in self._by_history(experiments, laws):
             out = []
             for site in self.trace.observations.values():
                 for figures in predictive(site):
@@ -209,35 +207,47 @@ class HiddenMarkov(FiniteLaws):
         return _in_order(each)
 
     def predicted_quantiles(
-        self, e: Experiment, theta: np.ndarray, law: np.ndarray, levels: np.ndarray
-    ) -> np.ndarray:
-        """(T, P, K) at the levels (P,), likewise: of the mixture of the laws given each value. NaN
-        where these have no distribution function."""
-        out = np.full((e.steps, len(levels), e.y.shape[1]), np.nan)
-        k = -1
-        for site in self.trace.observations.values():
-            for channel in channels(site):
-                k += 1
-                if channel is None:
-                    continue
-
-                def below(values: np.ndarray, k: int = k, f: Expr = channel.below) -> np.ndarray:
-                    y = e.y.copy()
-                    y[:, k] = values
-                    own = self._observed(f, replace(e, y=y), theta)
-                    return np.sum(law * np.where(law > 0.0, own, 0.0), axis=1)
-
+        self, experiments: Sequence[Experiment], theta: np.ndarray, laws: Sequence[np.ndarray],
+        levels: np.ndarray,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """(T, P, K) of each experiment at the levels (P,), likewise: of the mixture of the laws
+        given each value. NaN where these have no distribution function, or no inverse of it."""
+        sites = self.trace.observations.values()
+        every = [c for site in sites for c in channels(site)]
+        each = []
+        for h, law in self._by_history(experiments, laws):
+            out = np.full((*law.shape[:2], len(levels), len(every)), np.nan)
+            for k, channel in enumerate(every):
                 for j, level in enumerate(levels):
-                    own = [self._observed(f, e, theta) for f in channel.ends(level)]
-                    low = np.min([np.where(law > 0.0, q, np.inf) for q in own], axis=(0, 2))
-                    high = np.max([np.where(law > 0.0, q, -np.inf) for q in own], axis=(0, 2))
-                    out[:, j, k] = inverted(below, level, low, high, channel.whole)
-        return out
+                    if channel is not None:
+                        out[:, :, j, k] = self._quantile(h, theta, law, k, channel, level)
+            each.append((h, list(out)))
+        return _in_order(each)
 
-    def _observed(self, expression: Expr, e: Experiment, theta: np.ndarray) -> np.ndarray:
-        """(T or 1, K) an expression of the observation's law, of one experiment."""
-        (h,) = self.histories_of([e])
-        return self.over_values(expression, h, theta, "observation")[0]
+    def _quantile(
+        self, h: Histories, theta: np.ndarray, law: np.ndarray, k: int, channel: Channel,
+        level: float,
+    ) -> np.ndarray:  # fmt: skip
+        """(S, T) of channel k, by the laws (S, T, K) of the combinations that are predicted."""
+        own = self.trace.observation_symbols[k]
+
+        def below(values: np.ndarray) -> np.ndarray:
+            there = replace(h, rows={**h.rows, own: values})
+            found = self.over_values(channel.below, there, theta, "observation")
+            return np.sum(law * np.where(law > 0.0, found, 0.0), axis=2)
+
+        ends = [self.over_values(f, h, theta, "observation") for f in channel.ends(level)]
+        low = np.min([np.where(law > 0.0, q, np.inf) for q in ends], axis=(0, 3))
+        high = np.max([np.where(law > 0.0, q, -np.inf) for q in ends], axis=(0, 3))
+        return inverted(below, level, low, high, channel.whole)
+
+    def _by_history(
+        self, experiments: Sequence[Experiment], laws: Sequence[np.ndarray]
+    ) -> Iterator[tuple[Histories, np.ndarray]]:
+        """The laws (T, K) of each experiment as (S, T, K) of the distinct ones."""
+        for h in self.histories_of(experiments):
+            first = h.members[np.searchsorted(h.which, np.arange(h.size))]
+            yield h, np.stack([laws[i] for i in first])
 
     # -- derivatives
     def score(

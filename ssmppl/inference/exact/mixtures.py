@@ -16,8 +16,9 @@ def inverted(
 ) -> np.ndarray:  # fmt: skip
     """The smallest values at which distribution functions reach a level, by bisection.
 
-    below : values (T,) -> P(Y <= value) (T,). low, high : (T,) between which they lie: of a mixture
-        the least and the largest quantile of its parts. whole : whether values are whole numbers.
+    below : values -> P(Y <= value), in the shape of low and high, between which they lie: of a
+        mixture the least and the largest quantile of its parts. whole : whether values are whole
+        numbers.
     """
     low, high = low.copy(), high.copy()
     for _ in range(MOST):
