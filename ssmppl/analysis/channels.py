@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -12,37 +11,66 @@ from ssmppl.analysis.moves import drawn
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, attributed
 from ssmppl.language.distribution import Distribution
-from ssmppl.language.distributions import Beta, Categorical, Dirichlet, MvNormal, Normal
+from ssmppl.language.distributions import (
+    Beta,
+    Categorical,
+    Dirichlet,
+    Mixture,
+    MvNormal,
+    Normal,
+    ZeroInflated,
+)
 from ssmppl.language.sequential import SequentialNormal
 from ssmppl.language.trace import Site, Trace
+from ssmppl.language.written import Written
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One component given x_t. below : P(Y <= y), of its own symbol y. quantile : its inverse, of a
-    level. whole : whether its values are whole numbers."""
+    """One component given x_t. below : P(Y <= y), of its own symbol y. ends : values, of a level,
+    between which its inverse lies; of most laws that itself. whole : whether its values are whole
+    numbers."""
 
     below: Expr
-    quantile: Callable[[float], Expr]
+    ends: Callable[[float], list[Expr]]
     whole: bool
 
 
 def channels(site: Site) -> list[Channel | None]:
-    """Of every component; None where its law has no distribution function."""
+    """Of every component; None where its law has no distribution function, or no inverse of it."""
     law, y = alone(site.distribution), site.value
     if isinstance(law, Dirichlet):
         law = _shares(law)
-    if law.joint and not isinstance(law, Categorical):
+    parts = _parts(law)
+    joint = law.joint and not isinstance(law, Categorical)
+    if joint or not all(map(_inverts, parts)):
         return [None] * len(site.components)
     first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}
     places = [first[s] for s in site.components]
 
     below = law.cdf(y)
 
-    def quantile(place: int, level: float) -> Expr:
-        return _at(law.quantile(array(level)), site, place)
+    def ends(place: int) -> Callable[[float], list[Expr]]:
+        return lambda level: [_at(p.quantile(array(level)), site, place) for p in parts]
 
-    return [Channel(_at(below, site, p), partial(quantile, p), law.discrete) for p in places]
+    return [Channel(_at(below, site, p), ends(p), law.discrete) for p in places]
+
+
+def _parts(law: Distribution) -> list[Distribution]:
+    """The laws that a law is a mixture of: its quantiles lie between theirs."""
+    if isinstance(law, Mixture):
+        return [part for component in law.components for part in _parts(component)]
+    if isinstance(law, ZeroInflated) and isinstance(law.base, Mixture):
+        return [ZeroInflated(part, law.p) for part in _parts(law.base)]
+    return [law]
+
+
+def _inverts(law: Distribution) -> bool:
+    """Whether the quantiles of a law, and of what it is made of, have a formula."""
+    base = getattr(law, "base", None)
+    if base is not None and not _inverts(base):
+        return False
+    return not isinstance(law, Mixture) and (not isinstance(law, Written) or law.inverts())
 
 
 def _at(values: ExprArray, site: Site, place: int) -> Expr:

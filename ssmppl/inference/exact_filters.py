@@ -110,7 +110,8 @@ def forward_filter(
         As of `particle_filter`, with one `draw` and without `ess`, everything exact; and for each
         state x ``x_probability``: P(x_t = value given y_1:t), last dim `x_value`, whose coordinate
         holds the values. ``y_predicted_quantile`` inverts the distribution function of the mixture;
-        it is NaN for Wishart laws, whose components have none in closed form.
+        it is NaN for Wishart laws, whose components have none in closed form, and for laws of your
+        own without `@law.quantile`.
 
     Raises
     ------

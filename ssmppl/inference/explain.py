@@ -154,7 +154,7 @@ class Plan:
         }
         if self.trace.parameters:
             choices["maximize"] = choose_maximiser(kind, self.trace)
-        choices["smooth"] = choose_smoother(kind)
+        choices["smooth"] = choose_smoother(kind, self.trace)
         return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
 
     def _numbers(self) -> int:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ssmppl.analysis.smooth import smooth_filter_applies
-from ssmppl.analysis.structure import deterministic_memory, noisy_start
+from ssmppl.analysis.structure import deterministic_memory, noisy_start, without_density
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.models import KIND
 from ssmppl.inference.methods import (
+    IF2,
     PGAS,
     PMMH,
     DirectOptimization,
@@ -141,7 +142,7 @@ def start_as_parameter(trace: Trace) -> str:
 
 def choose_maximiser(
     kind: str | NotApplicable, trace: Trace
-) -> tuple[DirectOptimization | ScoreAscent, str]:
+) -> tuple[DirectOptimization | ScoreAscent | IF2, str]:
     """The method of `maximize` for a model of this kind, and the reason."""
     if not isinstance(kind, NotApplicable):
         return DirectOptimization(), (
@@ -153,6 +154,9 @@ def choose_maximiser(
             "for one scalar state a particle filter's likelihood can be made continuous in the "
             "parameters"
         )
+    singular = without_density(trace)
+    if singular is not None:
+        return IF2(), f"{singular.reason}: iterated filtering, which needs none"
     return ScoreAscent(), (
         "Fisher's identity gives the score by particle smoothing; direct optimisation does not "
         f"apply: {obstacle.reason}"
@@ -161,10 +165,15 @@ def choose_maximiser(
 
 
 def choose_smoother(
-    kind: str | NotApplicable,
+    kind: str | NotApplicable, trace: Trace
 ) -> tuple[KalmanSmoother | ForwardBackward | FFBSi, str]:
     """The method of `smooth` for a model of this kind, and the reason."""
     if isinstance(kind, NotApplicable):
+        singular = without_density(trace)
+        if singular is not None:
+            return FFBSi(kernel="genealogy"), (
+                f"{singular.reason}: the ancestors of the filter's own particles, which need none"
+            )
         return FFBSi(), f"the model is not linear and Gaussian: {kind.reason}"
     if kind == KIND[Deterministic]:
         return FFBSi(kernel="genealogy"), f"the model is {kind}, and every trajectory is the same"

@@ -134,7 +134,7 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
     exact = exact_model(problem.trace)
     if method is None:
         kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
-        chosen, why = choose_smoother(kind)
+        chosen, why = choose_smoother(kind, problem.trace)
         return chosen, f"automatically: {why}"
     kinds = (KalmanSmoother, ForwardBackward, FFBSi, FixedLag, PGAS)
     if isinstance(method, str):

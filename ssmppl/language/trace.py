@@ -19,8 +19,8 @@ import inspect
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from functools import cached_property
-from typing import Any
+from functools import cached_property, wraps
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -319,3 +319,21 @@ class _Tracer:
             later = "; a parameter is declared by a @prior, a state by @initial, an input by "
             later += f"ssm.Model(..., inputs=({name!r},))"
         return ModelError(reason, fix=f"use one of: {listing(name, names)}{later}", where=where)
+
+
+Derived = TypeVar("Derived")
+
+
+def once_per_trace(derive: Callable[[Trace], Derived]) -> Callable[[Trace], Derived]:
+    """What is derived from a trace alone: derived once, and kept for as long as the trace lives."""
+    kept: dict[int, tuple[weakref.ref[Trace], Derived]] = {}
+
+    @wraps(derive)
+    def derived(trace: Trace) -> Derived:
+        key = id(trace)
+        if key not in kept:
+            reference = weakref.ref(trace, lambda _: kept.pop(key, None))
+            kept[key] = reference, derive(trace)
+        return kept[key][1]
+
+    return derived

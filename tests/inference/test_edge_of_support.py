@@ -144,6 +144,40 @@ def test_shares_at_zero(method):
     assert found.standard_errors["m"] == pytest.approx(own["m"], rel=1e-3)
 
 
+@pytest.mark.parametrize(("k", "seen"), [(2, 0), (2, 1), (3, 0), (3, 1), (3, 2)])
+def test_a_share_of_all(k: int, seen: int):
+    """What was seen only ever: neither it nor the rest has a standard error, not even one of 0."""
+    model = ssm.Model("shares")
+    model.prior(lambda: {"p": ssm.Dirichlet(np.ones(k)), "m": ssm.Normal(0, sd=5)})
+    model.initial(lambda: {"s": ssm.Bernoulli(0.5)})
+    model.transition(lambda s: {"s": ssm.Bernoulli(0.5)})
+    model.observation(lambda s, p, m: {"c": ssm.Categorical(p), "y": ssm.Normal(m * s, sd=1)})
+    rng = np.random.default_rng(2)
+    data = {"y": rng.standard_normal(20) + 4.0 * rng.integers(0, 2, 20), "c": np.full(20, seen)}
+    found = ssm.maximize(model, data, seed=1, progress=False)
+    assert found.attrs["held_at_edge"] == {f"p[{i}]": float(i == seen) for i in range(k)}
+    assert np.isnan(found.standard_errors["p"]).all()
+    held = {"p": np.full(k, 1 / k)}
+    alone = ssm.maximize(model, data, fixed=held, seed=1, progress=False)
+    assert found.standard_errors["m"] == pytest.approx(alone.standard_errors["m"], rel=1e-3)
+
+
+def test_what_grows_without_bound_beside_an_edge_is_not_taken_for_certain():
+    model = ssm.Model("logit")
+    model.prior(lambda: {"s": ssm.HalfFlat(), "r": ssm.HalfFlat(), "a": ssm.Normal(0, sd=3)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {"x": ssm.Normal(0.5 * x, sd=s)})
+    model.observation(lambda x, r, a: {
+        "y": ssm.Normal(x, sd=r), "z": ssm.Normal(1 / (1 + np.exp(-a)), sd=0.1)
+    })  # fmt: skip
+    rng = np.random.default_rng(0)
+    y = rng.standard_normal(30)
+    data = {"y": y - 0.6 * np.r_[0.0, y[:-1]], "z": 1.5 + 0.1 * rng.standard_normal(30)}
+    found = ssm.maximize(model, data, seed=1, progress=False)
+    assert list(found.attrs["held_at_edge"]) == ["s"]
+    assert not found.standard_errors["a"] < 1e3
+
+
 # -- data that a model follows exactly
 def level(prior: type) -> ssm.Model:
     model = ssm.Model("level")
@@ -209,3 +243,28 @@ def test_sampling_constant_data():
             ssm.sample(level(ssm.HalfFlat), CONSTANT, method, **settings)
     idata = ssm.sample(level(ssm.InverseGamma), CONSTANT, **settings)
     assert np.all(idata.posterior["r"].to_numpy() > 0.01)
+
+
+def test_constant_data_of_states_without_noise():
+    """Beside counts, which are certain at the end of their support, and not without a bound."""
+    model = ssm.Model("steady", inputs=("u",))
+    model.prior(lambda: {"s": ssm.HalfNormal(sd=1), "p": ssm.Uniform(0, 1)})
+    model.initial(lambda: {"x": ssm.Dirac(1.0)})
+    model.transition(lambda x, u: {"x": ssm.Dirac(x**2 + u)})
+    model.observation(lambda x, s, p, u: {
+        "y": ssm.Normal(x + u, sd=s), "c": ssm.Bernoulli(p)
+    })  # fmt: skip
+    data = {"u": np.zeros(20), "c": np.ones(20), "y": np.ones(20)}
+    settings = {"seed": 1, "progress": False}
+    found = ssm.maximize(model, data, **settings)
+    assert not found.attrs["converged"]
+    assert "no maximum: the data of y are constant (1 in every row)" in found.notes[0]
+    with pytest.raises(ssm.SamplingError, match="the data of y are constant"):
+        ssm.sample(model, data, draws=50, warmup=50, chains=2, **settings)
+    data["y"] = data["y"] + 0.1 * np.random.default_rng(1).standard_normal(20)
+    found = ssm.maximize(model, data, **settings)
+    assert found.attrs["converged"]
+    assert found.attrs["held_at_edge"] == {"p": 1.0}
+    assert found.parameters["s"] == pytest.approx(
+        np.sqrt(np.mean((data["y"] - 1.0) ** 2)), rel=1e-5
+    )

@@ -247,3 +247,45 @@ def test_a_law_that_is_not_defined_has_none():
     first, second = found["n_predicted_quantile"].values[0]
     assert np.isnan(first).all()
     assert np.isfinite(second).all()
+
+
+@ssm.distribution(lower=0)
+def Decay(y, rate):
+    return np.log(rate) - rate * y
+
+
+@Decay.cdf
+def decayed(y, rate):
+    return 1 - np.exp(-rate * y)
+
+
+def test_mixtures_of_laws_given_the_regime_are_inverted_too():
+    """Their own quantiles have no formula, and of a law without an inverse there is none."""
+
+    def counts(z):
+        return ssm.Mixture([0.3, 0.7], [ssm.Poisson(1.0 + 6.0 * z), ssm.Binomial(4, 0.5)])
+
+    model = ssm.Model("mixed")
+    model.initial(lambda: {"z": ssm.Bernoulli(0.4)})
+    model.transition(lambda z: {"z": ssm.Bernoulli(np.where(z, 0.8, 0.3))})
+    model.observation(lambda z: {
+        "y": ssm.Mixture([0.25, 0.75], [ssm.Normal(3.0 * z, sd=0.5), ssm.Laplace(-2.0, scale=1)]),
+        "n": ssm.ZeroInflated(counts(z), 0.2),
+        "left": ssm.Mixture([0.5, 0.5], [Decay(1.0 + z), ssm.Gamma(2.0, rate=1.0)]),
+    })  # fmt: skip
+    nothing = np.full(1, np.nan)
+    found = ssm.forward_filter(model, {"y": nothing, "n": nothing, "left": nothing}, {})
+
+    def below_y(q):
+        return sum(w * (0.25 * stats.norm.cdf(q, 3.0 * z, 0.5) + 0.75 * stats.laplace.cdf(q, -2.0))
+                   for z, w in ((0, 0.6), (1, 0.4)))  # fmt: skip
+
+    def below_n(q):
+        poisson = 0.6 * stats.poisson.cdf(q, 1.0) + 0.4 * stats.poisson.cdf(q, 7.0)
+        parts = 0.3 * poisson + 0.7 * stats.binom.cdf(q, 4, 0.5)
+        return np.where(q < 0, 0.0, 0.2 + 0.8 * parts)
+
+    y, n = (found[f"{name}_predicted_quantile"].values[0, 0] for name in ("y", "n"))
+    np.testing.assert_allclose(below_y(y), LEVELS, rtol=1e-10)
+    assert np.all((below_n(n - 1) < LEVELS) & (below_n(n) >= LEVELS))
+    assert np.isnan(found["left_predicted_quantile"].values).all()

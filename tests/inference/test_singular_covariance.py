@@ -161,6 +161,24 @@ def test_methods_that_need_a_density_are_refused_at_once(method, instead: str):
     assert "ssm.Dirac" in str(error.value)
 
 
+def test_the_methods_chosen_without_one_are_not_refused():
+    """Of a model that is not linear: what needs a density is not chosen in the first place."""
+    model = ssm.Model("nonlinear")
+    model.prior(lambda: {"q": ssm.InverseGamma(2, scale=1)})
+    model.initial(lambda: {"x": ssm.MvNormal(np.zeros(2), covariance=START)})
+    model.transition(lambda x, q: {"x": ssm.MvNormal(F @ x, covariance=q * np.outer(G, G))})
+    model.observation(lambda x: {"y": ssm.Poisson(np.exp(x[1]))})
+    y = {"y": np.array([1.0, 0.0, 2.0, 1.0])}
+    plan = " ".join(str(ssm.explain(model, y)).split())
+    reason = "the covariance in the transition of x is singular (rank 1 of 2)"
+    for chosen in ("sample PMMH", "maximize IF2", "smooth FFBSi"):
+        assert f"{chosen}: {reason}" in plan
+    smoothed = ssm.smooth(model, y, {"q": 1.0}, seed=1)
+    assert smoothed.attrs["method"] == "FFBSi"
+    w = smoothed["x"].values[:, 1:] - smoothed["x"].values[:, :-1] @ F.T
+    assert w[..., 0] == pytest.approx(DT / 2 * w[..., 1], abs=1e-9)
+
+
 def test_explain_says_why():
     text = " ".join(str(ssm.explain(acceleration(), data())).split())
     assert "MetropolisHastings: linear Gaussian, and the covariance in the transition" in text

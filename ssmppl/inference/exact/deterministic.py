@@ -10,7 +10,6 @@ observations along the one trajectory. Its gradient goes along with it, by the s
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -18,15 +17,19 @@ import numpy as np
 
 from ssmppl.analysis.structure import without_noise
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.codegen.kits import predictive
 from ssmppl.codegen.program import compile_trace
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.scored import Scored
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
 from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state, run_filter
 from ssmppl.inference.problem import Problem, missing_of
-from ssmppl.language.trace import Trace
+from ssmppl.language.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,18 @@ class Deterministic(Scored):
         none = np.zeros((experiment.steps, run.path.shape[1], run.path.shape[1]))
         return SmoothedMoments(run.path, none, none.copy(), float(run.log_increments.sum()))
 
+    def observation_variances(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
+        """(T, K) of each component of y_t given the states; NaN where there is none."""
+        (h,) = histories(self.trace, [experiment], experiment.steps)
+        given: dict[Expr, np.ndarray] = {s: values[0] for s, values in h.rows.items()}
+        given |= dict(zip(self.trace.parameter_symbols, theta, strict=True))
+        states = self.path(experiment, theta).T
+        given |= dict(zip(self.trace.state_symbols, states, strict=True))
+        wanted = [v for site in self.trace.observations.values() for _, v, *_ in predictive(site)]
+        with np.errstate(all="ignore"):
+            found = evaluate(wanted, given)
+        return np.stack([np.broadcast_to(v, experiment.steps) for v in found], axis=1)
+
     def draw(
         self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
     ) -> np.ndarray:
@@ -141,14 +156,13 @@ class Deterministic(Scored):
         return self._scores[key].of(problem)
 
 
-_forms: dict[int, tuple[weakref.ref[Trace], NotApplicable | None, dict]] = {}
+@once_per_trace
+def _form(trace: Trace) -> tuple[NotApplicable | None, dict[tuple, CompleteScores]]:
+    """Which state has noise, and where the scores are kept."""
+    return without_noise(trace), {}
 
 
 def deterministic_model(trace: Trace) -> Deterministic | NotApplicable:
     """The traced model as one without noise in its states; or the reason why it has some."""
-    key = id(trace)
-    if key not in _forms:
-        reference = weakref.ref(trace, lambda _: _forms.pop(key, None))
-        _forms[key] = reference, without_noise(trace), {}
-    _, reason, scores = _forms[key]
+    reason, scores = _form(trace)
     return Deterministic(trace, scores) if reason is None else reason

@@ -6,7 +6,6 @@ compiled passes of `codegen/kernels/hidden_markov.py`.
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -25,7 +24,7 @@ from ssmppl.inference.exact.finite_laws import FiniteLaws
 from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.mixtures import inverted
-from ssmppl.language.trace import Trace
+from ssmppl.language.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
@@ -229,9 +228,9 @@ class HiddenMarkov(FiniteLaws):
                     return np.sum(law * np.where(law > 0.0, own, 0.0), axis=1)
 
                 for j, level in enumerate(levels):
-                    own = self._observed(channel.quantile(level), e, theta)
-                    low = np.min(np.where(law > 0.0, own, np.inf), axis=1)
-                    high = np.max(np.where(law > 0.0, own, -np.inf), axis=1)
+                    own = [self._observed(f, e, theta) for f in channel.ends(level)]
+                    low = np.min([np.where(law > 0.0, q, np.inf) for q in own], axis=(0, 2))
+                    high = np.max([np.where(law > 0.0, q, -np.inf) for q in own], axis=(0, 2))
                     out[:, j, k] = inverted(below, level, low, high, channel.whole)
         return out
 
@@ -318,15 +317,13 @@ def _in_order(each: Sequence[tuple[Histories, Sequence[T]]]) -> list[T]:
     return [places[i] for i in range(len(places))]
 
 
-Densities = dict[str, Expr]
-_forms: dict[int, tuple[weakref.ref[Trace], FiniteStates | NotApplicable, Densities]] = {}
+@once_per_trace
+def _form(trace: Trace) -> tuple[FiniteStates | NotApplicable, dict[str, Expr]]:
+    """The finite form, and where its densities are kept."""
+    return finite_states(trace), {}
 
 
 def hidden_markov(trace: Trace) -> HiddenMarkov | NotApplicable:
     """The finite form of a traced model, derived once; or the reason why it has none."""
-    key = id(trace)
-    if key not in _forms:
-        reference = weakref.ref(trace, lambda _: _forms.pop(key, None))
-        _forms[key] = reference, finite_states(trace), {}
-    _, form, densities = _forms[key]
+    form, densities = _form(trace)
     return form if isinstance(form, NotApplicable) else HiddenMarkov(trace, form, densities)

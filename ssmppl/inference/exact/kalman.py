@@ -7,7 +7,6 @@ and the sampler are in `kalman_moments.py`.
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -31,7 +30,7 @@ from ssmppl.inference.exact.kalman_moments import (
 )
 from ssmppl.inference.exact.kalman_score import Slopes, check_free, score, slopes
 from ssmppl.inference.exact.scored import Scored
-from ssmppl.language.trace import Trace
+from ssmppl.language.trace import Trace, once_per_trace
 
 __all__ = [
     "Disturbances",
@@ -188,7 +187,7 @@ class KalmanModel(Scored):
         ArgumentError : a matrix has no derivative in a free parameter; names it and the reason.
         """
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
-        found = _slopes(self.trace, self.form)
+        found = _slopes(self.trace)
         check_free(self.trace, found, wanted)
         total, gradient = 0.0, np.zeros(len(theta))
         for e in experiments:
@@ -215,30 +214,22 @@ class KalmanModel(Scored):
         return replace(found, log_likelihood=start.log_density(found.log_likelihood)), noise
 
 
-_forms: dict[int, tuple[weakref.ref[Trace], LinearGaussian | NotApplicable]] = {}
+_form = once_per_trace(linear_gaussian)
 
 
 def kalman_model(source: Trace | Program) -> KalmanModel | NotApplicable:
     """The linear Gaussian form of a traced model, derived once; or the reason why it has none."""
     trace = source.trace if isinstance(source, Program) else source
-    key = id(trace)
-    if key not in _forms:
-        reference = weakref.ref(trace, lambda _: _forms.pop(key, None))
-        _forms[key] = reference, linear_gaussian(trace)
-    form = _forms[key][1]
+    form = _form(trace)
     return form if isinstance(form, NotApplicable) else KalmanModel(trace, form)
 
 
-_slopes_of: dict[int, tuple[weakref.ref[Trace], Slopes]] = {}
-
-
-def _slopes(trace: Trace, form: LinearGaussian) -> Slopes:
-    """The derivatives of a traced model's matrices, derived once."""
-    key = id(trace)
-    if key not in _slopes_of:
-        reference = weakref.ref(trace, lambda _: _slopes_of.pop(key, None))
-        _slopes_of[key] = reference, slopes(trace, form)
-    return _slopes_of[key][1]
+@once_per_trace
+def _slopes(trace: Trace) -> Slopes:
+    """The derivatives of a linear Gaussian model's matrices."""
+    form = _form(trace)
+    assert not isinstance(form, NotApplicable)
+    return slopes(trace, form)
 
 
 def _applicable(source: Trace | Program) -> KalmanModel:

@@ -2,7 +2,8 @@
 
 A linear Gaussian model that can follow the data exactly, as any level does a constant series, has
 no maximum of the likelihood: it grows with every step of the variances towards zero, until what
-the filter predicts differs from the data by rounding only.
+the filter predicts differs from the data by rounding only. Likewise one without noise in its
+states.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.exact.models import ExactModel
 
@@ -25,18 +27,19 @@ def without_maximum(
 ) -> NotApplicable | None:
     """Why the likelihood has no maximum, if that is where a search ran to theta (P,): the model
     predicts a channel to within rounding there. None where it does not."""
-    if not isinstance(model, KalmanModel):
+    if not isinstance(model, (KalmanModel, Deterministic)):
         return None
+    laws = {n: site.distribution for n, site in model.trace.observations.items()}
     for e in experiments:
         try:
-            covariance = model.filter(e, theta).observation_covariance
+            predicted = _variances(model, e, theta)
         except SamplingError:
             continue
         for k, symbol in enumerate(model.trace.observation_symbols):
             seen = e.seen[:, k] > 0.0
-            if not seen.any():
+            if not seen.any() or laws[symbol.data[1]].discrete:
                 continue
-            y, variance = e.y[seen, k], covariance[seen, k, k]
+            y, variance = e.y[seen, k], predicted[seen, k]
             least = max(VANISHED * float(np.max(np.abs(y))), LEAST)
             if not np.sqrt(np.median(variance)) < least:
                 continue
@@ -45,9 +48,16 @@ def without_maximum(
             return NotApplicable(
                 f"the likelihood has no maximum: the data of {symbol!r} {how}, so that it grows "
                 "without bound as the variances of the noises go to zero",
-                model.trace.observations[symbol.data[1]].distribution.location,
+                laws[symbol.data[1]].location,
             )
     return None
+
+
+def _variances(model: KalmanModel | Deterministic, e: Experiment, theta: np.ndarray) -> np.ndarray:
+    """(T, K) of the one-step predictions of each component."""
+    if isinstance(model, Deterministic):
+        return model.observation_variances(e, theta)
+    return np.diagonal(model.filter(e, theta).observation_covariance, axis1=1, axis2=2)
 
 
 def check_mode(model: ExactModel, experiments: Iterable[Experiment], theta: np.ndarray) -> None:

@@ -24,7 +24,12 @@ from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.language.trace import Site
 from ssmppl.language.transforms import Transform, transforms, unconstrain
 
-OUTWARDS = (1.0, 4.0, 30.0)  # steps on the unconstrained scale: at the last nothing is left inside
+OUTWARDS = (1.0, 4.0)  # steps on the unconstrained scale
+FARTHEST = (
+    30.0,
+    15.0,
+    8.0,
+)  # the last of them: nothing is left inside, nor is it rounded to nothing
 INWARDS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 ROUNDING = 1e-9  # of the objective, relative
 AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb is not finished
@@ -61,7 +66,9 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
     loss = ROUNDING * (1.0 + abs(here))
     for j in range(len(z)):
         for sign in (-1.0, 1.0):
-            outwards = (moved(j, sign * s) for s in OUTWARDS)
+            ends = (moved(j, sign * s) for s in FARTHEST)
+            last = next((change for change in ends if change > -np.inf), -np.inf)
+            outwards = (last, *(moved(j, sign * s) for s in OUTWARDS))
             if not all(-loss <= change <= AT_MOST for change in outwards):
                 continue
             if any(not moved(j, -sign * s) > -FALL for s in INWARDS):
@@ -99,21 +106,28 @@ def edges(setup: Setup, theta: np.ndarray, information: np.ndarray) -> Edges | N
 def _reached(
     t: Transform, found: np.ndarray, kept: np.ndarray, known: dict[Expr, float]
 ) -> list[tuple[int, float]]:
-    """(component, edge) of one parameter; what is not identified beside it is no longer kept."""
+    """(component, edge) of one parameter; what is not identified beside it is no longer kept, and
+    what has no edge there is."""
     support = t.site.distribution.support()
     if support.kind == "positive definite":
+        kept[:] = True
         return []
     if support.kind == "simplex":
         k, out = t.site.shape[-1], []
         for row in range(len(found) // (k - 1)):
+            none = []
             for i in range(k - 1):
                 at = row * (k - 1) + i
                 if found[at] < 0.0:
-                    out.append((row * k + i, 0.0))
+                    none.append(i)
                 elif found[at] > 0.0:  # nothing of the stick is left
-                    out += [(row * k + j, 0.0) for j in range(i + 1, k)]
+                    none += range(i + 1, k)
                     kept[at + 1 : (row + 1) * (k - 1)] = False
                     break
+            out += [(row * k + i, 0.0) for i in none]
+            if len(none) == k - 1:
+                (whole,) = set(range(k)) - set(none)
+                out.append((row * k + whole, 1.0))
         return out
     ends = _ends(t.site, known)
     out = []
@@ -121,6 +135,8 @@ def _reached(
         lower, upper = map(float, ends[i])
         if np.isfinite(lower) or np.isfinite(upper):
             out.append((i, _edge(lower, upper, found[i])))
+        else:
+            kept[i] = True
     return out
 
 
