@@ -26,6 +26,7 @@ from ssmppl.language.distributions import (
     Gamma,
     Laplace,
     LogNormal,
+    Mixture,
     MvNormal,
     NegativeBinomial,
     Normal,
@@ -170,7 +171,7 @@ def has_scale(d: Distribution) -> NotApplicable | None:
     reason = f"its law is {kind}, whose variance follows from its mean"
     if isinstance(inner, Dirac):
         reason = "it has no noise (Dirac)"
-    elif isinstance(inner, Written):
+    elif isinstance(inner, (Mixture, Written)):
         reason = f"its law is {kind}, of which no argument is known to be its spread"
     return NotApplicable(reason, d.location)
 

@@ -33,6 +33,8 @@ class VonMises(Distribution):
     -----
     `mean` and `variance`, as in the predictions of a filter, are the circular ones: the direction
     within (-pi, pi], and 1 - I1(concentration) / I0(concentration), which lies in (0, 1].
+    A particle filter averages the directions of its particles as numbers: where they lie on both
+    sides of the cut, the average says nothing, and the PIT values still do.
     """
 
     closed = True

@@ -113,7 +113,8 @@ class Weibull(_Positive):
 
         given = array(value).view(np.ndarray)
         shape = np.broadcast_shapes(given.shape, self.shape)
-        wide, out = np.broadcast_to(given, shape), np.empty(shape, dtype=object)
+        wide: Any = np.broadcast_to(given, shape)
+        out = np.empty(shape, dtype=object)
         for i in np.ndindex(shape):
             out[i] = used(wide[i], i)
         return array(out)

@@ -16,6 +16,7 @@ from ssmppl.gap.augment import augment
 from ssmppl.gap.candidates import Scale, Scales, offers
 from ssmppl.gap.catalogue import effects
 from ssmppl.gap.effect import Auxiliary, effect, sds
+from ssmppl.gap.laws import has_scale
 from ssmppl.language.trace import trace
 from tests.gap.harness import EVERY, offered, scales, traced
 
@@ -344,3 +345,8 @@ def test_names_restrict_effects_add_and_a_mapping_renames():
     assert [c.effect for c in replaced] == [own]
     with pytest.raises(ArgumentError, match="effects holds 3"):
         offers(t, scales(t), [3])
+
+
+def test_a_mixture_is_not_told_to_have_a_variance_that_follows_from_its_mean():
+    law = ssm.Mixture([0.5, 0.5], [ssm.Normal(0, sd=1), ssm.Normal(0, sd=9)])
+    assert "no argument is known to be its spread" in str(has_scale(law))
