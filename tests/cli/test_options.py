@@ -44,7 +44,7 @@ def test_every_argument_of_a_verb_is_an_option_with_its_default(verb):
 def test_no_verb_is_without_a_command():
     lower = {n for n in ssm.__all__ if n[0].islower() and not n.startswith("plot_")}
     assert lower - {n.replace("-", "_") for n in COMMANDS} == {
-        "effect", "effects", "plots", "primitive",
+        "distribution", "effect", "effects", "plots", "primitive",
     }  # fmt: skip
 
 
