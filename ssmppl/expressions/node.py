@@ -53,7 +53,8 @@ BOOLEAN = frozenset(("lt", "le", "eq", "ne", "and", "or", "not"))
 
 INDEX_BY_SYMBOL = (
     "np.choose(k, table) is table[k] for a symbol k and an array of numbers: an element of a "
-    "vector, a row of a matrix; an array of symbols takes a symbol as its first index"
+    "vector, a row of a matrix; an array of symbols takes a symbol as its first index, if np.stack "
+    "made it of its elements or rows (np.array makes a plain one)"
 )
 
 # What Expr does that is defined in modules above this one, which fill it when they are imported

@@ -16,7 +16,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
 
-WIDTH = 78  # of one expression
+WIDTH = 73  # of one expression, which may stand behind `concentration=` of a law in a law
 
 _NUMPY = """exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
     arccosh arctanh abs sign floor ceil maximum minimum arctan2 logaddexp where"""

@@ -111,7 +111,7 @@ def switching(sticky: bool) -> ssm.Model:
         model.transition(lambda k, p: {"k": ssm.Categorical(p[k])})
     else:
         model.transition(lambda k, a, b, c: {"k": ssm.Categorical(
-            np.array([[a, 0.0, 1.0 - a], [0.0, b, 1.0 - b], [c[0], c[1], c[2]]])[k]
+            np.stack([np.stack([a, 0.0, 1.0 - a]), np.stack([0.0, b, 1.0 - b]), c])[k]
         )})  # fmt: skip
     model.observation(lambda k, m: {"y": ssm.Normal(m[k], sd=1.0)})
     return model

@@ -31,6 +31,7 @@ from ssmppl.inference.chains.parameter_steps import ParameterSteps, log_joint
 from ssmppl.inference.chains.pgas import PGASState
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.chains.walk import Metropolis, Point, WalkState
+from ssmppl.inference.exact import histories
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
@@ -81,6 +82,7 @@ class Transitions:
         """The data are now y (T, K), with the gaps that they have always had."""
         e = self.problem.experiments[0]
         e.y[:] = np.where(e.seen == 1.0, y, 0.0)
+        histories._kept.clear()  # which takes data for what never changes
         for move in self._moves():  # what they know of the data
             for known in ("references", "looks"):
                 move.__dict__.pop(known, None)
