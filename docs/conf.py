@@ -48,7 +48,8 @@ numpydoc_validation_checks = {
     "PR01", "PR02", "PR03", "PR07", "PR10", "RT01", "RT03", "YD01",
 }  # fmt: skip
 # What users catch or are handed, and do not make themselves: no parameters.
-numpydoc_validation_exclude = {r"Error$", r"\.UnsupportedOperation$", r"\.Plan$", r"\.Program$"}
+numpydoc_validation_exclude = {r"Error$", r"\.UnsupportedOperation$", r"\.Plan$", r"\.Program$",
+                               r"\.DeclaredDistribution$", r"\.Generator$"}  # fmt: skip
 
 nb_code_prompt_show = "Show the code"
 nb_code_prompt_hide = "Hide the code"

@@ -230,11 +230,11 @@ class DeclaredDistribution(Declared):
 
         Parameters
         ----------
-        *args, **kwargs : the law's arguments, numbers; those named as one of the following by their
-            place.
+        *args : the law's arguments, numbers; those named as one of the following have to be here.
         draws : number of draws.
         level : of the test; a right sampler fails with at most this probability.
         seed : of the draws.
+        **kwargs : the law's arguments by their names.
 
         Returns
         -------

@@ -55,35 +55,100 @@ class Generator:
         self._draws = draws
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
-        """Uniform between low and high, neither of them ever drawn."""
+        """Uniform between low and high, neither of them ever drawn.
+
+        Parameters
+        ----------
+        low, high : the ends, numbers or expressions.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return low + (high - low) * self._draws.uniform()
 
     def random(self) -> Any:
-        """Uniform between 0 and 1."""
+        """Uniform between 0 and 1.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return self._draws.uniform()
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0) -> Any:
-        """Normal of mean loc and standard deviation scale."""
+        """Normal of mean loc and standard deviation scale.
+
+        Parameters
+        ----------
+        loc, scale : its mean and standard deviation.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return loc + scale * self._draws.normal()
 
     def standard_normal(self) -> Any:
-        """Normal of mean 0 and standard deviation 1."""
+        """Normal of mean 0 and standard deviation 1.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return self._draws.normal()
 
     def exponential(self, scale: Any = 1.0) -> Any:
-        """Exponential of mean scale."""
+        """Exponential of mean scale.
+
+        Parameters
+        ----------
+        scale : its mean.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return -scale * apply("log", self._draws.uniform())
 
     def gamma(self, shape: Any, scale: Any = 1.0) -> Any:
-        """Gamma of mean shape scale."""
+        """Gamma of mean shape times scale.
+
+        Parameters
+        ----------
+        shape, scale : its shape, and the scale, 1 / rate.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return scale * self._draws.gamma(shape)
 
     def poisson(self, lam: Any = 1.0) -> Any:
-        """Poisson of mean lam."""
+        """Poisson of mean lam.
+
+        Parameters
+        ----------
+        lam : its mean.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return self._draws.poisson(lam)
 
     def binomial(self, n: Any, p: Any) -> Any:
-        """Binomial: successes among n, each of probability p."""
+        """Binomial: successes among n, each of probability p.
+
+        Parameters
+        ----------
+        n : number of trials.
+        p : probability of each success.
+
+        Returns
+        -------
+        expression : the draw.
+        """
         return self._draws.binomial(n, p)
 
     def __getattr__(self, name: str) -> Any:
