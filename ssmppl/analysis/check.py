@@ -107,8 +107,10 @@ def _culprit(
         pair = [factor.density, form.assemble()]
         for values in series[1:]:
             (a, b), (c, d) = evaluate(pair, values), evaluate(pair, {**values, **changed})
-            wrong = np.abs((a - c) - (b - d)) > TOLERANCE * (1.0 + np.abs(a) + np.abs(c))
-            missing = np.isfinite(a - c) & ~np.isfinite(b - d)
+            with np.errstate(invalid="ignore"):  # an infinite density at both tells nothing
+                one, two = a - c, b - d
+                wrong = np.abs(one - two) > TOLERANCE * (1.0 + np.abs(a) + np.abs(c))
+            missing = np.isfinite(one) & ~np.isfinite(two)
             if np.any(wrong | missing):
                 return factor.where
     return None

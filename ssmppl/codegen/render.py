@@ -45,7 +45,8 @@ CALLS = {
     "gammaincc": "gammaincc", "gammainccinv": "gammainccinv",
     "betaincinv": "betaincinv", "poisson_quantile": "poisson_quantile",
     "binomial_quantile": "binomial_quantile", "negbinomial_quantile": "negbinomial_quantile",
-    "pow": "power",
+    "poisson_survival_quantile": "poisson_survival_quantile",
+    "negbinomial_survival_quantile": "negbinomial_survival_quantile", "pow": "power",
 }  # fmt: skip
 MATRIX_CALLS = {"cholesky": "cholesky", "inverse": "inverse", "logdet": "logdet", "det": "det"}
 # Scalar sources of randomness; normals and uniforms come from buffers filled in bulk.

@@ -22,8 +22,8 @@ MODULES = {
     "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincinv",
     "random": "normal uniform gamma gamma_by poisson binomial vonmises",
     "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil "
-    "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile cholesky "
-    "inverse logdet det",
+    "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile "
+    "poisson_survival_quantile negbinomial_survival_quantile cholesky inverse logdet det",
     "flags": "exact kernel",
 }
 

@@ -37,6 +37,13 @@ MEANING: dict[str, Callable[..., Any]] = {
     "negbinomial_quantile": lambda r, p, q: _round_up(
         sp.nbdtrik(q, r, p), lambda k: sp.betainc(r, k + 1.0, p), q
     ),
+    # smallest k with P(X > k) <= q
+    "poisson_survival_quantile": lambda rate, q: special.smallest_below(
+        lambda k: sp.gammainc(k + 1.0, rate), q
+    ),
+    "negbinomial_survival_quantile": lambda r, p, q: special.smallest_below(
+        lambda k: sp.betainc(k + 1.0, r, 1.0 - np.asarray(p)), q
+    ),
     "neg": np.negative,
     "not": np.logical_not,
     "add": np.add,

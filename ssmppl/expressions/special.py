@@ -5,12 +5,14 @@ The compiled kernels (`codegen/kernels/laws.py`) compute the same by other ways.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import scipy.special as sp
 
 BISECTIONS = 80
+LARGEST_COUNT = 2.0**53
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
 PIECES = 6
 FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
@@ -53,6 +55,21 @@ def betabinomial_quantile(n: Any, a: Any, b: Any, q: Any) -> np.ndarray:
         total += np.exp(_log_mass(j, n, a, b))
         k += (j < n) & (total < q)
     return np.where(sound & (q >= 0) & (q <= 1), k, np.nan)
+
+
+def smallest_below(survival: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
+    """The smallest whole k >= 0 with survival(k) <= q, elementwise: doubled, then halved."""
+    (q,) = _wide(q)
+    high = np.zeros(np.broadcast_shapes(q.shape, np.shape(survival(np.zeros(())))))
+    while np.any(short := (survival(high) > q) & (high < LARGEST_COUNT)):
+        high = np.where(short, 2.0 * high + 1.0, high)
+    low, fits = np.full(high.shape, -1.0), survival(high) <= q
+    while np.any(high - low > 1.0):
+        middle = np.floor(0.5 * (low + high))
+        inside = survival(np.maximum(middle, 0.0)) <= q
+        low, high = np.where(inside, low, middle), np.where(inside, middle, high)
+    high = np.where(fits, high, np.where(np.isnan(survival(high)), np.nan, np.inf))
+    return np.where((q >= 0) & (q <= 1), high, np.nan)
 
 
 def vonmises_cdf(concentration: Any, x: Any) -> np.ndarray:

@@ -35,7 +35,8 @@ class Scale:
         v = v[np.isfinite(v)]
         v = v if v.size else np.zeros(1)
         at = [tuple(map(float, np.quantile(a, LEVELS))) for a in (v, np.abs(v))]
-        return cls(float(v.mean()), float(v.std()), *at)
+        size = float(np.abs(v).max()) or 1.0  # squares of numbers beyond 1e154 have none
+        return cls(size * float((v / size).mean()), size * float((v / size).std()), *at)
 
     def quantile(self, level: float) -> float:
         """By linear interpolation between `LEVELS`."""

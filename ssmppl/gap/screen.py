@@ -308,7 +308,11 @@ def _one_set(
         return {}
     if not all(np.all(np.isfinite(p.rows)) for p in passes):
         return {}
-    return dict(vars(question.statistics(data, passes, stream)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = question.statistics(data, passes, stream)
+    if not np.all(np.isfinite(found.columns)) or np.any(np.isinf(found.squares)):
+        return {}  # rows whose squares are beyond what a number can be
+    return dict(vars(found))
 
 
 def compared(law: Null, usual: np.ndarray, seen: Statistics) -> Efficient:

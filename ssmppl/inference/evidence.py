@@ -21,7 +21,7 @@ from scipy.special import gammaln
 from ssmppl.analysis.density import terms
 from ssmppl.counts import check_count
 from ssmppl.data import check_values
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains import smc2
@@ -165,6 +165,12 @@ def evidence(
         title="evidence",
     )  # fmt: skip
     other_ratio = np.concatenate(density) - law.log_density(points)
+    if not np.any(other_ratio > -np.inf):
+        raise SamplingError(
+            "the likelihood is zero wherever a t law with the draws' mean and covariance puts its "
+            "points, so that there is nothing to compare the draws with",
+            fix="give more draws, or method=ssm.SMC2(), which needs no such law",
+        )
     found, check = bridge(own_ratio, other_ratio), importance(other_ratio)
     known = _log_prior_of_fixed(problem, held)
     return Evidence(
@@ -256,9 +262,9 @@ def _without_parameters(
         return Evidence(exact, 0.0, {"method": filter_of(model)})
     assert method.particles is not None
     settings = FilterSettings(method.particles, method.proposal, rescue=method.rescue)
-    found = importance(repeated_estimates(problem, space.theta, settings, root, range(REPEATS)))
+    estimates = repeated_estimates(problem, space.theta, settings, root, range(REPEATS))
     return Evidence(
-        found.log_constant, found.standard_error,
+        *log_of_mean(estimates),
         {"method": "particle filter", "particles": method.particles, "repeats": REPEATS},
     )  # fmt: skip
 
@@ -334,7 +340,8 @@ class _Student:
     def log_density(self, points: np.ndarray) -> np.ndarray:
         d = len(self.location)
         u = np.linalg.solve(self.factor, (points - self.location).reshape(-1, d).T)
-        square = np.sum(u**2, axis=0).reshape(points.shape[:-1])
+        with np.errstate(over="ignore"):  # so far off that the density is zero
+            square = np.sum(u**2, axis=0).reshape(points.shape[:-1])
         log_norm = gammaln((DEGREES + d) / 2) - gammaln(DEGREES / 2)
         log_norm -= 0.5 * d * np.log(DEGREES * np.pi) + np.log(np.diag(self.factor)).sum()
         return log_norm - 0.5 * (DEGREES + d) * np.log1p(square / DEGREES)

@@ -148,7 +148,8 @@ def leave_future_out(
     elpd = np.array([r.elpd for r in rows])
     measured = np.isfinite(elpd) | np.isneginf(elpd)
     n = int(measured.sum())
-    spread = float(np.sqrt(n * np.var(elpd[measured], ddof=1))) if n > 1 else float("nan")
+    with np.errstate(invalid="ignore"):  # NaN where a row was impossible to every draw
+        spread = float(np.sqrt(n * np.var(elpd[measured], ddof=1))) if n > 1 else float("nan")
     labels = np.arange(1, whole.steps + 1) if whole.time is None else whole.time
     return to_dataset(
         {

@@ -75,6 +75,9 @@ class Poisson(_Counts):
     def quantile(self, p):
         return array(ew("poisson_quantile", self.rate, p))
 
+    def survival_quantile(self, p):
+        return array(ew("poisson_survival_quantile", self.rate, p))
+
     def sample_above(self, draws, lower):
         # X >= k where the k-th event of a unit Poisson process comes before `rate`: draw its
         # time, Gamma(k) cut off there, then the events of the time that is left.
@@ -132,6 +135,10 @@ class NegativeBinomial(_Counts):
     def quantile(self, p):
         r = self.dispersion
         return array(ew("negbinomial_quantile", r, r / (r + self.mean_), p))
+
+    def survival_quantile(self, p):
+        r = self.dispersion
+        return array(ew("negbinomial_survival_quantile", r, r / (r + self.mean_), p))
 
     def sample_above(self, draws, lower):
         # As for Poisson, with the process run at a gamma distributed speed g for the time m / r:
@@ -214,6 +221,9 @@ class Binomial(_OutOf):
     def quantile(self, p):
         return array(ew("binomial_quantile", self.n, self.p, p))
 
+    def survival_quantile(self, p):  # of the failures n - X
+        return self.n - ew("binomial_quantile", self.n, 1.0 - self.p, p)
+
     def sample_above(self, draws, lower):
         # X >= k where the k-th smallest of n uniforms, Beta(k, n - k + 1), is below p; the others
         # that are larger than it are uniform up to 1.
@@ -281,6 +291,9 @@ class BetaBinomial(_OutOf):
 
     def quantile(self, p):
         return array(ew("betabinomial_quantile", self.n, self.a, self.b, p))
+
+    def survival_quantile(self, p):
+        return self.n - ew("betabinomial_quantile", self.n, self.b, self.a, p)
 
     def weighted(self, power):
         factor = array(1.0)

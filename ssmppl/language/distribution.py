@@ -282,13 +282,12 @@ class Distribution:
         if whole_left:
             return self.quantile(p * self.cdf(upper))
         below = lower - 1.0 if self.discrete else lower
-        if whole_right and not self.discrete:  # no discrete distribution has survival_quantile
+        if whole_right and not self.discrete:
             return self.survival_quantile(q * self.survival(below))
         low = self.cdf(below)
         left = self.quantile(q * low + p * (1.0 if whole_right else self.cdf(upper)))
-        if self.discrete:
-            return left
-        right = self.survival_quantile(q * self.survival(below) + p * self.survival(upper))
+        rest = 0.0 if whole_right else p * self.survival(upper)
+        right = self.survival_quantile(q * self.survival(below) + rest)
         return array(elementwise("where", elementwise("lt", low, 0.5), left, right))
 
     def sample_above(self, draws: Draws, lower: ExprArray) -> ExprArray | None:

@@ -103,6 +103,11 @@ class ZeroInflated(Distribution):
         law = self.base.quantile(array(ew("maximum", left, 0.0)) / (1.0 - self.p))
         return _where(ew("le", left, 0.0), 0.0, law)
 
+    def survival_quantile(self, p):
+        above = array(p) / (1.0 - self.p)
+        law = self.base.survival_quantile(array(ew("minimum", above, 1.0)))
+        return _where(ew("le", 1.0, above), 0.0, law)
+
     def sample_above(self, draws, lower):
         above_zero = all(e.op == "const" and e.data >= 1.0 for e in array(lower).ravel())
         return self.base.sample_above(draws, lower) if above_zero else None

@@ -141,6 +141,14 @@ class Truncated(Distribution):
     def log_densities(self, value):
         return self.base.log_densities(array(value)) - self.base.log_mass(*self._bounds())
 
+    def guarded_log_densities(self, value):
+        """As of any law; NaN where so little of the base lies between the bounds that there is no
+        number for it, whose logarithm would make the density infinite."""
+        density, mass = super().guarded_log_densities(value), self.base.log_mass(*self._bounds())
+        if not any(symbols_of(e) for e in array(mass).ravel()):
+            return density  # looked at when the law was made
+        return _where(ew("lt", -math.inf, mass), density, math.nan)
+
     def _clip(self, value: Any) -> ExprArray:
         lower, upper = self._bounds()
         return array(ew("minimum", upper, ew("maximum", lower, value)))

@@ -36,6 +36,7 @@ REGIONS = (0.5, 0.9, 0.99)  # of the normal law that the likelihood tends to: wh
 DEEPEST = 12.0  # below the top, where the colours end
 MOST_DRAWS = 2000
 MOST_ROOM = 2.0  # widths of the range of later iterates, which all of them may take
+LARGEST = 1e300  # number that Matplotlib's ticks can be counted at
 PIECES = 32  # that the grid is cut into, for an executor
 
 
@@ -94,6 +95,13 @@ def plot_likelihood(
     inside = supports(problem.trace)
     ends = [_limits(name, walked, result, limits or {}, theta[k], inside[name])
             for name, k in zip(pair, where, strict=True)]  # fmt: skip
+    for name, (low, high) in zip(pair, ends, strict=True):
+        if not max(abs(low), abs(high)) < LARGEST:
+            raise ArgumentError(
+                f"the surface would reach from {low:g} to {high:g} in {name!r}, which no axis "
+                "holds",
+                fix=f"give limits={{{name!r}: (low, high)}} near plausible values",
+            )
     x, y = (np.linspace(low, high, points) for low, high in ends)
     theta[where] = [x[points // 2], y[points // 2]]
     settings = settle(problem, theta, particles, proposal, whole=True, integrate=True)

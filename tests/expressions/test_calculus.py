@@ -24,6 +24,7 @@ SYMBOLS = [X, Y, Z]
 NO_DERIVATIVE = {
     "poisson_quantile", "binomial_quantile", "negbinomial_quantile", "trigamma",
     "betabinomial_cdf", "betabinomial_quantile",
+    "poisson_survival_quantile", "negbinomial_survival_quantile",
 }  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from tests.expressions.graphs import TABLE, X, Y, Z, programs, run
 
 OTHERS = {
     "eq", "ne", "poisson_quantile", "binomial_quantile", "negbinomial_quantile",
+    "poisson_survival_quantile", "negbinomial_survival_quantile",
     "betabinomial_cdf", "betabinomial_quantile",
 }  # fmt: skip
 
@@ -99,6 +100,26 @@ def test_discrete_quantiles(name, args, cdf):
     q = np.concatenate([np.linspace(0.001, 0.999, 97), at_steps * (1 - 1e-9)])
     found = evaluate(apply(name, *args, X), {X: q})
     np.testing.assert_array_equal(found, law.ppf(q))
+
+
+@pytest.mark.parametrize(
+    ("name", "args", "law"),
+    [
+        ("poisson_survival_quantile", (3.5,), "poisson"),
+        ("negbinomial_survival_quantile", (2.5, 0.4), "nbinom"),
+    ],
+)
+def test_discrete_quantiles_of_the_upper_tail(name, args, law):
+    import scipy.stats as st
+
+    q = 10.0 ** -np.arange(0, 250, 0.7)
+    found = evaluate(apply(name, *args, X), {X: q})
+    survival = getattr(st, law)(*args).sf
+    assert np.all(survival(found) <= q * (1 + 1e-9))
+    assert np.all((found == 0) | (survival(found - 1) > q * (1 - 1e-9)))
+    at = evaluate(apply(name, *args, X), {X: np.array([0.0, -0.1, 1.1, np.nan])})
+    np.testing.assert_array_equal(at[1:], np.nan)
+    assert at[0] > 170
 
 
 def test_opaque_functions():

@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.elementary import exp, log1p
 from ssmppl.codegen.kernels.flags import exact, precise
-from ssmppl.codegen.kernels.incomplete import betainc, gammaincc
+from ssmppl.codegen.kernels.incomplete import betainc, gammainc, gammaincc
 
 LARGEST_COUNT = 2.0**53
 
@@ -127,6 +127,47 @@ def _smallest(cdf, q, a, b, c):
         else:
             low = middle
     return high
+
+
+@exact
+def _poisson_survival(k, a, b, c):
+    return gammainc(k + 1.0, a)
+
+
+@exact
+def _negbinomial_survival(k, r, p, c):
+    return betainc(k + 1.0, r, 1.0 - p)
+
+
+@exact
+def _smallest_below(survival, q, a, b):
+    """The smallest whole k >= 0 with survival(k) <= q: `_smallest` for the upper tail."""
+    if not 0.0 <= q <= 1.0:
+        return math.nan
+    low, high = -1.0, 0.0
+    while survival(high, a, b, 0.0) > q:
+        low, high = high, 2.0 * high + 1.0
+        if high > LARGEST_COUNT:
+            return math.inf
+    if math.isnan(survival(high, a, b, 0.0)):
+        return math.nan
+    while high - low > 1.0:
+        middle = np.floor(0.5 * (low + high))
+        if survival(middle, a, b, 0.0) <= q:
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+@exact
+def poisson_survival_quantile(rate, q):
+    return _smallest_below(_poisson_survival, q, rate, 0.0)
+
+
+@exact
+def negbinomial_survival_quantile(r, p, q):
+    return _smallest_below(_negbinomial_survival, q, r, p)
 
 
 @exact

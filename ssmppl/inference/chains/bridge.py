@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from ssmppl.inference.particles.filtering import log_of_mean
+
 TOLERANCE = 1e-10
 MOST_ITERATIONS = 1000
 
@@ -53,8 +55,7 @@ def bridge(own: np.ndarray, other: np.ndarray) -> Bridge:
 
 def importance(other: np.ndarray) -> Bridge:
     """The same constant from the draws of q alone: exp(log_constant) is unbiased for r."""
-    log_r = float(logsumexp(other) - np.log(other.size))
-    return Bridge(log_r, float(np.sqrt(_relative_variance(np.exp(other - log_r)) / other.size)))
+    return Bridge(*log_of_mean(other))
 
 
 def _relative_variance(values: np.ndarray) -> float:

@@ -134,8 +134,8 @@ def log_joint(steps: ParameterSteps, theta: np.ndarray, paths: list[np.ndarray])
     value = program.entry("log_prior")(theta) if len(theta) else 0.0
     if value == -np.inf:
         return -np.inf
-    part = np.empty(1)
+    value, part = float(value), np.empty(1)  # floats, which add inf and -inf without a warning
     for e, path in zip(steps.problem.experiments, paths, strict=True):
         program.entry("log_joint")(theta, e.y, e.seen, e.u, path, part)
-        value += part[0]
-    return -np.inf if np.isnan(value) else float(value)
+        value += float(part[0])
+    return -np.inf if np.isnan(value) else value

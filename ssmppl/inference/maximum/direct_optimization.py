@@ -87,10 +87,13 @@ class ExactClimb:
                 start = self.setup.start
                 if k:
                     rng = np.random.default_rng(self.setup.seed(k))
-                    start = self.best + rng.standard_normal(len(start))
+                    centre = self.best if len(self.best) else self.setup.start
+                    start = centre + rng.standard_normal(len(start))
                 stopped = self._quasi_newton(start)
-                self._check(self.setup.chart.at(self.best).theta)
-            gap = self._polish()
+                if len(self.best):
+                    self._check(self.setup.chart.at(self.best).theta)
+            if len(self.best):
+                gap = self._polish()
         except KeyboardInterrupt:
             if not np.isfinite(self.best_value):
                 raise

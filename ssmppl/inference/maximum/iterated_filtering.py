@@ -96,7 +96,8 @@ def climb(setup: Setup, method: IF2) -> Ascent:
     if isinstance(found, Hilltop):
         z = found.z
         jacobian = setup.chart.at(z).jacobian
-        error = jacobian @ found.error @ jacobian.T
+        with np.errstate(over="ignore"):
+            error = jacobian @ found.error @ jacobian.T
         report |= {"beyond_the_swarms": found.moved, "estimate": f"{found}, the search for which "
                    f"began at the {report['estimate']}"}  # fmt: skip
         if by_particles:

@@ -62,7 +62,8 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
     problem.proposal(proposal)
     settings = FilterSettings(int(method.particles), proposal)
     each = -(-method.trajectories // method.runs)
-    kernel, why = choose_kernel(problem, settings, each, method.kernel)
+    passes = int(method.chains * method.iterations * method.runs)
+    kernel, why = choose_kernel(problem, settings, each, method.kernel, passes)
     if kernel == "genealogy":
         raise ArgumentError(
             'kernel="genealogy" gives paths that meet in one', fix='use "exact", or "auto"'

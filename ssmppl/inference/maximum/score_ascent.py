@@ -29,6 +29,7 @@ from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import ScoreAscent
+from ssmppl.inference.particles.backward import choose_kernel
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.particle_score import (
     Run,
@@ -108,7 +109,11 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     if proposal == "auto":
         proposal = choose(setup.problem, theta, exact=False).name
     settings = settle(setup.problem, theta, counts["particles"], proposal)
-    smoothing = Smoothing(settings, counts["trajectories"], method.kernel)
+    kernel, why = choose_kernel(
+        setup.problem, settings, counts["trajectories"], method.kernel,
+        passes=counts["runs"] * counts["iterations"],
+    )  # fmt: skip
+    smoothing = Smoothing(settings, counts["trajectories"], kernel)
 
     def runs(z: np.ndarray, k: int) -> list[Run]:
         theta, log_prior = setup.space.parameters(z)
@@ -122,7 +127,7 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     run = _paper if paper else _newton
     with Progress(counts["iterations"], "ScoreAscent", shown=setup.progress) as bar:
         ascent = run(setup, method, start, runs, counts["iterations"], bar)
-    ascent.report.update(counts | {"proposal": proposal})
+    ascent.report.update(counts | {"proposal": proposal, "kernel": f"{kernel}: {why}"})
     if scores.differences:
         ascent.report["central_differences"] = scores.differences
     return ascent
@@ -174,6 +179,7 @@ def _safe_slope(
     return z, _slope(setup, z, runs(z, k))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # looked at below
 def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
     point, found = setup.chart.at(z), combine(runs)
     j = point.jacobian

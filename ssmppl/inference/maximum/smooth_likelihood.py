@@ -80,8 +80,9 @@ class SmoothClimb:
             for k in range(restarts + 1):
                 self._quasi_newton(start)
                 rng = np.random.default_rng(self.setup.seed(k))
-                start = self.best + 3.0 * self.unit * rng.standard_normal(len(self.best))
-            for _ in range(3):
+                centre = self.best if len(self.best) else self.setup.start
+                start = centre + 3.0 * self.unit * rng.standard_normal(len(centre))
+            for _ in range(3 if len(self.best) else 0):
                 gap, information, error = self._top()
                 if gap < CLOSE or not np.isfinite(gap):
                     break

@@ -93,9 +93,12 @@ def particle_system(
 
 
 def choose_kernel(
-    problem: Problem, settings: FilterSettings, trajectories: int, kernel: str = "auto"
-) -> tuple[str, str]:
+    problem: Problem, settings: FilterSettings, trajectories: int, kernel: str = "auto",
+    passes: int = 1,
+) -> tuple[str, str]:  # fmt: skip
     """(kernel, why): "auto" resolved, and what does not apply refused.
+
+    passes : how many times a climb draws that many trajectories.
 
     Raises
     ------
@@ -119,7 +122,7 @@ def choose_kernel(
     never = deterministic_memory(problem.trace) is None
     steps = [e.steps for e in problem.experiments]
     pairs = sum(t * (t + 1) / 2 for t in steps) if never else sum(steps)
-    if never and settings.particles * trajectories * pairs > MOST_WEIGHTS:
+    if never and settings.particles * trajectories * passes * pairs > MOST_WEIGHTS:
         return "mcmc", (
             "deterministic components change all later densities with each index, which makes the "
             "exact kernel too expensive for so many steps"

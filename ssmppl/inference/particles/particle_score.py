@@ -94,7 +94,8 @@ def one_run(
             fix="keep parameters and states off the edges where a law's density is 0 or infinite",
         )
     hessian = scores.hessian(theta, paths).mean(axis=0) if second else None
-    return Run(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
+    with np.errstate(over="ignore", invalid="ignore"):  # as in `combine`
+        return Run(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
 
 
 def several_runs(
@@ -107,6 +108,7 @@ def several_runs(
     return run_tasks(task, list(numbers), executor=executor)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # the squares of some scores have no number
 def combine(runs: Sequence[Run]) -> ParticleScore:
     """Weighted averages of at least two runs, with their errors."""
     n = len(runs)
@@ -148,5 +150,4 @@ def _louis(runs: Sequence[Run], w: np.ndarray) -> np.ndarray:
     own = (means * (w**2)[:, None]).T @ means
     product = (np.outer(total, total) - own) / (1.0 - w @ w)
     inside = [-r.hessian - r.square for r in runs if r.hessian is not None]
-    with np.errstate(invalid="ignore"):  # no information where a second derivative is infinite
-        return np.tensordot(w, np.stack(inside), axes=1) + product
+    return np.tensordot(w, np.stack(inside), axes=1) + product

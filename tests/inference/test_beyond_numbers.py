@@ -1,0 +1,230 @@
+"""Verbs where a likelihood is zero, a score or a parameter beyond what can be squared.
+
+NumPy's warnings are errors here, as they are where verbs are called at random.
+"""
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.gap.scales import Scale
+from ssmppl.inference.evidence import _Student
+from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
+from ssmppl.inference.particles.backward import choose_kernel
+from ssmppl.inference.particles.filtering import FilterSettings
+from tests.inference.smoothing_cases import smoothing_case
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+
+def boxed(prior=None):
+    """y within 1/2 of a nonlinear state; far off it is impossible."""
+    model = ssm.Model("boxed")
+    if prior is not None:
+
+        @model.prior
+        def prior_of():
+            return {"q": prior}
+
+        @model.transition
+        def transition_by(x, q):
+            return {"x": ssm.Normal(np.sin(x), sd=q)}
+    else:
+
+        @model.transition
+        def transition(x):
+            return {"x": ssm.Normal(np.sin(x), sd=0.2)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Uniform(-1, 1)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Uniform(x - 0.5, x + 0.5)}
+
+    return model
+
+
+def test_the_evidence_of_impossible_data():
+    found = ssm.evidence(boxed(), {"y": [0.0, 100.0, 0.0]}, seed=1, progress=False)
+    assert found.log_evidence == -np.inf
+    assert np.isnan(found.standard_error)
+
+
+def test_a_t_law_far_away():
+    law = _Student(np.zeros(1), np.eye(1))
+    assert law.log_density(np.array([[1e200]])) == [-np.inf]
+    assert np.isfinite(law.log_density(np.array([[1e100]])))
+
+
+def test_a_row_that_no_draw_allows_in_leave_future_out():
+    model = boxed(ssm.Uniform(0.1, 0.3))
+    y = np.zeros(9)
+    y[8] = 30.0
+    found = ssm.leave_future_out(
+        model, {"y": y}, first=6, particles=50, draws=20, warmup=20, chains=2, seed=1,
+        progress=False,
+    )  # fmt: skip
+    assert found.attrs["elpd"] == -np.inf
+    assert np.isnan(found.attrs["standard_error"])
+
+
+def switching(observed):
+    """Two states; the second value of y is possible with probability `observed` in both."""
+    model = ssm.Model("switching")
+
+    @model.prior
+    def prior():
+        return {"p": ssm.Uniform(0.1, 0.9)}
+
+    @model.initial
+    def initial():
+        return {"k": ssm.Categorical([0.5, 0.5])}
+
+    @model.transition
+    def transition(k, p):
+        return {"k": ssm.Categorical(np.stack([p, 1 - p]))}
+
+    @model.observation
+    def observation(k):
+        return {"y": ssm.Categorical([1 - observed, observed])}
+
+    return model
+
+
+@pytest.mark.parametrize("restarts", [0, 2])
+def test_no_climb_where_the_likelihood_is_zero(restarts):
+    method = ssm.DirectOptimization(restarts=restarts)
+    with pytest.raises(ssm.ArgumentError, match=r"zero at every point(?s:.*)give start="):
+        ssm.maximize(
+            switching(0.0), {"y": [0, 1, 0]}, method, start={"p": 0.5}, seed=1, progress=False
+        )
+
+
+@pytest.mark.parametrize("restarts", [0, 2])
+def test_no_climb_where_the_continuous_filter_is_zero(restarts, monkeypatch):
+    monkeypatch.setattr(SmoothLikelihood, "one", lambda self, theta, seed: -np.inf)
+    method = ssm.DirectOptimization(particles=20, averages=2, restarts=restarts)
+    with pytest.raises(ssm.SamplingError, match="zero at the start"):
+        ssm.maximize(
+            boxed(ssm.Uniform(0.1, 0.3)), {"y": np.zeros(3)}, method, seed=1, progress=False
+        )
+
+
+def narrow():
+    model = ssm.Model("narrow")
+
+    @model.prior
+    def prior():
+        return {"s": ssm.Gamma(2, rate=2)}
+
+    @model.initial
+    def initial(s):
+        return {"x": ssm.Normal(0, sd=s)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.Normal(np.sin(x), sd=1)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1)}
+
+    return model
+
+
+def test_scores_whose_squares_are_beyond_numbers():
+    found = ssm.score(narrow(), {"y": [0.0, 0.1]}, {"s": 1e-160}, seed=1, particles=20)
+    assert abs(found.gradient["s"]) > 1e155
+
+
+def test_a_surface_that_no_axis_holds():
+    model = ssm.Model("two scales")
+
+    @model.prior
+    def prior():
+        return {"a": ssm.HalfNormal(sd=1), "b": ssm.HalfNormal(sd=1)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x, a):
+        return {"x": ssm.Normal(x, sd=a)}
+
+    @model.observation
+    def observation(x, b):
+        return {"y": ssm.Normal(x, sd=b)}
+
+    with pytest.raises(ssm.ArgumentError, match=r"in 'a', which no axis holds(?s:.*)limits="):
+        ssm.plot_likelihood(model, {"y": [0.0, 1.0]}, parameters={"a": 1e308, "b": 1.0}, points=3)
+
+
+def test_the_scale_of_numbers_that_have_no_squares():
+    found = Scale.of([1e200, -1e200, 3e200, np.nan])
+    assert found.mean == pytest.approx(1e200)
+    assert found.sd == pytest.approx(1e200 * np.std([1, -1, 3]))
+    assert Scale.of([0.0, 0.0]).sd == 0.0
+
+
+def test_an_update_whose_check_meets_infinite_densities():
+    """exp(-p^2) to the third power of a tanh: 0 at some points of the check."""
+    model = ssm.Model("check")
+
+    @model.prior
+    def prior():
+        return {"p": ssm.Exponential(rate=1)}
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.Normal(np.sin(x), sd=1)}
+
+    @model.observation
+    def observation(p):
+        up = 0.5 + 0.5 * np.tanh(p**3)
+        return {
+            "y": ssm.Normal(np.arctan(p / p), precision=p),
+            "k": ssm.Categorical(np.stack([0.5 * up, 0.5 * up, 1 - up])),
+        }
+
+    assert "p" in str(ssm.explain(model))
+
+
+def test_a_climb_counts_all_its_backward_passes():
+    vehicle, *_ = smoothing_case("vehicle")
+    settings = FilterSettings(500, "bootstrap")
+    assert choose_kernel(vehicle, settings, 200)[0] == "exact"
+    assert choose_kernel(vehicle, settings, 200, passes=100_000)[0] == "mcmc"
+
+
+def test_a_truncation_to_what_has_no_probability():
+    """The mass beyond 800 has no number: neither have the density and its parameter's posterior."""
+    model = ssm.Model("far")
+
+    @model.prior
+    def prior():
+        return {"r": ssm.Uniform(0.001, 1.5)}
+
+    @model.initial
+    def initial(r):
+        return {"x": ssm.Truncated(ssm.Gamma(2, rate=r), lower=800)}
+
+    @model.transition
+    def transition(x, r):
+        return {"x": ssm.Truncated(ssm.Gamma(2, rate=r), lower=800)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1)}
+
+    data = {"y": [801.0, 805.0, 802.0]}
+    idata = ssm.sample(model, data, ssm.PMMH(particles=50), draws=300, warmup=200, seed=1,
+                       progress=False)  # fmt: skip
+    assert np.all(np.isfinite(idata["sample_stats"]["log_likelihood"]))
+    assert float(idata["posterior"]["r"].max()) < 0.93  # where gammaincc is 0
