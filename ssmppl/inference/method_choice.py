@@ -157,6 +157,12 @@ def choose_maximiser(
     singular = without_density(trace)
     if singular is not None:
         return IF2(), f"{singular.reason}: iterated filtering, which needs none"
+    if deterministic_memory(trace) is None and not noisy_start(trace):
+        return IF2(), (
+            "components that follow without a noise of their own never forget the past, so that "
+            "particle smoothing takes time that grows with the square of the rows: iterated "
+            "filtering, which only simulates; of some hundred rows ScoreAscent is more precise"
+        )
     return ScoreAscent(), (
         "Fisher's identity gives the score by particle smoothing; direct optimisation does not "
         f"apply: {obstacle.reason}"

@@ -107,18 +107,36 @@ def test_an_interrupted_ascent_gives_its_average(monkeypatch):
     assert np.isfinite(found.log_likelihood)
 
 
-def test_it_is_chosen_for_several_nonlinear_states():
+def chosen(transition):
+    """Method and reason for a state of two components, the first of which is observed."""
     model = ssm.Model("two")
     model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
-    model.initial(lambda: {"x": ssm.Normal(np.zeros(2), sd=1)})
-    model.transition(lambda x, a: {"x": ssm.Normal(a * np.sin(x), sd=1)})
-    model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
+    model.transition(transition)
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     problem = pose(model, {"y": np.zeros(4)})
     setup = Setup(problem, space_of(problem, {}, {}), "likelihood", {}, {},
                   np.random.SeedSequence(1))  # fmt: skip
-    method, reason = choose_method(setup)
+    return choose_method(setup)
+
+
+def test_it_is_chosen_for_several_nonlinear_states():
+    method, reason = chosen(
+        lambda x, v, a: {"x": ssm.Normal(a * np.sin(v), sd=1), "v": ssm.Normal(x, sd=1)}
+    )
     assert isinstance(method, ssm.ScoreAscent)
     assert "2 components" in reason
+
+
+def test_it_is_not_where_a_position_never_forgets():
+    """Each index of a backward pass would change all later positions."""
+    method, reason = chosen(
+        lambda x, v, a: {"x": ssm.Dirac(x + v), "v": ssm.Normal(v - a * np.sin(x), sd=1)}
+    )
+    assert isinstance(method, ssm.IF2)
+    assert "never forget" in reason
+    method, _ = chosen(lambda x, v, a: {"x": ssm.Dirac(np.sin(v)), "v": ssm.Normal(a * x, sd=1)})
+    assert isinstance(method, ssm.ScoreAscent)  # x forgets all but the last v
 
 
 @pytest.mark.slow
