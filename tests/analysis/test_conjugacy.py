@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ssmppl.analysis import check
 from ssmppl.analysis.check import verify
 from ssmppl.analysis.conjugacy import derive_updates
 from ssmppl.analysis.sufficient import complete_data
@@ -130,3 +131,26 @@ def test_blocks_are_compared_component_by_component_beside_vectors():
         lambda x, w: {"y": ssm.Normal(x, sd=w[0]), "z": ssm.StudentT(4, x, scale=w[1])}
     )
     assert ("phi", "mu", "r") in {u.block for u in derive_updates(trace(model))}
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_the_search_for_the_line_of_a_fault_passes_infinite_densities():
+    model = Model("edge")
+    model.prior(lambda: {"p": ssm.Exponential(rate=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=1)})
+    model.observation(lambda p: {
+        "k": ssm.Bernoulli(0.5 + 0.5 * np.tanh(p**3)), "y": ssm.Normal(0, precision=p)
+    })  # fmt: skip
+    data = complete_data(trace(model))
+    (update,) = derive_updates(data.trace)
+    p = next(iter(update.components))
+    rows = [
+        {**row, p: np.full(check.POINTS, 50.0)}
+        for row in check.random_series(data, np.random.default_rng(1))
+    ]
+    for row in rows:
+        row.update({s: np.zeros(check.POINTS) for s in data.trace.observation_symbols})
+    changed = {p: np.full(check.POINTS, 60.0)}
+    (line,) = {f.where for f in data.holding([p]) if f.role == "observation"}
+    assert check._culprit(data, update, rows, changed) in (None, line)

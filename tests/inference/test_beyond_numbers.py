@@ -3,11 +3,14 @@
 NumPy's warnings are errors here, as they are where verbs are called at random.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import ssmppl as ssm
 from ssmppl.gap.scales import Scale
+from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.evidence import _Student
 from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
 from ssmppl.inference.particles.backward import choose_kernel
@@ -169,33 +172,6 @@ def test_the_scale_of_numbers_that_have_no_squares():
     assert Scale.of([0.0, 0.0]).sd == 0.0
 
 
-def test_an_update_whose_check_meets_infinite_densities():
-    """exp(-p^2) to the third power of a tanh: 0 at some points of the check."""
-    model = ssm.Model("check")
-
-    @model.prior
-    def prior():
-        return {"p": ssm.Exponential(rate=1)}
-
-    @model.initial
-    def initial():
-        return {"x": ssm.Normal(0, sd=1)}
-
-    @model.transition
-    def transition(x):
-        return {"x": ssm.Normal(np.sin(x), sd=1)}
-
-    @model.observation
-    def observation(p):
-        up = 0.5 + 0.5 * np.tanh(p**3)
-        return {
-            "y": ssm.Normal(np.arctan(p / p), precision=p),
-            "k": ssm.Categorical(np.stack([0.5 * up, 0.5 * up, 1 - up])),
-        }
-
-    assert "p" in str(ssm.explain(model))
-
-
 def test_a_climb_counts_all_its_backward_passes():
     vehicle, *_ = smoothing_case("vehicle")
     settings = FilterSettings(500, "bootstrap")
@@ -203,28 +179,29 @@ def test_a_climb_counts_all_its_backward_passes():
     assert choose_kernel(vehicle, settings, 200, passes=100_000)[0] == "mcmc"
 
 
-def test_a_truncation_to_what_has_no_probability():
-    """The mass beyond 800 has no number: neither have the density and its parameter's posterior."""
-    model = ssm.Model("far")
+def test_a_log_joint_of_both_infinities_is_no_probability():
+    """An infinite prior density at an edge, and data that are impossible there."""
 
-    @model.prior
-    def prior():
-        return {"r": ssm.Uniform(0.001, 1.5)}
+    def log_joint_of(theta, y, seen, u, path, part):
+        part[0] = -np.inf
 
-    @model.initial
-    def initial(r):
-        return {"x": ssm.Truncated(ssm.Gamma(2, rate=r), lower=800)}
+    entries = {"log_prior": lambda theta: np.float64(np.inf), "log_joint": log_joint_of}
+    row = SimpleNamespace(y=None, seen=None, u=None)
+    problem = SimpleNamespace(program=SimpleNamespace(entry=entries.get), experiments=[row])
+    assert log_joint(SimpleNamespace(problem=problem), np.zeros(1), [np.zeros(1)]) == -np.inf
 
-    @model.transition
-    def transition(x, r):
-        return {"x": ssm.Truncated(ssm.Gamma(2, rate=r), lower=800)}
 
-    @model.observation
-    def observation(x):
-        return {"y": ssm.Normal(x, sd=1)}
-
-    data = {"y": [801.0, 805.0, 802.0]}
-    idata = ssm.sample(model, data, ssm.PMMH(particles=50), draws=300, warmup=200, seed=1,
-                       progress=False)  # fmt: skip
-    assert np.all(np.isfinite(idata["sample_stats"]["log_likelihood"]))
-    assert float(idata["posterior"]["r"].max()) < 0.93  # where gammaincc is 0
+def test_errors_of_an_estimate_that_has_no_square():
+    """IF2 at e^460: the variance of its Monte Carlo error is beyond what a number can be."""
+    model = ssm.Model("huge")
+    model.prior(lambda: {"s": ssm.LogNormal(460.0, sd=1.0)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {"x": ssm.Normal(np.sin(x) + np.log(s) - 460.0, sd=0.3)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=0.3)})
+    y = ssm.simulate(model, {"s": np.exp(460.3)}, steps=40, seed=1)["y"].values[0]
+    found = ssm.maximize(
+        model, {"y": y}, ssm.IF2(particles=100, iterations=10), start={"s": np.exp(460.0)}, seed=1,
+        progress=False,
+    )  # fmt: skip
+    assert 459.5 < np.log(found.parameters["s"]) < 461.0
+    assert "beyond_the_swarms" in found.attrs

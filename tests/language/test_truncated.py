@@ -213,3 +213,13 @@ def test_slopes_of_a_truncated_weibull_by_its_shape(bounds):
     slope = float(evaluate(differentiate([density], X)[0], {X: 2.0}))
     below, above = (float(evaluate(density, {X: 2.0 + h})) for h in (-1e-5, 1e-5))
     assert slope == pytest.approx((above - below) / 2e-5, rel=1e-6)
+
+
+def test_a_mass_that_has_no_number_leaves_no_density():
+    """The share of Gamma(2, rate) beyond 800 is 1e-345 at a rate of 1: no infinite density."""
+    law = D.Truncated(D.Gamma(2.0, rate=symbol("parameter", "rate")), lower=800.0)
+    log_density = law.log_density(X)
+    for rate, known in [(0.9, True), (1.0, False)]:
+        found = evaluate(log_density, {symbol("parameter", "rate"): rate, X: 805.0})
+        assert np.isfinite(found) == known
+        assert np.isnan(found) != known
