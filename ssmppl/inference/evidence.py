@@ -127,6 +127,7 @@ def evidence(
     Raises
     ------
     ArgumentError : a free parameter has an improper prior, so that p(y) has no meaning.
+    SamplingError : the likelihood is zero wherever the law bridged to puts its points.
     """
     for name, value, least in (("draws", draws, 4), ("warmup", warmup, 0), ("chains", chains, 1)):
         check_count(name, value, least)

@@ -179,8 +179,22 @@ def _safe_slope(
     return z, _slope(setup, z, runs(z, k))
 
 
-@np.errstate(over="ignore", invalid="ignore")  # looked at below
 def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope = _combined(setup, z, runs)
+    if not all(
+        np.all(np.isfinite(m))
+        for m in (slope.gradient, slope.noise, slope.information, slope.complete)
+    ):
+        raise SamplingError(
+            "the log joint density has no finite second derivative at "
+            f"{spelled(setup.problem.trace, setup.chart.at(z).theta)}",
+            fix="give start={name: value} off the edges of the laws, or use IF2",
+        )
+    return slope
+
+
+def _combined(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
     point, found = setup.chart.at(z), combine(runs)
     j = point.jacobian
     log_z = np.array([r.log_z for r in runs])
@@ -194,19 +208,10 @@ def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
         each = each + point.d_log_prior
     natural = found.information if found.information is not None else np.zeros_like(hessian)
     rest = -second.theta - prior
-    slope = Slope(
+    return Slope(
         z, gradient, each, log_z, j.T @ found.gradient_covariance @ j,
         j.T @ natural @ j + rest, -j.T @ hessian @ j + rest, natural,
     )  # fmt: skip
-    if not all(
-        np.all(np.isfinite(m)) for m in (gradient, slope.noise, slope.information, slope.complete)
-    ):
-        raise SamplingError(
-            "the log joint density has no finite second derivative at "
-            f"{spelled(setup.problem.trace, point.theta)}",
-            fix="give start={name: value} off the edges of the laws, or use IF2",
-        )
-    return slope
 
 
 def _preconditioner(b: np.ndarray | None, slope: Slope) -> np.ndarray:

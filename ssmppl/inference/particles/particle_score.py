@@ -108,9 +108,13 @@ def several_runs(
     return run_tasks(task, list(numbers), executor=executor)
 
 
-@np.errstate(over="ignore", invalid="ignore")  # the squares of some scores have no number
 def combine(runs: Sequence[Run]) -> ParticleScore:
     """Weighted averages of at least two runs, with their errors."""
+    with np.errstate(over="ignore", invalid="ignore"):  # the squares of some scores have no number
+        return _combined(runs)
+
+
+def _combined(runs: Sequence[Run]) -> ParticleScore:
     n = len(runs)
     log_z = np.array([r.log_z for r in runs])
     share = np.exp(log_z - log_z.max())
