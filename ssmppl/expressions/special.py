@@ -65,8 +65,8 @@ def smallest_below(survival: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
         high = np.where(short, 2.0 * high + 1.0, high)
     low, fits = np.full(high.shape, -1.0), survival(high) <= q
     while np.any(high - low > 1.0):
-        middle = np.floor(0.5 * (low + high))
-        inside = survival(np.maximum(middle, 0.0)) <= q
+        middle = np.maximum(np.floor(0.5 * (low + high)), 0.0)
+        inside = survival(middle) <= q
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
     high = np.where(fits, high, np.where(np.isnan(survival(high)), np.nan, np.inf))
     return np.where((q >= 0) & (q <= 1), high, np.nan)

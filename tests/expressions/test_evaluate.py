@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
+from ssmppl.codegen.kernels import scalars
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import MEANING, evaluate, numpy_draws
 from ssmppl.expressions.expr import MATRIX_OPS, OPS, Expr, apply, constant, symbol
@@ -116,10 +117,14 @@ def test_discrete_quantiles_of_the_upper_tail(name, args, law):
     found = evaluate(apply(name, *args, X), {X: q})
     survival = getattr(st, law)(*args).sf
     assert np.all(survival(found) <= q * (1 + 1e-9))
+    assert np.all(found >= 0)
     assert np.all((found == 0) | (survival(found - 1) > q * (1 - 1e-9)))
     at = evaluate(apply(name, *args, X), {X: np.array([0.0, -0.1, 1.1, np.nan])})
     np.testing.assert_array_equal(at[1:], np.nan)
     assert at[0] > 170
+    kernel = getattr(scalars, name)
+    np.testing.assert_array_equal([kernel(*args, p) for p in q], found)
+    assert np.all(np.isnan([kernel(*args, p) for p in (-0.1, 1.1, np.nan)]))
 
 
 def test_opaque_functions():

@@ -13,9 +13,7 @@ from ssmppl.gap.scales import Scale
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.evidence import _Student
 from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
-from ssmppl.inference.particles.backward import choose_kernel
-from ssmppl.inference.particles.filtering import FilterSettings
-from tests.inference.smoothing_cases import smoothing_case
+from ssmppl.inference.particles import backward
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -172,11 +170,29 @@ def test_the_scale_of_numbers_that_have_no_squares():
     assert Scale.of([0.0, 0.0]).sd == 0.0
 
 
-def test_a_climb_counts_all_its_backward_passes():
-    vehicle, *_ = smoothing_case("vehicle")
-    settings = FilterSettings(500, "bootstrap")
-    assert choose_kernel(vehicle, settings, 200)[0] == "exact"
-    assert choose_kernel(vehicle, settings, 200, passes=100_000)[0] == "mcmc"
+@pytest.mark.parametrize(
+    "method",
+    [
+        ssm.ScoreAscent(particles=10, trajectories=5, runs=2, iterations=2),
+        ssm.ParticleEM(particles=10, trajectories=5, runs=1, chains=1, iterations=4, burn_in=1),
+    ],
+    ids=lambda m: type(m).__name__,
+)
+def test_a_climb_counts_all_its_backward_passes(method, monkeypatch):
+    """One pass over four rows evaluates 10 * 5 * 10 densities, the climb four times as many."""
+    model = ssm.Model("position")
+    model.prior(lambda: {"q": ssm.InverseGamma(3, scale=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1), "v": ssm.Normal(0, sd=1)})
+    model.transition(
+        lambda x, v, q: {"x": ssm.Dirac(x + v), "v": ssm.Normal(np.sin(x), variance=q)}
+    )
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    for most, kernel in [(2001, "exact"), (1000, "mcmc")]:
+        monkeypatch.setattr(backward, "MOST_WEIGHTS", most)
+        found = ssm.maximize(
+            model, {"y": np.zeros(4)}, method, start={"q": 1.0}, seed=1, progress=False
+        )
+        assert found.attrs["kernel"].startswith(kernel)
 
 
 def test_a_log_joint_of_both_infinities_is_no_probability():
