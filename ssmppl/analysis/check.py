@@ -128,7 +128,8 @@ def summed_statistics(update: Update, series: list[Point]) -> np.ndarray:
         for t, values in enumerate(series):
             if _counts(role, t):
                 for i, c in enumerate(update.coefficients[role]):
-                    total[i] += evaluate(c, values)
+                    with np.errstate(invalid="ignore"):  # inf - inf: a point that is not compared
+                        total[i] += evaluate(c, values)
     return total
 
 

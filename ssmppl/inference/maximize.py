@@ -267,7 +267,7 @@ def natural_covariance(
     with np.errstate(all="ignore"):
         curvature = jacobian.T @ information @ jacobian
     if setup.with_prior:
-        slope = np.linalg.pinv(point.jacobian).T @ point.d_log_prior
+        slope = point.inverse().T @ point.d_log_prior
         second = setup.chart.curvature(z, slope)
         curvature = curvature + (second.theta - second.log_prior)[np.ix_(kept, kept)]
     if not np.all(np.isfinite(curvature)):

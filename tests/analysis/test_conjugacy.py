@@ -154,3 +154,18 @@ def test_the_search_for_the_line_of_a_fault_passes_infinite_densities():
     changed = {p: np.full(check.POINTS, 60.0)}
     (line,) = {f.where for f in data.holding([p]) if f.role == "observation"}
     assert check._culprit(data, update, rows, changed) in (None, line)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_statistics_of_both_infinities_are_no_number():
+    model = Model("mean")
+    model.prior(lambda: {"m": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=1)})
+    model.observation(lambda x, m: {"y": ssm.Normal(m + x, sd=1)})
+    data = complete_data(trace(model))
+    (update,) = derive_updates(data.trace)
+    rows = check.random_series(data, np.random.default_rng(1))
+    for t, row in enumerate(rows):
+        row.update({s: np.full(check.POINTS, (-1) ** t * np.inf) for s in data.trace.state_symbols})
+    assert np.isnan(check.summed_statistics(update, rows)).any()

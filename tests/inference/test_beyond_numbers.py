@@ -12,8 +12,11 @@ import ssmppl as ssm
 from ssmppl.gap.scales import Scale
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.evidence import _Student
+from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
 from ssmppl.inference.particles import backward
+from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.problem import pose
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -221,3 +224,16 @@ def test_errors_of_an_estimate_that_has_no_square():
     )  # fmt: skip
     assert 459.5 < np.log(found.parameters["s"]) < 461.0
     assert "beyond_the_swarms" in found.attrs
+
+
+@pytest.mark.parametrize("objective", ["likelihood", "posterior"])
+def test_the_information_at_an_infinite_parameter_is_no_number(objective):
+    model = ssm.Model("far")
+    model.prior(lambda: {"s": ssm.Gamma(2, rate=2), "p": ssm.Uniform(0, 1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {"x": ssm.Normal(np.sin(x), sd=s)})
+    model.observation(lambda x, p: {"y": ssm.Normal(p * x, sd=1)})
+    problem = pose(model, {"y": np.zeros(3)})
+    setup = Setup(problem, space_of(problem, {}, {}), objective, {}, {}, np.random.SeedSequence(0))
+    assert np.isnan(setup.natural(np.array([800.0, 0.0]), np.eye(2))).all()
+    assert np.isfinite(setup.natural(np.array([1.0, 0.0]), np.eye(2))).all()

@@ -120,11 +120,12 @@ class Setup:
         The gradient of the likelihood is zero there, or minus that of the log prior.
         """
         point = self.chart.at(z)
-        inverse = np.linalg.pinv(point.jacobian)
+        inverse = point.inverse()
         if self.with_prior:
             slope = -inverse.T @ point.d_log_prior
             information = information + self.chart.curvature(z, slope).theta
-        return inverse.T @ information @ inverse
+        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
+            return inverse.T @ information @ inverse
 
     def exact_at(self, z: np.ndarray) -> float:
         """The exact log-likelihood at z (F,); -inf off the support, and where there is none."""

@@ -45,6 +45,12 @@ class Point:
         with np.errstate(all="ignore"):  # at the edge of what floating point can hold
             return gradient @ self.jacobian
 
+    def inverse(self) -> np.ndarray:
+        """(F, P) d z / d theta along the free directions; NaN where the Jacobian is not finite."""
+        if not np.all(np.isfinite(self.jacobian)):
+            return np.full(self.jacobian.T.shape, np.nan)
+        return np.linalg.pinv(self.jacobian)
+
 
 @dataclass(frozen=True)
 class Curvature:

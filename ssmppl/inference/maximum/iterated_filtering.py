@@ -96,7 +96,7 @@ def climb(setup: Setup, method: IF2) -> Ascent:
     if isinstance(found, Hilltop):
         z = found.z
         jacobian = setup.chart.at(z).jacobian
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
             error = jacobian @ found.error @ jacobian.T
         report |= {"beyond_the_swarms": found.moved, "estimate": f"{found}, the search for which "
                    f"began at the {report['estimate']}"}  # fmt: skip

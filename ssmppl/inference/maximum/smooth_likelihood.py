@@ -197,7 +197,8 @@ class SmoothClimb:
 
     def _natural_error(self, error: np.ndarray | None) -> np.ndarray | None:
         jacobian = self.setup.chart.at(self.best).jacobian
-        return None if error is None else jacobian @ error @ jacobian.T
+        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
+            return None if error is None else jacobian @ error @ jacobian.T
 
 
 def _log_mean(log_z: np.ndarray) -> float:
