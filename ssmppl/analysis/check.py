@@ -31,6 +31,10 @@ NEEDED = 5
 STEPS = 4
 TOLERANCE = 1e-8
 _ATTEMPTS = 4
+# What a factor does far out must be seen, too, as a hinge of an input bends where the input is; but
+# at most points a density should be a number.
+_LATE = (0.0, 0.0, 0.0, 30.0, 1000.0)  # steps before the first
+_SIZES = (1.0, 1.0, 1.0, -1.0, 30.0, -30.0, 1e3)
 _HINT = ": roots and logarithms of products are split as if each factor were positive"
 Point = dict[Expr, np.ndarray]
 
@@ -164,29 +168,37 @@ def random_series(data: CompleteData, rng: np.random.Generator, steps: int = STE
     trace = data.trace
     parameters = random_parameters(data, rng)
     rows: list[Point] = []
+    late = rng.choice(_LATE, POINTS)
+    sizes = {s: rng.choice(_SIZES, POINTS) for s in trace.input_symbols}
+    spread = np.abs(rng.choice(_SIZES, POINTS))
     for t in range(steps):
         values = dict(parameters)
-        values[symbol("time", "t")] = np.full(POINTS, t + 1.0)
-        values[symbol("time_prev", "t")] = np.full(POINTS, float(t))
+        values[symbol("time", "t")] = late + t + 1.0
+        values[symbol("time_prev", "t")] = late + t
         for name, shape in trace.inputs.items():
             for s in symbols("input", name, shape).ravel():
-                values[s] = rng.uniform(0.3, 2.0, POINTS)
+                values[s] = rng.uniform(0.3, 2.0, POINTS) * sizes[s]
         if t > 0:
             last = rows[-1]
             for s in [*trace.state_symbols, *trace.observation_symbols, *trace.input_symbols]:
                 values[previous(s)] = last[s]
         for site in (trace.transition if t else trace.initial).values():
-            _fill(site, values, rng)
+            _fill(site, values, rng, spread)
         for site in trace.observations.values():
-            _fill(site, values, rng)
+            _fill(site, values, rng, spread)
             for s in site.components:
                 values[seen(s)] = (rng.random(POINTS) < 0.8).astype(float)
         rows.append(values)
     return rows
 
 
-def _fill(site: Site, values: Point, rng: np.random.Generator) -> None:
-    """Values of a site's components, inside the support that its law has at these values."""
+def _fill(
+    site: Site, values: Point, rng: np.random.Generator, spread: np.ndarray | float = 1.0
+) -> None:
+    """Values of a site's components, inside the support that its law has at these values.
+
+    spread : (POINTS,) the size of those that can be any number.
+    """
     support = site.distribution.support()
     components = site.components
     if support.kind == "simplex":
@@ -208,18 +220,26 @@ def _fill(site: Site, values: Point, rng: np.random.Generator) -> None:
     )  # fmt: skip
     maker = _MAKERS[support.kind]
     for c, low, high in zip(site.value.ravel(), lower, upper, strict=True):
-        values[c] = maker(low, high, rng)
+        drawn = maker(low, high, rng)
+        values[c] = np.where(np.isfinite(low) | np.isfinite(high), drawn, spread * drawn)
 
 
 def _interval(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Inside and near the bounds; where 0 lies between them, on both sides of it."""
     positive = np.exp(0.5 * rng.standard_normal(POINTS))
     inside = rng.uniform(0.1, 0.9, POINTS)
+    inside = np.where(rng.random(POINTS) < 0.3, inside**6, inside)
+    inside = np.where(rng.random(POINTS) < 0.3, 1.0 - inside, inside)
+    share, which = rng.uniform(0.05, 0.95, POINTS), rng.integers(0, 4, POINTS)
     with np.errstate(all="ignore"):
-        return np.where(
+        drawn = np.where(
             np.isfinite(low),
             np.where(np.isfinite(high), low + (high - low) * inside, low + positive),
             np.where(np.isfinite(high), high - positive, rng.standard_normal(POINTS)),
         )
+        within = (low < 0.0) & (high > 0.0)
+        drawn = np.where(within & np.isfinite(low) & (which == 0), low * share, drawn)
+        return np.where(within & np.isfinite(high) & (which == 1), high * share, drawn)
 
 
 def _integers(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np.ndarray:

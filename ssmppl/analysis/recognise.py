@@ -20,7 +20,7 @@ from ssmppl.analysis.families_matrix import MatrixNormalWishart, Wishart, lower_
 from ssmppl.analysis.sufficient import BlockForm
 from ssmppl.expressions.algebra import Monomial, Separation, separate
 from ssmppl.expressions.expr import Expr, apply, item, matrix_op
-from ssmppl.expressions.terms import cancels
+from ssmppl.expressions.zero import cancels
 
 
 def match_scalar(component: Expr, monomials: Sequence[Monomial], positive: bool) -> list[Family]:

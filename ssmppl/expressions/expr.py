@@ -12,6 +12,7 @@ from ssmppl.expressions.graph import (
     dependent,
     depends_on,
     pack,
+    rebuilt,
     substitute,
     symbols_of,
     topological,
@@ -37,7 +38,7 @@ from ssmppl.expressions.node import (
     symbol,
     user_location,
 )
-from ssmppl.expressions.simplify import apply
+from ssmppl.expressions.simplify import apply, split_constant
 from ssmppl.expressions.text import symbol_text, to_text
 
 __all__ = [
@@ -59,7 +60,9 @@ __all__ = [
     "item",
     "matrix_op",
     "pack",
+    "rebuilt",
     "recording",
+    "split_constant",
     "substitute",
     "symbol",
     "symbol_text",

@@ -129,11 +129,12 @@ def substitute(roots: list[Expr], replacement: dict[Expr, Expr]) -> list[Expr]:
     for node in topological(roots):
         if node in done:
             continue
-        args = tuple(done[a] for a in node.args)
-        if all(new is old for new, old in zip(args, node.args, strict=True)):
-            done[node] = node
-        elif node.op in FOLD:
-            done[node] = apply(node.op, *args)
-        else:
-            done[node] = Expr(node.op, args, node.data)
+        done[node] = rebuilt(node, tuple(done[a] for a in node.args))
     return [done[r] for r in roots]
+
+
+def rebuilt(node: Expr, args: tuple[Expr, ...]) -> Expr:
+    """The node with other arguments, simplified."""
+    if all(new is old for new, old in zip(args, node.args, strict=True)):
+        return node
+    return apply(node.op, *args) if node.op in FOLD else Expr(node.op, args, node.data)

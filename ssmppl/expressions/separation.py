@@ -21,6 +21,7 @@ from ssmppl.expressions.expr import (
     constant,
     dependent,
     matrix_op,
+    split_constant,
     substitute,
     symbols_of,
     to_text,
@@ -35,7 +36,6 @@ from ssmppl.expressions.terms import (
     gathered,
     monomial_expr,
     scaled,
-    split_constant,
     summed,
 )
 

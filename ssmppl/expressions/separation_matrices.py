@@ -16,6 +16,7 @@ from ssmppl.expressions.expr import (
     dependent,
     item,
     matrix_op,
+    split_constant,
     symbols_of,
     to_text,
 )
@@ -27,7 +28,6 @@ from ssmppl.expressions.terms import (
     gathered,
     monomial_expr,
     scaled,
-    split_constant,
 )
 
 _MINUS = constant(-1.0)

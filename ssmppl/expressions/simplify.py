@@ -161,3 +161,21 @@ RULES: dict[str, tuple[Rule, ...]] = {
         ("where(x, a, a) = a", lambda x, a, b: a is b, lambda x, a, b: a),
     ),
 }  # fmt: skip
+
+
+def split_constant(e: Expr) -> tuple[float, Expr]:
+    """e = number * core."""
+    number, one = 1.0, constant(1.0)
+    while True:
+        if e.op == "const":
+            return number * e.data, one
+        if e.op == "neg":
+            number, e = -number, e.args[0]
+        elif e.op == "mul" and e.args[0].op == "const":
+            number, e = number * e.args[0].data, e.args[1]
+        elif e.op == "mul" and e.args[1].op == "const":
+            number, e = number * e.args[1].data, e.args[0]
+        elif e.op == "div" and e.args[1].op == "const":
+            number, e = number / e.args[1].data, e.args[0]
+        else:
+            return number, e
