@@ -169,3 +169,20 @@ def test_statistics_of_both_infinities_are_no_number():
     for t, row in enumerate(rows):
         row.update({s: np.full(check.POINTS, (-1) ** t * np.inf) for s in data.trace.state_symbols})
     assert np.isnan(check.summed_statistics(update, rows)).any()
+
+
+@pytest.mark.parametrize("bounds", [(-1, 20), (-20, 1), (-0.1, np.inf), (-np.inf, 0.1)])
+def test_no_update_that_holds_on_one_side_of_zero_only(bounds):
+    """log(a**2) is 2 log(a) where a is positive, which most of these supports are."""
+    model = Model("square")
+    low, high = bounds
+    if np.isinf(low) or np.isinf(high):
+        cut = {"lower": low} if np.isinf(high) else {"upper": high}
+        model.prior(lambda: {"a": ssm.Truncated(ssm.Normal(0, sd=30), **cut)})
+    else:
+        model.prior(lambda: {"a": ssm.Uniform(low, high)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, a: {"x": ssm.Normal(np.sin(x), variance=a**2)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    (update,) = derive_updates(trace(model))
+    assert update.needs_log_joint and not update.functions

@@ -7,12 +7,13 @@ import ssmppl as ssm
 from tests.statistics.checks import assert_within, deviations
 
 U = np.array([15.0, -20.0, 22.0, 26.0, 30.0, 20.0, 2.0, 28.0, 19.0, 31.0])
+# Each adds summands to a mean m, one by one, as a user writes them.
 KINKS = {
-    "degree days": (lambda u, b: b * np.maximum(u - 18, 0) + 0.5 * b * np.maximum(u - 24, 0)),
-    "above a threshold": (lambda u, b: b * np.maximum(u, 18) - 18 * b),
-    "the absolute value": (lambda u, b: b * np.abs(u) - b * u),
-    "a dead zone": (lambda u, b: b * np.maximum(u - 2, 0) - b * np.maximum(-u - 2, 0)),
-    "limits": (lambda u, b: b * u - b * np.clip(u, -3, 3)),
+    "degree days": lambda m, u, b: m + b * np.maximum(u - 18, 0) + 0.5 * b * np.maximum(u - 24, 0),
+    "above a threshold": lambda m, u, b: m + b * np.maximum(u, 18) - 18 * b,
+    "the absolute value": lambda m, u, b: m + b * np.abs(u) - b * u,
+    "a dead zone": lambda m, u, b: m + b * np.maximum(u - 2, 0) - b * np.maximum(-u - 2, 0),
+    "limits": lambda m, u, b: m + b * u - b * np.clip(u, -3, 3),
 }
 
 
@@ -29,7 +30,7 @@ def driven(kink):
 
     @model.transition
     def transition(x, u, b):
-        return {"x": ssm.Normal(0.5 * x + kink(u, b), sd=0.5)}
+        return {"x": ssm.Normal(kink(0.5 * x, u, b), sd=0.5)}
 
     @model.observation
     def observation(x):
@@ -43,7 +44,7 @@ def moments(kink, b):
     mean, covariance = np.zeros(len(U)), np.zeros((len(U), len(U)))
     covariance[0, 0] = 1.0
     for t in range(1, len(U)):
-        mean[t] = 0.5 * mean[t - 1] + float(kink(U[t - 1], b))
+        mean[t] = float(kink(0.5 * mean[t - 1], U[t - 1], b))
         covariance[t, :t] = covariance[:t, t] = 0.5 * covariance[t - 1, :t]
         covariance[t, t] = 0.25 * covariance[t - 1, t - 1] + 0.25
     return mean, covariance + 0.09 * np.eye(len(U))
