@@ -45,8 +45,8 @@ def verify(data: CompleteData, update: Update, seed: int = 1) -> NotApplicable |
     compared = 0
     names = ", ".join(update.block)
     for _ in range(_ATTEMPTS):
-        series = random_series(data, rng)
-        other = random_parameters(data, rng)
+        series = random_series(data, rng, wide=True)
+        other = random_parameters(data, rng, wide=True)
         changed = {c: other[c] for c in update.components}
         first = joint(data, update, series)
         second = joint(data, update, [{**values, **changed} for values in series])
@@ -155,29 +155,38 @@ def log_q(update: Update, totals: np.ndarray, value: np.ndarray) -> tuple[float,
 
 
 # -- moderate random points
-def random_parameters(data: CompleteData, rng: np.random.Generator) -> Point:
-    """Parameters inside their supports, near 1 on whatever scale they have."""
+def random_parameters(data: CompleteData, rng: np.random.Generator, wide: bool = False) -> Point:
+    """Parameters inside their supports, near 1 on whatever scale they have.
+
+    wide : also near the bounds of their supports, and on both sides of 0.
+    """
     values: Point = {}
     for site in data.trace.parameters.values():
-        _fill(site, values, rng)
+        _fill(site, values, rng, np.ones(POINTS) if wide else None)
     return values
 
 
-def random_series(data: CompleteData, rng: np.random.Generator, steps: int = STEPS) -> list[Point]:
-    """Rows of symbol -> values, each of shape (POINTS,), consistent with the supports."""
+def random_series(
+    data: CompleteData, rng: np.random.Generator, steps: int = STEPS, wide: bool = False
+) -> list[Point]:
+    """Rows of symbol -> values, each of shape (POINTS,), consistent with the supports.
+
+    wide : at some points the states, the inputs and the time are far from moderate.
+    """
     trace = data.trace
-    parameters = random_parameters(data, rng)
+    parameters = random_parameters(data, rng, wide)
     rows: list[Point] = []
-    late = rng.choice(_LATE, POINTS)
-    sizes = {s: rng.choice(_SIZES, POINTS) for s in trace.input_symbols}
-    spread = np.abs(rng.choice(_SIZES, POINTS))
+    late, spread, sizes = np.zeros(POINTS), None, {}
+    if wide:
+        late, spread = rng.choice(_LATE, POINTS), np.abs(rng.choice(_SIZES, POINTS))
+        sizes = {s: rng.choice(_SIZES, POINTS) for s in trace.input_symbols}
     for t in range(steps):
         values = dict(parameters)
         values[symbol("time", "t")] = late + t + 1.0
         values[symbol("time_prev", "t")] = late + t
         for name, shape in trace.inputs.items():
             for s in symbols("input", name, shape).ravel():
-                values[s] = rng.uniform(0.3, 2.0, POINTS) * sizes[s]
+                values[s] = rng.uniform(0.3, 2.0, POINTS) * sizes.get(s, 1.0)
         if t > 0:
             last = rows[-1]
             for s in [*trace.state_symbols, *trace.observation_symbols, *trace.input_symbols]:
@@ -193,11 +202,11 @@ def random_series(data: CompleteData, rng: np.random.Generator, steps: int = STE
 
 
 def _fill(
-    site: Site, values: Point, rng: np.random.Generator, spread: np.ndarray | float = 1.0
+    site: Site, values: Point, rng: np.random.Generator, spread: np.ndarray | None = None
 ) -> None:
     """Values of a site's components, inside the support that its law has at these values.
 
-    spread : (POINTS,) the size of those that can be any number.
+    spread : (POINTS,) the size of those that can be any number; others are near their bounds, too.
     """
     support = site.distribution.support()
     components = site.components
@@ -221,25 +230,35 @@ def _fill(
     maker = _MAKERS[support.kind]
     for c, low, high in zip(site.value.ravel(), lower, upper, strict=True):
         drawn = maker(low, high, rng)
-        values[c] = np.where(np.isfinite(low) | np.isfinite(high), drawn, spread * drawn)
+        if spread is not None and support.kind != "integers":
+            drawn = _edged(drawn, low, high, rng)
+            drawn = np.where(np.isfinite(low) | np.isfinite(high), drawn, spread * drawn)
+        values[c] = drawn
 
 
 def _interval(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Inside and near the bounds; where 0 lies between them, on both sides of it."""
     positive = np.exp(0.5 * rng.standard_normal(POINTS))
     inside = rng.uniform(0.1, 0.9, POINTS)
-    inside = np.where(rng.random(POINTS) < 0.3, inside**6, inside)
-    inside = np.where(rng.random(POINTS) < 0.3, 1.0 - inside, inside)
-    share, which = rng.uniform(0.05, 0.95, POINTS), rng.integers(0, 4, POINTS)
     with np.errstate(all="ignore"):
-        drawn = np.where(
+        return np.where(
             np.isfinite(low),
             np.where(np.isfinite(high), low + (high - low) * inside, low + positive),
             np.where(np.isfinite(high), high - positive, rng.standard_normal(POINTS)),
         )
-        within = (low < 0.0) & (high > 0.0)
-        drawn = np.where(within & np.isfinite(low) & (which == 0), low * share, drawn)
-        return np.where(within & np.isfinite(high) & (which == 1), high * share, drawn)
+
+
+def _edged(
+    drawn: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Some of the numbers moved towards a bound, or between it and 0 where 0 lies inside."""
+    which, share = rng.integers(0, 4, POINTS), rng.uniform(0.001, 0.999, POINTS)
+    with np.errstate(all="ignore"):
+        for k, bound in enumerate((low, high)):
+            across = np.where(
+                (low < 0.0) & (high > 0.0), bound * share, bound + share**4 * (drawn - bound)
+            )
+            drawn = np.where((which == k) & np.isfinite(bound), across, drawn)
+    return drawn
 
 
 def _integers(low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> np.ndarray:

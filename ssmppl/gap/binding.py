@@ -12,7 +12,16 @@ import numpy as np
 from ssmppl.errors import ModelError, NotApplicable, listing
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, as_expr, constant, substitute, symbol, symbols_of
+from ssmppl.expressions.expr import (
+    Expr,
+    as_expr,
+    constant,
+    substitute,
+    symbol,
+    symbols_of,
+    to_text,
+)
+from ssmppl.expressions.zero import wide_points
 from ssmppl.gap.anatomy import Anatomy, Part, components, time_symbol
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.declared import PROFILES
@@ -21,6 +30,7 @@ from ssmppl.language.calling import call
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.trace import previous, symbols
 
+_POINTS = 200  # at which an effect of strength 0 is held against the model
 _WITHOUT_STATES = ("parameter", "input", "time")  # what an initial law may depend on
 
 
@@ -253,10 +263,12 @@ def check_base(candidate: Candidate, anatomy: Anatomy, bound: Bound, role: str) 
         (left,) = substitute([value], zero)
         if left is base:
             continue
-        rest = left - base
-        rng = np.random.default_rng(1)
-        at = {s: rng.uniform(0.3, 1.5, 20) for s in symbols_of(rest)}
-        if np.nanmax(np.abs(evaluate(rest, at) + np.zeros(20))) > 1e-9:
+        names = sorted(symbols_of([left, base]), key=to_text)
+        at = wide_points(names, _POINTS, np.random.default_rng(1))
+        with np.errstate(all="ignore"):
+            one, two = (evaluate(e, at) + np.zeros(_POINTS) for e in (left, base))
+            off = np.abs(one - two) > 1e-9 * (1.0 + np.abs(one) + np.abs(two))
+        if np.any(off & np.isfinite(one) & np.isfinite(two)):
             raise _refuse(
                 candidate.effect,
                 f"at strength 0 it gives {left!r} in place of {base!r}",

@@ -185,4 +185,5 @@ def test_no_update_that_holds_on_one_side_of_zero_only(bounds):
     model.transition(lambda x, a: {"x": ssm.Normal(np.sin(x), variance=a**2)})
     model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     (update,) = derive_updates(trace(model))
-    assert update.needs_log_joint and not update.functions
+    assert update.needs_log_joint
+    assert not update.functions

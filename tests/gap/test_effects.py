@@ -140,6 +140,7 @@ def with_function(function, **options):
     [
         (lambda v, strength: v, {}, "at strength 0 it gives v_prev"),
         (lambda v, strength: 1.0, {}, "at strength 0 it gives 1"),
+        (lambda v, strength: np.maximum(v - 18, 0) + strength, {}, "at strength 0 it gives max"),
         (lambda u, strength: 2.0 * u, {"kind": "input", "on": "u"}, "at strength 0 it gives 2"),
         (lambda v, strength, lenght: 0.0, {}, "asks for 'lenght'"),
         (lambda v, strength: np.stack([v, v]), {}, "it returned"),
