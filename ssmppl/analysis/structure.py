@@ -189,15 +189,17 @@ def _gaussian_law(
 
 def without_density(trace: Trace) -> NotApplicable | None:
     """Why the states have no joint density beside their Dirac components: a covariance that is
-    singular whatever the parameters are."""
+    singular whatever the parameters are, or in some cases of the conditions in it."""
     for role, sites in (("initial law", trace.initial), ("transition", trace.transition)):
         for site in sites.values():
             if isinstance(site.distribution, MvNormal) and site.distribution.root is not None:
                 rank = sum(any(e is not constant(0.0) for e in column)
                            for column in site.distribution.root.view(np.ndarray).T)  # fmt: skip
+                full = site.shape[0]
+                how = f"(rank {rank} of {full})" if rank < full else "in some cases"
                 return NotApplicable(
-                    f"the covariance in the {role} of {site.name} is singular (rank {rank} of "
-                    f"{site.shape[0]}), so that its density does not exist",
+                    f"the covariance in the {role} of {site.name} is singular {how}, so "
+                    "that its density does not exist",
                     site.distribution.location,
                 )
     return None

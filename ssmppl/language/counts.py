@@ -21,6 +21,13 @@ def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
     return _where(ew("eq", count, 0.0), 0.0, array(count) * ew(log, p))
 
 
+def _events(lower: Any) -> tuple[Any, Any]:
+    """How many events a count of at least `lower` has for sure, and the number of the last of them;
+    1 where there is none, whose time is 0."""
+    k = ew("maximum", lower, 0.0)
+    return k, ew("maximum", k, 1.0)
+
+
 class _Counts(Distribution):
     discrete = True
 
@@ -82,8 +89,9 @@ class Poisson(_Counts):
         # X >= k where the k-th event of a unit Poisson process comes before `rate`: draw its
         # time, Gamma(k) cut off there, then the events of the time that is left.
         def draw(i):
-            k, rate = ew("maximum", lower[i], 1.0), self.rate[i]
-            time = ew("gammaincinv", k, draws.uniform() * ew("gammainc", k, rate))
+            (k, nth), rate = _events(lower[i]), self.rate[i]
+            time = ew("gammaincinv", nth, draws.uniform() * ew("gammainc", nth, rate))
+            time = ew("where", ew("lt", k, 1.0), 0.0, time)
             return k + draws.poisson(ew("maximum", rate - time, 0.0))
 
         return _each(self, draw)
@@ -144,8 +152,9 @@ class NegativeBinomial(_Counts):
         # As for Poisson, with the process run at a gamma distributed speed g for the time m / r:
         # time / (1 + time) of the k-th event ~ Beta(k, r), and g ~ Gamma(r + k, 1 + time) given it.
         def draw(i):
-            k, r, m = ew("maximum", lower[i], 1.0), self.dispersion[i], self.mean_[i]
-            share = ew("betaincinv", k, r, draws.uniform() * ew("betainc", k, r, m / (r + m)))
+            (k, nth), r, m = _events(lower[i]), self.dispersion[i], self.mean_[i]
+            below = draws.uniform() * ew("betainc", nth, r, m / (r + m))
+            share = ew("where", ew("lt", k, 1.0), 0.0, ew("betaincinv", nth, r, below))
             left = m / r - share / (1.0 - share)
             speed = draws.gamma(r + k) * (1.0 - share)
             return k + draws.poisson(speed * ew("maximum", left, 0.0))
@@ -228,9 +237,10 @@ class Binomial(_OutOf):
         # X >= k where the k-th smallest of n uniforms, Beta(k, n - k + 1), is below p; the others
         # that are larger than it are uniform up to 1.
         def draw(i):
-            k, n, p = ew("maximum", lower[i], 1.0), self.n[i], self.p[i]
+            (k, nth), n, p = _events(lower[i]), self.n[i], self.p[i]
             b = ew("maximum", n - k + 1.0, 1.0)
-            kth = ew("betaincinv", k, b, draws.uniform() * ew("betainc", k, b, p))
+            kth = ew("betaincinv", nth, b, draws.uniform() * ew("betainc", nth, b, p))
+            kth = ew("where", ew("lt", k, 1.0), 0.0, kth)
             chance = ew("maximum", p - kth, 0.0) / (1.0 - kth)
             return k + draws.binomial(ew("maximum", n - k, 0.0), chance)
 

@@ -4,22 +4,26 @@ One with zeros off its diagonal is a Normal law of each component, and is taken 
 rank is less than its size (q G G', one noise that drives several states) has no density; draws need
 a root of it, found by the Cholesky recursion in the given order, whose pivots of zero leave columns
 of zeros (Higham 2002, "Accuracy and stability of numerical algorithms", section 10.3).
+A pivot that is zero in some cases only leaves zeros there. What was found is held against the
+matrix over a wide range, as one that is singular at moderate values may have another noise beyond.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, constant, symbols_of
+from ssmppl.expressions.expr import Expr, constant
 from ssmppl.language.continuous import Normal
 from ssmppl.language.distribution import Distribution
 from ssmppl.language.multivariate import MvNormal
+from ssmppl.language.places import PLAIN, Places, moderate, numbers_at, wide, with_cases
 
-POINTS = 4  # random values of the symbols at which a pivot has to be zero
-ZERO = 1e-10  # of the largest variance: what is zero in floating point
+ZERO = 1e-10  # of the variances: what is zero in floating point
+AGREE = 1e-8  # of the variances: what a root may differ by
 LARGEST = 12  # components; the root of more is not written out in symbols
 
 
@@ -48,46 +52,64 @@ def find_root(law: Distribution) -> None:
 
 
 def _singular_root(matrix: ExprArray) -> ExprArray | None:
-    """Lower triangular L, (d, d), with L L' = the matrix; None where its rank is full, or it is
-    no covariance at the points that are tried."""
-    points = _points(matrix)
-    if np.linalg.matrix_rank(_numbers(matrix, points)[0], hermitian=True) == len(matrix):
+    """Lower triangular L, (d, d), with L L' = the matrix wherever it is a covariance; None where
+    its rank is full at moderate values of its symbols, or no such L was found."""
+    entries = with_cases(matrix.ravel())
+    points = moderate(entries)
+    values, scale, valid = _covariances(entries, points)
+    plain = values[:PLAIN][valid[:PLAIN]]
+    if not len(plain) or np.linalg.matrix_rank(plain, hermitian=True).max() == len(matrix):
         return None
     n, zero = len(matrix), constant(0.0)
     left = np.array(matrix.view(np.ndarray), dtype=object)
     root = np.full((n, n), zero, dtype=object)
-    largest = np.max(np.abs(_numbers(matrix, points)), axis=(1, 2))
-    rank = 0
     for k in range(n):
-        values = _numbers(array(left[k:, k:]), points)
-        small = np.abs(values[:, :, 0]) <= ZERO * largest[:, None]  # (points, rows below)
-        if small[:, 0].all():
-            if not small.all():
-                return None
-            continue
-        if not np.all(values[:, 0, 0] > ZERO * largest):
+        column = numbers_at(with_cases(left[k:, k]), points)[valid]
+        small = np.abs(column) <= ZERO * (scale[:, k:] * scale[:, k, None])[valid]  # (points, rows)
+        gone = small[:, 0]
+        if not small[gone].all() or np.any(column[~gone, 0] < 0.0):
             return None
+        if gone.all():
+            continue
         pivot = ew("sqrt", left[k, k])
         for i in range(k, n):
             if not small[:, i - k].all():
-                root[i, k] = pivot if i == k else left[i, k] / pivot
+                own = pivot if i == k else left[i, k] / pivot
+                if gone.any():  # a noise that is there in some cases only
+                    own = ew("where", ew("lt", ZERO * matrix[k, k], left[k, k]), own, 0.0)
+                root[i, k] = own
         for i in range(k + 1, n):
             for j in range(k + 1, n):
                 left[i, j] = left[i, j] - root[i, k] * root[j, k]
-        rank += 1
-    return array(root) if rank < n else None
+    return array(root) if _is_root(array(root), matrix) else None
 
 
-def _points(matrix: ExprArray) -> list[dict[Expr, float]]:
-    """Values of the matrix's symbols, drawn where most parameters may be."""
-    rng = np.random.default_rng(20)
-    symbols = list(symbols_of(list(matrix.ravel())))
-    return [dict(zip(symbols, rng.uniform(0.2, 0.9, len(symbols)), strict=True))
-            for _ in range(POINTS)]  # fmt: skip
+def _is_root(root: ExprArray, matrix: ExprArray) -> bool:
+    """Whether L L' = the matrix at wide points, and in all cases of the conditions in it.
 
-
-def _numbers(matrix: ExprArray, points: list[dict[Expr, float]]) -> np.ndarray:
-    """The matrix at each point, (points, rows, columns); zeros where it is not finite."""
+    Points where rounding leaves L without a number are no witness.
+    """
+    n = len(matrix)
+    entries = with_cases(matrix.ravel())
+    forms = with_cases([*matrix.ravel(), *root.ravel()])
+    points = wide(entries)
+    values, scale, valid = _covariances(entries, points)
+    found = numbers_at(forms[n * n :], points).reshape(-1, n, n)
     with np.errstate(all="ignore"):
-        values = [np.array(evaluate(list(matrix.ravel()), p), dtype=float) for p in points]
-    return np.nan_to_num(np.array(values)).reshape(len(points), *matrix.shape)
+        apart = np.abs(found @ found.transpose(0, 2, 1) - values)
+        differs = apart > AGREE * scale[:, :, None] * scale[:, None, :]
+    return not np.any(differs[valid])
+
+
+def _covariances(entries: list[Expr], points: Places) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The matrix at each point, (P, d, d), the roots of its diagonal, (P, d), and whether it is a
+    covariance there, (P,)."""
+    n = math.isqrt(len(entries))
+    values = numbers_at(entries, points).reshape(-1, n, n)
+    valid = np.isfinite(values).all(axis=(1, 2))
+    values = np.where(valid[:, None, None], values, 0.0)
+    diagonal = np.diagonal(values, axis1=1, axis2=2)
+    scale = np.sqrt(np.abs(diagonal))
+    unit = np.where(scale > 0.0, scale, 1.0)
+    least = np.linalg.eigvalsh(values / unit[:, :, None] / unit[:, None, :])[:, 0]
+    return values, scale, valid & (diagonal >= 0.0).all(axis=1) & (least >= -AGREE)

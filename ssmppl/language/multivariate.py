@@ -71,8 +71,8 @@ class MvNormal(_Joint):
     mean : shape (d,), or one number for all components.
     covariance, precision, cholesky : exactly one of them, (d, d): the covariance, its inverse, or
         its lower factor L with L L' = covariance. As the law of states a covariance may be
-        singular for all values of its symbols, as q G G' is: methods that need no density of the
-        transition take it.
+        singular, as q G G' is, for all values of its symbols or in some cases of the conditions in
+        it: methods that need no density of the transition take it.
     """
 
     root: ExprArray | None = None  # of a singular covariance, (d, d); see `covariances.py`

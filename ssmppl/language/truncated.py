@@ -23,8 +23,13 @@ from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.inflated import ZeroInflated
 from ssmppl.language.mixtures import Mixture
 from ssmppl.language.positive import Exponential
-from ssmppl.language.symmetric import Laplace
-from ssmppl.language.truncated_moments import exponential_moments, is_infinite, normal_moments
+from ssmppl.language.symmetric import HalfNormal, Laplace
+from ssmppl.language.truncated_moments import (
+    exponential_moments,
+    is_infinite,
+    normal_moments,
+    weighted_moments,
+)
 from ssmppl.language.written import Written
 
 MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
@@ -237,12 +242,14 @@ class Truncated(Distribution):
         lower, upper = self._bounds()
         if isinstance(self.base, Normal):
             return normal_moments(self.base, lower, upper)
+        if isinstance(self.base, HalfNormal):
+            return normal_moments(Normal(self._full(0.0), sd=self.base.sd), lower, upper)
         if isinstance(self.base, Uniform):
             return 0.5 * (lower + upper), (upper - lower) ** 2 / 12.0
         if isinstance(self.base, Exponential):
             return exponential_moments(self.base, lower, upper)
         if self.base.weighted(1) is not None:
-            return self._weighted_moments(lower, upper)
+            return weighted_moments(self.base, lower, upper)
         if isinstance(self.base, ZeroInflated):
             return self._inflated_moments(self.base, lower, upper)
         if self.discrete:
@@ -256,18 +263,6 @@ class Truncated(Distribution):
             mean = _where(finite, mean, limit)
             variance = _where(self.base.has_moment(2), variance, divergent)
         return mean, variance
-
-    def _weighted_moments(self, lower: ExprArray, upper: ExprArray) -> tuple[ExprArray, ExprArray]:
-        """From the laws with density x f(x) and x^2 f(x): `Distribution.weighted`."""
-        mass, moments = self.base.log_mass(lower, upper), []
-        for power in (1, 2):
-            weighted = self.base.weighted(power)
-            assert weighted is not None
-            factor, law = weighted
-            shift = float(power) if self.discrete else 0.0
-            moments.append(factor * ew("exp", law.log_mass(lower - shift, upper - shift) - mass))
-        mean, second = moments
-        return mean, second - mean * (mean - 1.0 if self.discrete else mean)
 
     def _inflated_moments(
         self, base: ZeroInflated, lower: ExprArray, upper: ExprArray

@@ -27,6 +27,7 @@ from ssmppl.language.rules import is_symmetric
 from ssmppl.language.trace import Site, Trace, symbols, trace
 from tests.codegen.models import declare
 from tests.language.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
+from tests.language.test_truncated import COUNTS, check_counts
 
 N = 20_000
 LEVEL = 1e-6 / (len(CASES) + 6 * len(JOINT_CASES) + len(TRUNCATED_CASES))  # Bonferroni
@@ -228,6 +229,16 @@ def test_truncated_laws(case):
 
 
 X = symbols("state", "x", ()).ravel()[0]
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_counts_from_a_lower_bound_that_is_a_symbol(name):
+    """One compiled sampler for bounds above, at and below 0."""
+    base, law = COUNTS[name]
+    bound = symbols("parameter", "bound", ()).ravel()[0]
+    made = Compiled(D.Truncated(base, lower=bound), [bound])
+    for at_least in (-3, 0, 1, 2):
+        check_counts(made.sample(np.array([float(at_least)]), 10)[0], law, at_least)
 
 
 # -- the whole way through `simulate`, for one law of each kind of randomness

@@ -5,6 +5,7 @@ Held against the joint normal law of all states and data, written out in NumPy.
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
 
 import numpy as np
@@ -14,6 +15,10 @@ import scipy.stats
 
 import ssmppl as ssm
 from ssmppl.analysis.structure import without_density
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import symbol, topological
+from ssmppl.language.covariances import find_root
 from ssmppl.language.trace import trace
 
 DT, ROWS = 0.5, 40
@@ -218,3 +223,82 @@ def test_a_root_of_rank_two():
     d = np.diagonal(expected)
     error = np.sqrt((expected**2 + np.outer(d, d)) / len(drawn))
     assert np.all(np.abs(drawn.T @ drawn / len(drawn) - expected) < 4.5 * error)
+
+
+# -- another noise beyond the values that most parameters have
+H = np.array([1.0, 0.5])
+LAST_ALONE = 3  # t up to which there is one noise only
+
+
+def switched() -> ssm.Model:
+    model = ssm.Model("a second noise from the fifth row on")
+    model.initial(lambda: {"x": ssm.Normal(np.zeros(2), sd=1)})
+
+    def transition(t):
+        second = np.where(t > LAST_ALONE, 1.0, 0.0) * np.eye(2)
+        return {"x": ssm.MvNormal(np.zeros(2), covariance=0.1 * np.outer(H, H) + second)}
+
+    model.transition(transition)
+    model.observation(lambda x: {"y": ssm.Normal(x[1], sd=0.5)})
+    return model
+
+
+def test_a_second_noise_in_later_rows():
+    n = 20_000
+    x = ssm.simulate(switched(), steps=8, draws=n, seed=1)["x"].to_numpy()
+    for t in range(1, 8):  # of the step to row t + 1
+        expected = 0.1 * np.outer(H, H) + (t > LAST_ALONE) * np.eye(2)
+        d = np.diagonal(expected)
+        error = np.sqrt((expected**2 + np.outer(d, d)) / n)
+        assert np.all(np.abs(x[:, t].T @ x[:, t] / n - expected) < 4.5 * error)
+    y = {"y": np.array([0.1, 0.0, -0.2, 0.1, 1.5, -1.0, 0.8, 2.0])}
+    sd = np.sqrt([1.25, *3 * [0.275], *4 * [1.275]])
+    exact = scipy.stats.norm(0.0, sd).logpdf(y["y"]).sum()
+    assert ssm.log_likelihood(switched(), y, {}) == pytest.approx(exact)
+    log_z = ssm.log_likelihood(switched(), y, {}, proposal="bootstrap", particles=2000,
+                               repeats=100, seed=1)  # fmt: skip
+    ratio = np.exp(log_z - exact)
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std(ddof=1) / 10.0
+    assert "singular in some cases" in " ".join(str(ssm.explain(switched(), y)).split())
+
+
+Q, U, V, T = (symbol("parameter", n) for n in "quvt")
+ONE = Q * np.outer(H, H)
+L = np.array([1.0, 3.0])
+BEYOND = {  # a matrix, and values at which it has to be seen whole
+    "a row": (ONE + np.where(T > 3, 1.0, 0.0) * np.eye(2), {T: [3, 4]}),
+    "a negative value": (ONE + (np.abs(U) - U) * np.eye(2), {U: [-1e3, -0.1, 0, 2]}),
+    "a threshold": (ONE + np.maximum(U - 18, 0) * np.eye(2), {U: [17, 18, 19, 1e4]}),
+    "one far away": (ONE + np.maximum(U - 1e7, 0) * np.eye(2), {U: [1, 1e7, 2e7]}),
+    "one value": (ONE + np.where(np.equal(U, 7), 1.0, 0.0) * np.eye(2), {U: [6, 7]}),
+    "two in a sum": (ONE + np.where(U + V > 1000, 1.0, 0.0) * np.eye(2), {U: [1, 999], V: [0, 2]}),
+    "the only noise": (np.where(T > 3, Q, 0.0) * np.outer(H, H), {T: [3, 4]}),
+    "one or the other": (
+        np.where(T > 3, Q, 0.0) * np.outer(H, H) + np.where(T <= 3, Q, 0.0) * np.outer(L, L),
+        {T: [3, 4]},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_roots_hold_in_all_cases(name: str):
+    matrix, special = BEYOND[name]
+    law = ssm.MvNormal(np.zeros(2), covariance=matrix)
+    find_root(law)
+    assert law.root is not None
+    for values in itertools.product([0.1, 3.0], *special.values()):
+        at = dict(zip([Q, *special], values, strict=True))
+        root, whole = evaluate(law.root, at), evaluate(array(matrix), at)
+        assert root @ root.T == pytest.approx(whole, rel=1e-9, abs=1e-12)
+
+
+def test_no_root_of_what_is_regular_beyond_moderate_values():
+    law = ssm.MvNormal(np.zeros(2), covariance=ONE + np.exp(-60.0 - 100.0 * U) * np.eye(2))
+    find_root(law)
+    assert law.root is None
+
+
+def test_roots_of_plain_covariances_have_no_cases():
+    law = ssm.MvNormal(np.zeros(2), covariance=ONE)
+    find_root(law)
+    assert not any(e.op == "where" for e in topological(law.root.ravel()))

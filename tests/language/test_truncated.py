@@ -223,3 +223,38 @@ def test_a_mass_that_has_no_number_leaves_no_density():
         found = evaluate(log_density, {symbol("parameter", "rate"): rate, X: 805.0})
         assert np.isfinite(found) == known
         assert np.isnan(found) != known
+
+
+COUNTS = {  # and the law from SciPy
+    "poisson": (D.Poisson(2.0), st.poisson(2.0)),
+    "negative binomial": (D.NegativeBinomial(2.0, dispersion=3.0), st.nbinom(3.0, 0.6)),
+    "binomial": (D.Binomial(5, 0.3), st.binom(5, 0.3)),
+}
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_counts_from_a_lower_bound_that_is_an_expression(name):
+    """At and below 0 too, where it cuts nothing off."""
+    base, law = COUNTS[name]
+    n = symbol("input", "n")
+    lower = array([n, -3.0, n + 1.0, n + 2.0])
+    drawn = evaluate(
+        array(D.Truncated(base, lower=lower).sample(Draws("x"))),
+        {n: 0.0},
+        numpy_draws(np.random.default_rng(3), (20_000,)),
+    )
+    for x, at_least in zip(drawn, (0, -3, 1, 2), strict=True):
+        check_counts(x, law, at_least)
+
+
+def check_counts(x, law, at_least):
+    """Frequencies of counts given that they are at least this, by the chi-square test."""
+    k = np.arange(40)
+    expected = np.where(k >= at_least, law.pmf(k), 0.0) / law.sf(at_least - 1) * len(x)
+    observed = np.bincount(x.astype(int), minlength=40)
+    assert observed[: max(at_least, 0)].sum() == 0
+    big = expected >= 8
+    e = np.append(expected[big], expected[~big].sum())
+    o = np.append(observed[big], observed[~big].sum())
+    e, o = (v[e > 0] for v in (e, o))
+    assert st.chi2.sf(((o - e) ** 2 / e).sum(), len(e) - 1) > 1e-6
