@@ -365,7 +365,7 @@ def test_a_start_without_a_reciprocal_is_refused():
     space = space_of(bounded(POSITIVE, lambda b: ssm.Normal(0, sd=1)), {}, {})
     assert space.theta[1] == 0.0
     where = coordinates(space, "unconstrained", {"a": "reciprocal"})
-    with pytest.raises(ssm.ArgumentError, match="start at a = 0, .* reciprocal scale"):
+    with pytest.raises(ssm.ArgumentError, match=r"start at a = 0, .* reciprocal scale"):
         where.at(space.z[space.where])
 
 
