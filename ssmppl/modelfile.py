@@ -156,9 +156,9 @@ def read_csv(path: Path) -> pd.DataFrame:
             f"the rows of {path} have more values than its first line has names, {len(names)}",
             fix="give each column a name, and write decimal numbers with points",
         ) from error
-    except (ValueError, UnicodeDecodeError, OSError) as error:  # pandas' own derive from ValueError
+    except Exception as error:  # pandas', and what each form of compression raises
         raise DataError(
-            f"{path} cannot be read as a CSV file: {str(error).strip()}",
+            f"{path} cannot be read as a CSV file: {str(error).strip() or type(error).__name__}",
             fix="give a text file with the names of its columns in the first line, values "
             "separated by commas",
         ) from error

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import click
 
-from ssmppl.cli.reading import has_posterior
+from ssmppl.cli.reading import PARQUET, TABLES, has_posterior, pyarrow
 
 __all__ = ["file_of_model", "new_file", "numbered", "target"]
 
 
 def target(
     output: Path | None, source: Path, ending: str, mark: str = "", given: Sequence[Path] = (),
-    pieces: int = 1,
+    pieces: int = 1, table: bool = True,
 ) -> Path:  # fmt: skip
     """The file for a result: `output`, or the name of `source` in the working directory.
 
@@ -25,11 +25,17 @@ def target(
         draws; "_states".
     given : the files that the command reads.
     pieces : number of files that are written, `numbered` where there are several.
+    table : whether the result can be written as one, too.
 
     Raises
     ------
-    click.UsageError : a file would be written that is read.
+    click.UsageError : a file would be written that is read, or in a form that the result has not.
+    ArgumentError : a library is missing that writes it.
     """
+    if output is not None and not table and output.suffix.lower() in TABLES:
+        raise click.UsageError(
+            f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
+        )
     read = (*given, source)
     if output is None:
         output = Path(source.stem + ending)
@@ -46,9 +52,12 @@ def new_file(output: Path | None, read: Iterable[Path]) -> Path | None:
     Raises
     ------
     click.UsageError : it is one of them.
+    ArgumentError : a library is missing that writes it.
     """
     if output is not None and _among(read, output):
         raise click.UsageError(f"-o {output} is a file that is read: name another.")
+    if output is not None and output.suffix.lower() in PARQUET:
+        pyarrow()  # found out now that it is missing, and not after the work
     return output
 
 
