@@ -32,10 +32,6 @@ def target(
     click.UsageError : a file would be written that is read, or in a form that the result has not.
     ArgumentError : a library is missing that writes it.
     """
-    if output is not None and not table and output.suffix.lower() in TABLES:
-        raise click.UsageError(
-            f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
-        )
     read = (*given, source)
     if output is None:
         output = Path(source.stem + ending)
@@ -43,6 +39,10 @@ def target(
             output = Path(f"{source.stem}{mark}{ending}")
     for path in numbered(output, pieces):
         new_file(path, read)
+    if not table and output.suffix.lower() in TABLES:
+        raise click.UsageError(
+            f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
+        )
     return output
 
 
