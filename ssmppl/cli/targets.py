@@ -38,24 +38,24 @@ def target(
         if _among(read, output) or (mark != "_posterior" and has_posterior(output)):
             output = Path(f"{source.stem}{mark}{ending}")
     for path in numbered(output, pieces):
-        new_file(path, read)
-    if not table and output.suffix.lower() in TABLES:
-        raise click.UsageError(
-            f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
-        )
+        new_file(path, read, table)
     return output
 
 
-def new_file(output: Path | None, read: Iterable[Path]) -> Path | None:
+def new_file(output: Path | None, read: Iterable[Path], table: bool = True) -> Path | None:
     """`output`, which is none of the files that are read.
 
     Raises
     ------
-    click.UsageError : it is one of them.
+    click.UsageError : it is one of them, or in a form that the result has not.
     ArgumentError : a library is missing that writes it.
     """
     if output is not None and _among(read, output):
         raise click.UsageError(f"-o {output} is a file that is read: name another.")
+    if output is not None and not table and output.suffix.lower() in TABLES:
+        raise click.UsageError(
+            f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
+        )
     if output is not None and output.suffix.lower() in PARQUET:
         pyarrow()  # found out now that it is missing, and not after the work
     return output
