@@ -151,19 +151,19 @@ def read_csv(path: Path) -> pd.DataFrame:
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(path, skipinitialspace=True, index_col=False)
     except pd.errors.ParserWarning as error:  # pandas would leave out what has no name
-        _check_separator(path)
+        _check_separator(path, names)
         raise DataError(
             f"the rows of {path} have more values than its first line has names, {len(names)}",
             fix="give each column a name, and write decimal numbers with points",
         ) from error
-    except (ValueError, UnicodeDecodeError, OSError) as error:  # pandas' own derive from ValueError
+    except Exception as error:  # pandas', and what each form of compression raises
         raise DataError(
-            f"{path} cannot be read as a CSV file: {str(error).strip()}",
+            f"{path} cannot be read as a CSV file: {str(error).strip() or type(error).__name__}",
             fix="give a text file with the names of its columns in the first line, values "
             "separated by commas",
         ) from error
     if len(table.columns) == 1:
-        _check_separator(path)
+        _check_separator(path, names)
     given = names.dropna().str.strip()
     if given.duplicated().any():
         raise DataError(
@@ -173,9 +173,9 @@ def read_csv(path: Path) -> pd.DataFrame:
     return labelled(table)
 
 
-def _check_separator(path: Path) -> None:
+def _check_separator(path: Path, names: pd.Series) -> None:
     """Refuse a table whose values are separated by semicolons or tabs, as spreadsheets write it."""
-    header = path.open(encoding="utf-8", errors="replace").readline()
+    header = ",".join(names.fillna("").astype(str))  # the file itself may be compressed
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
         if mark in header and "," not in header:
             raise DataError(

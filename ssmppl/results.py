@@ -10,8 +10,9 @@ import datetime
 import json
 import os
 import platform
+import re
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "arviz",
     "save",
+    "time_axes",
     "to_dataset",
     "to_inference_data",
 ]
@@ -47,6 +49,7 @@ def to_inference_data(
     prior_predictive: Mapping[str, np.ndarray] | None = None,
     posterior_predictive: Mapping[str, np.ndarray] | None = None,
     over_time: Collection[str] = (),
+    stats_over_time: Collection[str] = (),
     time: Any = None,
     dims: Mapping[str, Sequence[str]] | None = None,
     coords: Mapping[str, Any] | None = None,
@@ -65,7 +68,9 @@ def to_inference_data(
     observed_data, constant_data
         Arrays of shape (T, ...).
     over_time
-        Names whose first axis after chain and draw is time: the states, and statistics per step.
+        Names of posterior and prior whose first axis after chain and draw is time: the states.
+    stats_over_time
+        Likewise of sample_stats, whose names are another matter: a state may be called `lp`.
     time
         The T values of the `time` coordinate; row numbers from 1 if None.
     dims
@@ -87,6 +92,7 @@ def to_inference_data(
     }
     fixed = {"observed_data": observed_data, "constant_data": constant_data}
     written = _provenance() | netcdf_attributes(attrs or {})
+    own = {"sample_stats": stats_over_time}
     groups: dict[str, xr.Dataset] = {}
     for group, variables in {**sampled, **fixed}.items():
         if not variables:
@@ -95,7 +101,7 @@ def to_inference_data(
         groups[group] = _dataset(
             variables,
             sample_dims=() if group in fixed else ("chain", "draw"),
-            over_time=variables if by_row else over_time,
+            over_time=variables if by_row else own.get(group, over_time),
             time=time,
             dims=dims or {},
             coords=coords or {},
@@ -168,6 +174,13 @@ def arviz() -> Any:
         warnings.simplefilter("ignore", FutureWarning)
         import arviz
     return arviz
+
+
+def time_axes(dims: Iterable[Any]) -> list[str]:
+    """Those of some dims that rows lie along: `time`, or `time_1`, `time_2`, ... by experiment."""
+    numbers = {str(d): re.fullmatch(r"time(?:_(\d+))?", str(d)) for d in dims}
+    found = {d: int(match[1] or 0) for d, match in numbers.items() if match}
+    return sorted(found, key=lambda d: found[d])
 
 
 def netcdf_attributes(attrs: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.results import arviz
+from ssmppl.results import arviz, time_axes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +39,7 @@ def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
 
     posterior = _posterior(idata)
     if var_names is None:
-        names = [name for name, v in posterior.data_vars.items() if not _has_time(v.dims)]
+        names = [name for name, v in posterior.data_vars.items() if not time_axes(v.dims)]
     else:
         names = list(var_names)
         unknown = [name for name in names if name not in posterior.data_vars]
@@ -122,8 +122,3 @@ def _posterior(idata: Any) -> Any:
             fix="give what ssm.sample returned; a result of a filter or smoother is an xarray "
             "Dataset, whose states ssm.plot_states shows and .to_dataframe() lists",
         ) from None
-
-
-def _has_time(dims: Iterable[Any]) -> bool:
-    """Whether there is a time axis: `time`, or `time_<experiment>` where there are several."""
-    return any(dim == "time" or str(dim).startswith("time_") for dim in dims)

@@ -55,7 +55,9 @@ ATTRS = {
 
 @pytest.fixture
 def idata(arrays):
-    return results.to_inference_data(**arrays, over_time={"x", "z", "update_rate"}, attrs=ATTRS)
+    return results.to_inference_data(
+        **arrays, over_time={"x", "z"}, stats_over_time={"update_rate"}, attrs=ATTRS
+    )
 
 
 def dims(idata, group, name):
@@ -148,7 +150,9 @@ def test_draws_on_disk_are_saved_without_being_taken_into_memory(tmp_path):
     ids=["floats", "dates", "periods", "zoned", "text"],
 )
 def test_time_coordinate_survives(arrays, time, tmp_path):
-    idata = results.to_inference_data(**arrays, over_time={"x", "z", "update_rate"}, time=time)
+    idata = results.to_inference_data(
+        **arrays, over_time={"x", "z"}, stats_over_time={"update_rate"}, time=time
+    )
     again = results.arviz().from_netcdf(str(results.save(idata, tmp_path / "run.nc")))
     expected = idata["posterior"]["time"].values
     np.testing.assert_array_equal(again["posterior"]["time"].values, expected)

@@ -90,7 +90,7 @@ def sample(
         ssmppl sample model.py data.csv --method pgas --settings particles=50 interweave=auto
         ssmppl sample model.py data.csv --draws 100000 --checkpoint night.npz
     """
-    path = target(output, data[0], ".nc", "_posterior", data)
+    path = target(output, data[0], ".nc", "_posterior", data, table=False)
     chosen = method_of(SAMPLERS, method, settings, particles)
     loaded = load_model(model)
     try:

@@ -41,6 +41,7 @@ from ssmppl.cli.rendering import (
 )
 from ssmppl.cli.targets import file_of_model, new_file, target
 from ssmppl.modelfile import load_model, parse_assignments
+from ssmppl.results import time_axes
 from ssmppl.tables import wide_table
 
 __all__ = ["forecast", "leave_future_out", "predict"]
@@ -80,7 +81,9 @@ def predict(
         ssmppl predict model.py data.csv --posterior posterior.nc --seed 1
         ssmppl predict model.py --steps 100 --draws 500 -o prior.nc
     """
-    path = target(output, posterior or file_of_model(model), "_predictive.nc", "_2", data)
+    path = target(
+        output, posterior or file_of_model(model), "_predictive.nc", "_2", data, table=False
+    )
     loaded, seed = load_model(model), drawn_seed(seed)
     idata = read_posterior(posterior) if posterior else None
     read = read_data(data) if data else None
@@ -92,8 +95,7 @@ def predict(
     count = drawn.sizes["chain"] * drawn.sizes["draw"]
     heading(f"{loaded.name}: {count} draws from the {group.replace('_', ' ')} distribution")
     experiments = []
-    axes = [str(dim) for dim in drawn.dims if dim == "time" or str(dim).startswith("time_")]
-    for axis in axes:
+    for axis in time_axes(drawn.dims):
         time = drawn[axis].values
         own = {str(n): v for n, v in drawn.data_vars.items() if axis in v.dims}
         spreads = spread(own, ("chain", "draw"))

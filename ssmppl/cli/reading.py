@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["NETCDF", "PARQUET", "as_table", "has_posterior", "pyarrow", "read_data",
+__all__ = ["NETCDF", "PARQUET", "TABLES", "as_table", "has_posterior", "pyarrow", "read_data",
            "read_posterior", "read_table"]  # fmt: skip
 
 PARQUET = (".parquet", ".pq")
+TABLES = (".csv", *PARQUET)
 NETCDF = (".nc", ".nc4", ".netcdf", ".cdf", ".h5")
 HDF5, CLASSIC = b"\x89HDF", b"CDF"  # how netCDF files begin
 SAFE_ARROW = (15,)  # earlier ones can be made to unpickle by a file (CVE-2023-47248)
@@ -116,7 +117,7 @@ def _read_netcdf(path: Path) -> xr.Dataset:
     try:
         with xr.open_dataset(path, engine=engine) as found:
             dataset: xr.Dataset = found.load()
-    except (ValueError, OSError, KeyError, TypeError) as error:
+    except (ValueError, OSError, EOFError, LookupError, TypeError) as error:
         raise DataError(
             f"{path} cannot be read as a netCDF file: {_first_line(error)}",
             fix="give a file that xarray.Dataset.to_netcdf wrote",

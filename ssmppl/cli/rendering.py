@@ -17,7 +17,7 @@ import click
 import numpy as np
 
 from ssmppl.cli.group import AS_JSON, INTERRUPTED
-from ssmppl.cli.reading import PARQUET, pyarrow
+from ssmppl.cli.reading import PARQUET, TABLES, pyarrow
 from ssmppl.errors import ArgumentError
 from ssmppl.results import save
 from ssmppl.tables import quantiles_of, state_table, summary_text
@@ -202,7 +202,7 @@ def write(result: Any, path: Path, table: pd.DataFrame | None = None) -> Path:
     """
     suffix = path.suffix.lower()
     try:
-        if result is not None and suffix not in (".csv", *PARQUET):
+        if result is not None and suffix not in TABLES:
             return save(result, path)
         if table is None:
             raise ArgumentError(

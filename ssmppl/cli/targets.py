@@ -7,14 +7,14 @@ from pathlib import Path
 
 import click
 
-from ssmppl.cli.reading import has_posterior
+from ssmppl.cli.reading import PARQUET, TABLES, has_posterior, pyarrow
 
 __all__ = ["file_of_model", "new_file", "numbered", "target"]
 
 
 def target(
     output: Path | None, source: Path, ending: str, mark: str = "", given: Sequence[Path] = (),
-    pieces: int = 1,
+    pieces: int = 1, table: bool = True,
 ) -> Path:  # fmt: skip
     """The file for a result: `output`, or the name of `source` in the working directory.
 
@@ -25,10 +25,12 @@ def target(
         draws; "_states".
     given : the files that the command reads.
     pieces : number of files that are written, `numbered` where there are several.
+    table : whether the result can be written as one, too.
 
     Raises
     ------
-    click.UsageError : a file would be written that is read.
+    click.UsageError : a file would be written that is read, or in a form that the result has not.
+    ArgumentError : a library is missing that writes it.
     """
     read = (*given, source)
     if output is None:
@@ -36,19 +38,26 @@ def target(
         if _among(read, output) or (mark != "_posterior" and has_posterior(output)):
             output = Path(f"{source.stem}{mark}{ending}")
     for path in numbered(output, pieces):
-        new_file(path, read)
+        new_file(path, read, table)
     return output
 
 
-def new_file(output: Path | None, read: Iterable[Path]) -> Path | None:
+def new_file(output: Path | None, read: Iterable[Path], table: bool = True) -> Path | None:
     """`output`, which is none of the files that are read.
 
     Raises
     ------
-    click.UsageError : it is one of them.
+    click.UsageError : it is one of them, or in a form that the result has not.
+    ArgumentError : a library is missing that writes it.
     """
     if output is not None and _among(read, output):
         raise click.UsageError(f"-o {output} is a file that is read: name another.")
+    if output is not None and not table and output.suffix.lower() in TABLES:
+        raise click.UsageError(
+            f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
+        )
+    if output is not None and output.suffix.lower() in PARQUET:
+        pyarrow()  # found out now that it is missing, and not after the work
     return output
 
 

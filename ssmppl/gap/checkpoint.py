@@ -31,6 +31,7 @@ from ssmppl.inference.checkpoints.origin import (
     text_of,
 )
 from ssmppl.inference.tasks import run_tasks
+from ssmppl.language.fingerprints import fingerprint
 from ssmppl.language.trace import Trace
 
 SECONDS = 5.0  # between two writings, at least
@@ -195,16 +196,7 @@ def digests(
         "mode": mode,
         "model": model_digest(trace),
         "data": data_digest(experiments),
-        "set of effects": digest(*(_effect(e) for e in effects)),
+        "set of effects": digest(*map(fingerprint, effects)),
         "settings": digest(*(f"{k}={text_of(v)}" for k, v in sorted(settings.items()))),
         "version of this package": sources_digest(*FOLDERS),
     }
-
-
-def _effect(e: Effect) -> str:
-    """Its declaration, and the compiled text of its function."""
-    code = e.function.__code__
-    plain = [c for c in code.co_consts if c is None or isinstance(c, int | float | str | tuple)]
-    declared = [e.name, e.form, e.kind, e.on, e.lower, e.upper, dict(e.shapes), dict(e.given),
-                dict(e.states), e.profile, e.process]  # fmt: skip
-    return f"{declared!r} {code.co_code.hex()} {code.co_names} {plain!r}"

@@ -26,7 +26,7 @@ from ssmppl.inference.posterior_draws import (
 from ssmppl.inference.simulation import check_finite, check_samplers, feeds_back
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
-from ssmppl.results import to_dataset
+from ssmppl.results import time_axes, to_dataset
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -203,8 +203,7 @@ def _which(trace: Trace, posterior: Any, experiment: int | None) -> tuple[str, s
     ------
     ArgumentError : there are several, and none or an unknown one was asked for.
     """
-    numbers = [d.removeprefix("time_") for d in map(str, posterior.dims) if d.startswith("time_")]
-    known = sorted(int(d) for d in numbers if d.isdigit())
+    known = [int(d.removeprefix("time_")) for d in time_axes(posterior.dims) if d != "time"]
     if not known and experiment in (None, 1):
         return "", "time"
     if experiment in known:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ssmppl.data import Experiment
+from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.language.trace import Trace
 
@@ -61,6 +62,33 @@ def zone_of(attrs: Mapping[str, Any], axis: str) -> str:
     """The zone that the labels of a dim were given in, by the attributes of a result."""
     found = attrs.get(TIME_ZONES, {})
     return str((json.loads(found) if isinstance(found, str) else found).get(axis, ""))
+
+
+def check_names(trace: Trace, experiments: Sequence[Experiment], states: bool = True) -> None:
+    """Refuse a parameter called as results call what belongs to one of several experiments.
+
+    states : whether these are in the results.
+
+    Raises
+    ------
+    ModelError : there is one, `x_1` beside the state `x`.
+    """
+    numbers = range(1, len(experiments) + 1) if len(experiments) > 1 else ()
+    roles: dict[str, Iterable[str]] = {
+        "state": trace.initial if states else (), "observation": trace.observations,
+        "input": trace.inputs, "dimension": ("time",),
+    }  # fmt: skip
+    for name, site in trace.parameters.items():
+        for role, known in roles.items():
+            for own in known:
+                k = next((k for k in numbers if name == f"{own}_{k}"), None)
+                if k is not None:
+                    raise ModelError(
+                        f"{name!r} is a parameter, and in results of several data sets the "
+                        f"{role} {own!r} of the {k}. of them",
+                        fix=f"rename the parameter, as {own}_first: no number may follow `{own}_`",
+                        where=site.distribution.location,
+                    )
 
 
 class Labels:

@@ -135,8 +135,9 @@ def start_as_parameter(trace: Trace) -> str:
     """How a model whose states have noise in their first row only is made exact."""
     name = noisy_start(trace)[0].name
     return (
-        f"only the first row of the states has noise: with it as a parameter ({name}_1 in @prior, "
-        f"ssm.Dirac({name}_1) in @initial) the likelihood is exact, and everything faster"
+        f"only the first row of the states has noise: with it as a parameter ({name}_first in "
+        f"@prior, ssm.Dirac({name}_first) in @initial) the likelihood is exact, and everything "
+        "faster"
     )
 
 

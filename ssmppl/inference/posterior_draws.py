@@ -81,7 +81,7 @@ def states_of(trace: Trace, posterior: Any, mark: str, axis: str) -> np.ndarray 
     values: Mapping[str, Any] = {
         name: _drawn(posterior, f"{name}{mark}", site.shape, (axis,))
         for name, site in trace.initial.items()
-        if f"{name}{mark}" in posterior
+        if f"{name}{mark}" in posterior and axis in posterior[f"{name}{mark}"].dims
     }
     if len(values) < len(trace.initial):
         return None

@@ -18,7 +18,7 @@ from ssmppl.data import (
     unpack_states,
 )
 from ssmppl.errors import ArgumentError, ModelError
-from ssmppl.inference.labels import Labels, observes
+from ssmppl.inference.labels import Labels, check_names, observes
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.posterior_draws import all_draws, parameters_of, posterior_of, states_of
 from ssmppl.inference.prior import draw_prior
@@ -30,7 +30,7 @@ from ssmppl.inference.simulation import (
 )
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
-from ssmppl.results import to_inference_data
+from ssmppl.results import time_axes, to_inference_data
 
 # Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
 Drawn = tuple[np.ndarray, np.ndarray]
@@ -129,7 +129,7 @@ def _check_paths(paths: np.ndarray | None, e: Experiment, conditional: bool | No
 
 def _check_count(posterior: Any, given: int) -> None:
     """Trajectories belong to data sets by their place in the list, so that all have to be there."""
-    sampled = sum(str(d).rpartition("_")[0] == "time" or d == "time" for d in posterior.dims)
+    sampled = len(time_axes(posterior.dims))
     if sampled != given:
         raise ArgumentError(
             f"the posterior holds trajectories of {sampled} data sets, the data are {given}",
@@ -143,7 +143,10 @@ def _from_prior(
 ) -> Any:  # fmt: skip
     check_count("draws", draws, 1)
     check_drawable(traced)
-    theta = draw_prior(traced, np.random.default_rng(root), draws)
+    check_names(traced, experiments)
+    theta = draw_prior(
+        traced, np.random.default_rng(root), draws, instead="or posterior draws by idata="
+    )
     prior = {n: v[None] for n, v in unpack_parameters(traced, theta).items()}
     over_time: list[str] = []
     predicted: dict[str, np.ndarray] = {}

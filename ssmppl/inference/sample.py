@@ -36,7 +36,7 @@ from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_diges
 from ssmppl.inference.draws import Block, ChainDraws, stack
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.models import exact_model, kind_of
-from ssmppl.inference.labels import Labels, observes
+from ssmppl.inference.labels import Labels, check_names, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.particles import pilot, proposal_choice
@@ -161,6 +161,14 @@ def sample(
     if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
         states, warmup, thin = False, 0, 1
         chosen = smc2.settled(chosen, draws)
+    if not states and all(name in held for name in problem.trace.parameters):
+        what = "SMC2 draws parameters only" if isinstance(chosen, SMC2) else "states=False"
+        raise ArgumentError(
+            f"there is nothing to draw: no parameter is free, and {what}",
+            fix="draw the states, by another method than SMC2 and without states=False, or leave a "
+            "parameter out of fixed=",
+        )
+    check_names(problem.trace, problem.experiments, states)
     if states and checkpoint is None:  # twice: of each chain, and put together
         numbers = problem.rows * len(problem.trace.state_symbols)
         check_room(

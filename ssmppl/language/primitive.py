@@ -8,10 +8,8 @@ proposals are still derived, as they need its value only.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import inspect
-import types
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +19,7 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array, scalar_or_array
 from ssmppl.expressions.expr import Expr
+from ssmppl.language.fingerprints import fingerprint
 from ssmppl.language.model import location_of
 from ssmppl.language.packing import holder_of
 
@@ -35,7 +34,7 @@ class Primitive:
         self.location = location_of(function)
         self.arguments = _arguments(function)
         self.compiled = _compile(function, len(self.arguments))
-        self.name = f"{function.__name__}_{_digest(function)}"
+        self.name = f"{function.__name__}_{fingerprint(function)[:8]}"
         self.__name__, self.__doc__ = function.__name__, function.__doc__
         REGISTRY[self.name] = self.compiled
 
@@ -75,7 +74,9 @@ def _by_name(module: str, name: str) -> Primitive:
 def _restored(name: str, function: Callable[..., float]) -> Primitive:
     """The primitive of this name, compiled once in each process."""
     if name not in _made:
-        _made[name] = Primitive(function)
+        made = _made[name] = Primitive(function)
+        made.name = name  # generated code has it, whatever else of the function travelled
+        REGISTRY[name] = made.compiled
     return _made[name]
 
 
@@ -148,24 +149,3 @@ def _compile(function: Callable[..., float], n: int) -> Callable[..., Any]:
             where=location_of(function),
         )
     return compiled
-
-
-def _digest(function: Callable[..., float], within: tuple[Any, ...] = ()) -> str:
-    """Changes with the function's code and with what it takes from outside: numbers, and functions
-    by the same rule; the same in every process. within : functions that it is called from."""
-    outside = inspect.getclosurevars(function)
-    plain = {}
-    for name, value in {**outside.globals, **outside.nonlocals}.items():
-        called = getattr(value, "py_func", value)
-        if inspect.isfunction(called):
-            around = (*within, function)
-            plain[name] = name if called in around else _digest(called, around)
-        elif not isinstance(value, types.ModuleType):
-            plain[name] = repr(value)
-    text = repr((_code(function.__code__), sorted(plain.items())))
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-def _code(code: types.CodeType) -> tuple:
-    constants = [c for c in code.co_consts if not isinstance(c, types.CodeType)]
-    return code.co_code, repr(constants), code.co_names

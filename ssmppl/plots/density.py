@@ -14,6 +14,7 @@ from ssmppl.inference.prior import draw_prior
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Site, Trace, trace
 from ssmppl.plots.reading import components
+from ssmppl.results import time_axes
 
 __all__ = ["Prior", "estimated", "prior_draws", "priors_of", "supports", "window"]
 
@@ -147,7 +148,7 @@ def prior_draws(dataset: Any) -> dict[str, Prior]:
     """The priors of a group of draws from them."""
     found: dict[str, Prior] = {}
     for name, variable in dataset.data_vars.items():
-        if not any(str(d).startswith("time") for d in variable.dims):
+        if not time_axes(variable.dims):
             values = variable.transpose("chain", "draw", ...).values
             flat = values.reshape(-1, *values.shape[2:])
             found |= {k: Prior(draws=v) for k, v in components(str(name), flat, 1)}

@@ -15,6 +15,7 @@ from ssmppl.plots.density import Prior, estimated, prior_draws, priors_of, windo
 from ssmppl.plots.drawing import few, handed, key, multiples, only_below, styled
 from ssmppl.plots.reading import components, group_of, is_inference_data, pick, wrong_kind
 from ssmppl.plots.style import MAIN, OTHER, bare
+from ssmppl.results import time_axes
 
 __all__ = ["parameter_draws", "plot_maximization", "plot_prior_posterior"]
 
@@ -33,7 +34,7 @@ def parameter_draws(idata: Any, verb: str) -> dict[str, np.ndarray]:
     posterior = group_of(verb, idata, "posterior", "give what ssm.sample returns")
     found: dict[str, np.ndarray] = {}
     for name, variable in posterior.data_vars.items():
-        if not any(str(d) == "time" or str(d).startswith("time_") for d in variable.dims):
+        if not time_axes(variable.dims):
             values = variable.transpose("chain", "draw", ...).values
             found |= components(str(name), np.asarray(values, dtype=float), 2)
     if not found:

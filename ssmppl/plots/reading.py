@@ -15,6 +15,7 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.inference.posterior_draws import group
+from ssmppl.results import time_axes
 from ssmppl.tables import quantiles_of
 
 __all__ = [
@@ -131,11 +132,7 @@ def pick(labels: Iterable[str], var_names: Any, what: str) -> list[str]:
 
 def over_time(dataset: Any) -> list[tuple[str, str]]:
     """(mark, dim over time) of each experiment: ("", "time"), or ("_1", "time_1"), ..."""
-    dims = [str(d) for d in dataset.dims]
-    numbers = sorted(int(d[5:]) for d in dims if d.startswith("time_") and d[5:].isdigit())
-    if numbers:
-        return [(f"_{k}", f"time_{k}") for k in numbers]
-    return [("", "time")] if "time" in dims else []
+    return [(axis.removeprefix("time"), axis) for axis in time_axes(dataset.dims)]
 
 
 def bands(draws: np.ndarray) -> np.ndarray:

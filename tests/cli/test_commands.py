@@ -289,6 +289,29 @@ def test_wrong_options(series, args, code, found):
     assert found in fails("sample", "walk.py", series, *args, code=code)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".PQ"])
+def test_a_suffix_that_draws_do_not_fit_is_refused_at_once(series, monkeypatch, suffix):
+    """After all sampling nothing was written, and the draws were gone."""
+    for verb in ("sample", "predict"):
+        monkeypatch.setattr(ssm, verb, lambda *a, **k: pytest.fail("it was run"))
+        said = fails(verb, "walk.py", series, "-o", f"post{suffix}", code=2)
+        assert "fit into no table" in said
+        assert not Path(f"post{suffix}").exists()
+
+
+@pytest.mark.parametrize("verb", ["smooth", "maximize", "simulate", "leave-future-out"])
+def test_a_form_that_cannot_be_written_is_refused_at_once(series, monkeypatch, verb):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setattr(ssm, verb.replace("-", "_"), lambda *a, **k: pytest.fail("it was run"))
+    data = [] if verb == "simulate" else [series]
+    assert "pip install 'ssmppl[parquet]'" in fails(verb, "walk.py", *data, "-o", "post.parquet")
+
+
+def test_nothing_to_sample(series):
+    said = fails("sample", "walk.py", series, *QUICK, "--fixed", "q=0.3", "--no-states")
+    assert "nothing to draw" in said
+
+
 def test_data_that_do_not_fit(folder):
     Path("d.csv").write_text("time,z\n1,2\n", encoding="utf-8")
     message = fails("sample", "walk.py", "d.csv")

@@ -100,6 +100,24 @@ def test_other_separators_are_named(dated, text, found):
         read_table(dated(text))
 
 
+@pytest.mark.parametrize("name", ["t.csv.gz", "t.csv.bz2", "t.csv.xz", "t.csv.zip", "t.nc", "h.nc"])
+def test_files_cut_short_are_told(tmp_path, name):
+    """Wherever they end; that of a .gz was said to be an abort."""
+    path, cut = tmp_path / name, tmp_path / f"cut_{name}"
+    y = np.random.default_rng(1).normal(size=200)
+    if name.endswith(".nc"):
+        engine = "scipy" if name == "t.nc" else "h5netcdf"
+        xr.Dataset({"y": ("time", y)}).to_netcdf(path, engine=engine)
+    else:
+        pd.DataFrame({"y": y}).to_csv(path, index=False)
+    whole = path.read_bytes()
+    assert len(read_table(path)["y"]) == 200
+    for length in [1, 2, 3, 4, 5, 8, *np.linspace(12, 0.95 * len(whole), 12).astype(int)]:
+        cut.write_bytes(whole[:length])
+        with pytest.raises(DataError, match=f"cut_{name}"):
+            read_table(cut)
+
+
 @pytest.mark.parametrize("rows", ["1,1,5\n2,2,5\n", "1,2,\n2,3,4\n", "a,1,2\nb,2,3\n"])
 def test_rows_of_more_values_than_names_are_no_table(dated, rows):
     """pandas takes the first value as a label, and all others stand one column too far left."""

@@ -126,3 +126,15 @@ def test_an_effect_is_known_by_its_code():
         return digests(trace(level()), [], [own], "fast", {})["set of effects"]
 
     assert made(2) == made(2) != made(3)
+
+
+def test_an_effect_is_known_by_the_numbers_that_its_code_finds():
+    def made(scale, **settings):
+        @ssm.effect(on="rate", name="own", **settings)
+        def own(v, strength):
+            return -strength * np.tanh(v / scale)
+
+        return digests(trace(level()), [], [own], "fast", {})["set of effects"]
+
+    assert made(0.3) == made(0.3) != made(0.5)
+    assert made(0.3) != made(0.3, requires="both signs")

@@ -314,4 +314,4 @@ def test_noise_in_the_first_row_only_is_told_how_to_be_exact():
     model.transition(lambda x, a: {"x": ssm.Dirac(a * np.sin(x))})
     model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     text = " ".join(str(ssm.explain(model)).split())
-    assert "with it as a parameter (x_1 in @prior, ssm.Dirac(x_1) in @initial)" in text
+    assert "with it as a parameter (x_first in @prior, ssm.Dirac(x_first) in @initial)" in text

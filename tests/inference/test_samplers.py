@@ -297,3 +297,88 @@ def test_parameters_that_nothing_depends_on_keep_their_prior(method, draws):
         distance = st.kstest(draws.ravel(), law.cdf).statistic
         assert size > 100
         assert st.kstwobign.sf(distance * np.sqrt(size)) > 1e-3, (name, distance, size)
+
+
+def bounded_initial():
+    return {"x": ssm.Normal(0, sd=1)}
+
+
+def bounded_transition(x, a):
+    return {"x": ssm.Normal(0.5 * x + np.sum(a), sd=1)}
+
+
+def bounded_observation(x):
+    return {"y": ssm.Normal(x, sd=1)}
+
+
+BOUNDED_DATA = {"y": np.array([1.5, 2.2, 0.9])}
+
+
+def bounded(parent, child):
+    """b has a law, and a has one given b."""
+    model = ssm.Model("bounded")
+
+    @model.prior
+    def parents():
+        return {"b": parent}
+
+    @model.prior
+    def children(b):
+        return {"a": child(b)}
+
+    model.initial(bounded_initial)
+    model.transition(bounded_transition)
+    model.observation(bounded_observation)
+    return pose(model, BOUNDED_DATA)
+
+
+POSITIVE, REAL = ssm.Gamma(2, rate=1), ssm.Normal(1, sd=2)
+LOGARITHMS = {
+    "a real one": (POSITIVE, lambda b: ssm.Normal(1, sd=2), {}, False),
+    "a positive one": (REAL, lambda b: ssm.LogNormal(b, sd=2), {}, True),
+    "truncated at 0": (REAL, lambda b: ssm.Truncated(ssm.Normal(b, sd=2), lower=0), {}, True),
+    "truncated below 0": (REAL, lambda b: ssm.Truncated(ssm.Normal(b, sd=2), lower=-1), {}, False),
+    "between constants": (REAL, lambda b: ssm.Uniform(0, 3), {}, True),
+    "above a positive one": (POSITIVE, lambda b: ssm.Uniform(b, 9), {}, True),
+    "above a real one": (REAL, lambda b: ssm.Uniform(b, 9), {}, False),
+    "above a known one": (REAL, lambda b: ssm.Uniform(b, 9), {"b": 0.5}, True),
+    "above a known negative one": (REAL, lambda b: ssm.Uniform(b, 9), {"b": -0.5}, False),
+}
+
+
+@pytest.mark.parametrize("name", LOGARITHMS)
+def test_a_logarithm_is_taken_where_the_support_has_one(name):
+    """Whatever the value that the chain begins from: it moves on, and there was no warning."""
+    parent, child, fixed, fits = LOGARITHMS[name]
+    held = {n: np.asarray(v) for n, v in fixed.items()}
+    space = space_of(bounded(parent, child), held, {"a": np.asarray(2.0)})
+    if fits:
+        where = coordinates(space, "unconstrained", {"a": "log"})
+        w = where.at(space.z[space.where])
+        np.testing.assert_allclose(where.parameters(w)[0], space.theta, rtol=1e-12)
+        return
+    with pytest.raises(ssm.ArgumentError, match="a is not confined to positive numbers"):
+        coordinates(space, "unconstrained", {"a": "log"})
+
+
+def test_a_start_without_a_reciprocal_is_refused():
+    space = space_of(bounded(POSITIVE, lambda b: ssm.Normal(0, sd=1)), {}, {})
+    assert space.theta[1] == 0.0
+    where = coordinates(space, "unconstrained", {"a": "reciprocal"})
+    with pytest.raises(ssm.ArgumentError, match=r"start at a = 0, .* reciprocal scale"):
+        where.at(space.z[space.where])
+
+
+def test_a_logarithm_is_of_every_component():
+    model = ssm.Model("two")
+
+    @model.prior
+    def prior():
+        return {"a": ssm.Uniform([0.0, -1.0], 9)}
+
+    model.initial(bounded_initial)
+    model.transition(bounded_transition)
+    model.observation(bounded_observation)
+    space = space_of(pose(model, BOUNDED_DATA), {}, {})
+    with pytest.raises(ssm.ArgumentError, match="a is not confined"):
+        coordinates(space, "unconstrained", {"a": "log"})

@@ -59,7 +59,9 @@ def test_pmmh_is_chosen_where_no_ancestor_can_be_sampled_and_parameters_are_few(
     moved.transition(lambda h, y, a: {"h": ssm.Dirac(0.1 + 0.5 * h + a * y**2)})
     moved.observation(lambda h: {"y": ssm.Normal(0, variance=h)})
     assert "sample PMMH: every state follows from those before it" in chosen(moved)
-    assert "with it as a parameter (h_1 in @prior, ssm.Dirac(h_1) in @initial)" in chosen(moved)
+    assert "with it as a parameter (h_first in @prior, ssm.Dirac(h_first) in @initial)" in chosen(
+        moved
+    )
     free = ssm.Model("free")
     free.initial(lambda: {"x": ssm.Normal(0, sd=1)})
     free.transition(lambda x: {"x": ssm.Normal(np.sin(x), sd=1)})

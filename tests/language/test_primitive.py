@@ -11,7 +11,7 @@ import ssmppl as ssm
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.primitive import _digest
+from ssmppl.language.fingerprints import fingerprint
 from ssmppl.language.trace import trace
 
 LEVEL = 0.25
@@ -140,4 +140,4 @@ def test_a_name_follows_called_functions_and_not_their_addresses():
 
         return friction
 
-    assert _digest(make(3)) == _digest(make(3)) != _digest(make(2))
+    assert fingerprint(make(3)) == fingerprint(make(3)) != fingerprint(make(2))

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssmppl.analysis.bounds import Interval, interval
 from ssmppl.errors import ArgumentError, listing
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import Expr
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
 from ssmppl.language.trace import Site
@@ -42,7 +45,12 @@ class Coordinates:
         return self.space.problem
 
     def at(self, z_free: np.ndarray) -> np.ndarray:
-        """w of a point given by the unconstrained values of the free parameters."""
+        """w of a point given by the unconstrained values of the free parameters.
+
+        Raises
+        ------
+        ArgumentError : some parameter has no w there, as 0 has no reciprocal.
+        """
         if bool(np.all(self.kinds == "unconstrained")):
             return z_free
         theta, _ = self.space.parameters(z_free)
@@ -50,7 +58,16 @@ class Coordinates:
         z[self.space.where] = z_free
         w = np.where(self.kinds == "unconstrained", z[self._in_z], theta[self._in_theta])
         log, reciprocal = self.kinds == "log", self.kinds == "reciprocal"
-        w[log], w[reciprocal] = np.log(w[log]), 1.0 / w[reciprocal]
+        with np.errstate(divide="ignore", invalid="ignore"):  # seen below
+            w[log], w[reciprocal] = np.log(w[log]), 1.0 / w[reciprocal]
+        for i in np.flatnonzero(~np.isfinite(w) & (log | reciprocal)):
+            symbol = self.problem.trace.parameter_symbols[self.place[i]]
+            name, value = symbol.data[1], theta[self.place[i]]
+            raise ArgumentError(
+                f"a chain would start at {symbol!r} = {value:g}, which has no finite value on the "
+                f"{self.kinds[i]} scale",
+                fix=f'use "natural" or "unconstrained" for {name}, or give start={{"{name}": ...}}',
+            )
         return w
 
     def parameters(self, w: np.ndarray) -> tuple[np.ndarray, float]:
@@ -114,7 +131,7 @@ def coordinates(space: Space, scale: str, transform: Mapping[str, str] | None) -
     place: list[int] = []
     by_z = np.zeros(len(trace.parameters), dtype=bool)
     index = {s: i for i, s in enumerate(trace.parameter_symbols)}
-    start = 0
+    reach, start = _reach(space), 0
     for k, (site, t) in enumerate(zip(trace.parameters.values(), transforms(trace), strict=True)):
         kind = given.get(site.name, scale)
         if space.free[k] and kind == "unconstrained":
@@ -122,14 +139,28 @@ def coordinates(space: Space, scale: str, transform: Mapping[str, str] | None) -
             kinds += [kind] * len(t.free)
             place += range(start, start + len(t.free))
         elif space.free[k]:
-            _check(site, kind, space.theta[[index[s] for s in site.components]])
+            _check(site, kind, reach)
             kinds += [kind] * len(site.components)
             place += [index[s] for s in site.components]
         start += len(t.free)
     return Coordinates(space, np.array(kinds, dtype="U13"), np.array(place, dtype=int), by_z)
 
 
-def _check(site: Site, kind: str, values: np.ndarray) -> None:
+def _reach(space: Space) -> dict[Expr, Interval]:
+    """An enclosure of the support of each parameter's components, those of its parents known."""
+    reach: dict[Expr, Interval] = {}
+    values = dict(zip(space.problem.trace.parameter_symbols, space.theta.tolist(), strict=True))
+    for site, free in zip(space.problem.trace.parameters.values(), space.free, strict=True):
+        support = site.distribution.support()
+        ends = [np.broadcast_to(array(a).view(np.ndarray), site.shape).ravel()
+                for a in (support.lower, support.upper)]  # fmt: skip
+        for s, low, high in zip(site.value.ravel(), *ends, strict=True):
+            whole = interval(low, reach)[0], interval(high, reach)[1]
+            reach.setdefault(s, whole if free else (values[s], values[s]))
+    return reach
+
+
+def _check(site: Site, kind: str, reach: Mapping[Expr, Interval]) -> None:
     support = site.distribution.support().kind
     if support in ("simplex", "positive definite"):
         raise ArgumentError(
@@ -138,7 +169,7 @@ def _check(site: Site, kind: str, values: np.ndarray) -> None:
             fix=f'add transform={{"{site.name}": "unconstrained"}}',
             where=site.distribution.location,
         )
-    if kind == "log" and not np.all(values > 0.0):
+    if kind == "log" and not all(reach[s][0] >= 0.0 for s in site.components):
         raise ArgumentError(
             f"{site.name} is not confined to positive numbers: it has no logarithm",
             fix=f'use "natural" or "unconstrained" for {site.name}',

@@ -300,9 +300,9 @@ def run_smc2(setup: Setup, method: SMC2, executor: Any, progress: bool) -> Runs:
             raise ArgumentError(
                 f"{name}={getattr(method, name)!r}", fix="give a share, from 0 to 1"
             )
-    draw_prior(
-        setup.problem.trace, np.random.default_rng(0), 1, setup.held
-    )  # improper: refused now
+    draw_prior(  # improper: refused now
+        setup.problem.trace, np.random.default_rng(0), 1, setup.held, "or its value by fixed="
+    )
     filters = Filters(setup.space, method, _proposal(setup, method))
     states = [begin(filters, setup, r) for r in range(setup.chains)]
     rows = setup.problem.rows

@@ -17,8 +17,10 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import Expr, topological
+from ssmppl.language.distributions import Distribution
 from ssmppl.language.primitive import Primitive
 from ssmppl.language.trace import Site, Trace
+from ssmppl.language.written import Written
 
 # What the digits of draws depend on besides this package: compilers, random number generators,
 # special functions, factorisations.
@@ -102,7 +104,7 @@ def _data(e: Experiment) -> str:
 
 def model_digest(trace: Trace) -> str:
     """Of laws and expressions, without where they were written."""
-    lines = [trace.name]
+    lines = [trace.name, repr(trace.inputs)]
     roots: list[Expr] = []
     for role in ("parameters", "initial", "transition", "observations", "proposal"):
         for name, site in getattr(trace, role).items():
@@ -117,9 +119,13 @@ def model_digest(trace: Trace) -> str:
     return digest("\n".join(lines))
 
 
-def _law(distribution: Any) -> str:
-    base = getattr(distribution, "base", None)
-    return f"{type(distribution).__name__}{f' of {_law(base)}' if base is not None else ''}"
+def _law(law: Distribution) -> str:
+    """What its expressions are of: Normal(x, sd=a) and Normal(x, variance=a) hold the same."""
+    parts = [type(law).__name__, repr(law.shape), *law.parameters, *map(_law, law.inside())]
+    if isinstance(law, Written):
+        parts += [repr(law.bounds), repr(law.patterns.tolist()),
+                  repr([(pattern, *forms) for pattern, forms in law.forms.items()])]  # fmt: skip
+    return f"({' '.join(parts)})"
 
 
 def _roots(site: Site) -> list[Expr]:

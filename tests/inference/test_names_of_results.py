@@ -1,0 +1,154 @@
+"""Names of a user's that results could take for their own: statistics, axes of time, numbers."""
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.plots.density import prior_draws
+from ssmppl.plots.parameters import parameter_draws
+from ssmppl.results import time_axes
+
+rng = np.random.default_rng(0)
+U = np.ones(12)
+DATA = [{"y": rng.normal(size=n), "u": U[:n]} for n in (12, 9)]
+SHORT = {"draws": 12, "warmup": 8, "chains": 2, "seed": 1, "progress": False}
+
+
+def model(parameter, state="x", shape=()):
+    """A linear Gaussian model with a parameter, and a state, of these names."""
+    made = ssm.Model("names", inputs=("u",))
+    text = f"""
+def prior():
+    return {{{parameter!r}: ssm.Gamma(np.full({shape!r}, 2.0), rate=2), "q": ssm.Gamma(2, rate=2)}}
+
+def initial({parameter}):
+    return {{{state!r}: ssm.Normal(np.sum({parameter}), sd=0.5)}}
+
+def transition({state}, u, q):
+    return {{{state!r}: ssm.Normal(0.9 * {state} + u, precision=q)}}
+
+def observation({state}):
+    return {{"y": ssm.Normal({state}, sd=1)}}
+"""
+    space = {"np": np, "ssm": ssm}
+    exec(text, space)
+    for role in ("prior", "initial", "transition", "observation"):
+        getattr(made, role)(space[role])
+    return made
+
+
+# -- numbers of experiments
+@pytest.mark.parametrize(
+    ("parameter", "found"),
+    [("x_1", "state 'x'"), ("x_2", "the 2. of them"), ("y_1", "observation 'y'"),
+     ("u_2", "input 'u'"), ("time_1", "dimension 'time'")],
+)  # fmt: skip
+def test_a_parameter_called_like_a_trajectory_is_refused(parameter, found):
+    """Its draws would be written over by those of the state, or their dims be mistaken for its."""
+    with pytest.raises(ssm.ModelError, match=f"'{parameter}' is a parameter.*{found}") as error:
+        ssm.sample(model(parameter), DATA, ssm.MetropolisHastings(), **SHORT)
+    assert f"as {parameter[:-2]}_first" in str(error.value)
+    with pytest.raises(ssm.ModelError, match=f"'{parameter}' is a parameter.*{found}"):
+        ssm.predict(model(parameter), None, DATA, draws=5, seed=1)
+
+
+@pytest.mark.parametrize("parameter", ["x_3", "x_first", "x_11"])
+def test_other_numbers_are_no_ones(parameter):
+    posterior = ssm.sample(model(parameter), DATA, ssm.MetropolisHastings(), **SHORT)["posterior"]
+    assert posterior[parameter].dims == ("chain", "draw")
+    assert posterior["x_1"].dims == ("chain", "draw", "time_1")
+
+
+def test_of_one_data_set_all_names_are_free():
+    idata = ssm.sample(model("x_1"), DATA[0], ssm.MetropolisHastings(), **SHORT)
+    assert idata["posterior"]["x_1"].dims == ("chain", "draw")
+    free = ssm.predict(model("x_1"), idata, DATA, seed=1)  # x_1 is no trajectory
+    assert free["posterior_predictive"]["y_2"].dims == ("chain", "draw", "time_2")
+    without = ssm.sample(model("x_1"), DATA, ssm.MetropolisHastings(), **SHORT, states=False)
+    assert without["posterior"]["x_1"].dims == ("chain", "draw")
+
+
+# -- statistics
+METHODS = {
+    ssm.MetropolisHastings(): ["lp", "log_likelihood", "acceptance_rate"],
+    ssm.Gibbs(): ["lp"],
+    ssm.PMMH(particles=20, proposal="bootstrap"): ["log_likelihood"],
+    ssm.PGAS(particles=5, proposal="bootstrap"): ["update_rate", "ess"],
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "name"), [(m, n) for m, names in METHODS.items() for n in names]
+)
+def test_a_state_called_like_a_statistic(method, name):
+    """After all sampling the statistic was taken for one by row, and nothing was returned."""
+    own, plain = (ssm.sample(model("a", state), DATA[0], method, **SHORT) for state in (name, "x"))
+    assert own["posterior"][name].dims == ("chain", "draw", "time")
+    assert own["sample_stats"][name].dims == ("chain", "draw")
+    np.testing.assert_array_equal(own["posterior"]["a"], plain["posterior"]["a"])
+    np.testing.assert_array_equal(own["posterior"][name], plain["posterior"]["x"])
+    np.testing.assert_array_equal(own["sample_stats"][name], plain["sample_stats"][name])
+
+
+# -- axes
+def test_which_dims_are_time():
+    dims = ["chain", "time_2", "draw", "time_10", "time_constants_dim_0", "time_1", "times",
+            "time_1_dim_0", "time_", "x_time"]  # fmt: skip
+    assert time_axes(dims) == ["time_1", "time_2", "time_10"]
+    assert time_axes(["draw", "time", "timeout_dim_0"]) == ["time"]
+
+
+@pytest.mark.parametrize("data", [DATA[0], DATA], ids=["one", "two"])
+@pytest.mark.parametrize("name", ["time_constants", "timeout"])
+def test_a_vector_of_times_is_a_parameter(name, data):
+    made = model(name, shape=(2,))
+    idata = ssm.sample(made, data, ssm.MetropolisHastings(), **SHORT)
+    labels = [f"{name}[0]", f"{name}[1]", "q"]
+    assert list(ssm.summary(idata).index) == labels
+    assert list(parameter_draws(idata, "plot")) == labels
+    prior = ssm.predict(made, None, data, draws=5, seed=1)["prior"]
+    assert list(prior_draws(prior)) == labels
+    predicted = ssm.predict(made, idata, data, seed=1)
+    assert predicted["posterior_predictive"].attrs["conditional"] == 1
+    forecast = ssm.forecast(made, idata, 3, {"u": U[:3]}, seed=1,
+                            experiment=2 if isinstance(data, list) else None)  # fmt: skip
+    assert forecast["y"].shape == (24, 3)
+
+
+# -- nothing
+@pytest.mark.parametrize("method", [None, ssm.Gibbs(), ssm.SMC2(parameters=20)])
+def test_nothing_to_draw_is_said_at_once(method):
+    fixed = {"a": 1.0, "q": 1.0}
+    states = {} if isinstance(method, ssm.SMC2) else {"states": False}
+    with pytest.raises(ssm.ArgumentError, match="nothing to draw: no parameter is free"):
+        ssm.sample(model("a"), DATA[0], method, fixed=fixed, **states, **SHORT)
+
+
+def test_an_improper_prior_is_told_what_the_call_has():
+    improper = ssm.Model("improper")
+
+    @improper.prior
+    def prior():
+        return {"q": ssm.HalfFlat()}
+
+    @improper.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1)}
+
+    @improper.transition
+    def transition(x, q):
+        return {"x": ssm.Normal(x, variance=q)}
+
+    @improper.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=1)}
+
+    data = {"y": DATA[0]["y"]}
+    calls = {
+        "its value by fixed=": lambda: ssm.sample(improper, data, ssm.SMC2(parameters=20), **SHORT),
+        "posterior draws by idata=": lambda: ssm.predict(improper, None, data, draws=5),
+        "its value by parameters=": lambda: ssm.simulate(improper, steps=5),
+    }
+    for fix, call in calls.items():
+        with pytest.raises(ssm.ArgumentError, match=f"'q' a proper prior, or {fix}"):
+            call()
