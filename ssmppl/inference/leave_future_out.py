@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
-from ssmppl.counts import check_count
+from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.models import exact_model
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.methods import Method
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -99,6 +100,8 @@ def leave_future_out(
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     KeyboardInterrupt : Ctrl-C, while it samples too; nothing is kept.
     """
+    check_executor(executor)
+    check_number("threshold", threshold, lambda v: True, "give a number, as 0.7", infinite=True)
     problem = pose(model, data)
     if len(problem.experiments) > 1:
         raise ArgumentError(

@@ -36,6 +36,7 @@ from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_diges
 from ssmppl.inference.draws import Block, ChainDraws, stack
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.models import exact_model, kind_of
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.labels import Labels, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
@@ -45,6 +46,7 @@ from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.progress import announced
 from ssmppl.inference.runner import run_chains
+from ssmppl.inference.settings import check_settings
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import transforms
 from ssmppl.results import to_inference_data
@@ -147,6 +149,8 @@ def sample(
     for name, value, least in (("draws", draws, 1), ("warmup", warmup, 0), ("chains", chains, 1),
                                ("thin", thin, 1)):  # fmt: skip
         check_count(name, value, least)
+    check_executor(executor)
+    check_settings(method)
     problem = pose(model, data)
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")

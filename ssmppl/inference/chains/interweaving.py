@@ -206,8 +206,6 @@ def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noise
 def asked(
     problem: Problem, setting: str | bool, model: ExactModel | None
 ) -> Noises | NotApplicable:
-    if not (setting is True or setting is False or setting == "auto"):
-        raise ArgumentError(f"interweave={setting!r}", fix='use "auto", True or False')
     if setting is False:
         return NotApplicable("interweave=False")
     found = applicable(noises(problem.trace, problem.program.missing), model)
@@ -229,7 +227,7 @@ def interweaving(
 
     Raises
     ------
-    ArgumentError : `interweave` is neither "auto" nor a truth value, or is True and cannot be.
+    ArgumentError : `interweave` is True and cannot be.
     """
     found = asked(setup.problem, setting, model)
     if isinstance(found, NotApplicable):

@@ -14,7 +14,6 @@ import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
-from ssmppl.counts import check_count
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.chains.elimination import Eliminating, Learned, describe
 from ssmppl.inference.chains.elimination import asked as asked_to_eliminate
@@ -45,7 +44,6 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
     memory = deterministic_memory(problem.trace)
     usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
     particles = usual if method.particles is None else method.particles
-    check_count("particles", particles, 2)
     proposal = method.proposal
     if proposal == "auto":
         by_transition = method.eliminate not in (False, "auto")
