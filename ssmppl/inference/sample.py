@@ -25,11 +25,11 @@ from ssmppl.inference.chains import (
     pgas,
     pmmh,
     smc2,
+    update_rates,
     walk,
 )
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.chains.update_rates import told
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
@@ -62,7 +62,7 @@ PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
 STATES = Codec(
     [
         walk.WalkState, walk.Point, walk.Run, langevin.Local, pgas.PGASState, gibbs.GibbsState,
-        interweaving.Tuning, elimination.Learned, smc2.State, smc2.Particles,
+        interweaving.Tuning, elimination.Learned, update_rates.Watch, smc2.State, smc2.Particles,
         pilot.Pilot, pilot.Tuning, proposal_choice.Choice,
     ]
 )  # fmt: skip
@@ -165,15 +165,8 @@ def sample(
     if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
         states, warmup, thin = False, 0, 1
         chosen = smc2.settled(chosen, draws)
-    if states and checkpoint is None:  # twice: of each chain, and put together
-        numbers = problem.rows * len(problem.trace.state_symbols)
-        check_room(
-            f"{chains} chains of {draws} draws of the states of {problem.rows} rows, twice while "
-            "they are put together",
-            2 * chains * draws * numbers,
-            "states=False leaves them out, thin= with fewer draws keeps fewer, checkpoint= keeps "
-            "them on disk",
-        )
+    if checkpoint is None:
+        _check_room(problem, chosen, chains, draws, states)
     root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
@@ -198,7 +191,7 @@ def sample(
         "seconds": time.perf_counter() - began if kept is None else kept.seconds,
     }  # fmt: skip
     if isinstance(chosen, PGAS):
-        attrs |= told(problem, result)
+        attrs |= update_rates.told(problem, result)
     whole = stack(result) if kept is None else kept.stack(result)
     if not isinstance(chosen, SMC2):
         free = free_components(problem.trace, held)
@@ -206,6 +199,20 @@ def sample(
         theta = whole[0]["theta"][:, :, free]
         attrs |= mixing.told(labels, theta, bool(attrs["interrupted"]), chosen, warmup)
     return _to_arviz(problem, whole, held, states, attrs)
+
+
+def _check_room(problem: Problem, method: Method, chains: int, draws: int, states: bool) -> None:
+    """That memory holds what the draws have of each row, twice: of each chain, and put together."""
+    each = {"states": len(problem.trace.state_symbols) if states else 0}
+    by_row = isinstance(method, PMMH) or (isinstance(method, PGAS) and method.log_likelihood)
+    each["log-likelihoods"] = int(by_row)
+    fix = "thin= with fewer draws keeps fewer, checkpoint= keeps them on disk"
+    check_room(
+        f"{chains} chains of {draws} draws of the {' and '.join(n for n, v in each.items() if v)} "
+        f"of {problem.rows} rows, twice while they are put together",
+        2 * chains * draws * problem.rows * sum(each.values()),
+        f"states=False leaves them out, {fix}" if states else fix,
+    )
 
 
 def _drawn(

@@ -83,6 +83,27 @@ def test_every_method_goes_on(killed, tmp_path, name):
     goes_on(killed, name, tmp_path / "a.npz", (2, 9, 30, 41))
 
 
+@pytest.mark.parametrize("name", ["PGAS", "PMMH, gradient", "Gibbs"])
+def test_a_call_without_states_goes_on_and_keeps_none(killed, tmp_path, name):
+    """Nor are they in the file; all other draws, and how often trajectories changed, are those of
+    the call that keeps them."""
+    path, whole = tmp_path / "a.npz", bits(call(name))
+    expected = {k: v for k, v in whole.items() if k[:11] != "posterior x"}
+    assert len(expected) == len(whole) - 2
+    for n in (9, 30):
+        assert killed(n, name, path, states=False)
+    assert bits(call(name, path, states=False)) == expected
+    assert bits(call(name, path, states=False)) == expected, "once more, from the finished file"
+    with np.load(path) as file:
+        assert b"path_" not in b"".join(v.tobytes() for v in file.values())
+
+
+def test_more_draws_without_states_count_in_how_often_they_changed(tmp_path):
+    path = tmp_path / "a.npz"
+    call("PGAS", path, states=False, draws=7)
+    assert bits(call("PGAS", path, states=False)) == bits(call("PGAS", states=False))
+
+
 def test_seed_none_goes_on_with_the_seed_of_the_file(killed, tmp_path):
     path = tmp_path / "a.npz"
     assert killed(20, "PGAS", path, seed=None)

@@ -124,19 +124,20 @@ def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelih
     """The particle filter in the form that the method needs, compiled to find out if it applies."""
     problem = setup.problem
     if method.correlation:
-        correlated = CorrelatedLikelihood(problem, settings, method.correlation)
+        correlated = CorrelatedLikelihood(problem, settings, method.correlation, setup.states)
         _ = correlated.filter
         return correlated
     if method.order:
         held = [n not in setup.held for n, s in problem.trace.parameters.items()
                 for _ in s.components]  # fmt: skip
         wanted = tuple(np.flatnonzero(held).tolist())
-        scored = ScoredLikelihood(problem, settings, method.lag, wanted, method.order == 2)
+        second = method.order == 2
+        scored = ScoredLikelihood(problem, settings, method.lag, wanted, second, setup.states)
         _ = scored.filter
         return scored
     if is_marginal(settings.proposal):
-        return MarginalLikelihood(problem, settings)
-    return ParticleLikelihood(problem, settings)
+        return MarginalLikelihood(problem, settings, setup.states)
+    return ParticleLikelihood(problem, settings, setup.states)
 
 
 def _tuned(setup: Setup, method: PMMH, theta: np.ndarray, proposal: str) -> Tuning:
