@@ -86,7 +86,7 @@ def test_every_method_goes_on(killed, tmp_path, name):
 
 @pytest.mark.parametrize("name", ["PGAS", "PMMH, gradient", "Gibbs"])
 def test_a_call_without_states_goes_on_and_keeps_none(killed, tmp_path, monkeypatch, name):
-    """All other draws, and how often trajectories changed, are those of the call that keeps them."""
+    """All other draws, and how often trajectories changed, are those of a call that keeps them."""
     path, whole, kept, real = tmp_path / "a.npz", bits(call(name)), [], ChainFile.stack
 
     def stack(self, chains):
