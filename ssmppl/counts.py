@@ -1,8 +1,12 @@
-"""What a call counts: whole numbers, and whether the machine's memory holds that many."""
+"""What a call counts and measures: whole numbers and others within their range, and whether the
+machine's memory holds that many."""
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Callable
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,23 @@ def check_count(name: str, value: Any, least: int) -> None:
     if not whole or value < least:
         raise ArgumentError(f"{name}={value!r}", fix=f"give a whole number of at least {least}")
     check_room(f"{name}={value}", value, f"give a smaller {name}=")
+
+
+def check_number(
+    name: str, value: Any, fits: Callable[[float], bool], fix: str, *, infinite: bool = False
+) -> None:
+    """Refuse what is no number, or one that does not fit; NaN never does.
+
+    infinite : whether one beyond all bounds may fit.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise ArgumentError(f"{name}={value!r}", fix=fix)
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number or fraction beyond the range of float
+        number = math.nan
+    if math.isnan(number) or (math.isinf(number) and not infinite) or not fits(number):
+        raise ArgumentError(f"{name}={value!r}", fix=fix)
 
 
 def check_room(what: str, numbers: int, fix: str) -> None:

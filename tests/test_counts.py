@@ -98,6 +98,17 @@ def test_draws_on_disk_take_no_memory(monkeypatch, tmp_path):
     ssm.sample(model, DATA, ssm.PGAS(particles=5), **short, states=False)
 
 
+def test_log_likelihoods_of_rows_take_memory_without_states_too(monkeypatch):
+    monkeypatch.setattr(counts, "memory", lambda: 10_000)
+    short = {"draws": 30, "warmup": 0, "chains": 2, "states": False, "progress": False}
+    for method in (ssm.PMMH(particles=5), ssm.PGAS(particles=5, log_likelihood=True)):
+        with pytest.raises(ssm.ArgumentError, match="draws of the log-likelihoods of 50 rows") as e:
+            ssm.sample(model, DATA, method, **short)
+        assert "states=False" not in str(e.value)
+        with pytest.raises(ssm.ArgumentError, match="of the states and log-likelihoods of 50 rows"):
+            ssm.sample(model, DATA, method, **{**short, "states": True})
+
+
 @pytest.mark.parametrize("name", ["particles", "repeats"])
 def test_counts_that_no_machine_holds_are_refused(name):
     with pytest.raises(ssm.ArgumentError, match=f"{name}=1000000000000: 8,000 GB of numbers"):

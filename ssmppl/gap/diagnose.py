@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.counts import check_count
+from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.gap.answer import Results, answer
@@ -36,6 +36,7 @@ from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.share import HowFar, how_far
 from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.workshop import Workshop, proposal_of
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import pose
 from ssmppl.inference.progress import announced
@@ -96,10 +97,10 @@ def diagnose(
     """
     if mode not in MODES:
         raise ArgumentError(f"mode={mode!r}", fix=f"use one of: {listing(str(mode), MODES)}")
-    if not 0.0 < alpha < 0.5:
-        raise ArgumentError(f"alpha={alpha!r}", fix="give an error rate such as 0.05")
+    check_number("alpha", alpha, lambda v: 0.0 < v < 0.5, "give an error rate such as 0.05")
     if particles is not None:
         check_count("particles", particles, 10)
+    check_executor(executor)
     return _Diagnosis(
         model, data, effects, mode, alpha, fixed, particles, executor, checkpoint, progress, seed
     ).run()

@@ -28,6 +28,7 @@ from ssmppl.inference.chains import smc2
 from ssmppl.inference.chains.bridge import Bridge, bridge, importance
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.models import exact_log_likelihood, exact_model, filter_of
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.methods import PMMH, SMC2, MetropolisHastings
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -41,6 +42,7 @@ from ssmppl.inference.particles.pilot import Space, find_mode, space_of, tune_pa
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.sample import sample
+from ssmppl.inference.settings import check_settings
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import unconstrain
@@ -131,6 +133,8 @@ def evidence(
     """
     for name, value, least in (("draws", draws, 4), ("warmup", warmup, 0), ("chains", chains, 1)):
         check_count(name, value, least)
+    check_executor(executor)
+    check_settings(method)
     problem = pose(model, data)
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
@@ -185,9 +189,8 @@ def evidence(
 
 def _by_smc2(setup: Setup, method: SMC2, executor: Executor | None, progress: bool) -> Evidence:
     """The mean over independent runs, each of which estimates p(y) without bias."""
-    found = smc2.run_smc2(
-        setup, replace(method, parameters=method.parameters or PARAMETERS), executor, progress
-    )
+    wanted = PARAMETERS if method.parameters is None else method.parameters
+    found = smc2.run_smc2(setup, replace(method, parameters=wanted), executor, progress)
     value, error = log_of_mean(found.log_evidence)
     return Evidence(value, error, {"method": "SMC2", **found.report})
 

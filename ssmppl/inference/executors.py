@@ -32,6 +32,23 @@ MOST = 8  # functions that a worker keeps; each may hold the data
 _functions: Known[Callable[..., Any]] = Known(MOST)
 
 
+def check_executor(executor: Any) -> None:
+    """Refuse what is no executor, before anything is done.
+
+    Raises
+    ------
+    ArgumentError : naming what was given.
+    """
+    if executor is None or isinstance(executor, Executor):
+        return
+    of_dask = callable(getattr(executor, "get_executor", None))
+    raise ArgumentError(
+        f"executor={executor!r} is no concurrent.futures.Executor",
+        fix="give client.get_executor()" if of_dask
+        else "give one, as concurrent.futures.ThreadPoolExecutor(4), or None for threads",
+    )  # fmt: skip
+
+
 class Absent:
     """What a worker answers that does not know a function's digest."""
 

@@ -13,6 +13,7 @@ from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.models import EXACT
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.labels import component_dims, observes, with_data
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
@@ -100,6 +101,7 @@ def particle_filter(
     SamplingError : all weights vanish at some step, with `rescue` those of all that were drawn;
         names the step, the row and the parameters.
     """
+    check_executor(executor)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
     check_count("repeats", repeats, 1)

@@ -21,12 +21,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import logsumexp
 
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
-from ssmppl.counts import check_count
+from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.models import exact_model
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.methods import Method
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 TASKS = 16  # pieces that the draws are cut into
+TIED = 1e-9  # difference of log weights that is rounding
 THRESHOLD = 0.7  # of the Pareto shape: beyond it the weights' errors are no longer known
 
 
@@ -99,6 +102,8 @@ def leave_future_out(
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
     KeyboardInterrupt : Ctrl-C, while it samples too; nothing is kept.
     """
+    check_executor(executor)
+    check_number("threshold", threshold, lambda v: True, "give a number, as 0.7", infinite=True)
     problem = pose(model, data)
     if len(problem.experiments) > 1:
         raise ArgumentError(
@@ -133,7 +138,7 @@ def leave_future_out(
         fresh = refits == 0
         if not fresh:
             log_w, shape = _smoothed(increments[:, since:t].sum(axis=1))
-            fresh = shape > threshold
+            fresh = not shape <= threshold  # NaN is none to trust
         if fresh:
             idata = sample(model, _until(whole, t), seed=_number(seeds, refits), **settings)
             posterior = posterior_of(idata)
@@ -194,8 +199,14 @@ def _row(
 
 def _smoothed(log_w: np.ndarray) -> tuple[np.ndarray, float]:
     """Normalised log weights, their tail smoothed, and the shape of the Pareto law that did it."""
-    if not np.isfinite(log_w).any():
+    top, n = log_w.max(), len(log_w)
+    if not np.isfinite(top):
         return log_w, np.inf
+    tail = min(int(np.ceil(min(n / 5.0, 3.0 * np.sqrt(n)))), n - 1)  # draws, as of psislw
+    if np.partition(log_w, n - 1 - tail)[n - 1 - tail] > top - TIED:
+        # As after rows without data: so many have the greatest weight that there is no tail, and
+        # psislw, with none beyond its cut, would say that nothing can be trusted.
+        return log_w - logsumexp(log_w), -np.inf
     if hasattr(arviz(), "psislw"):
         smoothed, shape = arviz().psislw(log_w)
     else:  # ArviZ 1.x

@@ -19,6 +19,7 @@ from ssmppl.inference.exact.models import (
     exact_log_likelihood,
     form_of,
 )
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     estimates_task,
@@ -100,6 +101,7 @@ def log_likelihood(
     ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
     SamplingError : weights are NaN for some particles, naming the step and the user's line.
     """
+    check_executor(executor)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)

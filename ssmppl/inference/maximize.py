@@ -17,6 +17,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, 
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
 from ssmppl.inference.exact.exact_score import exact_score
 from ssmppl.inference.exact.models import kind_of
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.maximum import (
     direct_optimization,
     em,
@@ -40,6 +41,7 @@ from ssmppl.inference.particles.particle_score import Smoothing, combine, severa
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import pose
+from ssmppl.inference.settings import check_settings
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 
@@ -107,6 +109,8 @@ def maximize(
             f"method={method!r} is no method of maximisation",
             fix=written_as(method, CLIMBS) or f"use {names} or None",
         )
+    check_executor(executor)
+    check_settings(method)
     problem = pose(model, data)
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")

@@ -41,7 +41,7 @@ class Problem:
         ------
         ArgumentError : no proposal has this name, or it could not be derived; gives the reason.
         """
-        found = self.program.proposal(name)
+        found = self.program.proposal(name) if isinstance(name, str) else None
         if found is None:
             known = [
                 "auto",

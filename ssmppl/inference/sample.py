@@ -25,17 +25,18 @@ from ssmppl.inference.chains import (
     pgas,
     pmmh,
     smc2,
+    update_rates,
     walk,
 )
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.chains.update_rates import told
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
 from ssmppl.inference.draws import Block, ChainDraws, stack
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.models import exact_model, kind_of
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.labels import Labels, check_names, observes
 from ssmppl.inference.method_choice import choose_sampler, why_stuck
 from ssmppl.inference.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
@@ -45,6 +46,7 @@ from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.progress import announced
 from ssmppl.inference.runner import run_chains
+from ssmppl.inference.settings import check_settings
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import transforms
 from ssmppl.results import to_inference_data
@@ -60,7 +62,7 @@ PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
 STATES = Codec(
     [
         walk.WalkState, walk.Point, walk.Run, langevin.Local, pgas.PGASState, gibbs.GibbsState,
-        interweaving.Tuning, elimination.Learned, smc2.State, smc2.Particles,
+        interweaving.Tuning, elimination.Learned, update_rates.Watch, smc2.State, smc2.Particles,
         pilot.Pilot, pilot.Tuning, proposal_choice.Choice,
     ]
 )  # fmt: skip
@@ -147,6 +149,8 @@ def sample(
     for name, value, least in (("draws", draws, 1), ("warmup", warmup, 0), ("chains", chains, 1),
                                ("thin", thin, 1)):  # fmt: skip
         check_count(name, value, least)
+    check_executor(executor)
+    check_settings(method)
     problem = pose(model, data)
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
@@ -169,15 +173,8 @@ def sample(
             "parameter out of fixed=",
         )
     check_names(problem.trace, problem.experiments, states)
-    if states and checkpoint is None:  # twice: of each chain, and put together
-        numbers = problem.rows * len(problem.trace.state_symbols)
-        check_room(
-            f"{chains} chains of {draws} draws of the states of {problem.rows} rows, twice while "
-            "they are put together",
-            2 * chains * draws * numbers,
-            "states=False leaves them out, thin= with fewer draws keeps fewer, checkpoint= keeps "
-            "them on disk",
-        )
+    if checkpoint is None:
+        _check_room(problem, chosen, chains, draws, states)
     root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
@@ -202,7 +199,7 @@ def sample(
         "seconds": time.perf_counter() - began if kept is None else kept.seconds,
     }  # fmt: skip
     if isinstance(chosen, PGAS):
-        attrs |= told(problem, result)
+        attrs |= update_rates.told(problem, result)
     whole = stack(result) if kept is None else kept.stack(result)
     if not isinstance(chosen, SMC2):
         free = free_components(problem.trace, held)
@@ -210,6 +207,20 @@ def sample(
         theta = whole[0]["theta"][:, :, free]
         attrs |= mixing.told(labels, theta, bool(attrs["interrupted"]), chosen, warmup)
     return _to_arviz(problem, whole, held, states, attrs)
+
+
+def _check_room(problem: Problem, method: Method, chains: int, draws: int, states: bool) -> None:
+    """That memory holds what the draws have of each row, twice: of each chain, and put together."""
+    each = {"states": len(problem.trace.state_symbols) if states else 0}
+    by_row = isinstance(method, PMMH) or (isinstance(method, PGAS) and method.log_likelihood)
+    each["log-likelihoods"] = int(by_row)
+    fix = "thin= with fewer draws keeps fewer, checkpoint= keeps them on disk"
+    check_room(
+        f"{chains} chains of {draws} draws of the {' and '.join(n for n, v in each.items() if v)} "
+        f"of {problem.rows} rows, twice while they are put together",
+        2 * chains * draws * problem.rows * sum(each.values()),
+        f"states=False leaves them out, {fix}" if states else fix,
+    )
 
 
 def _drawn(

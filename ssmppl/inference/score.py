@@ -15,6 +15,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.estimate import by_name, free_components, table
 from ssmppl.inference.exact.exact_score import ExactScore, exact_score
 from ssmppl.inference.exact.models import EXACT, exact_model
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import seed_sequence
@@ -123,6 +124,7 @@ def score(
     ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
     SamplingError : all weights vanish at some step; names the step, the row and the parameters.
     """
+    check_executor(executor)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, fixed)
     held = check_values(problem.trace, fixed, argument="fixed")

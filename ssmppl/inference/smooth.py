@@ -21,6 +21,7 @@ from ssmppl.inference.method_choice import choose_smoother
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.settings import check_settings
 from ssmppl.inference.smoothers import Call, Found, by_exact_passes, by_ffbsi, by_fixed_lag, by_pgas
 from ssmppl.inference.smoothing_methods import (
     FFBSi,
@@ -102,6 +103,7 @@ def smooth(
     SamplingError : weights vanish or are NaN; names the step, the user's line, the parameters.
     """
     began = time.perf_counter()
+    check_settings(method)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
     chosen, why = _choose(problem, method)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from ssmppl.counts import check_count, check_room
+from ssmppl.counts import check_room
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains import pgas
@@ -143,7 +143,6 @@ def by_ffbsi(call: Call, method: FFBSi) -> list[Found]:
     if method.kernel != "genealogy":
         need_density(call.problem.trace, f'FFBSi(kernel="{method.kernel}")', "smooth")
     settings = _filter(call, method, integrate=may_integrate(call.problem, method))
-    check_count("moves", method.moves, 0)
     draws = TRAJECTORIES if call.trajectories is None else call.trajectories
     _check_draws(call, draws)
     marginal = is_marginal(settings.proposal)
@@ -177,7 +176,6 @@ def by_fixed_lag(call: Call, method: FixedLag) -> list[Found]:
         )
     settings = _filter(call, method)
     lag = LAG if method.lag is None else method.lag
-    check_count("lag", lag, 0)
     out = []
     for i, e in enumerate(call.problem.experiments):
         stream = random_state(call.root, i)

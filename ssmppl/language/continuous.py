@@ -120,13 +120,16 @@ class Normal(Distribution):
     def _in_lower_tail(
         self, lower: ExprArray, upper: ExprArray
     ) -> tuple[ExprArray | bool, ExprArray, ExprArray]:
-        """(flip, a, b): the interval, standardised, mirrored where it lies above the mean."""
+        """(flip, a, b): the interval, standardised, mirrored where it lies above the mean.
+
+        An open side is -inf itself, not so by the mean and sd: these have no slope there.
+        """
         a, b = self.standard(lower), self.standard(upper)
         whole_left, whole_right = self.open_sides(lower, upper)
         if whole_left:
-            return False, a, b
+            return False, self._full(-INFINITY), b
         if whole_right:
-            return True, -b, -a
+            return True, self._full(-INFINITY), -a
         flip = array(ew("lt", 0.0, a))
         return flip, _where(flip, -b, a), _where(flip, -a, b)
 

@@ -77,7 +77,10 @@ class Exponential(_Positive):
 
     # Without memory: beyond `lower` it starts anew, whatever the tail.
     def log_mass(self, lower, upper):
+        whole_right = self.open_sides(array(lower), array(upper))[1]
         lower = array(ew("maximum", lower, 0.0))
+        if whole_right:
+            return array(-self._rate() * lower)
         width = array(upper) - lower
         return -self._rate() * lower + ew("log", -array(ew("expm1", -self._rate() * width)))
 

@@ -14,6 +14,7 @@ from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.estimate import Estimate
 from ssmppl.inference.exact.models import EXACT, exact_log_likelihood
+from ssmppl.inference.executors import check_executor
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -81,6 +82,7 @@ def plot_likelihood(
     for name, value, least in (("points", points, 2), ("particles", particles, 1),
                                ("repeats", repeats, 1)):  # fmt: skip
         check_count(name, value, least)
+    check_executor(executor)
     problem = pose(model, data)
     walked, centre = _given(result)
     pair = _pair(problem, walked, var_names)

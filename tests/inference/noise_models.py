@@ -121,9 +121,36 @@ def mixed_observation(x, g, v):
     return {"y": ssm.Normal(x + v[0], sd=0.5), "n": ssm.Normal(v[1] + g, sd=0.5)}
 
 
+# --- seen through a law that is cut off on one side ----------------------------------------------
+
+cut = ssm.Model("cut off, by its noises")
+
+
+@cut.prior
+def cut_prior():
+    return {"s": ssm.Gamma(5, rate=10), "r": ssm.Gamma(5, rate=10)}
+
+
+@cut.initial
+def cut_initial():
+    return {"x": ssm.Normal(0.5, sd=1.0)}
+
+
+@cut.transition
+def cut_transition(x, s):
+    return {"x": ssm.Normal(0.8 * x, sd=s)}
+
+
+@cut.observation
+def cut_observation(x, r):
+    return {"y": ssm.Truncated(ssm.Normal(x, sd=r), lower=0.0)}
+
+
 STEPS = 4
-HOLE = {"linear": ("y", 2), "vector": ("count", 1), "mixed": ("n", 2)}  # a value that is missing
-MODELS = {"linear": linear, "vector": vector, "mixed": mixed}
+HOLE = {  # a value that is missing
+    "linear": ("y", 2), "vector": ("count", 1), "mixed": ("n", 2), "cut": ("y", 1)
+}  # fmt: skip
+MODELS = {"linear": linear, "vector": vector, "mixed": mixed, "cut": cut}
 CASES = [(name, steered) for name in MODELS for steered in (True, False)]
 CASES.remove(("mixed", True))
 

@@ -13,6 +13,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.inference import runner
 from ssmppl.inference.checkpoints import archive, chains, origin
+from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.sample import PREPARE
 from tests.inference import checkpoint_models as models
 from tests.inference.checkpoint_models import CALLS, bits, call
@@ -81,6 +82,31 @@ def test_a_killed_call_goes_on(killed, tmp_path, name):
 )
 def test_every_method_goes_on(killed, tmp_path, name):
     goes_on(killed, name, tmp_path / "a.npz", (2, 9, 30, 41))
+
+
+@pytest.mark.parametrize("name", ["PGAS", "PMMH, gradient", "Gibbs"])
+def test_a_call_without_states_goes_on_and_keeps_none(killed, tmp_path, monkeypatch, name):
+    """All other draws, and how often trajectories changed, are those of a call that keeps them."""
+    path, whole, kept, real = tmp_path / "a.npz", bits(call(name)), [], ChainFile.stack
+
+    def stack(self, chains):
+        kept.append(real(self, chains))
+        return kept[-1]
+
+    monkeypatch.setattr(ChainFile, "stack", stack)
+    expected = {k: v for k, v in whole.items() if k[:11] != "posterior x"}
+    assert len(expected) == len(whole) - 2
+    for n in (9, 30):
+        assert killed(n, name, path, states=False)
+    assert bits(call(name, path, states=False)) == expected
+    assert bits(call(name, path, states=False)) == expected, "once more, from the finished file"
+    assert [set(drawn) & {"theta", "path_0", "path_1"} for drawn, _ in kept] == 2 * [{"theta"}]
+
+
+def test_more_draws_without_states_count_in_how_often_they_changed(tmp_path):
+    path = tmp_path / "a.npz"
+    call("PGAS", path, states=False, draws=7)
+    assert bits(call("PGAS", path, states=False)) == bits(call("PGAS", states=False))
 
 
 def test_seed_none_goes_on_with_the_seed_of_the_file(killed, tmp_path):

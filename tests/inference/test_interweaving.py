@@ -234,6 +234,106 @@ def test_mutants_are_found(kind, steered):
     assert np.abs(z).max() > limit, np.round(z, 1)
 
 
+# --- the choice among moves ----------------------------------------------------------------------
+
+
+class OnPrior:
+    """A move whose density is flat, so that the steps are on the prior; where `here` says not, it
+    cannot be made at all."""
+
+    def __init__(self, here=lambda theta: True):
+        self.here = here
+
+    def stand(self, theta, paths):
+        return (0.0 if self.here(theta) else -np.inf), None
+
+    def at(self, theta, held, paths):
+        return self.stand(theta, paths)[0], paths
+
+
+NEVER, SELDOM = OnPrior(lambda theta: False), OnPrior(lambda theta: theta[0] > 0.93)
+
+
+@pytest.mark.parametrize("other", [NEVER, SELDOM], ids=["never", "seldom"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_move_that_cannot_be_made_is_not_chosen(other, place):
+    """However wide its walk is left; and the law of the chain is the prior, exactly."""
+    problem, theta, paths = posed("linear", 2)
+    moves = (other, OnPrior()) if place == 0 else (OnPrior(), other)
+    space, adapting = space_of(problem, {}, {}), 400
+    d = len(space.where)
+    kernel = Interweaving(
+        space, moves, np.arange(d), np.full(d, 3.0), adapting, 0, constant_bounds(problem.trace)
+    )
+    tuning, rng, drawn = kernel.begin(), np.random.default_rng(7), []
+    for k in range(adapting + 12_000):
+        tuning, share = kernel.step(tuning, theta, paths, rng)
+        if k >= adapting:
+            assert tuning.chosen == 1 - place
+            assert share in (0.0, 0.25, 0.5, 0.75, 1.0)
+        if k >= adapting and k % 30 == 0:
+            drawn.append(theta.copy())
+    laws = stats.uniform(0.3, 0.65), stats.invgamma(4, scale=2), stats.gamma(4, scale=1 / 8)
+    for values, law in zip(np.array(drawn).T, laws, strict=True):
+        assert stats.kstest(values, law.cdf).pvalue > LEVEL
+
+
+def test_of_two_moves_that_can_be_made_the_wider_is_chosen():
+    problem, theta, paths = posed("linear", 2)
+    start = theta[0]
+    narrow, wide = (OnPrior(lambda t, w=w: abs(t[0] - start) < w) for w in (0.02, 0.1))
+    space = space_of(problem, {}, {})
+    kernel = Interweaving(
+        space, (narrow, wide), np.arange(1), np.ones(3), 400, 0, constant_bounds(problem.trace)
+    )
+    tuning, rng = kernel.begin(), np.random.default_rng(7)
+    for _ in range(402):
+        tuning, _ = kernel.step(tuning, theta, paths, rng)
+    assert tuning.chosen == 1
+
+
+def without_guide():
+    """The data are seen through a root, which has no slope where the approximation begins."""
+    model = ssm.Model("through a root")
+    model.prior(lambda: {"s": ssm.HalfNormal(sd=1), "r": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, s: {"x": ssm.Normal(0.9 * x, sd=s)})
+    model.observation(lambda x, r: {"y": ssm.Normal(np.sqrt(np.maximum(x, 0.0)), sd=r)})
+    return model
+
+
+def test_an_approximation_that_comes_to_no_number_is_left_out():
+    y = ssm.simulate(without_guide(), {"s": 0.5, "r": 0.3}, steps=30, seed=1)["y"].values[0]
+    found = ssm.sample(
+        without_guide(), {"y": y}, ssm.PGAS(particles=10, interweave=True), draws=5, warmup=20,
+        chains=1, seed=1, progress=False,
+    )  # fmt: skip
+    told = found["posterior"].attrs["interweaving"]
+    assert told == "s: moved with the noises of the transition held fixed"
+
+
+def test_where_nothing_else_could_be_held_the_reason_is_told():
+    model = ssm.Model("through a root, of known states")
+    model.prior(lambda: {"r": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.9 * x, sd=0.5)})
+    model.observation(lambda x, r: {"y": ssm.Normal(np.sqrt(np.maximum(x, 0.0)), sd=r)})
+    y = ssm.simulate(model, {"r": 0.3}, steps=30, seed=1)["y"].values[0]
+    few = {"draws": 3, "warmup": 200, "chains": 1, "seed": 1, "progress": False}
+    found = ssm.sample(model, {"y": y}, ssm.PGAS(particles=10, interweave="auto"), **few)
+    assert "none: the Gaussian approximation" in found["posterior"].attrs["interweaving"]
+    with pytest.raises(ArgumentError, match="interweave=True does not apply: the Gaussian"):
+        ssm.sample(model, {"y": y}, ssm.PGAS(particles=10, interweave=True), **few)
+
+
+def test_data_cut_off_on_one_side_have_an_approximation():
+    """At every parameter point; the derivatives of their density were NaN."""
+    for i in range(4):
+        problem, theta, _ = posed("cut", i)
+        move = move_of(problem, theta, True)
+        assert move.stands_near()
+
+
 # --- the verb ------------------------------------------------------------------------------------
 
 FAST = ssm.Model("states seen plainly")

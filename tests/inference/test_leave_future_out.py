@@ -7,6 +7,7 @@ from scipy.special import logsumexp
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.leave_future_out import _smoothed
 from ssmppl.inference.problem import pose
 from tests.statistics.checks import MCSE, seed_of
 
@@ -36,6 +37,10 @@ def y():
 
 @pytest.fixture(scope="module")
 def exact(y):
+    return by_grid(y)
+
+
+def by_grid(y):
     """log p(y_t | y_{1:t-1}) for every t, by a grid over a and tau."""
     a, tau = np.meshgrid(np.linspace(-0.995, 0.995, 100), np.linspace(0.02, 9, 150))
     problem = pose(plain(), {"y": y})
@@ -68,6 +73,41 @@ def test_scores_are_those_of_the_grid(threshold, y, exact):
         assert found.attrs["refits"] < 3
     else:
         assert found.attrs["refits"] == len(rows)
+
+
+def test_rows_without_data_leave_the_draws_as_good_as_they_were(y):
+    """Their weights are all equal, which needs no new draws; nor do the rows after them."""
+    y = y.copy()
+    y[11:19] = np.nan
+    found = ssm.leave_future_out(
+        plain(), {"y": y}, first=12, draws=400, warmup=300, chains=2,
+        seed=seed_of("lfo gap"), progress=False,
+    )  # fmt: skip
+    assert not found["sampled_anew"].values[1:10].any()
+    assert np.isneginf(found["pareto_shape"].values[:10]).all()
+    row = found.sel(time=21)
+    error = float(row["elpd"]) - by_grid(y)[20]
+    assert abs(error) < MCSE * float(row["mc_error"])
+
+
+def test_weights_without_a_tail_need_no_smoothing():
+    """Equal up to rounding, or a good share at their greatest, as likelihoods that say yes or no
+    give; fewer at their greatest are no sample to trust."""
+    rng = np.random.default_rng(1)
+    for log_w in (
+        np.zeros(500),
+        3.0 + 1e-13 * rng.normal(size=500),
+        np.where(np.arange(500) % 3, -np.inf, 2.0),
+        np.where(np.arange(500) % 3, np.log(0.25), 0.0),
+    ):
+        smoothed, shape = _smoothed(log_w)
+        assert shape == -np.inf
+        w = np.exp(log_w)
+        assert np.exp(smoothed) == pytest.approx(w / w.sum(), rel=1e-9)
+    assert _smoothed(np.where(np.arange(500) < 3, 0.0, -np.inf))[1] == np.inf
+    assert _smoothed(np.full(500, -np.inf))[1] == np.inf
+    assert abs(_smoothed(0.1 * rng.normal(size=500))[1]) < 0.5
+    assert _smoothed(2.0 * rng.standard_exponential(500))[1] > 0.7  # no variance: k = 2
 
 
 @pytest.mark.slow

@@ -7,7 +7,14 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.chains import update_rates
-from ssmppl.inference.chains.update_rates import movement, random_components, told
+from ssmppl.inference.chains.pgas import PGASState
+from ssmppl.inference.chains.update_rates import (
+    Watch,
+    movement,
+    random_components,
+    told,
+    watched_movement,
+)
 from ssmppl.inference.draws import ChainDraws
 from ssmppl.inference.problem import pose
 from ssmppl.inference.sample import _chosen
@@ -98,6 +105,46 @@ def stuck_draws(steps, until, columns, rng):
     paths = rng.normal(size=(4, 100, steps, columns))
     paths[:, :, :until] = paths[:, :1, :until]
     return paths
+
+
+def watched(paths, waiting=3):
+    """What is left of them where draws leave trajectories out, after a warmup that does not count;
+    (chains, draws, T, D)."""
+    out = []
+    for chain in paths:
+        watch = Watch(waiting)
+        for path in [*np.full_like(chain[:waiting], 9.0), *chain]:
+            watch = watch.after([path])
+        out.append(watch)
+    return out
+
+
+def made_up_without_paths(paths):
+    states = [PGASState(*[None] * 4, watch=w) for w in watched(paths)]
+    return [ChainDraws({"theta": np.zeros((len(p), 1))}, {}, {}, s)
+            for p, s in zip(paths, states, strict=True)]  # fmt: skip
+
+
+@pytest.mark.parametrize("chains", [1, 3])
+def test_what_was_watched_is_what_the_draws_would_have_told(chains):
+    rng = np.random.default_rng(4)
+    paths = np.floor(rng.normal(size=(chains, 101, 4, 2)) * 2.0)
+    paths[:, :, 1], paths[1:, :60, 2], paths[-1:, :, 3, 1] = 3.1, 7.0, 8.5
+    rate, ever, apart = watched_movement(watched(paths), 0)
+    expected = movement(paths)
+    np.testing.assert_array_equal(rate, expected[0])
+    np.testing.assert_array_equal(ever, expected[1])
+    np.testing.assert_allclose(apart, expected[2], rtol=1e-12)
+
+
+def test_rows_that_stand_still_are_told_without_draws_of_them():
+    problem = pose(integrated(), {"y": np.zeros(9)})
+    paths = stuck_draws(9, 3, 2, np.random.default_rng(1))
+    with pytest.warns(UserWarning, match="3 rows from 1 to 3 "):
+        expected = told(problem, made_up(paths))
+    with pytest.warns(UserWarning, match="3 rows from 1 to 3 "):
+        assert told(problem, made_up_without_paths(paths)) == expected
+    assert told(problem, made_up_without_paths(paths[:, :1])) == {}
 
 
 def test_rows_that_stand_still_are_told_with_a_warning():

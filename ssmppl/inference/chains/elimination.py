@@ -240,10 +240,7 @@ def asked(
 
 def _named(problem: Problem, setting: object, held: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     free = [n for n in problem.trace.parameters if n not in held]
-    if not isinstance(setting, (tuple, list)) or not all(isinstance(n, str) for n in setting):
-        raise ArgumentError(
-            f"eliminate={setting!r}", fix='use "auto", True, False or a tuple of parameters\' names'
-        )
+    assert isinstance(setting, (tuple, list))
     for name in setting:
         if name not in free:
             raise ArgumentError(

@@ -82,18 +82,18 @@ def prepare(setup: Setup, method: Gibbs) -> Sampler:
         "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
-    return Sampler(partial(gibbs_block, steps, setup.thin), states, report)
+    return Sampler(partial(gibbs_block, steps, setup.thin, setup.states), states, report)
 
 
 def gibbs_block(
-    steps: GibbsSteps, thin: int, state: GibbsState, n: int
+    steps: GibbsSteps, thin: int, with_paths: bool, state: GibbsState, n: int
 ) -> tuple[GibbsState, Block]:
-    """n draws of one chain, each after `thin` sweeps."""
+    """n draws of one chain, each after `thin` sweeps; with_paths : whether with trajectories."""
     model = needed_model(steps.problem, "Gibbs")
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta, tuning, further = state.theta.copy(), state.tuning, steps.interweaving
     draws: dict[str, list[np.ndarray]] = {"theta": []}
-    draws |= {f"path_{i}": [] for i in range(len(steps.problem.experiments))}
+    draws |= {f"path_{i}": [] for i in range(len(steps.problem.experiments)) if with_paths}
     stats: dict[str, list[float]] = {"lp": [], "acceptance_rate": []}
     if further is not None:
         stats["interweaved"] = []
@@ -107,7 +107,7 @@ def gibbs_block(
             infos = draw_parameters(steps, theta, paths, generator)
             accepted, made = accepted + sum(infos), made + len(infos)
         draws["theta"].append(theta.copy())
-        for i, path in enumerate(paths):
+        for i, path in enumerate(paths if with_paths else ()):
             draws[f"path_{i}"].append(path)
         stats["lp"].append(log_joint(steps, theta, paths))
         stats["acceptance_rate"].append(accepted / made if made else 1.0)

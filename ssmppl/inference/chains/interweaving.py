@@ -95,8 +95,8 @@ class Interweaving:
     def _tune(self, tuning: Tuning, where: np.ndarray) -> Tuning:
         size = 2.4 / np.sqrt(max(len(where), 1))
         factors = tuple(size * np.diag(self.scale[where]) for _ in self.moves)
-        chosen = 0 if len(self.moves) == 1 or not self.adapting else None
-        return replace(tuning, where=where, factors=factors, chosen=chosen, seen=())
+        chosen, won = 0 if len(self.moves) == 1 or not self.adapting else None, (0,) * len(factors)
+        return replace(tuning, where=where, factors=factors, chosen=chosen, seen=(), won=won)
 
     def step(
         self, tuning: Tuning, theta: np.ndarray, paths: Paths, generator: np.random.Generator
@@ -111,13 +111,16 @@ class Interweaving:
         accepted, made = 0, 0
         if len(tuning.where):
             if tuning.chosen is None and sweep >= self.adapting:
-                tuning = replace(tuning, chosen=int(np.argmax(_volumes(tuning.factors))))
+                tuning = replace(tuning, chosen=_farthest(tuning))
             for k in range(len(self.moves)):
                 if tuning.chosen is None or tuning.chosen == k:
                     factor, won = self._propose(k, tuning, theta, paths, generator)
                     accepted, made = accepted + won, made + PROPOSALS
                     factors = (*tuning.factors[:k], factor, *tuning.factors[k + 1 :])
                     tuning = replace(tuning, factors=factors)
+                    if tuning.chosen is None:
+                        wins = (*tuning.won[:k], tuning.won[k] + won, *tuning.won[k + 1 :])
+                        tuning = replace(tuning, won=wins)
         return replace(tuning, sweep=sweep + 1), accepted / made if made else 0.0
 
     def _propose(
@@ -181,7 +184,8 @@ class Tuning:
 
     sweep : how many it has made. where : positions of the numbers that move; None while it looks,
     empty where none does. factors : of each move's walk, (d, d). chosen : the move that is made;
-    None while all are tried. seen : (d_free,) of each sweep while it looks.
+    None while all are tried. seen : (d_free,) of each sweep while it looks. won : of each
+    move, steps that were accepted while all were tried.
     """
 
     sweep: int
@@ -189,11 +193,18 @@ class Tuning:
     factors: tuple[np.ndarray, ...]
     chosen: int | None
     seen: tuple[np.ndarray, ...]
+    won: tuple[int, ...] = ()
 
 
-def _volumes(factors: Sequence[np.ndarray]) -> list[float]:
-    """log |S| of each walk. All are tuned to one rate of acceptance: the widest goes farthest."""
-    return [float(np.sum(np.log(np.diag(f)))) for f in factors]
+def _farthest(tuning: Tuning) -> int:
+    """The move of the greatest accepted steps times their squared size |S|^(2/d), the speed at
+    which its walk spreads. All are tuned to one rate of acceptance, so that mostly the widest wins;
+    but one that can seldom or never be made, where the guide is no number, stays as wide as it
+    began."""
+    with np.errstate(divide="ignore"):
+        won = np.log(np.array(tuning.won, dtype=float))
+    size = [float(np.mean(np.log(np.diag(f)))) for f in tuning.factors]
+    return int(np.argmax(won + 2.0 * np.array(size)))
 
 
 def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noises | NotApplicable:
@@ -206,18 +217,20 @@ def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noise
 def asked(
     problem: Problem, setting: str | bool, model: ExactModel | None
 ) -> Noises | NotApplicable:
-    if not (setting is True or setting is False or setting == "auto"):
-        raise ArgumentError(f"interweave={setting!r}", fix='use "auto", True or False')
     if setting is False:
         return NotApplicable("interweave=False")
     found = applicable(noises(problem.trace, problem.program.missing), model)
     if isinstance(found, NotApplicable) and setting is True:
-        raise ArgumentError(
-            f"interweave=True does not apply: {found.reason}",
-            fix='use interweave="auto" or False',
-            where=found.where,
-        )
+        raise _refused(found)
     return found
+
+
+def _refused(found: NotApplicable) -> ArgumentError:
+    return ArgumentError(
+        f"interweave=True does not apply: {found.reason}",
+        fix='use interweave="auto" or False',
+        where=found.where,
+    )
 
 
 def interweaving(
@@ -229,7 +242,7 @@ def interweaving(
 
     Raises
     ------
-    ArgumentError : `interweave` is neither "auto" nor a truth value, or is True and cannot be.
+    ArgumentError : `interweave` is True and cannot be.
     """
     found = asked(setup.problem, setting, model)
     if isinstance(found, NotApplicable):
@@ -244,9 +257,18 @@ def interweaving(
     moves: list[Any] = []
     if model is not None:
         moves = [Collapsed(setup.problem, model)]
-    else:
-        moves += [NoiseMove(setup.problem, found, True, near)] if steered else []
-        moves += [NoiseMove(setup.problem, found, False, near)] if found.parameters else []
+    elif steered:
+        moves = [NoiseMove(setup.problem, found, True, near)]
+        if not moves[0].stands_near():
+            reason = "the Gaussian approximation to the states' posterior comes to no number"
+            none = NotApplicable(reason)
+            found, steered, moves = replace(found, guide=none), False, []
+            if not found.parameters:
+                if setting is True:
+                    raise _refused(none)
+                return None, f"none: {reason}"
+    if model is None and found.parameters:
+        moves.append(NoiseMove(setup.problem, found, False, near))
     names = found.tied if steered or model is not None else found.parameters
     owner = [t.site.name for t in transforms(setup.problem.trace) for _ in t.free]
     movable = np.array([k for k, i in enumerate(space.where) if owner[i] in names], dtype=int)

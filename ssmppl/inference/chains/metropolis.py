@@ -16,7 +16,7 @@ import numpy as np
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.coordinates import coordinates
 from ssmppl.inference.chains.langevin import Langevin
-from ssmppl.inference.chains.pmmh import STRETCH, adapts, settings_of, walk_factor
+from ssmppl.inference.chains.pmmh import STRETCH, adapts, given_factor, settings_of, walk_factor
 from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.chains.walk import (
     Metropolis,
@@ -96,17 +96,14 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
 
     Raises
     ------
-    ArgumentError : the likelihood is not exact, or a setting is out of range or does not apply.
+    ArgumentError : the likelihood is not exact, or a setting does not apply.
     """
     problem, space = setup.problem, setup.space
     exact = needed_model(problem, "MetropolisHastings")
-    if method.order not in (None, 0, 1):
-        raise ArgumentError(
-            f"order={method.order!r}",
-            fix="use 0 (random walk), 1 (Langevin, by the gradient) or None",
-        )
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
+    if method.covariance is not None:
+        given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
     factor = walk_factor(setup, method, where, pilot, kind)
@@ -131,7 +128,8 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
         move, tuning, usual = Langevin(where, factor, newton=False), 0.0, 0.574
     kernel = Metropolis(
         where, ExactLikelihood(problem, setup.states, scored), move, setup.warmup,
-        setup.warmup if adapts(method) else 0, method.target_acceptance or usual, setup.thin,
+        setup.warmup if adapts(method) else 0,
+        usual if method.target_acceptance is None else method.target_acceptance, setup.thin,
     )  # fmt: skip
     starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []

@@ -70,6 +70,11 @@ class NoiseMove:
             return (None,) * len(self.problem.experiments)
         return tuple(filter_.mode(self.near, e.y, e.seen, e.u) for e in self.problem.experiments)
 
+    def stands_near(self) -> bool:
+        """Whether every experiment has a guide at `near`; elsewhere it hardly has, if not there."""
+        experiments = self.problem.experiments
+        return all(self._guide(i, self.near, e) is not None for i, e in enumerate(experiments))
+
     def stand(self, theta: np.ndarray, paths: Paths) -> tuple[float, Paths]:
         total, held = 0.0, []
         widest = max(len(self.found.initial.noise), len(self.found.transition.noise))

@@ -27,10 +27,12 @@ from ssmppl.inference.problem import Problem
 
 @dataclass(frozen=True)
 class ParticleLikelihood:
-    """An independent run of the particle filter for every point."""
+    """An independent run of the particle filter for every point. states : whether draws keep its
+    paths."""
 
     problem: Problem
     settings: FilterSettings
+    states: bool = True
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
         if self.settings.rescue:
@@ -79,7 +81,7 @@ class ParticleLikelihood:
         return Run(total, tuple(paths), tuple(increments))
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
-        return paths_of(point)
+        return kept_of(point, self.states)
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,13 @@ class MarginalLikelihood(ParticleLikelihood):
     """A Rao-Blackwellised filter; what it integrates out is drawn for the kept draws."""
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
-        found = paths_of(point)
+        found = kept_of(point, self.states)
         for i, e in enumerate(self.problem.experiments):
             path = point.run.paths[i][None]
-            found[f"path_{i}"] = draw_given(self.problem, e, point.theta, path, stream)[0]
+            # drawn even where it is left out, so that the chain is the same with and without
+            drawn = draw_given(self.problem, e, point.theta, path, stream)[0]
+            if self.states:
+                found[f"path_{i}"] = drawn
         return found
 
 
@@ -113,6 +118,7 @@ class ScoredLikelihood(_WithFilter):
     lag: int
     wanted: tuple[int, ...]
     second: bool
+    states: bool = True
 
     @cached_property
     def filter(self) -> ScoredFilter:
@@ -153,7 +159,7 @@ class ScoredLikelihood(_WithFilter):
         return Run(total, tuple(paths), tuple(increments), score, information)
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
-        return paths_of(point)
+        return kept_of(point, self.states)
 
 
 @dataclass(frozen=True)
@@ -167,6 +173,7 @@ class CorrelatedLikelihood(_WithFilter):
     problem: Problem
     settings: FilterSettings
     correlation: float
+    states: bool = True
 
     @cached_property
     def filter(self) -> NumberedFilter:
@@ -215,12 +222,12 @@ class CorrelatedLikelihood(_WithFilter):
         return rho * old + np.sqrt(1.0 - rho * rho) * new.reshape(shape)
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
-        return paths_of(point)
+        return kept_of(point, self.states)
 
 
-def paths_of(point: Point) -> dict[str, np.ndarray]:
-    """The path of the run and its increments, by the names of the draws."""
-    named = {f"path_{i}": path for i, path in enumerate(point.run.paths)}
+def kept_of(point: Point, states: bool) -> dict[str, np.ndarray]:
+    """The increments of the run and, of the states, its path, by the names of the draws."""
+    named = {f"path_{i}": path for i, path in enumerate(point.run.paths if states else ())}
     return named | {f"increment_{i}": v for i, v in enumerate(point.run.increments)}
 
 

@@ -7,14 +7,13 @@ integrated out of the first of these (`elimination.py`).
 from __future__ import annotations
 
 import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
-from ssmppl.counts import check_count
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.chains.elimination import Eliminating, Learned, describe
 from ssmppl.inference.chains.elimination import asked as asked_to_eliminate
@@ -26,6 +25,7 @@ from ssmppl.inference.chains.parameter_steps import (
     plan_updates,
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.update_rates import Watch
 from ssmppl.inference.draws import Block
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.filtering import FilterSettings, failure
@@ -45,7 +45,6 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
     memory = deterministic_memory(problem.trace)
     usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
     particles = usual if method.particles is None else method.particles
-    check_count("particles", particles, 2)
     proposal = method.proposal
     if proposal == "auto":
         by_transition = method.eliminate not in (False, "auto")
@@ -75,7 +74,8 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
     for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
-        states.append(start_chain(sweeper, theta, generator, stream))
+        begun = start_chain(sweeper, theta, generator, stream)
+        states.append(begun if setup.states else replace(begun, watch=Watch(setup.warmup)))
     report = {
         "particles": settings.particles,
         "proposal": proposal,
@@ -116,8 +116,9 @@ class Sweeper(ParameterSteps):
 
 @dataclass(frozen=True)
 class PGASState:
-    """Where a chain stands: theta (P,), one trajectory (T, D) per experiment, random states, and
-    how its further steps are tuned and what it has learned."""
+    """Where a chain stands: theta (P,), one trajectory (T, D) per experiment, random states, how
+    its further steps are tuned and what it has learned; and how the trajectories have moved, where
+    the draws leave them out."""
 
     theta: np.ndarray
     paths: tuple[np.ndarray, ...]
@@ -125,6 +126,7 @@ class PGASState:
     stream: np.ndarray
     tuning: Tuning | None = None
     learned: Learned | None = None
+    watch: Watch | None = None
 
 
 def start_chain(
@@ -164,8 +166,8 @@ def pgas_block(
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta, paths, tuning = state.theta.copy(), [p.copy() for p in state.paths], state.tuning
     further, without, learned = sweeper.interweaving, sweeper.without, state.learned
-    draws: dict[str, list[np.ndarray]] = {"theta": []}
-    draws |= {f"path_{i}": [] for i in range(len(paths))}
+    watch, draws = state.watch, dict[str, list[np.ndarray]](theta=[])
+    draws |= {f"path_{i}": [] for i in range(len(paths)) if watch is None}
     stats: dict[str, list[float]] = {"lp": [], "update_rate": [], "ess": [], "acceptance_rate": []}
     if further is not None:
         stats["interweaved"] = []
@@ -183,7 +185,9 @@ def pgas_block(
             moved, ess = moved + rates[0] / thin, ess + rates[1] / thin
             accepted, made = accepted + sum(infos), made + len(infos)
         draws["theta"].append(theta.copy())
-        for i, path in enumerate(paths):
+        if watch is not None:
+            watch = watch.after(paths)
+        for i, path in enumerate(paths if watch is None else ()):
             draws[f"path_{i}"].append(path.copy())
         if predictive:
             for i, increments in enumerate(_predictive(sweeper, theta, stream)):
@@ -197,7 +201,7 @@ def pgas_block(
     block = Block(
         {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
     )
-    return PGASState(theta, tuple(paths), generator, stream, tuning, learned), block
+    return PGASState(theta, tuple(paths), generator, stream, tuning, learned, watch), block
 
 
 def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.chains.coordinates import Coordinates, coordinates
 from ssmppl.inference.chains.curvature import fitted_covariance
@@ -35,7 +34,7 @@ from ssmppl.inference.chains.walk import (
     start_chain,
 )
 from ssmppl.inference.methods import PMMH, MetropolisHastings
-from ssmppl.inference.particles.filtering import FilterSettings, check_rescue, random_state
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.pilot import (
     SCALE_REPEATS,
@@ -60,10 +59,9 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
 
     Raises
     ------
-    ArgumentError : a setting is out of range, or does not apply to the model; gives the reason.
+    ArgumentError : a setting does not apply to the model; gives the reason.
     """
     problem, space = setup.problem, setup.space
-    check_settings(method)
     where = coordinates(space, method.scale, method.transform)
     if method.covariance is not None:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
@@ -99,7 +97,8 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
         usual = 0.3
     kernel = Metropolis(
         where, _likelihood(setup, method, settings), move, setup.warmup,
-        setup.warmup if adapts(method) else 0, method.target_acceptance or usual, setup.thin,
+        setup.warmup if adapts(method) else 0,
+        usual if method.target_acceptance is None else method.target_acceptance, setup.thin,
     )  # fmt: skip
     states = []
     starts = setup.once(
@@ -121,56 +120,24 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     return Sampler(partial(metropolis_block, kernel), states, report)
 
 
-def check_settings(method: PMMH) -> None:
-    """Refuse settings that are out of range, or that exclude each other."""
-    if method.particles is not None:
-        check_count("particles", method.particles, 1)
-    check_count("lag", method.lag, 0)
-    if method.order not in (0, 1, 2):
-        raise ArgumentError(
-            f"order={method.order!r}",
-            fix="use 0 (random walk), 1 (gradient) or 2 (gradient and information)",
-        )
-    if not 0.0 <= method.correlation < 1.0:
-        raise ArgumentError(
-            f"correlation={method.correlation!r}",
-            fix="give a number from 0 (fresh random numbers) to below 1, as 0.99",
-        )
-    check_rescue(method.rescue)
-    if method.rescue and (method.order or method.correlation):
-        raise ArgumentError(
-            f"rescue={method.rescue} together with order={method.order}, correlation="
-            f"{method.correlation}: the filters of these draw a fixed number of particles",
-            fix="use ssm.PMMH(rescue=...) with order=0 and correlation=0.0",
-        )
-    if method.rescue and method.proposal == "tempered":
-        raise ArgumentError(
-            f'rescue={method.rescue} together with proposal="tempered"', fix="use one of them"
-        )
-    if method.order and method.correlation:
-        raise ArgumentError(
-            f"order={method.order} together with correlation={method.correlation}",
-            fix="use one of them: the sorted filter of the correlated method keeps no scores",
-        )
-
-
 def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelihood:
     """The particle filter in the form that the method needs, compiled to find out if it applies."""
     problem = setup.problem
     if method.correlation:
-        correlated = CorrelatedLikelihood(problem, settings, method.correlation)
+        correlated = CorrelatedLikelihood(problem, settings, method.correlation, setup.states)
         _ = correlated.filter
         return correlated
     if method.order:
         held = [n not in setup.held for n, s in problem.trace.parameters.items()
                 for _ in s.components]  # fmt: skip
         wanted = tuple(np.flatnonzero(held).tolist())
-        scored = ScoredLikelihood(problem, settings, method.lag, wanted, method.order == 2)
+        second = method.order == 2
+        scored = ScoredLikelihood(problem, settings, method.lag, wanted, second, setup.states)
         _ = scored.filter
         return scored
     if is_marginal(settings.proposal):
-        return MarginalLikelihood(problem, settings)
-    return ParticleLikelihood(problem, settings)
+        return MarginalLikelihood(problem, settings, setup.states)
+    return ParticleLikelihood(problem, settings, setup.states)
 
 
 def _tuned(setup: Setup, method: PMMH, theta: np.ndarray, proposal: str) -> Tuning:

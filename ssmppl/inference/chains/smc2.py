@@ -290,16 +290,10 @@ def run_smc2(setup: Setup, method: SMC2, executor: Any, progress: bool) -> Runs:
 
     Raises
     ------
-    ArgumentError : a setting is out of range; a prior is improper; no parameter explains a row.
+    ArgumentError : a prior is improper; no parameter explains a row.
     KeyboardInterrupt : by Ctrl-C, as parameters given some of the rows are not what was asked for.
     """
-    for name, least in (("parameters", 2), ("particles", 1), ("moves", 1)):
-        check_count(name, getattr(method, name), least)
-    for name in ("ess_threshold", "acceptance"):
-        if not 0.0 <= getattr(method, name) <= 1.0:
-            raise ArgumentError(
-                f"{name}={getattr(method, name)!r}", fix="give a share, from 0 to 1"
-            )
+    check_count("parameters", method.parameters, 2)  # as many as draws, where none were given
     draw_prior(  # improper: refused now
         setup.problem.trace, np.random.default_rng(0), 1, setup.held, "or its value by fixed="
     )
@@ -339,7 +333,7 @@ def settled(method: SMC2, draws: int) -> SMC2:
     ------
     ArgumentError : more draws are wanted than there are particles in the parameters.
     """
-    method = replace(method, parameters=method.parameters or draws)
+    method = replace(method, parameters=draws if method.parameters is None else method.parameters)
     assert method.parameters is not None
     if draws > method.parameters:
         raise ArgumentError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,44 @@ from ssmppl.language.trace import Site
 
 LOW = 0.02  # share of draws at which a row changes, below which there is a warning
 APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
+Paths = tuple[np.ndarray, ...]
 PIECE = 2**25  # bytes of draws that are looked at together
 FEWEST = 50  # draws of a chain from which rates are worth a warning
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How the trajectories of a chain have moved, for one whose draws leave them out.
+
+    waiting : draws of the warmup to come. draws : n since then. Of these for each experiment,
+    (T, D): first, last; changed, how often a number was another than in the draw before; mean;
+    square, the sum of squared distances from it.
+    """
+
+    waiting: int
+    draws: int = 0
+    first: Paths = ()
+    last: Paths = ()
+    changed: Paths = ()
+    mean: Paths = ()
+    square: Paths = ()
+
+    @np.errstate(invalid="ignore", over="ignore")  # as in `movement`
+    def after(self, paths: Sequence[np.ndarray]) -> Watch:
+        """With one more draw (Welford 1962)."""
+        if self.waiting:
+            return replace(self, waiting=self.waiting - 1)
+        new, n = tuple(p.copy() for p in paths), self.draws + 1
+        if n == 1:
+            none = tuple(np.zeros_like(p) for p in new)
+            return Watch(0, 1, new, new, none, new, none)
+        off = [x - m for x, m in zip(new, self.mean, strict=True)]
+        mean = tuple(m + o / n for m, o in zip(self.mean, off, strict=True))
+        apart = [x - m for x, m in zip(new, mean, strict=True)]
+        square = tuple(s + o * a for s, o, a in zip(self.square, off, apart, strict=True))
+        pairs = zip(self.changed, new, self.last, strict=True)
+        changed = tuple(c + (x != before) for c, x, before in pairs)
+        return Watch(0, n, self.first, new, changed, mean, square)
 
 
 def told(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
@@ -29,16 +66,21 @@ def told(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
 
     The rate of a row is the share of successive draws between which some component changed that is
     not deterministic. A discrete state that the data determine need not change: its rows count
-    where the chains differ besides.
+    where the chains differ besides. Where draws leave trajectories out, all that the chains have
+    made count, which after an interrupt, or in a checkpoint that holds more, may be more draws than
+    were asked for.
     """
     least, stuck = 1.0, []
-    for i in range(len(problem.experiments)):
-        paths = [c.draws[f"path_{i}"] for c in result]  # of each chain (draws, T, D)
-        draws, steps, _ = paths[0].shape
-        if draws < 2:
-            return {}
-        free, discrete = random_components(problem, steps)
-        rate, ever, apart = movement(paths)
+    kept = "path_0" in result[0].draws
+    draws = min(len(c.draws["path_0"]) if kept else c.state.watch.draws for c in result)
+    if draws < 2:
+        return {}
+    for i, e in enumerate(problem.experiments):
+        free, discrete = random_components(problem, e.steps)
+        if kept:
+            rate, ever, apart = movement([c.draws[f"path_{i}"] for c in result])
+        else:
+            rate, ever, apart = watched_movement([c.state.watch for c in result], i)
         # a continuous one that stands still is never right
         counted = free & (~discrete | (apart > APART))
         varied = free & ever
@@ -103,6 +145,18 @@ def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.nd
         square = square + piece.var(axis=1) * m + off**2 * (a * m / (a + m))
         mean = mean + off * (m / (a + m))
     return changed / (len(paths) * (n - 1)), ever, gelman_rubin(mean, square / (n - 1))
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def watched_movement(watches: Sequence[Watch], i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `movement`, of experiment i of chains that were watched."""
+    changed = np.stack([w.changed[i] for w in watches])
+    start = watches[0].first[i]
+    ever = (changed > 0).any(axis=0) | np.any([w.first[i] != start for w in watches], axis=0)
+    mean = np.stack([w.mean[i] for w in watches])
+    variance = np.stack([w.square[i] / (w.draws - 1) for w in watches])
+    pairs = sum(w.draws - 1 for w in watches)
+    return changed.sum(axis=0) / pairs, ever, gelman_rubin(mean, variance)
 
 
 def gelman_rubin(means: np.ndarray, variances: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ import numpy as np
 import scipy
 
 from ssmppl.analysis.smooth import smooth_filter_applies
-from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.estimate import free_components
 from ssmppl.inference.exact.exact_score import exact_score
@@ -40,9 +39,6 @@ def climb(setup: Setup, method: DirectOptimization) -> Ascent:
     ------
     ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
     """
-    check_count("particles", method.particles, 2)
-    check_count("averages", method.averages, 2)
-    check_count("steps", method.steps, 1)
     if isinstance(setup.exact, NotApplicable):
         reason = smooth_filter_applies(setup.problem.trace)
         if reason is not None:
@@ -80,7 +76,6 @@ class ExactClimb:
         """All climbs, and Newton's steps from the best point."""
         restarts = self.method.restarts
         restarts = EXACT_RESTARTS if restarts is None else restarts
-        check_count("restarts", restarts, 0)
         interrupted, stopped, unbounded, gap = False, "", "", np.inf
         try:
             for k in range(restarts + 1):

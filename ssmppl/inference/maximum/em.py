@@ -27,7 +27,6 @@ from ssmppl.analysis.expectation import (
     moments_of,
 )
 from ssmppl.analysis.mstep import MStep
-from ssmppl.counts import check_count
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
@@ -57,9 +56,6 @@ def climb(setup: Setup, method: EM) -> Ascent:
     ------
     ArgumentError : the model has no exact smoother, or its states cannot be the missing data.
     """
-    check_count("iterations", method.iterations, 1)
-    if not method.tolerance > 0.0:
-        raise ArgumentError(f"tolerance={method.tolerance!r}", fix="give a positive number")
     if isinstance(setup.exact, NotApplicable):
         raise ArgumentError(
             "EM needs a linear Gaussian model, or one of finitely many states: "

@@ -15,7 +15,6 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.noisy_top import Fit, count, fitted
@@ -168,7 +167,6 @@ def check_points(method: IF2, d: int) -> None:
     """
     if method.points is None:
         return
-    check_count("points", method.points, 0)
     least = 2 * count(d, skew=True)
     if 0 < method.points < least:
         raise ArgumentError(

@@ -25,7 +25,6 @@ likelihood round it (`hilltop.py`); their noise is the error of the estimate.
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -33,7 +32,6 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.perturbed import Perturbed
-from ssmppl.counts import check_count
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.draws import stack
@@ -58,17 +56,10 @@ def climb(setup: Setup, method: IF2) -> Ascent:
 
     Raises
     ------
-    ArgumentError : a setting is out of range; no particle can be drawn from the initial law.
+    ArgumentError : a setting does not apply; no particle can be drawn from the initial law.
     SamplingError : the likelihood cannot be evaluated where any of the swarms ended.
     """
     setup.problem.proposal("bootstrap")
-    for name, least in (("particles", 2), ("iterations", 1), ("averaged", 1), ("evaluations", 2)):
-        check_count(name, getattr(method, name), least)
-    if not (_is_number(method.cooling) and 0.0 < method.cooling <= 1.0):
-        raise ArgumentError(
-            f"cooling={method.cooling!r}",
-            fix="give what is left of the steps after 50 iterations: above 0, at most 1",
-        )
     check_points(method, len(setup.space.where))
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
@@ -158,16 +149,12 @@ def _describe(recent: Sequence[Mapping[str, np.ndarray]]) -> str:
     return f"perturbed log-likelihood {best:.2f}"
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
-
-
 def step_scales(setup: Setup, method: IF2, model: Perturbed) -> np.ndarray:
     """(F,) standard deviations of the first steps: as asked for, 0 for what acts nowhere.
 
     Raises
     ------
-    ArgumentError : a name is no free parameter, or a number is not positive.
+    ArgumentError : a name is no free parameter.
     """
     given = method.perturbation
     named = given if isinstance(given, Mapping) else {}
@@ -177,14 +164,6 @@ def step_scales(setup: Setup, method: IF2, model: Perturbed) -> np.ndarray:
             raise ArgumentError(
                 f"perturbation names {name!r}, which is no free parameter",
                 fix=f"the free parameters are: {listing(str(name), free)}",
-            )
-    values: list[Any] = list(given.values()) if isinstance(given, Mapping) else [given]
-    for value in values:
-        if not (_is_number(value) and 0.0 < value < np.inf):
-            raise ArgumentError(
-                f"perturbation={given!r}",
-                fix="give positive numbers, standard deviations on the unconstrained scale; hold "
-                "a parameter still by fixed={...}",
             )
     usual = USUAL if isinstance(given, Mapping) else float(given)
     rows = np.mean([e.steps for e in setup.problem.experiments])
@@ -201,23 +180,15 @@ def _owners(setup: Setup) -> list[str]:
 
 
 def begin(setup: Setup, method: IF2) -> list[np.ndarray]:
-    """(F,) where each swarm begins.
-
-    Raises
-    ------
-    ArgumentError : `starts` is neither a number nor a list of parameter values.
-    """
+    """(F,) where each swarm begins."""
     wanted = method.starts
     if isinstance(wanted, Sequence) and not isinstance(wanted, str):
-        if not len(wanted):
-            raise ArgumentError("starts is empty", fix="give a number, or one mapping for each")
         out = []
         for k, values in enumerate(wanted):
             own = check_values(setup.problem.trace, values, argument=f"starts[{k}]")
             space = space_of(setup.problem, setup.held, {**setup.near, **own})
             out.append(space.z[space.where])
         return out
-    check_count("starts", wanted, 1)
     others = starts(setup, int(wanted) - 1) if int(wanted) > 1 else []  # type: ignore[call-overload]
     return [setup.start, *(setup.space_at(theta) for theta in others)]
 

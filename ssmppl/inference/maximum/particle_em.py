@@ -27,7 +27,6 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.draws import Block
 from ssmppl.inference.maximum.ascent import Ascent, Setup
@@ -49,10 +48,6 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
         move; names the line.
     SamplingError : the filter dies out.
     """
-    for name, least in (("particles", 2), ("trajectories", 1), ("runs", 1), ("burn_in", 0),
-                        ("chains", 1)):  # fmt: skip
-        check_count(name, getattr(method, name), least)
-    check_count("iterations", method.iterations, method.burn_in + 1)
     need_density(setup.problem.trace, "ParticleEM", "maximize")
     maximum, problem = maximiser(setup, "ParticleEM"), setup.problem
     theta = setup.space.parameters(setup.start)[0]

@@ -25,7 +25,6 @@ import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.weights import OK
-from ssmppl.counts import check_count
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
     PARTICLES,
@@ -51,7 +50,7 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
         missing data; names the line.
     """
     need_density(setup.problem.trace, "PSAEM", "maximize")
-    maximum = _checked(setup, method)
+    maximum = _by_statistics(setup)
     settings = conditional_settings(setup, method)
     states = []
     for chain, theta in enumerate(starts(setup, method.chains)):
@@ -79,14 +78,7 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
     )  # fmt: skip
 
 
-def _checked(setup: Setup, method: PSAEM) -> Maximiser:
-    check_count("burn_in", method.burn_in, 1)
-    check_count("iterations", method.iterations, method.burn_in + 1)
-    check_count("chains", method.chains, 1)
-    if not 0.5 < method.exponent <= 1.0:
-        raise ArgumentError(
-            f"exponent={method.exponent!r}", fix="give a number above 0.5 and at most 1"
-        )
+def _by_statistics(setup: Setup) -> Maximiser:
     maximum = maximiser(setup, "PSAEM")
     if isinstance(maximum.step, NotApplicable):
         raise ArgumentError(
@@ -103,7 +95,6 @@ def conditional_settings(setup: Setup, method: PSAEM) -> FilterSettings:
     memory = deterministic_memory(problem.trace)
     usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
     particles = usual if method.particles is None else method.particles
-    check_count("particles", particles, 2)
     proposal = pgas_proposal(problem) if method.proposal == "auto" else method.proposal
     problem.proposal(proposal)
     return FilterSettings(int(particles), proposal)

@@ -14,7 +14,7 @@ import numpy as np
 from ssmppl.codegen.kernels.random import new_state
 from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
-from ssmppl.counts import check_count
+from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
@@ -59,18 +59,16 @@ def filter_settings(
     ------
     ArgumentError : naming the argument, its value and the valid options.
     """
-    if resampling not in SCHEMES:
+    if not isinstance(resampling, str) or resampling not in SCHEMES:
         raise ArgumentError(
             f"resampling={resampling!r} is unknown",
             fix=f"use one of: {listing(str(resampling), SCHEMES)}",
         )
     check_count("particles", particles, 1)
-    number = isinstance(ess_threshold, (int, float, np.floating, np.integer))
-    if not (number and 0.0 <= ess_threshold <= 1.0):
-        raise ArgumentError(
-            f"ess_threshold={ess_threshold!r} is no share of the particles",
-            fix="give a number from 0 (never resample) to 1 (always)",
-        )
+    check_number(
+        "ess_threshold", ess_threshold, lambda v: 0.0 <= v <= 1.0,
+        "give a share of the particles, from 0 (never resample) to 1 (always)",
+    )  # fmt: skip
     check_rescue(rescue)
     if rescue and (resampling not in ("systematic", "multinomial") or ess_threshold < 1.0):
         raise ArgumentError(
