@@ -109,8 +109,6 @@ def test_the_p_of_where_counts_both_looks():
               for i, k in enumerate(keys)}  # fmt: skip
     wanted = localise(groups, nuisance[:-1], nuisance[-1])[0]
     np.testing.assert_allclose(sorted(table["p"]), sorted(wanted["p_either"]))
-    # Of two tests of one group, as far as they differ: more than the smaller p of one.
-    assert table["p"].min() > wanted[["p", "p_alone"]].min().min()
 
 
 @pytest.mark.parametrize(
