@@ -32,6 +32,7 @@ from ssmppl.gap.screen import Question, Screen
 from ssmppl.inference.particles.filtering import random_state
 
 SETS = 25  # simulated under each input
+MOST_VARIED = 4  # inputs that are replaced in turn
 SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
 
 
@@ -89,7 +90,9 @@ def separating(
     The base model is simulated under each, and its scores say how alike the candidates would be.
     """
     question, columns = screen.question, np.array(members, dtype=int)
-    inputs = simple_inputs(screen.experiments)
+    inputs = simple_inputs(screen.experiments, list(map(repr, question.trace.input_symbols)))
+    if not inputs:
+        return ""
     whole = question.theta(screen.theta)
     names = list(inputs)
     one = partial(_tried, question, list(inputs.values()), whole, columns, seed)
@@ -136,21 +139,34 @@ def _tried(
     return {"columns": found.columns[columns], "nuisance": found.nuisance}
 
 
-def simple_inputs(experiments: Sequence[Experiment]) -> dict[str, list[Experiment]]:
-    """The experiments under other inputs of the same length, each in the units of its own."""
+def simple_inputs(
+    experiments: Sequence[Experiment], names: Sequence[str]
+) -> dict[str, list[Experiment]]:
+    """The experiments with one of the inputs (L,) replaced at a time, in the units of its own.
+
+    What does not vary in an experiment is no drive (the length of a step, a setting), and stays.
+    """
+    ends = [(e.u.min(axis=0), e.u.max(axis=0)) for e in experiments]
+    varies = np.array([low < high for low, high in ends])
     out: dict[str, list[Experiment]] = {}
-    for e in experiments:
-        t = np.arange(e.steps)[:, None]
-        low, high, mean = e.u.min(axis=0), e.u.max(axis=0), e.u.mean(axis=0)
-        size = np.sqrt(2.0) * e.u.std(axis=0)
-        stair = np.minimum(t * LEVELS // e.steps, LEVELS - 1) / (LEVELS - 1.0)
-        made = {
-            "the same input at twice the size": 2.0 * e.u,
-            "the same input at half the size": 0.5 * e.u,
-            "a slow sine": mean + size * np.sin(2.0 * np.pi * t / (SLOW * e.steps)),
-            "a fast sine": mean + size * np.sin(2.0 * np.pi * t / FAST),
-            "a staircase over the same range": low + (high - low) * stair,
-        }
-        for name, u in made.items():
-            out.setdefault(name, []).append(replace(e, u=np.ascontiguousarray(u)))
+    for k in np.flatnonzero(varies.any(axis=0))[:MOST_VARIED].tolist():
+        for e, varied in zip(experiments, varies[:, k], strict=True):
+            for name, column in _others(e.u[:, k], names[k]).items():
+                u = e.u.copy()
+                u[:, k] = column if varied else e.u[:, k]
+                out.setdefault(name, []).append(replace(e, u=u))
     return out
+
+
+def _others(u: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    """Other courses of an input u (T,), by what they are called."""
+    t = np.arange(len(u))
+    low, high, mean, size = u.min(), u.max(), u.mean(), np.sqrt(2.0) * u.std()
+    stair = np.minimum(t * LEVELS // len(u), LEVELS - 1) / (LEVELS - 1.0)
+    return {
+        f"the same {name} at twice the size": 2.0 * u,
+        f"the same {name} at half the size": 0.5 * u,
+        f"a slow sine of {name}": mean + size * np.sin(2.0 * np.pi * t / (SLOW * len(u))),
+        f"a fast sine of {name}": mean + size * np.sin(2.0 * np.pi * t / FAST),
+        f"a staircase of {name} over the same range": low + (high - low) * stair,
+    }

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from ssmppl.errors import ArgumentError, Location, NotApplicable
-from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
 from ssmppl.gap.anatomy import Anatomy, Part
 from ssmppl.gap.binding import bind
@@ -239,9 +239,3 @@ def _role(c: Candidate, part: Part) -> str:
     if c.change in ("noise", "tail"):
         return "transition" if part.role == "state" else "observation"
     return c.change
-
-
-def strengths(candidates: Sequence[Candidate]) -> list[Expr]:
-    """The symbols of the candidates' strengths."""
-    out: list[ExprArray] = [symbols("parameter", c.strength, ()) for c in candidates]
-    return [s[()] for s in out]

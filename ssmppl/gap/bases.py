@@ -1,4 +1,4 @@
-"""Smooth bounded functions of states, inputs and time, in which a missing term is written.
+"""Smooth bounded functions of states and inputs, in which a missing term is written.
 
 Polynomials in s = tanh(z / `BEND`), z the standardised variable, orthonormal over its values: next
 to polynomials in z where the data are, and level beyond them. (Hermite functions, which vanish
@@ -8,7 +8,6 @@ functions alone: the same object is called on numbers and on symbols of a model.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,31 +37,6 @@ class Smooth:
         for c in self.coefficients[-2::-1]:
             value = value * s + c
         return value
-
-
-@dataclass(frozen=True)
-class Product:
-    """Product of one function of each of two variables."""
-
-    first: Smooth
-    second: Smooth
-
-    def __call__(self, x: Any, y: Any) -> Any:
-        return self.first(x) * self.second(y)
-
-
-@dataclass(frozen=True)
-class Wave:
-    """cos(pi k (t - start) / length) sqrt(2), or 1 for k = 0: slow changes over an experiment."""
-
-    order: int
-    start: float
-    length: float
-
-    def __call__(self, t: Any) -> Any:
-        if self.order == 0:
-            return 1.0 + 0.0 * t
-        return np.cos(np.pi * self.order * (t - self.start) / self.length) * float(np.sqrt(2.0))
 
 
 def bases(x: Any, count: int = 6) -> tuple[Smooth, ...]:
@@ -101,21 +75,3 @@ def bases(x: Any, count: int = 6) -> tuple[Smooth, ...]:
     mixed = np.linalg.inv(r[:distinct, :distinct]) * signs
     return tuple(Smooth(centre, BEND * sd, tuple(mixed[: n + 1, n].tolist()))
                  for n in range(distinct))  # fmt: skip
-
-
-def products(by_name: Mapping[str, Sequence[Smooth]]) -> dict[tuple[str, str], Product]:
-    """Of each pair of variables, the product of their functions of degree one.
-
-    For variables with at least two functions: what is missing where both are off their centres.
-    """
-    names = [n for n, functions in by_name.items() if len(functions) > 1]
-    return {
-        (a, b): Product(by_name[a][1], by_name[b][1])
-        for i, a in enumerate(names)
-        for b in names[i + 1 :]
-    }
-
-
-def waves(rows: int, count: int = 4, start: float = 0.0) -> tuple[Wave, ...]:
-    """The constant and the `count` slowest half-waves over `rows` steps from t = `start`."""
-    return tuple(Wave(k, float(start), float(rows)) for k in range(count + 1))

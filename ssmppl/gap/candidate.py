@@ -74,7 +74,8 @@ class Candidate:
         profile = PROFILES.get(self.effect.profile)
         time = inspect.signature(profile).parameters if profile and self.held else {}
         hidden = {s for s, _ in self.shape} if self.held and self.effect.process else {*time}
-        shape = ", ".join(f"{n}={_number(v)}" for n, v in self.shape if n not in hidden)
+        shape = ", ".join(f"{n}={v if isinstance(v, Expr) else f'{v:.14g}'}"
+                          for n, v in self.shape if n not in hidden)  # fmt: skip
         return f"{self.group} | {shape}" if shape else self.group
 
     @property
@@ -129,10 +130,13 @@ class Candidate:
 
     def __str__(self) -> str:
         form = f" ({self.form})" if self.form else ""
-        shape = ", ".join(f"{n} = {_number(v)}" for n, v in self.shape)
+        shape = ", ".join(f"{n} = {shape_text(v)}" for n, v in self.shape)
         return f"{self.effect.name}{form} in {self.equation}" + (f" with {shape}" if shape else "")
 
 
-def _number(value: float | Expr) -> str:
-    """The value of a shape parameter, or the symbol that stands for it."""
-    return repr(value) if isinstance(value, Expr) else f"{value:g}"
+def shape_text(value: float | Expr) -> str:
+    """The value of a shape parameter, a round one in full; or the symbol that stands for it."""
+    if isinstance(value, Expr):
+        return repr(value)
+    whole = f"{value:.14g}"
+    return whole if float(whole) == value else f"{value:g}"

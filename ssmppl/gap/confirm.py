@@ -24,7 +24,7 @@ class Predictions:
     """One-step predictions of the rows that count, all experiments in a row (T rows, K channels).
 
     log_density : (R, T) of R runs. mean, variance : (T, K), over the runs. observed : (T, K), NaN
-    where missing. starts : first row of each experiment.
+    where missing. starts : first row of each experiment that has rows that count.
     """
 
     log_density: np.ndarray
@@ -38,7 +38,12 @@ def predict(
     fitter: Fitter, fit: Fit, experiments: Sequence[Experiment], counts: Sequence[np.ndarray],
     seed: np.random.SeedSequence, runs: int = RUNS,
 ) -> Predictions:  # fmt: skip
-    """Filter all rows from the first with the fitted parameters, and keep those that count."""
+    """Filter all rows from the first with the fitted parameters, and keep those that count.
+
+    Experiments without any are left out.
+    """
+    held = [i for i, c in enumerate(counts) if c.any()] or [0]
+    experiments, counts = [experiments[i] for i in held], [counts[i] for i in held]
 
     def one(r: int) -> list[Pass]:
         stream = random_state(seed, 6, r)
@@ -115,12 +120,20 @@ def free_run(fitter: Fitter, fit: Fit, e: Experiment, seed: np.random.SeedSequen
         return FreeRun(draws.mean(axis=2), low, high)
 
 
-def rmse(run: FreeRun, e: Experiment, counts: np.ndarray) -> float:
-    """Root mean square error of a free run over the rows that count, channels in their own units
-    pooled by their standard deviations."""
-    y = np.where(e.seen == 1.0, e.y, np.nan)[counts]
+def rmse(
+    runs: Sequence[FreeRun], experiments: Sequence[Experiment], counts: Sequence[np.ndarray]
+) -> float:
+    """Root mean square error of free runs over the rows that count of all experiments, channels in
+    their own units pooled by their standard deviations; NaN where nothing was measured."""
+    y = np.concatenate([np.where(e.seen == 1.0, e.y, np.nan)[c]
+                        for e, c in zip(experiments, counts, strict=True)])  # fmt: skip
+    mean = np.concatenate([r.mean[c] for r, c in zip(runs, counts, strict=True)])
+    known = ~np.all(np.isnan(y), axis=0)
+    if not known.any():
+        return float("nan")
+    y, mean = y[:, known], mean[:, known]
+    scale = np.nanstd(y, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
     with np.errstate(all="ignore"):
-        scale = np.nanstd(y, axis=0)
-        scale = np.where(scale > 0.0, scale, 1.0)
-        error = np.sqrt(np.nanmean(((y - run.mean[counts]) / scale) ** 2))
+        error = np.sqrt(np.nanmean(((y - mean) / scale) ** 2))
     return float(error * np.mean(scale))

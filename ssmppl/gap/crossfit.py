@@ -22,15 +22,16 @@ from ssmppl.gap.attribute import Attribution, attribute
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.closed import closed
-from ssmppl.gap.confirm import Predictions, free_run, gain_of_mean, predict
+from ssmppl.gap.confirm import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import FOLDS, Fold, folds
 from ssmppl.gap.profiles import one_off
 from ssmppl.gap.reference import fit_reference
 from ssmppl.gap.refit import Refit
 from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.share import HowFar, notes_of, pooled
+from ssmppl.gap.share import NOT_GIVEN, HowFar, notes_of
 from ssmppl.gap.workshop import Workshop
+from ssmppl.inference.simulation import feeds_back
 
 SETS = 100  # simulated data sets in each fold
 SINGLES = 5  # refits in each fold
@@ -55,7 +56,8 @@ class CrossFit:
         """Share of the gap that is closed on the blocks left out."""
         out = HowFar()
         out.runs(self.base, self.experiments, self.chosen, seed)
-        parts = folds(self.experiments, FOLDS)
+        fed_back = feeds_back(self.workshop.trace)
+        parts = folds(self.experiments, FOLDS, fed_back=fed_back)
         each = []
         try:
             for k, fold in enumerate(parts):
@@ -63,7 +65,7 @@ class CrossFit:
                 where = kept.within(f"block {k + 1} of {len(parts)}")
                 each.append(where.of("held out", partial(self._one, fold, own, where)))
         except SSMError as error:
-            out.notes.append(f"the share of the gap that is closed is not given: {error.found}")
+            out.notes.append(NOT_GIVEN.format(error.found))
             return out
         table = {n: np.stack([v[n] for v in each], axis=-1) for n in each[0]}
         share = closed(table["base"], table["effect"], table["reference"], block=1)
@@ -123,7 +125,7 @@ class CrossFit:
         for name, model in (("before", models["base"]), ("after", effect)):
             at = [self.experiments[i] for i in inside]
             runs = [free_run(*model, e, seed) for e in at]
-            value = pooled(runs, at, [counts[i] for i in inside]) if at else 0.0
+            value = rmse(runs, at, [counts[i] for i in inside]) if at else 0.0
             out[name] = np.asarray(value)
         return out
 

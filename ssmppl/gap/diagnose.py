@@ -16,14 +16,14 @@ import numpy as np
 
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
-from ssmppl.errors import ArgumentError, listing
+from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.gap.answer import Results, answer
 from ssmppl.gap.apart import separating
 from ssmppl.gap.attribute import MOST_WORK, Attribution, attribute, measure
 from ssmppl.gap.candidates import Chosen
 from ssmppl.gap.candidates import chosen as chosen_effects
 from ssmppl.gap.checkpoint import Checkpoint, Numbers, digests
-from ssmppl.gap.confirm import predict
+from ssmppl.gap.confirm import Predictions, predict
 from ssmppl.gap.crossfit import CrossFit
 from ssmppl.gap.expected import Timed, in_words, timed
 from ssmppl.gap.expected import seconds as expected
@@ -204,12 +204,20 @@ class _Diagnosis:
         found = r.attribution
         if not self.parts or found is None or found.chosen is None or not found.fewer:
             return
-        plain = predict(r.base, r.fit, self.experiments, self.parts.confirm, self._seed(8))
+        try:
+            plain = self._confirmed(r.base, r.fit)
+        except SSMError:  # as will be said where the share is measured
+            return
         while found.fewer:
             last = found.chosen
-            seen = predict(
-                last.fitter, last.fit, self.experiments, self.parts.confirm, self._seed(8)
-            )
+            try:
+                seen = self._confirmed(last.fitter, last.fit)
+            except SSMError as error:
+                found.notes.append(
+                    f"{' and '.join(map(str, last.candidates))} fit better together, and whether "
+                    f"they predict held-out rows better is not known: {error.found}"
+                )
+                return
             gain = seen.log_density.sum(axis=1).mean() - plain.log_density.sum(axis=1).mean()
             if gain > 0.0:
                 return
@@ -219,6 +227,11 @@ class _Diagnosis:
                 f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
                 f"held-out rows worse than the model itself ({gain:.1f} nats): the last is left out"
             )
+
+    def _confirmed(self, fitter: Fitter, fit: Fit) -> Predictions:
+        """One-step predictions of the held-out rows."""
+        assert self.parts is not None
+        return predict(fitter, fit, self.experiments, self.parts.confirm, self._seed(8))
 
     def _how_far(self, r: Results) -> HowFar:
         once = r.chosen is not None and any(passing(c) for c in r.chosen.candidates)

@@ -134,7 +134,8 @@ def localise(
     -------
     Table key, statistic, z, p, kappa, and z_alone, p_alone: with the nuisance scores alone
     projected out. Where those are large and the former are not, the equations cannot be told apart
-    by these data. And the groups themselves, by key, with the others projected out.
+    by these data. p_either is that of the larger of the two z: who looks at both looks twice. And
+    the groups themselves, by key, with the others projected out.
     """
     import pandas as pd
 
@@ -150,12 +151,13 @@ def localise(
 
     def together(found: list[Group]) -> np.ndarray:
         z, null = np.array([g.z for g in found]), np.stack([g.null for g in found], axis=1)
-        return familywise(z, null, sided=1).p
+        return familywise(z, null, sided=1, groups=np.arange(len(found)) % len(keys)).p
 
     table = pd.DataFrame({
         "key": pd.Series(keys, dtype=object), "statistic": [g.statistic for g in apart],
         "z": [g.z for g in apart], "p": together(apart), "kappa": [g.kappa for g in apart],
         "z_alone": [g.z for g in alone], "p_alone": together(alone),
+        "p_either": together([*apart, *alone]),
     })  # fmt: skip
     return table, dict(zip(keys, apart, strict=True))
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from ssmppl.data.times import label_text
 
-__all__ = ["DASH", "interval", "is_number", "number", "p_text", "percent", "span", "with_error"]
+__all__ = [
+    "DASH", "interval", "is_number", "label", "number", "p_text", "percent", "span", "with_error",
+]  # fmt: skip
 
 DASH = "–"
 SMALLEST_P = 0.001  # below it, only the bound is said
@@ -91,7 +95,7 @@ def span(first: Any, last: Any, experiment: Any = "") -> str:
 
     experiment : "2" or "1 to 3", where there are several.
     """
-    ends = [_label(end) for end in (first, last)]
+    ends = [label(end) for end in (first, last)]
     if not all(ends):
         return ""
     if not isinstance(experiment, str) or not experiment:
@@ -102,10 +106,15 @@ def span(first: Any, last: Any, experiment: Any = "") -> str:
     return f"{span(first, last)} of experiment {a}"
 
 
-def _label(value: Any) -> str:
+def label(value: Any) -> str:
+    """Of a row: its time, or its number; "" where there is none."""
     if value is None or (isinstance(value, float) and math.isnan(value)) or str(value) == "NaT":
         return ""
-    if is_number(value):  # without commas: it may be a year
+    date = isinstance(value, np.datetime64)  # of nanoseconds it would be a number
+    if not date and is_number(value):  # without commas: it may be a year
         x = float(value)
-        return str(int(x)) if x == int(x) else f"{x:.6g}"
+        if x == int(x):
+            return str(int(x))
+        digits = max(6, len(str(int(abs(x)))) + 3)  # seconds of an epoch have ten in front
+        return f"{x:.{digits}g}"
     return label_text(value).removesuffix(" 00:00:00")

@@ -19,6 +19,7 @@ from ssmppl.data import Experiment
 
 SHARES = (0.4, 0.7)  # of the rows, where screen and choose end
 SHORTEST = 300  # rows in all, below which blocks are left out in turn instead
+LEAST_CONFIRMED = 10  # held-out rows, below which they are, too
 GAP = 5  # rows between the parts
 FOLDS = 10
 
@@ -46,14 +47,17 @@ class Parts:
     @property
     def confirm(self) -> list[np.ndarray]:
         """For each experiment (T,), whether a row counts in the end."""
-        return [np.arange(e.steps) >= min(n + GAP, e.steps - 1)
-                for e, n in zip(self.experiments, self.second, strict=True)]  # fmt: skip
+        return [_behind(n, e.steps) for e, n in zip(self.experiments, self.second, strict=True)]
 
     @property
     def chosen(self) -> list[np.ndarray]:
         """For each experiment (T2,), whether a row of `train` belongs to the choose part."""
-        return [np.arange(b) >= min(a + GAP, b - 1)
-                for a, b in zip(self.first, self.second, strict=True)]  # fmt: skip
+        return [_behind(a, b) for a, b in zip(self.first, self.second, strict=True)]
+
+
+def _behind(cut: int, rows: int) -> np.ndarray:
+    """(rows,) whether a row lies behind a cut and its gap, or is the last one behind the cut."""
+    return np.arange(rows) >= max(cut, min(cut + GAP, rows - 1))
 
 
 def head(e: Experiment, rows: int) -> Experiment:
@@ -67,18 +71,19 @@ def head(e: Experiment, rows: int) -> Experiment:
 
 
 def three_parts(experiments: Sequence[Experiment]) -> Parts:
-    """Every experiment cut at the same shares of its rows."""
+    """Every experiment cut at the same shares of its rows; one of up to three is for `train`."""
     a, b = SHARES
     return Parts(
         tuple(experiments),
-        tuple(max(2, round(a * e.steps)) for e in experiments),
-        tuple(max(3, round(b * e.steps)) for e in experiments),
+        tuple(min(e.steps, max(2, round(a * e.steps))) for e in experiments),
+        tuple(min(e.steps, max(3, round(b * e.steps))) for e in experiments),
     )
 
 
 def long_enough(experiments: Sequence[Experiment]) -> bool:
-    """Whether there are rows for three parts."""
-    return sum(e.steps for e in experiments) >= SHORTEST
+    """Whether there are rows for three parts: of many short experiments few are behind the cuts."""
+    held_out = sum(int(c.sum()) for c in three_parts(experiments).confirm)
+    return sum(e.steps for e in experiments) >= SHORTEST and held_out >= LEAST_CONFIRMED
 
 
 @dataclass(frozen=True)
@@ -89,24 +94,32 @@ class Fold:
     train: tuple[Experiment, ...]
 
 
-def folds(experiments: Sequence[Experiment], count: int = FOLDS) -> list[Fold]:
-    """Contiguous blocks of rows, over all experiments in a row, set missing in turn."""
+def folds(
+    experiments: Sequence[Experiment], count: int = FOLDS, *, fed_back: bool = False
+) -> list[Fold]:
+    """Contiguous blocks of rows, over all experiments in a row, set missing in turn.
+
+    fed_back : a transition names observations, so that it reads them where they are missing, too.
+    """
     sizes = [e.steps for e in experiments]
     number = np.minimum(np.arange(sum(sizes)) * count // sum(sizes), count - 1)
     each = np.split(number, np.cumsum(sizes)[:-1])
     out = []
     for k in range(count):
         left = tuple(n == k for n in each)
-        out.append(
-            Fold(left, tuple(without(e, rows) for e, rows in zip(experiments, left, strict=True)))
-        )
+        train = tuple(without(e, rows, fed_back) for e, rows in zip(experiments, left, strict=True))
+        out.append(Fold(left, train))
     return out
 
 
-def without(e: Experiment, rows: np.ndarray) -> Experiment:
-    """An experiment with the observations of these rows missing; rows (T,) bool."""
+def without(e: Experiment, rows: np.ndarray, fed_back: bool = False) -> Experiment:
+    """An experiment with the observations of these rows missing; rows (T,) bool.
+
+    What is fed back stays in `y`, as an input does: only its density is left out.
+    """
     seen = np.where(rows[:, None], 0.0, e.seen)
     observed = {
         n: np.where(rows.reshape(-1, *[1] * (v.ndim - 1)), np.nan, v) for n, v in e.observed.items()
     }
-    return replace(e, seen=seen, y=np.where(seen == 1.0, e.y, 0.0), observed=observed)
+    y = e.y if fed_back else np.where(seen == 1.0, e.y, 0.0)
+    return replace(e, seen=seen, y=y, observed=observed)

@@ -16,7 +16,7 @@ from ssmppl.language.trace import Trace
 LEVELS = (
     0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.9, 0.95, 0.98, 0.99
 )  # fmt: skip
-DIGITS = 4  # of the numbers that shapes are given in
+DIGITS = 4  # of the numbers that shapes are given in, at least, and of the spread about them
 
 
 @dataclass(frozen=True)
@@ -82,4 +82,13 @@ def value_of(grid: Grid, v: float, scale: Scale | None, n: int) -> float:
         "size": lambda: scale.size(v),
     }
     found = meaning[grid.unit]()
-    return float(f"{found:.{DIGITS}g}") if math.isfinite(found) else 0.0
+    return _rounded(found, scale.sd) if math.isfinite(found) else 0.0
+
+
+def _rounded(value: float, spread: float) -> float:
+    """To `DIGITS` digits of itself or, if that is finer, of the spread: far from zero, as of
+    pressures about 101325, its own would not tell quantiles apart."""
+    sizes = [v for v in (abs(value), spread) if 0.0 < v < math.inf]
+    if not sizes:
+        return value
+    return round(value, DIGITS - 1 - math.floor(math.log10(min(sizes))))

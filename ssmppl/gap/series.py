@@ -1,8 +1,7 @@
 """Statistics of one data set from its smoothed scores per step, S (..., T, K).
 
-Weighted sums (drift, break) and quadratic forms 1/2 sum_st k(s, t) S_s S_t for the kernel k of a
-latent process. They take the first row of each experiment in `starts`, and cost a pass over the
-rows. A row without information is 0.
+Quadratic forms 1/2 sum_st k(s, t) S_s S_t for the kernel k of a latent process. They take the first
+row of each experiment in `starts`, and cost a pass over the rows. A row without information is 0.
 """
 
 from __future__ import annotations
@@ -31,33 +30,6 @@ def segments(rows: int, starts: Sequence[int] = WHOLE) -> Iterator[slice]:
             fix="give the first row of each experiment, increasing, the first one 0",
         )
     return (slice(a, b) for a, b in pairwise(edges))
-
-
-def relative_time(rows: int, starts: Sequence[int] = WHOLE) -> np.ndarray:
-    """(T,) tau in (0, 1]: t / T within each experiment, t from 1."""
-    return np.concatenate([np.arange(1, s.stop - s.start + 1) / (s.stop - s.start)
-                           for s in segments(rows, starts)])  # fmt: skip
-
-
-# --- weighted sums -------------------------------------------------------------------------------
-
-
-def drift(scores: np.ndarray, starts: Sequence[int] = WHOLE) -> np.ndarray:
-    """sum_t tau_t S_t: (..., K), of a linear drift that ends at the strength."""
-    scores = np.asarray(scores, float)
-    return np.einsum("t,...tk->...k", relative_time(scores.shape[-2], starts), scores)
-
-
-def steps(scores: np.ndarray, dates: Sequence[int]) -> np.ndarray:
-    """sum_{t >= d} S_t for each date d: (..., K, D), of a break from row d on."""
-    scores = np.asarray(scores, float)
-    before = np.zeros((*scores.shape[:-2], 1, scores.shape[-1]))
-    summed = np.concatenate([before, np.cumsum(scores, axis=-2)], axis=-2)
-    left = summed[..., -1:, :] - summed
-    return np.moveaxis(left[..., np.asarray(dates, int), :], -2, -1)
-
-
-# --- quadratic forms -----------------------------------------------------------------------------
 
 
 def autoregressive(

@@ -20,6 +20,7 @@ from ssmppl.gap.refit import Refit
 from ssmppl.gap.screen import Screen
 from ssmppl.gap.workshop import Workshop
 
+NOT_GIVEN = "the share of the gap that is closed is not given: {}"
 SAME = 1e-6  # relative difference of two gains that are the same model's
 
 
@@ -57,6 +58,24 @@ def how_far(
     """
     out = HowFar()
     out.runs(base, experiments, chosen, seed)
+    try:
+        _measure(out, workshop, parts, experiments, base, screen, chosen, leader, label, seed, kept)
+    except SSMError as error:  # a held-out row may be impossible under what was fitted to others
+        out.notes.append(NOT_GIVEN.format(error.found))
+    return out
+
+
+def _measure(
+    out: HowFar, workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
+    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, leader: Refit | None,
+    label: str, seed: np.random.SeedSequence, kept: Checkpoint,
+) -> None:  # fmt: skip
+    """The share, and what the reference gains beyond, into `out`.
+
+    Raises
+    ------
+    SSMError : a model cannot predict the held-out rows, or there are too few.
+    """
     counts = parts.confirm
     plain = predict(*base, experiments, counts, seed)
     try:
@@ -67,7 +86,7 @@ def how_far(
         best = predict(*reference, experiments, counts, seed)
     except SSMError as error:
         out.notes.append(f"no reference to measure the gap against: {error.found}")
-        return out
+        return
     model = (chosen.fitter, chosen.fit) if chosen else reference
     same = reference[1] is model[1]  # nothing was found beyond the chosen effects
     found = best if same else predict(*model, experiments, counts, seed)
@@ -84,11 +103,10 @@ def how_far(
         "effect": label, "F": share.F, "F_low": share.low, "F_high": share.high,
         "nats_per_sample": share.gain.nats_per_sample, "gain_mean": mean,
         "gain_noise": share.gain.nats - mean,
-        "rmse_before": pooled(out.before, experiments, counts),
-        "rmse_after": pooled(runs, experiments, counts),
+        "rmse_before": rmse(out.before, experiments, counts),
+        "rmse_after": rmse(runs, experiments, counts),
     })  # fmt: skip
     out.notes += notes_of(share, chosen is not None)
-    return out
 
 
 def notes_of(share: Closed, chosen: bool) -> list[str]:
@@ -104,11 +122,3 @@ def notes_of(share: Closed, chosen: bool) -> list[str]:
         f"{what}, so that the share is of its own gain: {share.gain.nats:.1f} nats on held-out "
         f"rows (95% interval {low:.1f} to {high:.1f})"
     ]
-
-
-def pooled(
-    runs: Sequence[FreeRun], experiments: Sequence[Experiment], counts: Sequence[np.ndarray]
-) -> float:
-    """Root mean square error over the rows that count of all experiments."""
-    each = [rmse(r, e, c) for r, e, c in zip(runs, experiments, counts, strict=True)]
-    return float(np.sqrt(np.mean(np.square(each))))

@@ -40,11 +40,15 @@ class Simulator:
     def sets(
         self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
     ) -> list[Experiment]:
-        """The experiments with observations drawn at theta (P,), missing where theirs are."""
+        """The experiments with observations drawn at theta (P,), missing where theirs are.
+
+        Where a transition reads observations, `y` has those that it read, seen or not.
+        """
         out = []
         for e in experiments:
             drawn = self.observations(e, theta, stream, 1)[:, :, 0]
-            out.append(replace(e, y=np.where(e.seen == 1.0, drawn, 0.0)))
+            y = drawn if self.feedback else np.where(e.seen == 1.0, drawn, 0.0)
+            out.append(replace(e, y=y))
         return out
 
     def observations(

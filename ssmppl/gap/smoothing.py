@@ -8,7 +8,7 @@ twisted where the model allows it, with fixed-lag smoothing over its genealogy; 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -215,19 +215,4 @@ def probability_transforms(
         fill_uniform(stream, uniforms)
         value = lower + uniforms.reshape(upper.shape) * (upper - lower)
         out.append(np.where(e.seen == 1.0, value, np.nan))
-    return out
-
-
-def simulated(
-    program: Program, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray,
-    feedback: bool,
-) -> list[Experiment]:  # fmt: skip
-    """Experiments of the same lengths, inputs and gaps with observations drawn from the model."""
-    out = []
-    d, k = len(program.trace.state_symbols), len(program.trace.observation_symbols)
-    for e in experiments:
-        x, drawn = np.empty((e.steps, d, 1)), np.empty((e.steps, k, 1))
-        y = np.zeros((e.steps, k))
-        program.entry("simulate")(theta, y, np.ones_like(e.seen), e.u, stream, x, drawn, feedback)
-        out.append(replace(e, y=np.where(e.seen == 1.0, drawn[:, :, 0], 0.0)))
     return out

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.gap.candidate import Candidate
+from ssmppl.gap.candidate import Candidate, shape_text
 from ssmppl.gap.classes import Classes
 from ssmppl.gap.confirm import FreeRun
 from ssmppl.gap.familywise import familywise
 from ssmppl.gap.localise import Group, curve, group_score, localise, regions
+from ssmppl.gap.numerals import label
 from ssmppl.gap.profiles import one_off
 from ssmppl.gap.refit import Refit
 from ssmppl.gap.report import tabulate
@@ -49,8 +50,7 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, G
     bins, own = screen.stacked("basis_bins"), screen.stacked("nuisance_bins")
     rows = []
     for row in table.itertuples():
-        key = row.key
-        p = min(row.p, row.p_alone)
+        key, p = row.key, row.p_either
         stretch = (0, sum(sizes))
         if p <= alpha and len(edges) > 3:
             at = when(
@@ -192,7 +192,7 @@ def causes_table(
     tests, tested = (1, {}) if tested is None else (2, tested)
     by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
     significant = screen.significant
-    times = screen.experiments[0].time
+    times = [e.time for e in screen.experiments]
     rows = []
     for i, k in enumerate(order):
         c, s = screen.question.candidates[k], screen.found
@@ -209,7 +209,7 @@ def causes_table(
             if sided and abs(strength) < least:  # the search runs towards the bound for ever
                 strength, error = 0.0, np.nan
         shaped = own.candidates[0].shape if own is not None else c.shape
-        shape = ", ".join(f"{n} = {v:g}{_when(c, n, v, times)}" for n, v in shaped)
+        shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in shaped)
         p = min(1.0, tests * min(float(significant[k]), tested.get(k, 1.0)))
         rows.append({
             "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
@@ -222,12 +222,13 @@ def causes_table(
     return tabulate("causes", rows)
 
 
-def _when(c: Candidate, shape: str, value: float, times: Any) -> str:
-    """The label of the row that a date is."""
-    if shape != "date" or not one_off(c) or times is None or not 1 <= value <= len(times):
+def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:
+    """The label of the row that a date is, if it is the same in all experiments that reach there;
+    times : of each, None where its rows have none."""
+    if shape != "date" or not one_off(c) or any(t is None for t in times):
         return ""
-    label = times[int(value) - 1]
-    return f" ({label:g})" if isinstance(label, float | np.floating) else f" ({label})"
+    found = {label(t[int(value) - 1]) for t in times if 1 <= value <= len(t)}
+    return f" ({found.pop()})" if len(found) == 1 else ""
 
 
 def classes_table(

@@ -9,33 +9,29 @@ from __future__ import annotations
 import hashlib
 import inspect
 import linecache
-import sys
-import sysconfig
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import ArgumentError, Location
+from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import slug
+from ssmppl.gap.imports import import_lines, imports, nodes_of
 from ssmppl.gap.laws import bounds_of, infinite
 from ssmppl.gap.spelling import Lines
 from ssmppl.gap.terms import parts_of, terms_with
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
 from ssmppl.language.model import Model
-from ssmppl.language.primitive import Primitive
 from ssmppl.language.trace import Site, Trace, symbols
-from ssmppl.language.written import Origin, Written
+from ssmppl.language.written import Written
 
 LINE = 96
-_INSTALLED = [sysconfig.get_path(k) for k in ("stdlib", "purelib", "platlib")]
 INDENT = "    "
-_TAKEN = ("np", "ssm", "special", "sys", "model", "prior", "initial", "transition", "observation",
-          "proposal")  # fmt: skip
+_TAKEN = ("t", "np", "ssm", "special", "sys", "model", "prior", "initial", "transition",
+          "observation", "proposal")  # fmt: skip
 
 
 def model_text(
@@ -78,8 +74,6 @@ def to_model(trace: Trace) -> Model:
 class _Writer:
     def __init__(self, trace: Trace, added: dict[str, Candidate]):
         self.trace, self.added = trace, added
-        self.primitives: dict[str, Primitive] = {}
-        self.laws: dict[str, Origin] = {}
         self.special = False
         sites = [*trace.initial.items(), *trace.parameters.items(), *trace.observations.items()]
         self.quantities: dict[str, Any] = {n: s.value for n, s in sites}
@@ -91,6 +85,9 @@ class _Writer:
                     "for a module",
                     fix="rename it",
                 )
+        roles = ("parameters", "initial", "transition", "observations", "proposal")
+        laws = [s.distribution for role in roles for s in getattr(trace, role).values()]
+        self.imports = imports(laws, {*self.names, *_TAKEN})
 
     def file(self, title: str, notes: Sequence[str]) -> str:
         laws = [self._law("prior", group) for group in self._priors()]
@@ -101,7 +98,10 @@ class _Writer:
         doc = "\n".join([title, *(["", *notes] if notes else [])])
         doc = doc.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
         close = "\n" if notes else ""
-        lines = [f'"""{doc}{close}"""', "", *self._imports(), ""]
+        known = ["import numpy as np"]
+        known += ["from scipy import special"] if self.special else []
+        known += ["", "import ssmppl as ssm"]
+        lines = [f'"""{doc}{close}"""', "", *import_lines(self.imports.values(), known), ""]
         return "\n".join([*lines, f"model = ssm.Model({self._arguments()})", "", "", body, ""])
 
     def _arguments(self) -> str:
@@ -122,7 +122,7 @@ class _Writer:
         groups: list[list[Site]] = []
         current: set[str] = set()
         for site in self.trace.parameters.values():
-            needs = {s.data[1] for s in symbols_of(_nodes(site.distribution))}
+            needs = {s.data[1] for s in symbols_of(nodes_of(site.distribution))}
             if not groups or needs & current:
                 groups.append([])
                 current = set()
@@ -131,14 +131,15 @@ class _Writer:
         return groups
 
     def _law(self, role: str, sites: list[Site]) -> str:
-        roots = [e for s in sites for e in _nodes(s.distribution)]
+        roots = [e for s in sites for e in nodes_of(s.distribution)]
         used = symbols_of(roots)
         wanted = {s.data[1] for s in used}
         known = [*self.trace.initial, *self.trace.observations, *self.trace.inputs,
                  *self.trace.parameters, "t"]  # fmt: skip
         arguments = [n for n in known if n in wanted]
-        lines = Lines(roots, self._arrays(used), {*self.names, *arguments, "np", "ssm", "special"},
-                      self._marks(roots), _wishes(role, sites), self._primitive)  # fmt: skip
+        taken = {*self.names, *arguments, *self.imports, "np", "ssm", "special"}
+        lines = Lines(roots, self._arrays(used), taken, self._marks(roots), _wishes(role, sites),
+                      lambda call: str(call.data.__name__))  # fmt: skip
         entries = []
         for s in sites:
             key = f'"{s.name}": '
@@ -218,96 +219,14 @@ class _Writer:
 
     def _written(self, d: Written, lines: Lines, room: int) -> str:
         """A law of the user's own, its arguments by name."""
-        name = d.origin.name
-        if self.laws.setdefault(name, d.origin) != d.origin or name in {*self.names, *_TAKEN}:
-            raise ArgumentError(
-                f"the model's file would have two things named {name!r}, one of them a law",
-                fix="rename the law",
-                where=d.origin.location,
-            )
         texts = []
         for i, (argument, values) in enumerate(d.parameters.items()):
             wide = bool(d.shape) and i == 0 and all(map(_same, d.parameters.values()))
             texts.append(f"{argument}={lines.array(values, scalar=not wide)}")
-        return _call(name, texts, room)
-
-    # -- what is imported
-    def _primitive(self, node: Expr) -> str:
-        wanted: Primitive = node.data
-        name = wanted.__name__
-        if self.primitives.setdefault(name, wanted).name != wanted.name:
-            raise ArgumentError(
-                f"the model calls two primitives named {name!r}",
-                fix="rename one of them",
-                where=wanted.location,
-            )
-        return name
-
-    def _imports(self) -> list[str]:
-        lines = ["import numpy as np"]
-        lines += ["from scipy import special"] if self.special else []
-        lines += ["", "import ssmppl as ssm"]
-        own, folders = [], []
-        homes = [(n, "primitive", p.location, p.function.__module__, p.function.__qualname__)
-                 for n, p in self.primitives.items()]  # fmt: skip
-        homes += [(n, "distribution", o.location, o.module, o.qualname)
-                  for n, o in self.laws.items()]  # fmt: skip
-        for name, kind, where, inside, path in homes:
-            module, folder = _home(name, kind, where, inside, path)
-            own.append(f"from {module} import {name}")
-            folders += [folder] if folder else []
-        if folders:
-            lines = ["import sys", "", *lines]
-            own = [*(f"sys.path.append({f!r})" for f in dict.fromkeys(folders)),
-                   *(f"{line}  # noqa: E402" for line in own)]  # fmt: skip
-        return [*lines, *([""] if own else []), *own]
-
-
-def _home(name: str, kind: str, where: Location, module: str, path: str) -> tuple[str, str]:
-    """(module, folder) to import a primitive or a distribution from, which has this path in the
-    module; the folder is empty where it is not needed.
-
-    Raises
-    ------
-    ArgumentError : it stands in no file, or inside of a function.
-    """
-    file = Path(where.file)
-    held = getattr(sys.modules.get(module), name, None)
-    if path == name and file.exists() and inspect.isfunction(held):
-        raise ArgumentError(
-            f"the {kind} {name!r} does not stand under that name in its file",
-            fix="decorate its def, which gives it its name",
-            where=where,
-        )
-    if path != name or not file.exists():
-        place = "inside of a function" if file.exists() else f"in {file}, which is no file"
-        raise ArgumentError(
-            f"the {kind} {name!r} is defined {place}: a model file cannot import it",
-            fix="define it at the top level of a Python file",
-            where=where,
-        )
-    file = file.resolve()
-    if any(file.is_relative_to(p) for p in _INSTALLED):
-        return module, ""
-    if "." not in module or module == "__main__":  # a file by itself, whatever it was run as
-        return file.stem, str(file.parent)
-    return module, str(file.parents[module.count(".")])
+        return _call(d.origin.name, texts, room)
 
 
 # -- layout
-def _nodes(d: Distribution) -> list[Expr]:
-    if isinstance(d, Flat):
-        return []
-    if isinstance(d, Mixture):
-        own = [e for w in d.weights for e in w.ravel()]
-        return [*own, *(e for law in d.components for e in _nodes(law))]
-    if isinstance(d, ZeroInflated):
-        return [*_nodes(d.base), *d.p.ravel()]
-    if isinstance(d, Truncated):
-        return [*_nodes(d.base), *(e for a in bounds_of(d).values() for e in a.ravel())]
-    return [e for a in d.parameters.values() for e in array(a).ravel()]
-
-
 def _wishes(role: str, sites: list[Site]) -> dict[Expr, str]:
     """What means would be called if they needed a name: `x_next`, `y_mean`."""
     out = {}

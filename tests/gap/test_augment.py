@@ -16,7 +16,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbol, symbols_of
-from ssmppl.gap.augment import augment, strengths
+from ssmppl.gap.augment import augment
 from ssmppl.gap.candidates import offers
 from ssmppl.gap.effect import Auxiliary, effect
 from ssmppl.gap.laws import NORMAL, heavier, noise_free, scaled, shifted
@@ -26,6 +26,11 @@ from tests.gap import models
 from tests.gap.harness import EVERY, content, nodes, offered, scales, traced
 
 LAWS = ("initial", "transition", "observations")
+
+
+def strengths(candidates):
+    """The symbols of the candidates' strengths."""
+    return [symbol("parameter", c.strength) for c in candidates]
 
 
 def at_zero(t, candidates):

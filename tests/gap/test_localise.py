@@ -65,19 +65,36 @@ def test_level_of_one_group(size):
 @pytest.mark.slow
 @pytest.mark.parametrize("heavy", [False, pytest.param(True, marks=pytest.mark.exhaustive)])
 def test_level_over_groups(heavy):
-    rng, together, alone, each = rng_of("many", heavy), [], [], []
+    rng, together, alone, either, each = rng_of("many", heavy), [], [], [], []
     world = World(rng, [12, 12, 6, 12, 8], heavy)
     for _ in range(1000):
         s, n = world(B + 1)
         table, found = localise(world.groups(s[:B], s[B]), n[:B], n[B])
         together.append(table["p"].min())
         alone.append(table["p_alone"].min())
+        either.append(table["p_either"].min())
         each.append([g.p for g in found.values()])
     for alpha in (0.05, 0.1):
         assert_level(together, alpha)
         assert_level(alone, alpha)
+        assert_level(either, alpha)
         for p in np.transpose(each):
             assert_level(p, alpha)
+
+
+def test_of_two_looks_one_p():
+    """Between the smaller of both and twice that (Bonferroni); of a single group both looks are the
+    same one, and cost nothing."""
+    rng = rng_of("either")
+    world = World(rng, [3, 3])
+    for _ in range(4):
+        s, n = world(B + 1)
+        groups = world.groups(s[:B], s[B])
+        least = localise(groups, n[:B], n[B])[0]
+        smaller = least[["p", "p_alone"]].min().min()
+        assert 0.8 * smaller <= least["p_either"].min() <= 2.5 * smaller
+        one, _ = localise({"a": groups["eq0", "mean"]}, n[:B], n[B])
+        np.testing.assert_array_equal(one["p_either"], one["p"])
 
 
 def test_the_equation_is_told():

@@ -48,16 +48,6 @@ def test_one_set_at_a_time_gives_the_same(scores):
                                series.autoregressive(scores, [0.8], STARTS)[1])  # fmt: skip
 
 
-def test_weighted_sums(scores):
-    _, time = within(STARTS)
-    length = np.diff([*STARTS, ROWS])[np.searchsorted(STARTS, np.arange(ROWS), side="right") - 1]
-    np.testing.assert_allclose(series.drift(scores, STARTS),
-                               np.einsum("t,btk->bk", time / length, scores))  # fmt: skip
-    dates = [0, 5, 59]
-    for i, d in enumerate(dates):
-        np.testing.assert_allclose(series.steps(scores, dates)[..., i], scores[:, d:].sum(axis=1))
-
-
 @pytest.mark.parametrize("starts", [(1,), (0, 60), (0, 5, 5), ()])
 def test_starts_that_make_no_experiments(scores, starts):
     with pytest.raises(ArgumentError, match="experiments that start at rows"):

@@ -14,14 +14,12 @@ from ssmppl.errors import NotApplicable
 from ssmppl.gap.columns import score_columns
 from ssmppl.gap.confirm import stretches
 from ssmppl.gap.fit import Fitter
+from ssmppl.gap.simulator import Simulator
 from ssmppl.gap.smoothing import (
     PREDICTIVE,
     Settings,
     Smoother,
     probability_transforms,
-)
-from ssmppl.gap.smoothing import (
-    simulated as simulated_sets,
 )
 from ssmppl.gap.workshop import proposal_of
 from ssmppl.inference.exact.kalman import KalmanModel
@@ -191,10 +189,10 @@ def test_predictions_of_simulated_data_are_uniform(name):
     model, smoother = smoother_of(name, Settings(500, "bootstrap"), exact=False)
     theta = check_parameters(model, THETA[name])
     given = bind(model, simulated(name, 100))
-    pits = []
+    simulator, pits = Simulator(smoother.program, smoother.missing, None), []
     for r in range(20):
         stream = random_state(seed_sequence(seed_of("pit", name)), r)
-        sets = simulated_sets(smoother.program, given, theta, stream, False)
+        sets = simulator.sets(given, theta, stream)
         passes = smoother.run(sets, theta, stream)
         pits.append(probability_transforms(passes, sets, stream)[0][5::10].ravel())
     assert stats.kstest(np.concatenate(pits), "uniform").pvalue > LEVEL

@@ -6,13 +6,21 @@ import numpy as np
 import pytest
 
 from ssmppl.gap.candidate import Candidate
-from ssmppl.gap.catalogue_motion import periodic_forcing, quadratic_drag, random_walk_load
-from ssmppl.gap.numerals import span
-from ssmppl.gap.tables import _experiments, causes_table
+from ssmppl.gap.catalogue_motion import (
+    level_break,
+    periodic_forcing,
+    quadratic_drag,
+    random_walk_load,
+)
+from ssmppl.gap.localise import localise
+from ssmppl.gap.numerals import label, span
+from ssmppl.gap.tables import _experiments, _when, causes_table, where_table
+from tests.statistics.checks import seed_of
 
 DRAG = Candidate(quadratic_drag, "v", strength="drag")
 LOAD = Candidate(random_walk_load, "v", strength="load")
 WAVE = Candidate(periodic_forcing, "v", (("period", 10.0), ("phase", 0.0)), strength="wave")
+BREAK = Candidate(level_break, "v", (("date", 2.0),), strength="break")
 
 
 def table(candidate, strength, variance, refits=(), *, sided=False, quadratic=False):
@@ -58,6 +66,49 @@ def test_shapes_are_those_of_the_refit():
     found = refitted(WAVE.with_shape(period=9.5, phase=1.0), 0.2, 0.1)
     assert table(WAVE, 0.2, 4.0, [found])["form"] == "period = 9.5, phase = 1"
     assert table(WAVE, 0.2, 4.0)["form"] == "period = 10, phase = 0"
+
+
+@pytest.mark.parametrize(
+    ("times", "text"),
+    [([None], ""), ([None, [7, 8, 9]], ""), ([np.arange(3) + 1.7e9 + 0.5], " (1700000001.5)"),
+     ([[1950, 1951, 1952]], " (1951)"), ([[1950, 1951], [1950]], " (1951)"),
+     ([[1950, 1951], [1960, 1961]], ""),
+     ([np.array(["2024-03-01", "2024-03-02"], dtype="M8[ns]")], " (2024-03-02)")],
+)  # fmt: skip
+def test_a_date_is_told_by_the_calendar_of_its_row(times, text):
+    """Of row 2; where experiments have other calendars there is none to tell it by."""
+    assert _when(BREAK, "date", 2.0, times) == text
+    assert _when(BREAK, "other", 2.0, times) == ""
+    assert _when(BREAK, "date", 9.0, times) == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.7e9 + 2.5, "1700000002.5"), (12345.678, "12345.678"), (0.1 + 0.2, "0.3"), (1999.0, "1999"),
+     (1 / 3, "0.333333"), (-2.5, "-2.5"), (float("nan"), "")],
+)  # fmt: skip
+def test_labels_keep_the_digits_that_tell_rows_apart(value, text):
+    assert label(value) == text
+
+
+def test_the_p_of_where_counts_both_looks():
+    """Each group is looked at alone and beside the others: the smaller of both is no p."""
+    rng = np.random.default_rng(seed_of("where"))
+    keys = [(f"eq{i}", "mean") for i in range(3)]
+    basis, nuisance = rng.standard_normal((101, 6)), rng.standard_normal((101, 2))
+    basis[-1] += 2.0
+    null = {"basis": basis[:-1], "nuisance": nuisance[:-1]}
+    null |= {"basis_bins": np.zeros((100, 1, 6)), "nuisance_bins": np.zeros((100, 1, 2))}
+    terms = [SimpleNamespace(equation=e, moment=m) for e, m in keys for _ in range(2)]
+    screen = SimpleNamespace(
+        observed=SimpleNamespace(basis=basis[-1], nuisance=nuisance[-1]), stacked=null.get,
+        question=SimpleNamespace(terms=terms), experiments=[SimpleNamespace(steps=1, time=None)],
+    )  # fmt: skip
+    table, _ = where_table(screen, alpha=0.0)
+    groups = {k: (basis[:-1, 2 * i : 2 * i + 2], basis[-1, 2 * i : 2 * i + 2])
+              for i, k in enumerate(keys)}  # fmt: skip
+    wanted = localise(groups, nuisance[:-1], nuisance[-1])[0]
+    np.testing.assert_allclose(sorted(table["p"]), sorted(wanted["p_either"]))
 
 
 @pytest.mark.parametrize(

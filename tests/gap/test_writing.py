@@ -164,6 +164,45 @@ def test_primitives_are_imported_from_the_users_file():
     assert_round_trip(t)
 
 
+@ssm.primitive
+def total(v):
+    return 0.1 if v > 0.0 else -0.1
+
+
+@ssm.primitive
+def y_mean(v):
+    return 0.2 if v > 0.0 else -0.2
+
+
+@ssm.primitive
+def x(v):
+    return 0.1 * v
+
+
+def test_locals_do_not_take_the_names_of_what_is_imported():
+    """Sums that are written once are called `total`, and a mean `y_mean`, unless they are taken."""
+
+    def mean(x, z, a, P):
+        s = a * x + np.exp(-x) * a + 3 * np.sin(x)
+        return total(s) + s * y_mean(s)
+
+    t = trace(model_of(mean))
+    assert "total_2 = " in model_text(t)
+    assert "\n    total = " not in model_text(t)
+    assert "y_mean = " not in model_text(t)
+    assert_round_trip(t)
+
+
+def test_two_things_of_one_name_are_refused():
+    call = x
+    with pytest.raises(ArgumentError, match="two things named 'x', one of them a primitive"):
+        model_text(trace(model_of(lambda x, z, a, P: call(x))))
+    named = ssm.primitive(importable.function)
+    named.__name__ = "total"
+    with pytest.raises(ArgumentError, match="two things named 'total'"):
+        model_text(trace(model_of(lambda x, z, a, P: total(x) + named(x))))
+
+
 def test_a_primitive_that_no_file_can_import_is_refused():
     @ssm.primitive
     def local(v):
