@@ -263,3 +263,55 @@ def test_a_sweep_names_the_law_that_is_undefined():
     assert (status, t) == (JOINING + NAN, 1)
     error = sweep_failure(problem, theta, status, t, e)
     assert "the transition density into t=2 is not a number" in str(error)
+
+
+@pytest.mark.parametrize("proposal", ["bootstrap", "guided", "auxiliary"])
+def test_rows_without_data_weigh_nothing_wherever_a_particle_is(proposal):
+    """The residual of what was not measured is infinite: it is left out, not multiplied by 0."""
+    estimates = ssm.log_likelihood(
+        explosive(), {"y": UNSEEN}, {}, particles=1000, repeats=100, proposal=proposal,
+        seed=seed_of("unseen", proposal),
+    )  # fmt: skip
+    ratio = np.exp(estimates - explosive_exact()[0])
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std(ddof=1) / np.sqrt(len(ratio))
+
+
+def test_sweeps_over_rows_without_data():
+    found = ssm.smooth(
+        explosive(), {"y": UNSEEN}, {}, method="pgas", trajectories=50, seed=seed_of("unseen")
+    )
+    assert np.all(np.isfinite(found.x.values))
+
+
+def test_components_without_data_weigh_nothing_wherever_a_particle_is():
+    """A vector of which the measured part stays bounded, the other not; x beyond a grid is one
+    more value, which is never left."""
+    covariance, y = np.array([[0.25, 0.1], [0.1, 1.0]]), np.array([0.2, 0.9, 0.8, 0.7])
+    model = ssm.Model("bounded")
+    model.initial(lambda: {"x": ssm.Normal(0.0, sd=4.0)})
+    model.transition(lambda x: {"x": ssm.Normal(np.exp(x) - 1.0, sd=1.0)})
+    model.observation(
+        lambda x: {"y": ssm.MvNormal(np.stack([np.tanh(x), np.exp(x)]), covariance=covariance)}
+    )
+    x = np.linspace(-30.0, 30.0, 2001)
+    width, tanh = x[1] - x[0], np.append(np.tanh(x), 1.0)
+    law = np.append(stats.norm.pdf(x, 0.0, 4.0) * width, stats.norm.sf(30.0, 0.0, 4.0))
+    with np.errstate(over="ignore"):
+        middle = (np.exp(x) - 1.0)[:, None]
+    move = np.zeros((len(law), len(law)))
+    move[:-1] = np.hstack(
+        [stats.norm.pdf(x[None, :], middle, 1.0) * width, stats.norm.sf(30.0, middle, 1.0)]
+    )
+    move[-1, -1] = 1.0
+    total = 0.0
+    for t, value in enumerate(y):
+        law = (law @ move if t else law) * stats.norm.pdf(value, tanh, 0.5)
+        total += np.log(law.sum())
+        law /= law.sum()
+    data = {"y": np.column_stack([y, np.full(len(y), np.nan)])}
+    estimates = ssm.log_likelihood(
+        model, data, {}, particles=1000, repeats=100, proposal="bootstrap",
+        seed=seed_of("bounded"),
+    )  # fmt: skip
+    ratio = np.exp(estimates - total)
+    assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std(ddof=1) / np.sqrt(len(ratio))
