@@ -38,9 +38,7 @@ class Channel:
 
 def channels(site: Site) -> list[Channel | None]:
     """Of every component; None where its law has no distribution function, or no inverse of it."""
-    law, y = alone(site.distribution), site.value
-    if isinstance(law, Dirichlet):
-        law = _shares(law)
+    law, y = of_components(site.distribution), site.value
     parts = _parts(law)
     joint = law.joint and not isinstance(law, Categorical)
     if joint or not all(map(_inverts, parts)):
@@ -104,6 +102,12 @@ def alone(law: Distribution) -> Distribution:
     found = Normal(law.mean(), variance=law.variance())
     found.location = law.location
     return found
+
+
+def of_components(law: Distribution) -> Distribution:
+    """The law of each component alone, of a law that has them in closed form; any other as it
+    is."""
+    return _shares(law) if isinstance(law, Dirichlet) else alone(law)
 
 
 def _shares(law: Dirichlet) -> Beta:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.errors import Location
-from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, attributed, constant
 from ssmppl.expressions.linear import inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
@@ -102,12 +102,18 @@ def marginal_normal(d: MvNormal, value: ExprArray, masks: ExprArray) -> Expr:
     With m the 0/1 vector of measured components, the marginal law of these is that of m * y
     under covariance (m m') * C + diag(1 - m), less the unit variances of the others.
     """
-    residual = masks * (value - d.mean_)
+    residual = where_measured(masks, value - d.mean_)
     covariance = mask_covariance(d.covariance_matrix(), masks)
     quadratic = residual @ inverse(covariance) @ residual
     return -0.5 * (np.sum(masks) * LOG_2PI + log_determinant(covariance) + quadratic)
 
 
+def where_measured(masks: ExprArray, values: ExprArray) -> ExprArray:
+    """The values where they were measured, else 0; no product, which of an infinite one is NaN."""
+    return array(elementwise("where", masks, values, 0.0))
+
+
 def mask_covariance(covariance: ExprArray, masks: ExprArray) -> ExprArray:
     """(m m') * C + diag(1 - m): unit variance, uncorrelated, where not measured."""
-    return array(np.outer(masks, masks) * covariance + np.diag(array(1.0 - masks)))
+    kept = where_measured(array(np.outer(masks, masks)), covariance)
+    return array(kept + np.diag(array(1.0 - masks)))

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssmppl.analysis.density import Missing, Term, mask_covariance, terms
+from ssmppl.analysis.density import Missing, Term, mask_covariance, terms, where_measured
 from ssmppl.analysis.laplace import NEWTON_STEPS, gaussian_fit
 from ssmppl.analysis.moves import Proposal, Split, bootstrap, draws_of, resolved, split
 from ssmppl.analysis.structure import (
@@ -107,7 +107,8 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         block = split.gaussian
         residual = y - h @ block.mean - d
         if masks is not None:
-            h, residual = array(masks[:, None] * h), masks * residual
+            h = where_measured(array(masks[:, None]), h)
+            residual = where_measured(masks, residual)
             r = mask_covariance(r, masks)
         draw, predictive = _condition(block, h, r, residual, masks)
         return split.complete(draw), predictive

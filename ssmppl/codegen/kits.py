@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssmppl.analysis.channels import channel_draws, observation_draws
+from ssmppl.analysis.channels import channel_draws, observation_draws, of_components
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.structure import deterministic
@@ -23,7 +23,7 @@ from ssmppl.codegen.render import Names, Writer, depends
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
-from ssmppl.language.distributions import Categorical, MvNormal, Normal
+from ssmppl.language.distributions import Categorical
 from ssmppl.language.trace import Site, Trace
 from ssmppl.language.transforms import transforms
 
@@ -187,10 +187,7 @@ def prediction_kit(trace: Trace, layout: Layout, plain: Proposal, drawn: bool = 
 
 def predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
     """(mean, variance, P(Y <= y), P(Y < y)) for every component; nan where there is none."""
-    d = site.distribution
-    y = site.value
-    if isinstance(d, MvNormal):
-        d = Normal(d.mean(), variance=d.variance())
+    d, y = of_components(site.distribution), site.value
     nothing = array(np.full(site.shape, np.nan))
     if d.joint and not isinstance(d, Categorical):
         below = strictly = nothing

@@ -133,12 +133,11 @@ def forward_filter(
     for e, found, prediction, q in zip(
         problem.experiments, each, predictions, inverted, strict=True
     ):
-        x, law = exact.values, found.filtered
-        mean, square = law @ x, np.einsum("tk,ki,kj->tij", law, x, x)
+        law = found.filtered
+        mean, covariance, _ = exact.moments(law)
         run = FilterRun(
-            found.log_increments, np.full(e.steps, np.nan), mean,
-            square - mean[:, :, None] * mean[:, None, :], exact.quantiles(law, levels),
-            prediction, q,
+            found.log_increments, np.full(e.steps, np.nan), mean, covariance,
+            exact.quantiles(law, levels), prediction, q,
         )  # fmt: skip
         dataset = filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess")
         datasets.append(dataset.assign(_probabilities(exact, law, dataset)))

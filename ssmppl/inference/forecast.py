@@ -14,6 +14,9 @@ from ssmppl.counts import check_room
 from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.labels import TIME_ZONES, observes, zone_of
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.posterior_draws import (
@@ -24,6 +27,7 @@ from ssmppl.inference.posterior_draws import (
     states_of,
 )
 from ssmppl.inference.simulation import check_finite, check_samplers, feeds_back
+from ssmppl.language.distributions import MvNormal
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
 from ssmppl.results import time_axes, to_dataset
@@ -144,6 +148,10 @@ def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
                 "with NaN for what was not measured: each row is one step of the model",
                 stacklevel=3,
             )
+    elif np.issubdtype(time.dtype, np.timedelta64):  # NumPy takes these for numbers too
+        gaps = np.diff(time)
+        if len(gaps) and np.all(gaps == gaps[0]):
+            return np.asarray(time[-1] + gaps[0] * count)
     elif np.issubdtype(time.dtype, np.number) and len(time):
         gaps = np.diff(time) if len(time) > 1 else np.ones(1, time.dtype)
         if np.allclose(gaps, gaps[0], rtol=1e-6):
@@ -179,7 +187,9 @@ def _continued(
     states, observed = np.empty((n, steps, d)), np.empty((n, steps, k))
     simulate, observe = program.entry("simulate_on"), program.entry("observe_states")
     seen = np.ones_like(y)
-    unknown = feedback and bool(np.isnan(y[rows - 1]).any())
+    missing = np.isnan(y[rows - 1])
+    unknown = feedback and bool(missing.any())
+    gain = _gain(program.trace, theta, paths[:, -1], u[rows - 1], rows, missing) if unknown else ()
     for r in range(n):
         stream, own = random_state(root, r), y
         if feedback:  # what is drawn is written there, for the transition to read
@@ -188,12 +198,37 @@ def _continued(
             drawn = np.empty((rows, k, 1))
             x = np.ascontiguousarray(paths[r][:, :, None])
             observe(theta[r], own[:rows], seen[:rows], u[:rows], stream, x, drawn)
-            own[rows - 1] = np.where(np.isnan(y[rows - 1]), drawn[-1, :, 0], y[rows - 1])
+            own[rows - 1] = np.where(missing, drawn[-1, :, 0], y[rows - 1])
+            for left, given, k_given in gain:  # Matheron's rule: a joint draw, corrected
+                own[rows - 1, left] += k_given[r] @ (y[rows - 1] - drawn[-1, :, 0])[given]
         x, out = np.empty((steps, d, 1)), np.empty((steps, k, 1))
         last = np.ascontiguousarray(paths[r, -1][:, None])
         simulate(theta[r], own, seen, u, rows, last, stream, x, out, feedback)
         states[r], observed[r] = x[:, :, 0], out[:, :, 0]
     return states, observed
+
+
+def _gain(
+    trace: Trace, theta: np.ndarray, x: np.ndarray, u: np.ndarray, t: int, missing: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each channel jointly Gaussian and measured in part at row t: the missing components (m,),
+    the measured ones (s,), and C_ms C_ss^-1 (n, m, s) for each row of theta (n, P) and x (n, D).
+    Other joint laws are measured as a whole or not at all."""
+    values: dict[Expr, np.ndarray] = {symbol("time", "t"): np.array(float(t))}
+    values |= zip(trace.parameter_symbols, theta.T, strict=True)
+    values |= zip(trace.state_symbols, x.T, strict=True)
+    values |= zip(trace.input_symbols, u, strict=True)
+    place = {s: i for i, s in enumerate(trace.observation_symbols)}
+    out = []
+    for site in trace.observations.values():
+        own = np.array([place[s] for s in site.components])
+        law, gone = site.distribution, missing[own]
+        if isinstance(law, MvNormal) and gone.any() and not gone.all():
+            found = evaluate(array(law.covariance_matrix()), values)
+            found = np.broadcast_to(found.T, (len(theta), len(own), len(own)))  # symmetric
+            cross, spread = found[:, ~gone][:, :, gone], found[:, ~gone][:, :, ~gone]
+            out.append((own[gone], own[~gone], np.linalg.solve(spread, cross).transpose(0, 2, 1)))
+    return out
 
 
 def _which(trace: Trace, posterior: Any, experiment: int | None) -> tuple[str, str]:

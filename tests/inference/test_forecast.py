@@ -80,6 +80,56 @@ def test_a_forecast_has_the_law_of_the_model(feedback, seen):
                 mean, variance = mean - FUTURE[h], variance + R**2
 
 
+SPREADS = {
+    "same": lambda x, a, u: np.array([[1.0, 0.9, 0.3], [0.9, 1.0, 0.2], [0.3, 0.2, 0.5]]),
+    "by state, parameter, input": lambda x, a, u: np.array(  # x = 2 +- 0.3, a = +-A, u = 1
+        [[1.0 + x**2, a * x, 0.0], [a * x, 1.0 + 0.5 * u, 0.4], [0.0, 0.4, 1.0]]
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "measured", [[False, True, True], [True, False, True], [False, True, False]]
+)
+@pytest.mark.parametrize("spread", SPREADS)
+def test_what_is_missing_of_a_vector_is_drawn_given_the_rest(spread, measured):
+    """The transition reads y_T, of which a part was measured: exact given x_T, theta and that."""
+    covariance, measured = SPREADS[spread], np.array(measured)
+    m = ssm.Model("partly", inputs=("u",))
+    m.prior(lambda: {"a": ssm.Uniform(-1, 1)})
+    m.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
+    m.transition(lambda y: {"x": ssm.Normal(y[0] + 2.0 * y[1] - y[2], sd=Q)})
+    m.observation(lambda x, a, u: {
+        "z": ssm.Normal(x, sd=1.0),
+        "y": ssm.MvNormal(np.stack([x, -x, a]), covariance=covariance(x, a, u)),
+    })  # fmt: skip
+    rng = np.random.default_rng(seed_of("partly", spread))
+    x = rng.normal(2.0, 0.3, (CHAINS, DRAWS, ROWS))
+    y = rng.normal(size=(ROWS, 3))
+    y[-1] = np.where(measured, [2.5, -1.0, 0.7], np.nan)
+    idata = to_inference_data(
+        posterior={"a": np.repeat([[A], [-A]], DRAWS, axis=1), "x": x}, over_time={"x"},
+        observed_data={"y": y, "z": np.full(ROWS, np.nan)},
+        constant_data={"u": np.linspace(-1, 1, ROWS)},
+    )  # fmt: skip
+    seed = seed_of("partly", spread, measured)
+    found = ssm.forecast(m, idata, inputs={"u": [0.0]}, seed=seed)["x"].values[:, 0]
+    normal = []
+    for value, last, a in zip(found, x[:, :, -1].ravel(), np.repeat([A, -A], DRAWS), strict=True):
+        c, mean, w = (
+            covariance(last, a, 1.0),
+            np.array([last, -last, a]),
+            np.array([1.0, 2.0, -1.0]),
+        )
+        gain = c[:, measured] @ np.linalg.inv(c[np.ix_(measured, measured)])
+        middle = mean + gain @ (y[-1] - mean)[measured]
+        rest = c - gain @ c[measured]
+        normal.append((value - w @ middle) / np.sqrt(w @ rest @ w + Q**2))
+    normal = np.array(normal)
+    agree(normal, 0.0, 1.0)
+    assert stats.kstest(normal, "norm").pvalue > LEVEL / 12
+
+
 def test_the_same_seed_gives_the_same_draws():
     one, two, other = (
         ssm.forecast(model(), made(), inputs={"u": FUTURE}, seed=s) for s in (1, 1, 2)
@@ -111,6 +161,10 @@ def test_time_goes_on():
     assert after(np.array([1.0, 2.0, 5.0]), 2).tolist() == [4, 5]
     assert after(np.array(["a", "b"]), 2).tolist() == [3, 4]
     assert after(np.array([7]), 1).tolist() == [8]
+    hours = pd.timedelta_range("1h", periods=5, freq="90min").to_numpy()
+    np.testing.assert_array_equal(after(hours[:3], 2), hours[3:])
+    assert after(hours[[0, 1, 3]], 2).tolist() == [4, 5]
+    assert after(hours[:1], 2).tolist() == [2, 3]
     found = ssm.forecast(model(), made(time=np.arange(1990, 1990 + ROWS)), inputs={"u": FUTURE})
     assert found["time"].values.tolist() == list(range(1997, 2002))
 

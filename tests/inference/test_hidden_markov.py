@@ -116,6 +116,30 @@ def test_what_cannot_be_is_said():
         found.smooth(e, np.empty(0))
 
 
+def far(offset):
+    """A switch that is read, and remembered, far from zero."""
+    model = ssm.Model("far")
+    model.initial(lambda: {"z": ssm.Bernoulli(0.5), "level": ssm.Dirac(offset)})
+    model.transition(
+        lambda z, level: {"z": ssm.Bernoulli(0.2 + 0.6 * z), "level": ssm.Dirac(offset + z)}
+    )
+    model.observation(lambda z: {"y": ssm.Normal(offset + z, sd=0.1)})
+    return model
+
+
+def test_moments_far_from_zero_are_those_near_it():
+    y, offset = np.array([0.3, 0.6, np.nan, 0.45]), 1e9
+    near, there = (ssm.smooth(far(o), {"y": o + y}, {}) for o in (0.0, offset))
+    for name in ("z_sd", "level_sd", "covariance", "covariance_previous"):
+        np.testing.assert_allclose(there[name].values, near[name].values, atol=1e-6, err_msg=name)
+    near, there = (ssm.forward_filter(far(o), {"y": o + y}, {}) for o in (0.0, offset))
+    for name in ("y_predicted_sd", "level_sd", "y_pit"):
+        np.testing.assert_allclose(there[name].values, near[name].values, atol=1e-6, err_msg=name)
+    one = near.z_probability.sel(z_value=1.0).values[0] * 0.6 + 0.2  # of the row that follows
+    spread = np.sqrt(0.1**2 + one * (1.0 - one))
+    np.testing.assert_allclose(there.y_predicted_sd.values[0, 1:], spread[:-1], rtol=1e-6)
+
+
 def of(transition, initial=None):
     model = ssm.Model("made")
     model.prior(lambda: {"a": ssm.Normal(0, sd=1)})

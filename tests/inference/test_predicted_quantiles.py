@@ -82,6 +82,24 @@ def test_the_forward_filter_inverts_the_exact_distribution_function():
                 np.testing.assert_allclose(below, LEVELS[j], rtol=1e-10)
 
 
+def test_pit_values_of_shares_are_those_of_their_exact_laws():
+    """What has quantiles has PIT values: the share's own distribution function."""
+    data = data_of_wards()
+    p = predicted_regime(data)
+    each_regime = [
+        np.stack([one.cdf(y) for one, y in zip(laws("share", z), data["share"].T, strict=True)], 1)
+        for z in (0, 1)
+    ]
+    exact = (1 - p)[:, None] * each_regime[0] + p[:, None] * each_regime[1]
+    found = ssm.forward_filter(wards(), data, {}, seed=1)
+    np.testing.assert_allclose(found["share_pit"].values[0], exact, rtol=1e-10)
+    drawn = ssm.particle_filter(
+        wards(), data, {}, particles=4000, proposal="bootstrap", seed=seed_of("shares")
+    )
+    error = 5.0 * 0.5 / np.sqrt(drawn["ess"].values.min())
+    assert np.all(np.abs(drawn["share_pit"].values[0] - exact) < error)
+
+
 def test_quantiles_of_many_data_sets_are_those_of_each():
     """Of two shapes, in turn, one data set twice; one made by inputs of its own."""
     model = ssm.Model("many", inputs=("u",))

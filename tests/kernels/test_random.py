@@ -128,17 +128,6 @@ def test_discrete(case):
     assert p_value_of_mean(centred, law.var(), fourth - law.var() ** 2) > LEVEL
 
 
-def test_categorical():
-    p = np.array([0.0, 0.1, 0.0, 3.0, 1.5, 0.0])
-    state = new_state(7)
-    x = [random.categorical(state, p) for _ in range(5000)]
-    counts = np.bincount(np.array(x, dtype=int), minlength=6)
-    assert (counts[p == 0] == 0).all()
-    keep = p > 0
-    expected = p[keep] / p.sum() * len(x)
-    assert stats.chisquare(counts[keep], expected).pvalue > LEVEL
-
-
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 17, 1000])
 def test_bulk_normals(n):
     state = new_state(1)
@@ -267,10 +256,8 @@ def test_invalid_parameters_give_nan():
         assert np.isnan(random.poisson(state, bad))
         assert np.isnan(random.binomial(state, bad, 0.5))
         assert np.isnan(random.binomial(state, 5.0, bad))
-        assert np.isnan(random.categorical(state, np.array([0.5, bad])))
     assert np.isnan(random.gamma(state, 0.0))
     assert np.isnan(random.binomial(state, 2.5, 0.5))
-    assert np.isnan(random.categorical(state, np.zeros(3)))
 
 
 def test_degenerate_parameters():
@@ -279,6 +266,5 @@ def test_degenerate_parameters():
     assert random.binomial(state, 0.0, 0.5) == 0.0
     assert random.binomial(state, 7.0, 0.0) == 0.0
     assert random.binomial(state, 7.0, 1.0) == 7.0
-    assert random.categorical(state, np.array([0.0, 1e-300, 0.0])) == 1.0
     assert np.isfinite(random.log_gamma_draw(state, 1e-8))
     assert random.gamma(state, 1e300) == pytest.approx(1e300, rel=1e-3)

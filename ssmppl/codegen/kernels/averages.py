@@ -17,11 +17,13 @@ def weighted_statistics(
     None.
     """
     for m in range(paths.shape[0]):
-        if each is None and weights[m] == 0.0:
+        some = weights[m] > 0.0  # else it adds nothing, be it undefined
+        if each is None and not some:
             continue
         statistics(theta, y, seen, u, paths[m], part)
         for i in range(total.shape[0]):
-            total[i] += weights[m] * part[i]
+            if some:
+                total[i] += weights[m] * part[i]
             if each is not None:
                 each[m, i] = part[i]
 

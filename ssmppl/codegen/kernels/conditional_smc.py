@@ -56,6 +56,9 @@ from ssmppl.codegen.kernels.weights import (
     rule_out,
 )
 
+JOINING = 8
+"""Added to a status of the weights by which the reference's ancestor into row t is drawn."""
+
 
 @exact
 def draw_index(w, u):
@@ -76,7 +79,8 @@ def conditional_smc(
     connect, weigh_connected, weigh_observed, weigh_future, sizes, ahead, horizon, eliminated,
     theta, y, seen, u, particles, rng, reference, trajectory, statistics, paths=None, weights=None,
 ):  # fmt: skip
-    """One sweep from `reference` to `trajectory`; returns (status, t).
+    """One sweep from `reference` to `trajectory`; returns (status, t), the status also raised by
+    `JOINING`.
 
     statistics : (2,), written: the share of steps at which the trajectory changed, and the mean
     effective sample size as a share of N. paths, weights : (N, T, D) and (N,), written where given:
@@ -133,7 +137,7 @@ def conditional_smc(
                     add(log_v, part)
                 total, status = relative_weights(log_v, p)
                 if status != OK:
-                    return status, t
+                    return JOINING + status, t
                 keep = draw_relative(p, total, uniform(rng))
             # all others, given that one
             if ahead != NO_LOOK_AHEAD:

@@ -5,7 +5,8 @@ sampling: C. Chib, *Journal of Econometrics* 75 (1996).
 
 Notation: S sequences of T rows, K values; `start` (S or 1, K), `move` (S or 1, T or 1, K, K) with
 move[s, t, i, j] = P(x_t = j | x_{t-1} = i) (row 0 without meaning where there are T), log_g
-(S, T, K) of y_t given x_t. What has one row where there are S or T is the same for all.
+(S, T, K) of y_t given x_t. What has one row where there are S or T is the same for all. From a
+value i that the data rule out the move need not be defined: its probability 0 is no factor of it.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def forward(start, move, log_g, increments, predicted, filtered, stopped):
                 else:
                     total = 0.0
                     for i in range(n):
-                        total += filtered[s, t - 1, i] * move[b, a, i, j]
+                        if filtered[s, t - 1, i] > 0.0:
+                            total += filtered[s, t - 1, i] * move[b, a, i, j]
                     predicted[s, t, j] = total
             top = -np.inf
             for j in range(n):
@@ -78,7 +80,9 @@ def backward(move, predicted, filtered, smoothed, pairs):
             for i in range(n):
                 total = 0.0
                 for j in range(n):
-                    share = filtered[s, t - 1, i] * move[b, a, i, j] * ratio[j]
+                    share = 0.0
+                    if filtered[s, t - 1, i] > 0.0:
+                        share = filtered[s, t - 1, i] * move[b, a, i, j] * ratio[j]
                     total += share
                     if pairs.shape[0]:
                         pairs[s, t, i, j] = share
@@ -100,7 +104,7 @@ def sample_backward(move, filtered, which, uniforms, paths):
             total = 0.0
             for i in range(n):
                 w[i] = filtered[s, t, i]
-                if t < n_steps - 1:
+                if t < n_steps - 1 and w[i] > 0.0:
                     a = t + 1 if move.shape[1] > 1 else 0
                     w[i] *= move[b, a, i, paths[m, t + 1]]
                 total += w[i]

@@ -22,24 +22,8 @@ from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import copy, gather
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.resampling import PADDING, systematic
-from ssmppl.codegen.kernels.weights import ALL_ZERO, OK, normalise
-
-
-@exact
-def forget_nan(log_v):
-    """log_v = -inf where it is NaN."""
-    for i in range(log_v.size):
-        if log_v[i] != log_v[i]:
-            log_v[i] = -np.inf
-
-
-@exact
-def weighted_mean(values, w):
-    """Sum of w * values."""
-    total = 0.0
-    for i in range(values.size):
-        total += w[i] * values[i]
-    return total
+from ssmppl.codegen.kernels.summaries import weighted_mean
+from ssmppl.codegen.kernels.weights import ALL_ZERO, OK, normalise, rule_out
 
 
 @exact
@@ -79,7 +63,7 @@ def iterated_filter(
         else:
             draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
             weigh(theta, c, s, x_prev, fits, x, log_v)
-        forget_nan(log_v)
+        rule_out(log_v)
         log_sum, _, status = normalise(log_v, w)
         if status == ALL_ZERO:
             for i in range(n):

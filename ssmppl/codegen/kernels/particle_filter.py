@@ -23,7 +23,7 @@ from ssmppl.codegen.kernels.flags import exact, kernel
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.resampling import PADDING, resample, systematic
 from ssmppl.codegen.kernels.summaries import summarise
-from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise
+from ssmppl.codegen.kernels.weights import ALL_ZERO, NAN, OK, normalise, rule_out
 
 NO_LOOK_AHEAD, APPROXIMATE, EXACT, GUIDED = 0, 1, 2, 3
 # Resampling by a look-ahead that is too sharp would leave unbounded weights: with this share of
@@ -57,9 +57,11 @@ def count(ancestors):
 
 @kernel
 def add(log_v, log_base):
-    """log_v += log_base."""
+    """log_v += log_base. What one of them rules out stays so where the other is undefined: a
+    particle of weight zero may lie where the laws have no density, and is never chosen."""
     for i in range(log_v.size):
-        log_v[i] += log_base[i]
+        a, b = log_v[i], log_base[i]
+        log_v[i] = -np.inf if (a == -np.inf) | (b == -np.inf) else a + b
 
 
 @kernel
@@ -103,16 +105,15 @@ def look_ahead_weights(log_v, w, log_base, ahead, p):
     """p <- what to resample by: the weights w times the look-ahead values exp(log_v).
 
     Returns (effective size of p, status). log_v and log_base (N,) are overwritten. A look-ahead
-    that is no number rules its particle out where that cannot bias anything: the particle has no
-    weight, or a share of the plain weights is mixed in. Where nothing is left to go by, p = w.
+    that is no number rules its particle out where that cannot bias anything, as a share of the
+    plain weights is mixed in. Where nothing is left to go by, p = w.
     """
     take_log(w, log_base)
     add(log_v, log_base)
     _, size, status = normalise(log_v, p)
     if status == NAN:
-        for i in range(log_v.size):
-            if log_v[i] != log_v[i] and (w[i] == 0.0 or ahead != EXACT):
-                log_v[i] = -np.inf
+        if ahead != EXACT:
+            rule_out(log_v)
         _, size, status = normalise(log_v, p)
         if status == NAN and any_finite(log_v):
             return 0.0, status

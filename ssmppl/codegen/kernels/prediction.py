@@ -6,7 +6,27 @@ import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
-from ssmppl.codegen.kernels.summaries import weighted_mean, weighted_quantiles
+from ssmppl.codegen.kernels.summaries import (
+    weighted_mean,
+    weighted_product,
+    weighted_quantiles,
+)
+
+
+@exact
+def mix_channels(told, w, out):
+    """out (4, K) : mean, variance, P(Y <= y), P(Y < y) of each channel, over particles w : (N,).
+
+    told : (4 K, N), the same given each particle.
+    """
+    for k in range(out.shape[1]):
+        middles = told[4 * k]
+        out[0, k] = weighted_mean(middles, w)
+        between = weighted_product(middles, out[0, k], middles, out[0, k], w)
+        out[1, k] = weighted_mean(told[4 * k + 1], w) + between
+        for row in range(2, 4):
+            below = weighted_mean(told[4 * k + row], w)
+            out[row, k] = 1.0 if below > 1.0 else below  # weights sum to 1 + rounding
 
 
 @exact
@@ -36,16 +56,7 @@ def predict_step(
         draw(theta, c, s, x_prev, x, normals, uniforms, rng)
         w = w_prev
     moments(theta, c, s, x, out)
-    for k in range(n_channels):
-        mean = weighted_mean(out[4 * k], w)
-        square = 0.0
-        for i in range(n):
-            square += w[i] * (out[4 * k, i] - mean) ** 2
-        prediction[t, 0, k] = mean
-        prediction[t, 1, k] = weighted_mean(out[4 * k + 1], w) + square
-        for row in range(2, 4):
-            below = weighted_mean(out[4 * k + row], w)
-            prediction[t, row, k] = 1.0 if below > 1.0 else below  # weights sum to 1 + rounding
+    mix_channels(out, w, prediction[t])
     if levels.size > 0:
         normals, uniforms = np.empty(sizes[6] * n), np.empty(sizes[7] * n)
         fill_normal(stream, normals)

@@ -312,27 +312,3 @@ def vonmises(state, concentration):
         if c * (2.0 - c) > u or log(c / u) + 1.0 - c >= 0.0:
             angle = np.arccos(min(max(f, -1.0), 1.0))
             return angle if uniform(state) < 0.5 else -angle
-
-
-@exact
-def categorical(state, p):
-    """An index, as float64, with probabilities in proportion to p, shape (n,).
-
-    NaN unless every p_i >= 0 and their sum is positive and finite.
-    """
-    total = 0.0
-    for i in range(p.size):
-        if not (p[i] >= 0.0):
-            return np.nan
-        total += p[i]
-    if not (0.0 < total < np.inf):
-        return np.nan
-    left = total * uniform(state)
-    chosen = 0
-    for i in range(p.size):
-        if p[i] > 0.0:
-            chosen = i
-            left -= p[i]
-            if left < 0.0:
-                break
-    return float(chosen)

@@ -17,6 +17,7 @@ import numpy as np
 from ssmppl.codegen.kernels.filter_with_score import carry_back
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.particle_filter import copy, gather
+from ssmppl.codegen.kernels.prediction import mix_channels
 from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
 
 
@@ -94,14 +95,7 @@ def row_predictions(
             draw(theta, c, s, particles[t - 1], x, normals, uniforms, rng)
             copy(weights[t - 1], w)
         moments(theta, c, s, x, told)
-        for k in range(y.shape[1]):
-            for j in range(4):
-                out[t, j, k] = 0.0
-            for i in range(n):
-                for j in range(4):
-                    out[t, j, k] += w[i] * told[4 * k + j, i]
-                out[t, 1, k] += w[i] * told[4 * k, i] ** 2
-            out[t, 1, k] -= out[t, 0, k] ** 2
+        mix_channels(told, w, out[t])
 
 
 @exact

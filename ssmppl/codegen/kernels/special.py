@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from ssmppl.codegen.kernels.elementary import exp, expm1, log, log1p
+from ssmppl.codegen.kernels.elementary import exp, log, log1p
 from ssmppl.codegen.kernels.flags import exact
 
 _INF = np.inf
@@ -118,24 +118,6 @@ def i0e(x):
 def i1e(x):
     """exp(-|x|) I_1(x)."""
     return math.copysign(_bessel_i(1, abs(x)), x)
-
-
-@exact
-def logaddexp(a, b):
-    """log(e^a + e^b)."""
-    if a == b:
-        return a + 0.6931471805599453  # also for two infinities
-    top = max(a, b)
-    return top + log1p(exp(-abs(a - b)))
-
-
-@exact
-def log_diff_exp(a, b):
-    """log(e^a - e^b) for a >= b, NaN if a < b.  With t = a - b: a + log(1 - e^-t)."""
-    if b == -_INF:
-        return a
-    t = a - b
-    return a + (log(-expm1(-t)) if t < 0.6931471805599453 else log1p(-exp(-t)))
 
 
 @exact

@@ -1,4 +1,7 @@
-"""Weighted means, covariances and quantiles of particles."""
+"""Weighted means, covariances and quantiles of particles.
+
+A particle without weight counts for nothing, be its values infinite or undefined.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,8 @@ def weighted_mean(values, w):
     """sum_i w_i values_i, weights normalised."""
     total = 0.0
     for i in range(w.size):
-        total += w[i] * values[i]
+        share, value = w[i], values[i]
+        total += share * value if share > 0.0 else 0.0
     return total
 
 
@@ -21,7 +25,8 @@ def weighted_product(a, mean_a, b, mean_b, w):
     """sum_i w_i (a_i - mean_a) (b_i - mean_b)."""
     total = 0.0
     for i in range(w.size):
-        total += w[i] * (a[i] - mean_a) * (b[i] - mean_b)
+        share, product = w[i], (a[i] - mean_a) * (b[i] - mean_b)
+        total += share * product if share > 0.0 else 0.0
     return total
 
 

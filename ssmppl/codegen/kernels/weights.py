@@ -52,7 +52,8 @@ def largest(values):
 @exact
 def rule_out(log_v):
     """-inf in place of NaN: for states that no filter has drawn, but a path recomputed from another
-    ancestor leads to. Where they lead a law out of its range, that path is impossible."""
+    ancestor leads to, and for parameters that walk. What leads a law out of its range there is
+    impossible."""
     for i in range(log_v.size):
         if log_v[i] != log_v[i]:
             log_v[i] = -_INF

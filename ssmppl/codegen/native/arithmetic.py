@@ -8,12 +8,6 @@ from dataclasses import dataclass
 
 from ssmppl.errors import SSMError
 
-PLANES = frozenset(
-    ["y_data", "seen_data", "u_data", "states", "states_prev", "fits", "out"]
-)  # two-dimensional arrays; all others have one axis
-WHOLE = frozenset(["t"])  # parameters that are whole numbers
-STREAMS = frozenset(["rng"])  # of unsigned words, for draws
-
 FLOAT, BOOLEAN, INTEGER, ROW, PLANE, STREAM = "float", "boolean", "integer", "row", "plane", "rng"
 COMPARISONS = {ast.Lt: "olt", ast.LtE: "ole", ast.Gt: "ogt", ast.GtE: "oge", ast.Eq: "oeq",
                ast.NotEq: "une"}  # fmt: skip

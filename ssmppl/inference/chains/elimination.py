@@ -35,7 +35,7 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, ThetaValues
-from ssmppl.inference.particles.filtering import failure
+from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.problem import Problem
 
 WORTH = 20.0  # rows of what the warmup found, in the base of the first row
@@ -134,7 +134,7 @@ class Eliminating(ParameterSteps):
         run = module.conditional_smc_eliminated
         status, t = run(theta, e.y, e.seen, u, self.particles, stream, reference, new, own)
         if status != OK:
-            raise failure(self.problem, theta, status, t, e)
+            raise sweep_failure(self.problem, theta, status, t, e)
         out, total = np.ascontiguousarray(new[:, :d]), rows.total
         total[carried] = new[-1, d:]
         own[0] = np.mean(np.any(out != path, axis=1))

@@ -28,6 +28,7 @@ from ssmppl.inference.chains.sampling import Sampler, Setup
 from ssmppl.inference.chains.update_rates import Watch
 from ssmppl.inference.draws import Block
 from ssmppl.inference.methods import PGAS
+from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.problem import Problem
@@ -231,7 +232,7 @@ def _trajectories(
         new, own = np.empty_like(paths[i]), np.empty(2)
         status, t = run(theta, e.y, e.seen, e.u, settings.particles, stream, paths[i], new, own)
         if status != OK:
-            raise failure(problem, theta, status, t, e)
+            raise sweep_failure(problem, theta, status, t, e)
         paths[i] = new
         figures += own / len(paths)
     return float(figures[0]), float(figures[1])

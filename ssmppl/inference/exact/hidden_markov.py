@@ -129,16 +129,17 @@ class HiddenMarkov(FiniteLaws):
         return _in_order(out)
 
     def _moments(self, law: np.ndarray, pairs: np.ndarray, value: float) -> SmoothedMoments:
-        x = self.values
-        mean = law @ x
-        square = np.einsum("tk,ki,kj->tij", law, x, x)
-        product = np.einsum("tab,bi,aj->tij", pairs, x, x)
-        before = np.concatenate([mean[:1], mean[:-1]])
-        cross = product - mean[:, :, None] * before[:, None, :]
-        cross[0] = 0.0
-        return SmoothedMoments(
-            mean, square - mean[:, :, None] * mean[:, None, :], cross, value
-        )  # fmt: skip
+        mean, covariance, away = self.moments(law)
+        cross = np.zeros_like(covariance)
+        cross[1:] = _outer(away[1:], pairs[1:].transpose(0, 2, 1) @ away[:-1])
+        return SmoothedMoments(mean, covariance, cross, value)
+
+    def moments(self, law: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Means (T, D) and covariances (T, D, D) by laws (T, K) of the combinations, and what these
+        are away from the means (T, K, D): far from zero, squares of x would differ by rounding."""
+        mean = law @ self.values
+        away = self.values - mean[:, None, :]
+        return mean, _outer(away, law[:, :, None] * away), away
 
     def draw(
         self, experiment: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 1
@@ -196,13 +197,14 @@ class HiddenMarkov(FiniteLaws):
             out = []
             for site in self.trace.observations.values():
                 for figures in predictive(site):
-                    mean, variance, below, strictly = (
-                        self.over_values(f, h, theta, "observation") for f in figures
+                    mean, variance, below, strictly = (  # undefined where there is no weight
+                        np.where(law > 0.0, self.over_values(f, h, theta, "observation"), 0.0)
+                        for f in figures
                     )
                     middle = np.sum(law * mean, axis=2)
-                    square = np.sum(law * (variance + mean**2), axis=2)
+                    spread = np.sum(law * (variance + (mean - middle[..., None]) ** 2), axis=2)
                     shares = [np.sum(law * b, axis=2) for b in (below, strictly)]
-                    out.append(np.stack([middle, square - middle**2, *shares], axis=2))
+                    out.append(np.stack([middle, spread, *shares], axis=2))
             each.append((h, list(np.stack(out, axis=3))))
         return _in_order(each)
 
@@ -314,6 +316,11 @@ class HiddenMarkov(FiniteLaws):
         law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
         exact_entry("finite_backward")(found.move, found.predicted, found.filtered, law, both)
         return law, both
+
+
+def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(T, D, D) sums over K of products of a and b (T, K, D)."""
+    return a.transpose(0, 2, 1) @ b
 
 
 T = TypeVar("T")

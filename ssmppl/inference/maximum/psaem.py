@@ -37,7 +37,8 @@ from ssmppl.inference.draws import Block
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods import PSAEM
-from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state
+from ssmppl.inference.particles.backward import sweep_failure
+from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.singular import need_density
 
 
@@ -155,7 +156,7 @@ def averaged_sweep(
             theta, e.y, e.seen, e.u, n, stream, path, drawn, figures, all_paths, w
         )  # fmt: skip
         if status != OK:
-            raise failure(problem, theta, status, t, e)
+            raise sweep_failure(problem, theta, status, t, e)
         every.append(all_paths)
         weights.append(w)
         new.append(drawn)

@@ -22,8 +22,9 @@ import numpy as np
 from ssmppl.analysis.heights import transition_height
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
+from ssmppl.codegen.kernels.conditional_smc import JOINING
 from ssmppl.codegen.kernels.random import fill_uniform
-from ssmppl.codegen.kernels.weights import OK
+from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, OK
 from ssmppl.counts import check_count
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
@@ -213,6 +214,15 @@ def draw_particles(weights: np.ndarray, draws: int, stream: np.ndarray) -> np.nd
     return np.searchsorted(cumulative, uniforms * cumulative[-1], side="right")
 
 
+def sweep_failure(
+    problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
+) -> SamplingError:
+    """The error of a conditional particle filter that stopped at step t (from 0)."""
+    if status >= JOINING:
+        return pair_failure(problem, theta, status - JOINING, t - 1, experiment)
+    return failure(problem, theta, status, t, experiment)
+
+
 def pair_failure(
     problem: Problem, theta: np.ndarray, status: int, t: int, experiment: Experiment
 ) -> SamplingError:
@@ -221,7 +231,11 @@ def pair_failure(
     site = next(iter(problem.trace.transition.values()))
     what = "is not a number for some particle"
     fix = "some parameter, state or input leads outside the domain of an operation"
-    if status == ABOVE_BOUND:
+    if status == ALL_ZERO:
+        what, fix = "is zero from every particle", "use more particles"
+    elif status == INFINITE:
+        what = "is infinite for some particle"
+    elif status == ABOVE_BOUND:
         what = "lies above the bound that was derived for it"
         fix = 'a fault of ssmppl: use kernel="exact", and report the model'
     return SamplingError(

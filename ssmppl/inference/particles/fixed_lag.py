@@ -41,16 +41,17 @@ def lag_moments(system: ParticleSystem, lag: int, levels: np.ndarray) -> LagMome
         index = np.arange(n)
         for later in range(last, t, -1):
             index = system.ancestors[later, index]
-        w = system.weights[last]
+        kept = system.weights[last] > 0.0  # the others may be anywhere
+        index, w = index[kept], system.weights[last][kept]
         x = system.particles[t][:, index]
         out.mean[t] = x @ w
         z = x - out.mean[t][:, None]
         out.covariance[t] = (z * w) @ z.T
-        out.distinct[t] = len(np.unique(index[w > 0]))
+        out.distinct[t] = len(np.unique(index))
         for k in range(d):
             order = np.argsort(x[k])
             at = np.searchsorted(np.cumsum(w[order]), levels)
-            out.quantiles[t, :, k] = x[k, order[np.minimum(at, n - 1)]]
+            out.quantiles[t, :, k] = x[k, order[np.minimum(at, len(w) - 1)]]
         if t > 0:
             before = system.particles[t - 1][:, system.ancestors[t, index]]
             z_before = before - (before @ w)[:, None]

@@ -123,7 +123,7 @@ def _summarise(
             own[i] = particles[t, j]
         own[z] = m
         summarise(own, w, np.empty(0), out.mean[t], out.covariance[t], np.empty((0, size)))
-        out.covariance[t][np.ix_(z, z)] += v @ w
+        out.covariance[t][np.ix_(z, z)] += np.where(w > 0.0, v, 0.0) @ w
         if len(probabilities):
             normals = np.empty(m.size)
             fill_normal(rng, normals)

@@ -13,6 +13,8 @@ given it by the Kalman filter's backward sampler, and so owes nothing to the par
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ssmppl.analysis.density import Term, terms
@@ -40,6 +42,8 @@ from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import previous
 
 MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time
+WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore"}
+"""Particles without weight may lie where the laws are infinite or undefined."""
 NEGLIGIBLE = 1e-12  # of a variance, what rounding leaves of it
 
 
@@ -108,11 +112,13 @@ def backward_pass(
         x = paths[:, t + 1].T
         uniforms, chosen = np.empty(trajectories), np.empty(trajectories, dtype=np.int64)
         fill_uniform(stream, uniforms)
-        step = law.step(t)
+        with np.errstate(**WITHOUT_WEIGHT):
+            step = law.step(t)
         width = max(1, MOST_PAIRS // n)
         for first in range(0, trajectories, width):
             part = slice(first, min(first + width, trajectories))
-            log_w = step.log_weights(x[:, part], z[:, part])
+            with np.errstate(**WITHOUT_WEIGHT):
+                log_w = step.log_weights(x[:, part], z[:, part])
             if not np.all(np.isfinite(log_w.max(axis=0))):
                 raise pair_failure(problem, theta, NAN, t, experiment)
             chosen[part] = _drawn_indices(log_w, uniforms[part])
@@ -177,8 +183,7 @@ class _Law:
         cross = np.einsum("ijn,kjn->ikn", covariance, a)  # of z_t with (coupled x, z)_{t+1}
         spread = np.einsum("ijn,jkn->ikn", a, cross) + q
         predicted = np.einsum("ijn,jn->in", a, mean) + b
-        with np.errstate(divide="ignore"):
-            log_w = np.log(self.system.weights[t])
+        log_w = np.log(self.system.weights[t])
         return _Step(self, values, log_w, mean, covariance, cross, predicted, spread)
 
 
@@ -216,10 +221,9 @@ class _Step:
             values = dict(self.values)
             for i, s in enumerate(self.law.found.trace.state_symbols):
                 values[s] = x[i]
-            with np.errstate(divide="ignore"):
-                for found in evaluate([t.log_density for t in self.law.free], values):
-                    total += found
-        return total
+            for found in evaluate([t.log_density for t in self.law.free], values):
+                total += found
+        return np.where(self.log_w[:, None] == -np.inf, -np.inf, total)
 
     def draw(
         self, x: np.ndarray, z: np.ndarray, chosen: np.ndarray, stream: np.ndarray
