@@ -66,9 +66,20 @@ class Results:
         return self.attribution.chosen if self.attribution else None
 
     @property
+    def names(self) -> list[str]:
+        """Labels of the chosen effects."""
+        offered = self.screen.question.candidates
+        return labels(self.chosen.candidates, offered) if self.chosen else []
+
+    @property
     def label(self) -> str:
         """Of what the share that is closed is about."""
-        return " + ".join(labels(self.chosen.candidates)) if self.chosen else CURVES
+        return " + ".join(self.names) if self.chosen else CURVES
+
+    @property
+    def tested(self) -> dict[int, float] | None:
+        """p of the refits that were tested themselves, by column; None if none was to be."""
+        return self.attribution.p if self.attribution else None
 
     def classes(self) -> tuple[list[int], Classes]:
         """The leading shapes of all groups, best first, and their classes."""
@@ -101,21 +112,21 @@ def answer(r: Results, seconds: float) -> GapReport:
         values = _estimates(r.chosen.fitter, r.chosen.fit)
         own = augment(r.trace, list(r.chosen.candidates)).parameter_symbols
         estimates["after"] = {repr(s): values[repr(s)] for s in own}
-        augmented, text = _written(r.trace, r.chosen, notes)
+        augmented, text = _written(r.trace, r.chosen, r.names, notes)
     free = tabulate("free_run")
     if runs is not None:
         channels = [repr(s) for s in r.trace.observation_symbols]
         free = tables.run_table(r.experiments, channels, *runs)
+    causes = tables.causes_table(screen, r.refits, found, order, r.tested)
     return GapReport(
         verdict=verdict, where=where,
-        causes=tables.causes_table(
-            screen, r.refits, found, order, r.attribution.p if r.attribution else None
-        ),
+        causes=causes,
         classes=tables.classes_table(screen, found, order, r.separating),
         closed=share, detection=_detection(screen), residual_map=tables.map_table(screen),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
         model=augmented, model_text=text,
-        chosen=labels(r.chosen.candidates) if text and r.chosen else [], estimates=estimates,
+        chosen=r.names if text else [], estimates=estimates,
+        leading=_leading(r, order, found) if text else [],
         parts=_parts(r), notes=notes,
         settings={**r.settings, "candidates": len(set(screen.groups.tolist())),
                   "shapes": len(screen.question.candidates),
@@ -124,11 +135,25 @@ def answer(r: Results, seconds: float) -> GapReport:
     )  # fmt: skip
 
 
-def labels(candidates: Sequence[Candidate]) -> list[str]:
-    """Names of effects, with their equations where one name comes twice."""
-    names = [c.effect.name for c in candidates]
-    return [n if names.count(n) == 1 else f"{n} on {c.equation}"
-            for n, c in zip(names, candidates, strict=True)]  # fmt: skip
+def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> list[str]:
+    """Names of effects, with their equations where one of that name is offered for several."""
+    places: dict[str, set[str]] = {}
+    for c in (*offered, *candidates):
+        places.setdefault(c.effect.name, set()).add(c.equation)
+    return [c.effect.name if len(places[c.effect.name]) == 1
+            else f"{c.effect.name} on {c.equation}" for c in candidates]  # fmt: skip
+
+
+def _leading(r: Results, order: Sequence[int], found: Classes) -> list[dict[str, Any]]:
+    """The chosen effects: their rows in `causes`, and what the model with all of them says."""
+    chosen, offered = r.chosen, r.screen.question.candidates
+    assert chosen is not None
+    rows = [[offered[k].group for k in order].index(c.group) for c in chosen.candidates]
+    each = [Refit((order[i],), (c,), chosen.fitter, chosen.fit, chosen.gain)
+            for i, c in zip(rows, chosen.candidates, strict=True)]  # fmt: skip
+    told = tables.causes_table(r.screen, each, found, order, r.tested)
+    own = told[["form", "sign", "estimate", "se"]].to_dict("records")
+    return [{"row": i, **own[i]} for i in rows]
 
 
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
@@ -175,13 +200,15 @@ def _detection(screen: Screen) -> Any:
     )  # fmt: skip
 
 
-def _written(trace: Trace, chosen: Refit, notes: list[str]) -> tuple[Model | None, str]:
+def _written(
+    trace: Trace, chosen: Refit, names: Sequence[str], notes: list[str]
+) -> tuple[Model | None, str]:
     try:
         added = augment(trace, list(chosen.candidates))
         values = {n: v for n, v in chosen.fit.values().items() if n.split("[")[0] in
                   added.parameters}  # fmt: skip
         text = model_text(
-            added, title=f"{trace.name} with {' and '.join(labels(chosen.candidates))}",
+            added, title=f"{trace.name} with {' and '.join(names)}",
             notes=["Fitted values:", *(f"{n} = {v:.6g}" for n, v in values.items())],
         )  # fmt: skip
         return to_model(added), text

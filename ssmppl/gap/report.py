@@ -102,7 +102,9 @@ class GapReport:
     model, model_text : the model with the chosen effects added, and its file; None and "" if
         nothing was chosen.
     chosen : labels of the chosen effects: the effect's name, or "<effect> on <equation>" where
-        one effect is chosen for two equations.
+        that effect was tried on several equations.
+    leading : for each effect that the verdict names, its `row` in `causes`, and form, sign,
+        estimate and se in the model with all of them.
     estimates : {"before": {parameter: (value, standard error)}, "after": ...}; error 0 if fixed.
     parts : {"screen": (first, last), "confirm": ...}, row labels, or
         {"cross-fitting": number of blocks}; any further entry is text.
@@ -126,6 +128,7 @@ class GapReport:
     model: Model | None = None
     model_text: str = ""
     chosen: list[str] = field(default_factory=list)
+    leading: list[dict[str, Any]] = field(default_factory=list)
     estimates: dict[str, dict[str, tuple[Any, Any]]] = field(default_factory=dict)
     parts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

@@ -190,7 +190,8 @@ def which(report: GapReport) -> list[str]:
         gain = next((g for g in gains if is_number(g)), None)
         if gain is not None:
             by = "" if is_number(gains[0]) else "predicted "
-            text += f"; {by}gain {number(gain, 2)} nats, {p_text(row.get('p'))}"
+            alone = " by itself" * (len(found) > 1)
+            text += f"; {by}gain {number(gain, 2)} nats{alone}, {p_text(row.get('p'))}"
         out.append(sentence(text))
         others = rivals(report, row)
         if others:
