@@ -1,6 +1,7 @@
 """The report names the effects that were chosen, on their equations and with their strengths."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from ssmppl.gap.answer import Results, answer, labels
 from ssmppl.gap.attribute import Attribution
 from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.naming import leaders
+from ssmppl.gap.parts import GAP, head, three_parts
 from ssmppl.gap.printed import cause_rows
 from ssmppl.gap.refit import refit, refit_all
 from ssmppl.gap.scales import Scales
 from ssmppl.gap.screen import Question, ask
+from ssmppl.gap.share import HowFar
 from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.words import headline, which
+from ssmppl.gap.words import headline, how_far, how_sure, which
 from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import missing_of, pose
@@ -101,6 +104,70 @@ def test_the_report_names_what_was_chosen_where_it_was_chosen(loaded):
     marked = {line[0] for line in cause_rows(report) if line[0].startswith("→")}
     assert marked == {"→ constant load in v1", "→ sensor bias of y2"}
     assert "constant load on v1 and sensor bias on y2" in report.model_text.splitlines()[0]
+
+
+@pytest.mark.slow
+def test_what_stands_out_and_could_not_be_fitted_is_named(loaded):
+    """Nothing else in its place: the gap is there, and is not measured."""
+    (load,) = [k for k, c in enumerate(loaded.screen.question.candidates)
+               if (c.effect.name, c.equation) == ("constant load", "v1")]  # fmt: skip
+    rest = [r for r in loaded.refits if r.index != (load,)]
+    found = Attribution(loaded.fit, rest, unfitted=load, notes=["not refitted: it failed"])
+    report = answer(dataclasses.replace(loaded, attribution=found), 1.0)
+    assert report.verdict == "effect"
+    assert report.model is None
+    assert [(r["effect"], r["equation"]) for r in leaders(report)] == [("constant load", "v1")]
+    text = headline(report)
+    assert "the screen says that the model “pair” lacks constant load in v1 (p" in text.lower()
+    assert "could not be fitted" in text
+    assert how_far(report) == ["Not measured: the effect could not be fitted."]
+    assert "confirm" not in report.parts
+    assert "predicted gain" in which(report)[0]
+
+
+@pytest.mark.slow
+def test_the_p_of_a_screen_at_another_fit_is_not_told(loaded):
+    """Of a model that a refit led to a better fit of: only what refits were tested for is known."""
+    base = answer(loaded, 1.0).causes
+    tested = {loaded.refits[0].index[0]: 0.3}
+    found = Attribution(loaded.fit, loaded.refits, p=tested, rebased=True)
+    report = answer(dataclasses.replace(loaded, attribution=found), 1.0)
+    assert base["p"].min() < 0.001
+    assert report.causes["p"].iloc[0] == pytest.approx(0.6)  # the larger of two tests
+    assert report.causes["p"].iloc[1:].isna().all()
+    assert report.verdict == "no measurable gap"
+    assert "stands out from chance" in headline(report)
+    assert "p = 0.60" in headline(report)
+
+
+@pytest.mark.slow
+def test_parts_tell_the_rows_that_were_measured(loaded):
+    """From the first that counts, of the longest experiment, and only where something was."""
+    e = loaded.experiments[0]
+    two = (head(e, 20), e)
+    parts = three_parts(two)
+    results = dataclasses.replace(loaded, experiments=two, parts=parts)
+    report = answer(results, 1.0)
+    assert report.parts == {"screen": (1, 84)}
+    assert "How far the gap closes has not been measured." in headline(report)
+    assert "took no part" not in str(report)
+    run = SimpleNamespace(mean=e.y, low=e.y, high=e.y)
+    short = SimpleNamespace(mean=e.y[:20], low=e.y[:20], high=e.y[:20])
+    row = {"effect": "x", "F": 0.9, "F_low": 0.8, "F_high": 1.0, "nats_per_sample": 0.1}
+    far = HowFar([row], None, [short, run])
+    report = answer(dataclasses.replace(results, far=far), 1.0)
+    first = int(np.flatnonzero(parts.confirm[1])[0]) + 1
+    assert report.parts == {"screen": (1, 84), "confirm": (first, 120)}
+    assert first == 84 + GAP + 1
+    assert f"t = {first} to 120 of experiment 2, and likewise of the others" in how_far(report)[0]
+    assert "t = 1 to 84 of experiment 2" in how_sure(report)[0]
+    assert "Likewise of the other experiments. No row served twice." in how_sure(report)[0]
+    results.attribution.left_out = True
+    report = answer(dataclasses.replace(results, far=far), 1.0)
+    results.attribution.left_out = False
+    assert "No row served twice" not in str(report)
+    assert "took no part" not in str(report)
+    assert "decided on held-out rows" in " ".join(how_sure(report))
 
 
 def test_an_effect_offered_once_needs_no_equation(loaded):

@@ -125,7 +125,9 @@ def test_what_is_simulated_starts_where_the_data_do():
     exact = on_a_grid(data, DRAG)[1]
     found = FirstStates(fitter.smoother)(experiments[0], theta)
     assert abs(found[0] - exact) < 4.0 * VALUES["r"] / np.sqrt(100)
-    drawn = fitter.simulator.observations(experiments[0], theta, random_state(seed_sequence(3)), 400)
+    drawn = fitter.simulator.observations(
+        experiments[0], theta, random_state(seed_sequence(3)), 400
+    )
     assert drawn[0, 0].mean() == pytest.approx(found[0], abs=4.0 * VALUES["r"] / 20.0)
     assert drawn[0, 0].std() == pytest.approx(VALUES["r"], rel=4.0 / np.sqrt(800))
 
