@@ -170,6 +170,7 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     assert "decided on held-out rows" in " ".join(how_sure(report))
 
 
+@pytest.mark.slow
 def test_an_effect_offered_once_needs_no_equation(loaded):
     offered = loaded.screen.question.candidates
     assert labels(offered[:1], offered[:1]) == ["constant load"]

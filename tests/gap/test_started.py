@@ -7,10 +7,13 @@ import pytest
 from scipy.stats import norm
 
 import ssmppl as ssm
-from ssmppl.gap import crossfit, diagnose
+from ssmppl.gap.answer import _written
 from ssmppl.gap.candidates import offers
+from ssmppl.gap.checkpoint import Checkpoint
 from ssmppl.gap.confirm import predict
+from ssmppl.gap.refit import refit_all
 from ssmppl.gap.scales import Scales
+from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.started import FirstStates, Start, needs_start, start_of
 from ssmppl.gap.workshop import Workshop
@@ -100,6 +103,7 @@ def test_the_height_puts_a_wide_law_on_the_scale_of_the_flat_one():
     assert other - flat.log_likelihood([e], theta) == pytest.approx(lost, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_likelihood_with_an_effect_is_that_of_a_flat_start():
     data = recorded(15)
     fitter, theta, experiments = dragged(data)
@@ -119,6 +123,7 @@ def test_the_likelihood_with_an_effect_is_that_of_a_flat_start():
     assert abs(total.mean() - exact) < 4.0 * total.std() / np.sqrt(len(total)) + near + 0.01
 
 
+@pytest.mark.slow
 def test_what_is_simulated_starts_where_the_data_do():
     data = recorded(15)
     fitter, theta, experiments = dragged(data)
@@ -149,19 +154,33 @@ def test_a_start_is_given_only_where_a_flat_one_cannot_be():
     assert fitter.start is None
 
 
-@pytest.mark.exhaustive
-def test_drag_is_found_though_the_model_starts_flat(monkeypatch):
-    for module in (diagnose, crossfit):
-        monkeypatch.setattr(module, "FOLDS", 5)
-    monkeypatch.setattr(diagnose, "SETS", {"fast": 60, "full": 60})
-    data = recorded(320)
-    report = ssm.diagnose(driven(), data, ["quadratic drag", "constant load"], progress=False)
-    assert report.verdict == "effect"
-    assert report.chosen == ["quadratic drag"]
-    value, error = report.estimates["after"]["quadratic_drag_v"]
-    assert abs(value - DRAG) < 4.0 * error < DRAG
-    assert any("can start flat" in n for n in report.notes)
-    # The model that is handed back can be used, and gains what the table says.
-    after = {n: v for n, (v, _) in report.estimates["after"].items()}
-    assert np.isfinite(ssm.log_likelihood(report.model, data, after, particles=300, seed=1)).all()
-    assert report.closed["F"].iloc[0] > 0.5
+@pytest.mark.slow
+def test_drag_is_refitted_though_the_model_starts_flat():
+    """And the model that is handed back can be used, with the likelihood of the refit."""
+    data = recorded(150)
+    problem = pose(driven(), data)
+    (e,), missing, settings = problem.experiments, problem.program.missing, Settings(200)
+    base = Workshop(problem.trace, missing, {}, settings).fitter(())
+    fit = base.fit([e], seed_sequence(1), {})
+    states = base.states(e, fit.theta, random_state(seed_sequence(2)))
+    start = start_of(problem.trace, [states[0].mean(axis=0)], [states])
+    workshop = Workshop(problem.trace, missing, {}, settings, start)
+    scales = Scales.of(problem.trace, states, e.y, e.u, e.steps)
+    question = Question(problem.trace, scales, missing, (), settings, ["quadratic drag"])
+    kept = Checkpoint(None, {})
+    screen = ask(question, [e], fit.theta, 60, seed_sequence(3), kept)
+    (found,), failed = refit_all(
+        workshop, fit, screen, [[0]], [e], seed_sequence(4), kept, "refitting"
+    )
+    assert not failed
+    found = replace(found, fit=found.fitter.measured(found.fit, seed_sequence(5)))
+    error = found.errors["quadratic_drag_v"]
+    assert abs(found.strengths[0] - DRAG) < 4.0 * error < 2.0 * DRAG
+    assert found.gain > 10.0
+    notes = []
+    model, text = _written(problem.trace, found, ["quadratic drag"], notes)
+    assert not notes
+    assert "ssm.Flat()" not in text.split("@model.initial")[1]
+    given = {n: v for n, v in found.fit.values().items() if not n.startswith("size")}
+    told = ssm.log_likelihood(model, data, given, particles=2000, seed=1)[0] + start.height
+    assert told == pytest.approx(found.fit.log_likelihood, abs=4.0 * (found.fit.error + 0.1))
