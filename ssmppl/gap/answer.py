@@ -259,8 +259,8 @@ def _parts(r: Results) -> dict[str, Any]:
     if r.parts is None:
         return blocks or {"screen": _span(e, 0, None)}
     out: dict[str, Any] = {"screen": _span(e, 0, r.parts.second[i]), **blocks}
-    if measured and not blocks:
-        rows = np.flatnonzero(r.parts.confirm[i])
+    rows = np.flatnonzero(r.parts.confirm[i])
+    if measured and not blocks and len(rows):
         out["confirm"] = _span(e, int(rows[0]), int(rows[-1]) + 1)
     if r.attribution and r.attribution.left_out:
         out["choice"] = "that fewer effects were kept than fitted best was decided on held-out rows"
