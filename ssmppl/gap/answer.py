@@ -66,9 +66,30 @@ class Results:
         return self.attribution.chosen if self.attribution else None
 
     @property
+    def names(self) -> list[str]:
+        """Labels of the chosen effects."""
+        offered = self.screen.question.candidates
+        return labels(self.chosen.candidates, offered) if self.chosen else []
+
+    @property
     def label(self) -> str:
         """Of what the share that is closed is about."""
-        return " + ".join(labels(self.chosen.candidates)) if self.chosen else CURVES
+        return " + ".join(self.names) if self.chosen else CURVES
+
+    @property
+    def unfitted(self) -> int | None:
+        """Column of the effect that the verdict rests on, though it was not refitted."""
+        return self.attribution.unfitted if self.attribution else None
+
+    @property
+    def screened(self) -> bool:
+        """Whether the screen was asked at the model's fit as it is known now."""
+        return not (self.attribution and self.attribution.rebased)
+
+    @property
+    def tested(self) -> dict[int, float] | None:
+        """p of the refits that were tested themselves, by column; None if none was to be."""
+        return self.attribution.p if self.attribution else None
 
     def classes(self) -> tuple[list[int], Classes]:
         """The leading shapes of all groups, best first, and their classes."""
@@ -101,40 +122,63 @@ def answer(r: Results, seconds: float) -> GapReport:
         values = _estimates(r.chosen.fitter, r.chosen.fit)
         own = augment(r.trace, list(r.chosen.candidates)).parameter_symbols
         estimates["after"] = {repr(s): values[repr(s)] for s in own}
-        augmented, text = _written(r.trace, r.chosen, notes)
+        augmented, text = _written(r.trace, r.chosen, r.names, notes)
     free = tabulate("free_run")
     if runs is not None:
         channels = [repr(s) for s in r.trace.observation_symbols]
         free = tables.run_table(r.experiments, channels, *runs)
+    causes = tables.causes_table(screen, r.refits, found, order, r.tested, r.screened)
+    started = next((x.fitter.start for x in [*r.refits, r.chosen] if x and x.fitter.start), None)
+    if started:
+        notes.append(f"only linear Gaussian models can start flat: others start with {started}")
     return GapReport(
         verdict=verdict, where=where,
-        causes=tables.causes_table(
-            screen, r.refits, found, order, r.attribution.p if r.attribution else None
-        ),
+        causes=causes,
         classes=tables.classes_table(screen, found, order, r.separating),
         closed=share, detection=_detection(screen), residual_map=tables.map_table(screen),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
         model=augmented, model_text=text,
-        chosen=labels(r.chosen.candidates) if text and r.chosen else [], estimates=estimates,
+        chosen=r.names if text else [], estimates=estimates,
+        leading=_leading(r, order, found) if text or r.unfitted is not None else [],
         parts=_parts(r), notes=notes,
         settings={**r.settings, "candidates": len(set(screen.groups.tolist())),
                   "shapes": len(screen.question.candidates),
-                  "samples": sum(e.steps for e in r.experiments), "simulated sets": screen.sets},
+                  "samples": sum(e.steps for e in r.experiments), "simulated sets": screen.sets,
+                  "experiment": _longest(r.experiments) + 1 if len(r.experiments) > 1 else ""},
         seconds=seconds, mode=r.mode, interrupted=r.interrupted,
     )  # fmt: skip
 
 
-def labels(candidates: Sequence[Candidate]) -> list[str]:
-    """Names of effects, with their equations where one name comes twice."""
-    names = [c.effect.name for c in candidates]
-    return [n if names.count(n) == 1 else f"{n} on {c.equation}"
-            for n, c in zip(names, candidates, strict=True)]  # fmt: skip
+def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> list[str]:
+    """Names of effects, with their equations where one of that name is offered for several."""
+    places: dict[str, set[str]] = {}
+    for c in (*offered, *candidates):
+        places.setdefault(c.effect.name, set()).add(c.equation)
+    return [c.effect.name if len(places[c.effect.name]) == 1
+            else f"{c.effect.name} on {c.equation}" for c in candidates]  # fmt: skip
+
+
+def _leading(r: Results, order: Sequence[int], found: Classes) -> list[dict[str, Any]]:
+    """The chosen effects: their rows in `causes`, and what the model with all of them says; or the
+    one that stands out and could not be refitted."""
+    chosen, offered = r.chosen, r.screen.question.candidates
+    groups = [offered[k].group for k in order]
+    if r.unfitted is not None:
+        return [{"row": groups.index(offered[r.unfitted].group), "unfitted": True}]
+    if chosen is None:
+        return []
+    rows = [groups.index(c.group) for c in chosen.candidates]
+    each = [Refit((order[i],), (c,), chosen.fitter, chosen.fit, chosen.gain)
+            for i, c in zip(rows, chosen.candidates, strict=True)]  # fmt: skip
+    told = tables.causes_table(r.screen, each, found, order, r.tested, r.screened)
+    own = told[["form", "sign", "estimate", "se"]].to_dict("records")
+    return [{"row": i, **own[i]} for i in rows]
 
 
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
     """The verdict but for whether a gap can be measured at all, and the missing curve."""
     least = float(np.min(r.screen.family.p, initial=1.0))
-    asked = r.attribution is not None and r.mode == "full"
+    asked = r.attribution is not None and r.mode == "full" and r.unfitted is None
     if r.far is not None and _curves_beat(r.far, r.chosen is not None):
         best = r.chosen or (r.refits[0] if r.refits else None)
         tried = list(best.candidates) if best else []
@@ -175,13 +219,17 @@ def _detection(screen: Screen) -> Any:
     )  # fmt: skip
 
 
-def _written(trace: Trace, chosen: Refit, notes: list[str]) -> tuple[Model | None, str]:
+def _written(
+    trace: Trace, chosen: Refit, names: Sequence[str], notes: list[str]
+) -> tuple[Model | None, str]:
     try:
         added = augment(trace, list(chosen.candidates))
+        if chosen.fitter.start:
+            added = chosen.fitter.start.given(added)
         values = {n: v for n, v in chosen.fit.values().items() if n.split("[")[0] in
                   added.parameters}  # fmt: skip
         text = model_text(
-            added, title=f"{trace.name} with {' and '.join(labels(chosen.candidates))}",
+            added, title=f"{trace.name} with {' and '.join(names)}",
             notes=["Fitted values:", *(f"{n} = {v:.6g}" for n, v in values.items())],
         )  # fmt: skip
         return to_model(added), text
@@ -204,15 +252,23 @@ def _not_applicable(screen: Screen) -> Any:
 
 
 def _parts(r: Results) -> dict[str, Any]:
+    """What the rows were used for; those of the longest experiment stand for all."""
+    i = _longest(r.experiments)
+    e, measured = r.experiments[i], r.far is not None and bool(r.far.rows)
+    blocks = {"cross-fitting": r.blocks} if r.blocks and measured else {}
     if r.parts is None:
-        if r.blocks:
-            return {"cross-fitting": r.blocks}
-        return {"screen": _span(r.experiments[0], 0, None)}
-    second, e = r.parts.second[0], r.experiments[0]
-    out: dict[str, Any] = {"screen": _span(e, 0, second)}
-    if r.blocks:
-        return {**out, "cross-fitting": r.blocks}
-    return {**out, "confirm": _span(e, second, None)}
+        return blocks or {"screen": _span(e, 0, None)}
+    out: dict[str, Any] = {"screen": _span(e, 0, r.parts.second[i]), **blocks}
+    rows = np.flatnonzero(r.parts.confirm[i])
+    if measured and not blocks and len(rows):
+        out["confirm"] = _span(e, int(rows[0]), int(rows[-1]) + 1)
+    if r.attribution and r.attribution.left_out:
+        out["choice"] = "that fewer effects were kept than fitted best was decided on held-out rows"
+    return out
+
+
+def _longest(experiments: Sequence[Experiment]) -> int:
+    return int(np.argmax([e.steps for e in experiments]))
 
 
 def _span(e: Experiment, a: int, b: int | None) -> tuple[Any, Any]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ssmppl.data import Experiment, unpack_parameters
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import SSMError
 from ssmppl.gap.byrefit import LAX, gain_p, quick_enough, refit_p
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint
@@ -46,7 +46,9 @@ class Attribution:
     base : the model's own fit. refits, doubles : with one effect, with two; best first.
     chosen : what is kept, None for the model as it is. fewer : what it grew from, the fewest
     effects first. p : by the candidate's column, where its refit was tested itself. notes : why
-    others were not refitted.
+    others were not refitted. unfitted : the column of what stands out most, where it could not be
+    refitted and nothing that could be gains as much. rebased : whether `base` is not what the
+    screen was asked at. left_out : whether fewer were chosen in the end, by the held-out rows.
     """
 
     base: Fit
@@ -55,6 +57,9 @@ class Attribution:
     chosen: Refit | None = None
     fewer: list[Refit] = field(default_factory=list)
     p: dict[int, float] = field(default_factory=dict)
+    unfitted: int | None = None
+    rebased: bool = False
+    left_out: bool = False
     notes: list[str] = field(default_factory=list)
 
 
@@ -86,12 +91,15 @@ def attribute(
     out.refits = refits
     significant = False
     if not always:
-        before, own = out.base, alpha / 2  # of two tests, each has half
+        own = alpha / 2  # of two tests, each has half
         _rebase(out, workshop, train, _seed(seed, 6), kept, needed_gain(screen, alpha))
-        if out.base is before:  # else the screen was asked at the wrong place
+        if out.rebased:  # the screen was asked at the wrong place
+            out.p |= {r.index[0]: gain_p(screen, r) for r in out.refits}
+        else:
             significant = bool(np.min(screen.family.p, initial=1.0) <= own)
+            out.unfitted = _unfitted(screen, refits, own)
         significant |= _by_refit(out, workshop, screen, train, _seed(seed, 4), own, kept)
-    if not out.refits or not (significant or always):
+    if not out.refits or not (significant or always) or out.unfitted is not None:
         return
     scales = screen.question.scales
     if not quick:
@@ -103,11 +111,11 @@ def attribute(
     single, pair = out.chosen, None
     if steps > 1:
         rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept)
-        if significant:  # a step from the best one, against the best pair
+        if significant or always:  # a step from the best one, against the best pair
             _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, 2)
         if rival is not None and rival.merit > out.chosen.merit:
             out.chosen = rival
-        if significant and len(out.chosen.candidates) == 2:
+        if (significant or always) and len(out.chosen.candidates) == 2:
             pair = out.chosen
             _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
     out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen]
@@ -118,6 +126,17 @@ def attribute(
         )  # fmt: skip
     if not quick:
         measure(out, _seed(seed, 5), kept)
+
+
+def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | None:
+    """The leading candidate, if it is significant, was not refitted, and promises more than the
+    best refit gains: another one in its place would be the wrong answer."""
+    for k in leading(screen)[:1]:
+        done = {int(screen.groups[r.index[0]]) for r in refits}
+        best = max((r.merit for r in refits), default=0.0)
+        found = int(screen.groups[k]) not in done and screen.found.gain[k] > best
+        return k if found and float(screen.significant[k]) <= alpha else None
+    return None
 
 
 def _best_pair(
@@ -168,7 +187,12 @@ def _rebase(
     found = fitter.restored(train, numbers)
     better = found.log_likelihood - out.base.log_likelihood
     if better > 2.0 * np.hypot(found.error, out.base.error) + 0.1:
-        out.base = found
+        out.base, out.rebased = found, True
+        out.notes.append(
+            f"starting from the best refit the model itself fits better by {better:.1f} nats: p of "
+            "the effects are of their refits, what was not refitted has none, and `where` and the "
+            "checks of the predictions are of the fit before"
+        )
         out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
 
 
@@ -220,7 +244,7 @@ def _forward(
         own = kept.within(f"with {number + 1} effects")
         try:
             again = _screen_again(chosen, screen, rest, train, workshop, seed, kept)
-        except ArgumentError as error:
+        except SSMError as error:
             out.notes.append(f"whether a further effect is missing is not known: {error.found}")
             return
         if float(np.min(again.family.p, initial=1.0)) > LAX * alpha:
@@ -260,7 +284,7 @@ def _screen_again(
     fitter, number = chosen.fitter, len(chosen.candidates)
     question = Question(
         fitter.problem.trace, screen.question.scales, workshop.missing, tuple(fitter.fixed),
-        fitter.settings, candidates=rest,
+        fitter.settings, candidates=rest, simulator=fitter.simulator if fitter.start else None,
     )  # fmt: skip
     stage = f"screening for effect {number + 1}"
     sets = min(screen.sets, AGAIN)

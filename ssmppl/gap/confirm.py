@@ -48,6 +48,8 @@ def predict(
     def one(r: int) -> list[Pass]:
         stream = random_state(seed, 6, r)
         passes = fitter.smoother.run(experiments, fit.theta, stream)
+        for p in passes:
+            p.log_increments[:1] += fitter.height
         if fitter.exact or fitter.settings.proposal != "twisted":
             return passes
         return [

@@ -1,6 +1,8 @@
 """How far the gap closes where rows are too few, or the effect happens once: by leaving blocks out.
 
-Contiguous blocks of rows are set missing in turn; fit and selection are repeated on the rest (M.
+Contiguous blocks of rows are set missing in turn; fit and selection are repeated on the rest, the
+latter among the `SINGLES` leading effects, pairs of them and steps from the best, with the shapes
+that the screen has, up to as many effects as were chosen on all rows (M.
 Stone, *JRSS B* 36, 1974; blocks for dependent rows: P. Burman, E. Chow and D. Nolan, *Biometrika*
 81, 1994). l_b is the sum of the one-step log predictive densities of the block's rows, the filter
 run over all rows with what the other blocks gave: the quantity that is measured on the confirm part
@@ -81,6 +83,12 @@ class CrossFit:
             "rmse_after": float(np.sqrt(np.sum(size * table["after"] ** 2))),
         })  # fmt: skip
         out.notes += notes_of(share, self.chosen is not None)
+        same = int(table["same"].sum()) if "same" in table else len(each)  # resumed from before
+        if self.chosen is not None and same < len(each):
+            out.notes.append(
+                f"without the block, the effects chosen are those named here in {same} of "
+                f"{len(each)} blocks: the share is of what was chosen each time"
+            )
         return out
 
     def _one(self, fold: Fold, seed: np.random.SeedSequence, kept: Checkpoint) -> Numbers:
@@ -120,6 +128,8 @@ class CrossFit:
         out["gain_mean"] = np.asarray(gain_of_mean(found_by["base"], found_by["effect"]))
         measured = [(e.seen.any(axis=1) & c).sum()
                     for e, c in zip(self.experiments, counts, strict=True)]  # fmt: skip
+        groups = [{c.group for c in r.candidates} for r in (pick, self.chosen) if r]
+        out["same"] = np.asarray(float(len(groups) == 2 and groups[0] == groups[1]))
         out["rows"] = np.asarray(float(sum(measured)))
         inside = [i for i, m in enumerate(measured) if m]
         for name, model in (("before", models["base"]), ("after", effect)):

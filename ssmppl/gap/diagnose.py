@@ -35,6 +35,7 @@ from ssmppl.gap.scales import Scales
 from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.share import HowFar, how_far
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.started import start_of
 from ssmppl.gap.workshop import Workshop, proposal_of
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
@@ -165,8 +166,10 @@ class _Diagnosis:
         base = self.workshop.fitter(())
         training = self.parts.train if self.parts else self.experiments
         fit = self._fit("fitting", base, training, 1, {}, searched=False)
+        states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
+        self.workshop.start = start_of(self.trace, [x[0].mean(axis=0) for x in states], states)
         question = Question(
-            self.trace, self._scales(base, fit, training), self.workshop.missing,
+            self.trace, self._scales(states, training), self.workshop.missing,
             tuple(self.fixed), self.settings, self.effects,
         )  # fmt: skip
         if not question.candidates:
@@ -194,13 +197,16 @@ class _Diagnosis:
             self.kept,
         )  # fmt: skip
         r.attribution, r.fit = found, found.base
+        if found.unfitted is not None:  # nothing to measure, then
+            return
         self._borne_out(r)
         self._separated(r)
         r.far = self._how_far(r)
 
     def _borne_out(self, r: Results) -> None:
-        """Of several effects chosen together, the last again left out while all of them predict the
-        held-out rows no better than the model itself: what they fitted was chance."""
+        """Of several effects chosen together, fewer again while all of them predict the held-out
+        rows no better than the model itself: what they fitted was chance. It is a choice made on
+        these rows, and the report says so."""
         found = r.attribution
         if not self.parts or found is None or found.chosen is None or not found.fewer:
             return
@@ -221,11 +227,12 @@ class _Diagnosis:
             gain = seen.log_density.sum(axis=1).mean() - plain.log_density.sum(axis=1).mean()
             if gain > 0.0:
                 return
-            found.chosen = found.fewer.pop()
+            found.chosen, found.left_out = found.fewer.pop(), True
             measure(found, self._seed(4), self.kept)
             found.notes.append(
                 f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
-                f"held-out rows worse than the model itself ({gain:.1f} nats): the last is left out"
+                f"held-out rows worse than the model itself ({gain:.1f} nats); kept instead: "
+                + " and ".join(map(str, found.chosen.candidates))
             )
 
     def _confirmed(self, fitter: Fitter, fit: Fit) -> Predictions:
@@ -244,7 +251,7 @@ class _Diagnosis:
         workshop, question, base = self.workshop, r.screen.question, (r.base, r.fit)
         if self.parts:  # the code so far knows no missing rows
             missing = replace(self.workshop.missing, none=False)
-            workshop = Workshop(self.trace, missing, self.fixed, self.settings)
+            workshop = Workshop(self.trace, missing, self.fixed, self.settings, self.workshop.start)
             question = Question(
                 self.trace, question.scales, missing, tuple(self.fixed), self.settings,
                 self.effects,
@@ -307,14 +314,12 @@ class _Diagnosis:
         )  # fmt: skip
         self.kept.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
 
-    def _scales(self, base: Fitter, fit: Fit, experiments: Any) -> Scales:
+    def _scales(self, states: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> Scales:
         """From filtered states, observations and inputs."""
-        states = np.concatenate(
-            [base.states(e, fit.theta, random_state(self._seed(11))) for e in experiments]
-        )
         y = np.concatenate([np.where(e.seen == 1.0, e.y, np.nan) for e in experiments])
         u = np.concatenate([e.u for e in experiments])
-        return Scales.of(self.trace, states, y, u, max(e.steps for e in experiments))
+        longest = max(e.steps for e in experiments)
+        return Scales.of(self.trace, np.concatenate(states), y, u, longest)
 
     def _seed(self, stage: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(self.root.entropy, spawn_key=(*self.root.spawn_key, stage))

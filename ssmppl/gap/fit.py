@@ -8,7 +8,6 @@ still gain.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,6 +20,7 @@ from ssmppl.gap.columns import Columns, score_columns
 from ssmppl.gap.noisy_climb import NEAR, noisy_climb
 from ssmppl.gap.simulator import Simulator
 from ssmppl.gap.smoothing import Settings, Smoother
+from ssmppl.gap.started import FirstStates, Start
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.direct_optimization import climb, observed_information
@@ -83,10 +83,11 @@ class Fitter:
 
     def __init__(
         self, problem: Problem, fixed: Mapping[str, np.ndarray], settings: Settings,
-        executor: Executor | None = None,
+        start: Start | None = None,
     ):  # fmt: skip
+        """start : the law of x_1 is that one, in place of a flat one."""
         self.problem, self.fixed, self.settings = problem, dict(fixed), settings
-        self.executor = executor
+        self.start = start
         self.kalman = kalman_model(problem.trace)
         trace = problem.trace
         self.columns: Columns = score_columns(trace, trace, (), self.fixed, problem.program.missing)
@@ -114,7 +115,14 @@ class Fitter:
     @cached_property
     def simulator(self) -> Simulator:
         """Draws data sets from the model."""
-        return Simulator(self.problem.program, self.problem.program.missing, self.kalman)
+        program, held = self.problem.program, self.start.laws if self.start else ()
+        first = FirstStates(self.smoother) if self.start else None
+        return Simulator(program, program.missing, self.kalman, tuple(held), first)
+
+    @property
+    def height(self) -> float:
+        """Nats for each experiment that a law in place of a flat one takes."""
+        return self.start.height if self.start else 0.0
 
     def restored(self, experiments: Sequence[Experiment], numbers: Mapping[str, np.ndarray]) -> Fit:
         """The fit to `experiments` that had these `Fit.numbers`."""
@@ -276,7 +284,7 @@ class Fitter:
         settings = FilterSettings(particles, self.settings.proposal)
         try:
             return sum(
-                particle_system(problem, theta, settings, e, stream).log_Z
+                particle_system(problem, theta, settings, e, stream).log_Z + self.height
                 for e in problem.experiments
             )
         except SamplingError:

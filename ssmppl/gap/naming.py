@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ssmppl.gap.report import GapReport
 
 __all__ = [
-    "alternatives", "class_letters", "label", "leaders", "listed", "named", "rivals",
+    "alternatives", "class_letters", "label", "leaders", "listed", "marked", "named", "rivals",
     "row_label", "rows", "sentence", "tried",
 ]  # fmt: skip
 
@@ -61,16 +61,37 @@ def tried(report: GapReport) -> str:
 
 
 def leaders(report: GapReport) -> list[dict[str, Any]]:
-    """The rows of `causes` that the verdict is about: the chosen ones, else a significant best."""
+    """The rows of `causes` that the verdict is about: the chosen ones, as they are in the model
+    with all of them, else a significant best."""
     found = rows(report.causes)
-    out: list[dict[str, Any]] = []
+    if report.leading:
+        return [{**found[d["row"]], **{k: v for k, v in d.items() if k != "row"}}
+                for d in report.leading]  # fmt: skip
+    labels = report.chosen or [""]
+    return [{"effect": labels[n], "equation": ""} if i is None else found[i]
+            for n, i in enumerate(_places(report))]  # fmt: skip
+
+
+def marked(report: GapReport) -> set[int]:
+    """Which rows of `causes` the verdict is about."""
+    places = [d["row"] for d in report.leading] or _places(report)
+    return {i for i in places if i is not None}
+
+
+def _places(report: GapReport) -> list[int | None]:
+    """The same by the labels of what was chosen, None where there is no such row; the first where
+    nothing was chosen."""
+    found = rows(report.causes)
+    out: list[int | None] = []
     for name in report.chosen:
-        names = [r for r in found if name in (r["effect"], f"{r['effect']} on {r['equation']}")]
-        fresh = [r for r in names if r not in out]
-        out.append(fresh[0] if fresh else {"effect": name, "equation": ""})
+        wanted = [f"{r['effect']} on {r['equation']}" == name for r in found]
+        if not any(wanted):
+            wanted = [r["effect"] == name for r in found]
+        fresh = [i for i, same in enumerate(wanted) if same and i not in out]
+        out.append(fresh[0] if fresh else None)
     if report.chosen or report.verdict != "effect":
         return out
-    return found[:1]
+    return [0] if found else []
 
 
 def rivals(report: GapReport, row: dict[str, Any]) -> list[dict[str, Any]]:

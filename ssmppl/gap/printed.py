@@ -7,7 +7,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from ssmppl import markup
-from ssmppl.gap.naming import class_letters, leaders, row_label, rows, sentence
+from ssmppl.gap.naming import class_letters, marked, row_label, rows, sentence
 from ssmppl.gap.numerals import DASH, is_number, number, p_text, with_error
 from ssmppl.gap.words import (
     GLOSSARY,
@@ -31,13 +31,13 @@ SHOWN_CAUSES = 8
 
 def cause_rows(report: GapReport, shown: int = SHOWN_CAUSES) -> list[tuple[str, ...]]:
     """Header and the best causes: name, form, strength, gain, p, class letter."""
-    letters, chosen = class_letters(report), leaders(report)
+    letters, chosen = class_letters(report), marked(report)
     out: list[tuple[str, ...]] = [("effect", "form", "strength", "gain (nats)", "p", "alike")]
-    for r in rows(report.causes)[:shown]:
+    for i, r in enumerate(rows(report.causes)[:shown]):
         refit = is_number(r["gain_refit"])
         gain = number(r["gain_refit"] if refit else r["gain_screen"], 2)
         gain += "" if refit or gain == DASH else " *"
-        name = ("→ " if r in chosen else "  ") + row_label(r)
+        name = ("→ " if i in chosen else "  ") + row_label(r)
         form = r["form"] if isinstance(r["form"], str) else ""
         out.append((name, form, with_error(r["estimate"], r["se"]), gain,
                     p_text(r["p"]).removeprefix("p ").removeprefix("= "),

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssmppl.codegen.program import compile_trace
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import array
@@ -26,10 +25,8 @@ from ssmppl.gap.efficient import Null, efficient
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import Parts
 from ssmppl.gap.screen import Screen, with_parameters
-from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.tables import residual_groups
-from ssmppl.gap.workshop import Workshop, lift, proposal_of
-from ssmppl.inference.problem import Problem
+from ssmppl.gap.workshop import Workshop, lift
 from ssmppl.language.distributions import Normal
 
 GROUPS = 3  # of basis functions that are taken in, at most
@@ -137,11 +134,8 @@ def superset(
             law.location = site.distribution.location
             parameters[t.candidate.strength] = replace(site, distribution=law)
     trace = replace(trace, parameters={**ordered, **parameters})
-    program = compile_trace(trace, workshop.missing)
     given = {**shapes, **widths}
-    fixed = workshop.fixed | {n: np.asarray(v) for n, v in given.items()}
-    settings = Settings(workshop.settings.particles, proposal_of(program), workshop.settings.lag)
-    fitter = Fitter(Problem(trace, (), program), fixed, settings)
+    fitter = workshop.made(trace, given)
     values = unpack_parameters(start.problem.trace, start.theta)
     begin = {n: v for n, v in values.items() if n in trace.parameters and n not in given}
     begin |= {t.candidate.strength: np.asarray(0.0) for terms, _ in groups for t in terms}

@@ -102,13 +102,16 @@ class GapReport:
     model, model_text : the model with the chosen effects added, and its file; None and "" if
         nothing was chosen.
     chosen : labels of the chosen effects: the effect's name, or "<effect> on <equation>" where
-        one effect is chosen for two equations.
+        that effect was tried on several equations.
+    leading : for each effect that the verdict names, its `row` in `causes`, and form, sign,
+        estimate and se in the model with all of them; or `row` and `unfitted` for one that the
+        screen found and that could not be fitted.
     estimates : {"before": {parameter: (value, standard error)}, "after": ...}; error 0 if fixed.
-    parts : {"screen": (first, last), "confirm": ...}, row labels, or
-        {"cross-fitting": number of blocks}; any further entry is text.
+    parts : {"screen": (first, last), "confirm": ...}, row labels of the rows that were used, or
+        {"cross-fitting": number of blocks}; any further entry is text, such as "choice".
     notes : what has to be known before the figures are used.
     settings : the arguments used; of these the words use `alpha`, `candidates` (number tried),
-        `model` (name), `samples`, `seed`.
+        `model` (name), `samples`, `seed`, `experiment` (whose rows `parts` tells, of several).
     seconds, mode, interrupted : run time; "full" or "fast" (which stops after the screen); whether
         it was interrupted, and only the stages done before are here.
     """
@@ -126,6 +129,7 @@ class GapReport:
     model: Model | None = None
     model_text: str = ""
     chosen: list[str] = field(default_factory=list)
+    leading: list[dict[str, Any]] = field(default_factory=list)
     estimates: dict[str, dict[str, tuple[Any, Any]]] = field(default_factory=dict)
     parts: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)

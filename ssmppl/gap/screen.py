@@ -62,9 +62,11 @@ class Question:
     def __init__(
         self, trace: Trace, scales: Scales, missing: Missing, held: Sequence[str],
         settings: Settings, effects: Chosen = None, *,
-        candidates: Sequence[Candidate] | None = None,
+        candidates: Sequence[Candidate] | None = None, simulator: Simulator | None = None,
     ):  # fmt: skip
-        """candidates : these instead of what the catalogue offers, and no basis."""
+        """candidates : these instead of what the catalogue offers, and no basis. simulator : of the
+        model, where it is not the plain one."""
+        self._simulator = simulator
         self.trace, self.settings, self.scales = trace, settings, scales
         self.refused: list[Refused] = []
         self.terms: list[Term] = []
@@ -109,6 +111,8 @@ class Question:
     def simulator(self) -> Simulator:
         """Draws data sets from the model."""
         s = self.smoother
+        if self._simulator is not None:
+            return self._simulator
         return Simulator(s.program, s.missing, s.kalman)
 
     def grid(self, variable: str) -> np.ndarray:

@@ -1,13 +1,14 @@
 """Data sets drawn from a fitted model, with the lengths, inputs and gaps of the data.
 
-A component of x_1 whose law is Flat cannot be drawn: it starts at its smoothed mean given the data.
+A component of x_1 whose law is Flat cannot be drawn: it starts at its smoothed mean given the data,
+as does one whose law stands for a flat one (`started.py`).
 What a linear Gaussian model with a flat start says of its disturbances does not depend on where it
 starts (P. de Jong, *Annals of Statistics* 19, 1991).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,12 +28,17 @@ class Simulator:
     """Draws from a model at given parameters.
 
     program : of the model, which is used as it is where x_1 has a law. kalman : of the model where
-    it is linear and Gaussian.
+    it is linear and Gaussian. held : further states that start at a mean; found : of an experiment
+    and theta (P,), the means (D,) of x_1 that these take.
     """
 
-    def __init__(self, program: Program, missing: Missing, kalman: object):
+    def __init__(
+        self, program: Program, missing: Missing, kalman: object, held: Sequence[str] = (),
+        found: Callable[[Experiment, np.ndarray], np.ndarray] | None = None,
+    ):  # fmt: skip
         self.trace, self.feedback = program.trace, feeds_back(program.trace)
-        flat = flat_start(self.trace)
+        self.found = found
+        flat = [*flat_start(self.trace), *(self.trace.initial[n] for n in held)]
         self.starts: list[Expr] = [s for site in flat for s in site.components]
         self.kalman = kalman if isinstance(kalman, KalmanModel) else None
         self.program = compile_trace(_started(self.trace, flat), missing) if flat else program
@@ -66,11 +72,16 @@ class Simulator:
         return np.concatenate(drawn, axis=2)
 
     def _start(self, e: Experiment, theta: np.ndarray) -> list[float]:
-        if not self.starts or self.kalman is None:
+        if not self.starts:
             return []
-        place = {s: i for i, s in enumerate(self.kalman.trace.state_symbols)}
-        own = theta[: len(self.kalman.trace.parameter_symbols)]
-        mean = self.kalman.smooth(e, own).mean[0]
+        place = {s: i for i, s in enumerate(self.trace.state_symbols)}
+        own = theta[: len(self.trace.parameter_symbols)]
+        if self.found is not None:
+            mean = self.found(e, own)
+        elif self.kalman is not None:
+            mean = self.kalman.smooth(e, own).mean[0]
+        else:
+            return []
         return [float(mean[place[s]]) for s in self.starts]
 
 

@@ -182,12 +182,13 @@ def residual_groups(
 
 def causes_table(
     screen: Screen, refits: Sequence[Refit], found: Classes, order: Sequence[int],
-    tested: Mapping[int, float] | None,
+    tested: Mapping[int, float] | None, screened: bool = True,
 ) -> pd.DataFrame:  # fmt: skip
     """One row for each group of candidates, the refitted ones first; pairs are not listed.
 
     tested : p of refits whose own gain was tested, by column; None where no refit was to be tested.
-    With two tests p is twice the smaller one (Bonferroni).
+    With two tests p is twice the smaller one (Bonferroni). screened : whether the screen's own p
+    holds; else what was not tested has none.
     """
     tests, tested = (1, {}) if tested is None else (2, tested)
     by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
@@ -210,10 +211,13 @@ def causes_table(
                 strength, error = 0.0, np.nan
         shaped = own.candidates[0].shape if own is not None else c.shape
         shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in shaped)
-        p = min(1.0, tests * min(float(significant[k]), tested.get(k, 1.0)))
+        p = tested.get(k, np.nan)
+        if screened:
+            p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
             "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
-            "equation": c.equation, "z": float(s.z[k]), "p": p,
+            "equation": c.equation, "z": float(s.z[k]),
+            "p": float(np.minimum(1.0, tests * p)),
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
             "class_id": int(found.class_id[i]),
             "sign": "one-sided" if sided else ("+" if strength > 0 else "-"),

@@ -7,6 +7,7 @@ closes the gap, how sure that is, and what would tell what these data cannot.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ssmppl.gap.naming import (
@@ -71,8 +72,23 @@ def kept_back(report: GapReport) -> str:
         blocks = report.parts["cross-fitting"]
         return f"on {blocks} blocks of the data, each left out in turn"
     part = report.parts.get("confirm")
-    when = span(*part) if isinstance(part, tuple | list) and len(part) == 2 else str(part or "")
-    return "on data that took no part in the choice" + (f" ({when})" if when else "")
+    when = _when(report, part) if isinstance(part, tuple | list) else str(part or "")
+    if when and _experiment(report):
+        when += ", and likewise of the others"
+    own = "on data that took no part in the choice"
+    if "choice" in report.parts:
+        own = "on data that took part in the choice only in that an effect was left out again"
+    return own + (f" ({when})" if when else "")
+
+
+def _experiment(report: GapReport) -> str:
+    """Whose rows stand for those of all experiments; "" where there is one."""
+    return str(report.settings.get("experiment", ""))
+
+
+def _when(report: GapReport, part: Sequence[Any]) -> str:
+    first, last = part
+    return span(first, last, _experiment(report))
 
 
 # -- the three answers
@@ -85,15 +101,21 @@ def headline(report: GapReport) -> str:
     found = leaders(report) or [{"effect": "something", "equation": "", "p": None}]
     groups = [alternatives(report, row) for row in found]
     sure = p_text(found[0].get("p"))
-    if report.mode == "fast":
+    unfitted = bool(found[0].get("unfitted"))
+    if report.mode == "fast" or unfitted:
         text = f"the screen says that {named(report)} lacks {listed(groups[0], 'or')} ({sure} " \
                f"with {tried(report)})."  # fmt: skip
         text += " These data cannot tell which." * (len(groups[0]) > 1)
+        if unfitted:
+            return sentence(f"{text} The model with {row_label(found[0])} could not be fitted (see "
+                            "the notes), so that how far the gap closes is not known")  # fmt: skip
         return sentence(f"{text} How much of the gap that closes has not been measured yet")
     lacks, adding = _lacks(groups)
     text, measured = f"{named(report)} lacks {lacks}", share(report)
     if measured:
         return sentence(f"{text}. {adding} {measured}")
+    if not rows(report.closed):
+        return sentence(f"{text} ({sure}). How far the gap closes has not been measured")
     return sentence(
         f"{text} ({sure}), but {kept_back(report)} its gain is too uncertain to say how far the "
         "gap closes"
@@ -137,8 +159,10 @@ def _no_gap(report: GapReport) -> str:
     if best is None:
         return where + "."
     if is_number(best["p"]) and best["p"] <= report.settings.get("alpha", 0.05):
-        return f"{where}: {row_label(best)} stood out at first ({p_text(best['p'])}), but " \
-               f"{kept_back(report)} nothing could be gained."  # fmt: skip
+        text = f"{where}: {row_label(best)} stood out at first ({p_text(best['p'])}), but"
+        if not rows(report.closed):
+            return f"{text} what it gains has not been measured."
+        return f"{text} {kept_back(report)} nothing could be gained."
     return f"{where}: none of the {tried(report)} stands out from chance (the best, " \
            f"{row_label(best)}, has {p_text(best['p'])})."  # fmt: skip
 
@@ -190,7 +214,8 @@ def which(report: GapReport) -> list[str]:
         gain = next((g for g in gains if is_number(g)), None)
         if gain is not None:
             by = "" if is_number(gains[0]) else "predicted "
-            text += f"; {by}gain {number(gain, 2)} nats, {p_text(row.get('p'))}"
+            alone = " by itself" * (len(found) > 1)
+            text += f"; {by}gain {number(gain, 2)} nats{alone}, {p_text(row.get('p'))}"
         out.append(sentence(text))
         others = rivals(report, row)
         if others:
@@ -219,6 +244,8 @@ def how_far(report: GapReport) -> list[str]:
     if report.mode == "fast":
         return ["Not measured: fast mode stops after the screen."]
     closed = rows(report.closed)
+    if not closed and any(r.get("unfitted") for r in leaders(report)):
+        return ["Not measured: the effect could not be fitted."]
     if not closed:
         return ["Not measured."]
     first, out = closed[0], []
@@ -257,13 +284,17 @@ def how_sure(report: GapReport) -> list[str]:
     out = []
     if "cross-fitting" in report.parts:
         out.append(f"The data were used in turn: {report.parts['cross-fitting']} blocks, each "
-                   "predicted by models chosen and fitted without it.")  # fmt: skip
+                   "predicted by models that were fitted, and whose effects were chosen among the "
+                   "leading ones, without it.")  # fmt: skip
     else:
-        used = [(name, span(*report.parts[name])) for name in USE
+        used = [(name, _when(report, report.parts[name])) for name in USE
                 if isinstance(report.parts.get(name), tuple | list)]  # fmt: skip
         if used:
             text = listed([f"{USE[name]} {when}" for name, when in used])
-            out.append(sentence(text) + " No row served twice." * (len(used) > 1))
+            text = sentence(text)
+            text += " Likewise of the other experiments." * bool(_experiment(report))
+            once = len(used) > 1 and "choice" not in report.parts
+            out.append(text + " No row served twice." * once)
     out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
     alpha = report.settings.get("alpha", 0.05)
     tests = [r for r in rows(report.detection) if is_number(r["p"])]

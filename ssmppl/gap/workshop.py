@@ -17,18 +17,24 @@ from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.fit import Fitter
 from ssmppl.gap.screen import with_parameters
 from ssmppl.gap.smoothing import Settings
+from ssmppl.gap.started import Start, needs_start
 from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import LogNormal, Uniform
 from ssmppl.language.trace import Trace
 
 
 class Workshop:
-    """Makes and fits augmented models of one base model."""
+    """Makes and fits augmented models of one base model.
+
+    start : of those that cannot have the model's flat one.
+    """
 
     def __init__(
         self, trace: Trace, missing: Missing, fixed: Mapping[str, np.ndarray], settings: Settings,
+        start: Start | None = None,
     ):  # fmt: skip
         self.trace, self.missing, self.fixed, self.settings = trace, missing, dict(fixed), settings
+        self.start = start
         self._made: dict[tuple[tuple[str, str], ...], Fitter] = {}
 
     def __getstate__(self) -> dict:  # another process makes what it needs
@@ -41,7 +47,7 @@ class Workshop:
         key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
         if key not in self._made:
             trace = with_parameters(augment(self.trace, made), shapes) if made else self.trace
-            self._made[key] = self._fitter(trace, shapes)
+            self._made[key] = self.made(trace, shapes)
         return self._made[key].with_fixed(shapes)
 
     def with_free_shapes(
@@ -67,14 +73,17 @@ class Workshop:
             ]
             trace = with_parameters(augment(self.trace, made), given)
             trace = with_parameters(trace, map(share_of, free), lambda: Uniform(0, 1))
-            self._made[key] = self._fitter(trace, given)
+            self._made[key] = self.made(trace, given)
         return self._made[key].with_fixed(given)
 
-    def _fitter(self, trace: Trace, given: Mapping[str, float]) -> Fitter:
+    def made(self, trace: Trace, given: Mapping[str, float]) -> Fitter:
+        """The fitter of an augmented trace, with the values of what it was given besides."""
+        start = self.start if needs_start(trace) else None
+        trace = start.given(trace) if start else trace
         program = compile_trace(trace, self.missing)
         fixed = self.fixed | {n: np.asarray(v) for n, v in given.items()}
         settings = Settings(self.settings.particles, proposal_of(program), self.settings.lag)
-        return Fitter(Problem(trace, (), program), fixed, settings)
+        return Fitter(Problem(trace, (), program), fixed, settings, start)
 
 
 def share_of(shape: str) -> str:

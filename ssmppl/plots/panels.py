@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.naming import class_letters, leaders, row_label, rows
+from ssmppl.gap.naming import class_letters, marked, row_label, rows
 from ssmppl.gap.numerals import is_number, number, percent
 from ssmppl.gap.report import GapReport
 from ssmppl.plots.style import AFTER, BEFORE, DATA, FAINT, INK, SIGNED, bare, times
@@ -110,9 +110,17 @@ def _name(text: str) -> str:
 
 def bars(report: GapReport) -> list[dict[str, Any]]:
     """The rows of `causes` that `ranked_effects` shows: one for each effect and equation."""
-    best: dict[tuple[Any, Any], dict[str, Any]] = {}
-    for r in rows(report.causes):
-        best.setdefault((r["effect"], r["equation"]), r)
+    return [rows(report.causes)[i] for i in _barred(report)]
+
+
+def _barred(report: GapReport) -> list[int]:
+    """Their places in `causes`: of several forms the one that the verdict is about, or the best."""
+    best: dict[tuple[Any, Any], int] = {}
+    chosen = marked(report)
+    for i, r in enumerate(rows(report.causes)):
+        own = (r["effect"], r["equation"])
+        if own not in best or (i in chosen and best[own] not in chosen):
+            best[own] = i
     return list(best.values())[:MOST_EFFECTS]
 
 
@@ -121,23 +129,24 @@ def ranked_effects(report: GapReport, ax: Any) -> Any:
 
     The chosen ones are coloured; a letter marks effects that the data cannot tell apart.
     """
-    letters, chosen, shown = class_letters(report), leaders(report), bars(report)
+    letters, shown = class_letters(report), bars(report)
+    chosen = [i in marked(report) for i in _barred(report)]
     for i, r in enumerate(shown):
         refit = is_number(r["gain_refit"])
         gain = float(r["gain_refit"] if refit else r["gain_screen"])
         gain = gain if is_number(gain) else 0.0
-        colour = AFTER if r in chosen else FAINT
+        colour = AFTER if chosen[i] else FAINT
         ax.barh(
             i, gain, height=0.42, edgecolor=colour, linewidth=0.8,
             color=colour if refit else "none", hatch=None if refit else "////",
         )  # fmt: skip
         letter = letters.get(r["class_id"], "")
         end = f" {number(gain, 2)}" + (f"  {letter}" if letter else "")
-        ax.text(max(gain, 0.0), i, end, va="center", weight="bold" if r in chosen else "normal")
+        ax.text(max(gain, 0.0), i, end, va="center", weight="bold" if chosen[i] else "normal")
         form = f", {r['form']}" if isinstance(r["form"], str) and r["form"] else ""
         ax.text(0, i - 0.27, _name(row_label(r) + form), va="bottom", ha="left",
                 transform=ax.get_yaxis_transform(),
-                weight="bold" if r in chosen else "normal")  # fmt: skip
+                weight="bold" if chosen[i] else "normal")  # fmt: skip
     low, high = ax.get_xlim()
     ax.set_xlim(min(low, 0.0), max(high, 1.0) * 1.15)
     ax.set_ylim(len(shown) - 0.6, -0.9)

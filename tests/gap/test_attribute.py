@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ssmppl.gap import attribute as module
 from ssmppl.gap import catalogue_sensor as ssm_effects
 from ssmppl.gap import diagnose as diagnosis
 from ssmppl.gap import refit as refits_of
@@ -246,6 +247,49 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
     running._borne_out(results)
     assert len(out.chosen.candidates) == left
     assert len(out.notes) == 3 - left
+    assert out.left_out is (left < 3)
+    if out.notes:
+        assert out.notes[-1].endswith(f"kept instead: {' and '.join(['effect'] * left)}")
+
+
+@pytest.mark.parametrize(
+    ("refitted", "gain", "p", "expected"),
+    [
+        ((), 0.0, 0.001, 0),
+        ((1,), 5.0, 0.001, 0),
+        ((1,), 19.0, 0.001, None),  # another one gains more
+        ((1,), 5.0, 0.04, None),  # it does not stand out
+        ((0, 1), 5.0, 0.001, None),
+    ],
+)
+def test_what_leads_and_could_not_be_refitted(refitted, gain, p, expected):
+    screen = screen_of([6.0, 3.0, 0.5], np.eye(3))
+    screen.significant = np.array([p, 0.2, 1.0])
+    refits = [Refit((k,), (), None, None, gain) for k in refitted]
+    assert module._unfitted(screen, refits, 0.025) == expected
+
+
+@pytest.mark.parametrize("wanted", [1, 2, 3])
+def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, wanted):
+    """Where one effect stands for the best, and each step forward adds one."""
+    taken = []
+
+    def forward(out, *args):
+        taken.append(args[-1])
+        more = args[-1] - len(out.chosen.candidates)
+        out.chosen = replace(out.chosen, candidates=out.chosen.candidates + ("more",) * more)
+
+    one = Refit((0,), ("first",), None, None, 9.0)
+    monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
+    monkeypatch.setattr(module, "_best_pair", lambda *_: None)
+    monkeypatch.setattr(module, "_forward", forward)
+    screen = screen_of([6.0, 3.0], np.eye(2))
+    screen.question = SimpleNamespace(scales=None)
+    out = Attribution(None)
+    module.attribute(out, None, screen, (), seed_sequence(1), 0.05, Checkpoint(None, {}),
+                     always=True, singles=2, steps=wanted, quick=True)  # fmt: skip
+    assert len(out.chosen.candidates) == wanted
+    assert taken == {1: [], 2: [2, 2], 3: [2, 3]}[wanted]
 
 
 @pytest.mark.parametrize(("top", "share"), [(1.1, 1.0), (0.6, 0.5), (0.1, 0.25)])
