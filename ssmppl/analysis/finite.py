@@ -2,13 +2,15 @@
 
 Of Categorical, Bernoulli and Binomial laws, and of Truncated counts between numbers, the values are
 known; a deterministic component (a lag, a duration that starts over) takes those of its expression
-over the values of what it depends on, iterated until nothing new turns up.
+over the values of what it depends on, iterated until nothing new turns up. Every round but the last
+adds a value, so that a counter without end soon has too many.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +23,6 @@ from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import Site, Trace, previous
 
 MOST = 64  # combinations of values: a step costs their square
-ROUNDS = 16  # of deterministic components fed into each other
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,18 @@ def finite_states(trace: Trace) -> FiniteStates | NotApplicable:
                 return found
             for s, own in zip(site.value.ravel(), found, strict=True):
                 domain[s] = tuple(sorted({*domain.get(s, ()), *own}))
+    size = _combinations(domain)
+    if size > MOST:
+        return NotApplicable(f"the states have {size} combinations of values, more than {MOST}")
     reason = _follow(trace, domain)
     if reason is not None:
         return reason
     columns = [domain[s] for s in trace.state_symbols]
-    size = int(np.prod([len(c) for c in columns]))
-    if size > MOST:
-        return NotApplicable(f"the states have {size} combinations of values, more than {MOST}")
     return FiniteStates(np.array(list(itertools.product(*columns)), dtype=float))
+
+
+def _combinations(domain: Mapping[Expr, tuple[float, ...]]) -> int:
+    return math.prod(map(len, domain.values()))
 
 
 def _values(site: Site) -> list[tuple[float, ...]] | NotApplicable:
@@ -91,29 +96,36 @@ def _follow(trace: Trace, domain: dict[Expr, tuple[float, ...]]) -> NotApplicabl
             return NotApplicable(
                 f"the values of {site.name!r} depend on {others[0]!r}", site.distribution.location
             )
-    for _ in range(ROUNDS):
+    grown = True
+    while grown:
         grown = False
         for site, s, e in pairs:
             needed = symbols_of([e])
             known = [domain.get(before.get(n, n), ()) for n in needed]
             new = {*domain.get(s, ()), *_reached(e, needed, known)}
+            where = site.distribution.location
             if len(new) > MOST:
-                return NotApplicable(
-                    f"{site.name!r} takes more than {MOST} values", site.distribution.location
-                )
-            grown |= len(new) > len(domain.get(s, ()))
-            domain[s] = tuple(sorted(new))
-        if not grown:
-            return None
-    return NotApplicable("the values of deterministic components go on and on")
+                return NotApplicable(f"{site.name!r} takes more than {MOST} values", where)
+            if len(new) > len(domain.get(s, ())):
+                grown, domain[s] = True, tuple(sorted(new))
+                if _combinations(domain) > MOST:
+                    return NotApplicable(
+                        f"{site.name!r} takes so many values that the states have more than {MOST} "
+                        "combinations",
+                        where,
+                    )
+    for site, s, _ in pairs:
+        if s not in domain:
+            return NotApplicable(f"{site.name!r} takes no value", site.distribution.location)
+    return None
 
 
 def _reached(
     e: Expr, needed: Iterable[Expr], known: Iterable[tuple[float, ...]]
 ) -> Iterable[float]:
     needed = list(needed)
-    combinations = list(itertools.product(*known))
-    if not combinations or len(combinations) > MOST**2:
+    combinations = list(itertools.product(*known))  # of two rows of few: at most MOST**2
+    if not combinations:
         return []
     columns = dict(zip(needed, np.array(combinations, dtype=float).T, strict=True))
     found = np.asarray(evaluate(e, columns), dtype=float).ravel()

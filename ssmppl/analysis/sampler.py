@@ -10,7 +10,8 @@ The draw leaves the exact conditional invariant, whatever path it takes:
   log joint density: a Metropolis-Hastings step that proposes from the
   conjugate part, then always a sweep of slice steps, so that no value is held for long;
 - statistics under which the conjugate part is improper: slice steps. A Normal-Gamma block is then
-  updated separately, v by its Gamma given theta and theta by slices.
+  updated separately, v by its Gamma given theta (where nothing outside the family holds v) and
+  theta by slices.
 """
 
 from __future__ import annotations
@@ -71,8 +72,9 @@ class Sampler:
         known = {c: WHOLE if b is None else b for c, b in zip(components, self.bounds, strict=True)}
         self.ranges = [interval(functions[j], known) for j in update.correction]
         v = components[-1]
+        beside = [*(functions[j] for j in update.correction), *(f.density for f in update.left)]
         self.v_is_gamma = isinstance(update.conditional, NormalGamma) and not any(
-            v in symbols_of(functions[j]) for j in update.correction
+            v in symbols_of(e) for e in beside
         )
         self.natural = natural
 

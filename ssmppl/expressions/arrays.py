@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+from numpy.lib.array_utils import normalize_axis_tuple
 
 from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.expr import Expr, apply, as_expr, constant, pack, unpack, user_location
@@ -43,38 +45,42 @@ class ExprArray(np.ndarray):
         return _unpack_array, (table, [place[n] for n in nodes], self.shape)
 
     # NumPy's methods, which would bypass the protocols, by the functions of the same name.
-    def sum(self, axis=None, **kwargs):  # type: ignore[override]
-        return reduced("add", self, axis, **kwargs)
+    def sum(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.sum, self, args, kwargs)
 
-    def prod(self, axis=None, **kwargs):  # type: ignore[override]
-        return reduced("mul", self, axis, **kwargs)
+    def prod(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.prod, self, args, kwargs)
 
-    def mean(self, axis=None, **kwargs):  # type: ignore[override]
-        return mean(self, axis, **kwargs)
+    def mean(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.mean, self, args, kwargs)
 
-    def var(self, axis=None, ddof=0, **kwargs):  # type: ignore[override]
-        return var(self, axis, ddof, **kwargs)
+    def var(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.var, self, args, kwargs)
 
-    def std(self, axis=None, ddof=0, **kwargs):  # type: ignore[override]
-        return elementwise("sqrt", var(self, axis, ddof, **kwargs))
+    def std(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.std, self, args, kwargs)
 
-    def max(self, axis=None, **kwargs):  # type: ignore[override]
-        return reduced("maximum", self, axis, **kwargs)
+    def max(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.max, self, args, kwargs)
 
-    def min(self, axis=None, **kwargs):  # type: ignore[override]
-        return reduced("minimum", self, axis, **kwargs)
+    def min(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.min, self, args, kwargs)
 
-    def dot(self, other):  # type: ignore[override]
-        return dot(self, other)
+    def dot(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.dot, self, args, kwargs)
 
-    def clip(self, lower=None, upper=None):  # type: ignore[override]
-        return clip(self, lower, upper)
+    def clip(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.clip, self, args, kwargs)
 
-    def trace(self):  # type: ignore[override]
-        return trace(self)
+    def trace(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.trace, self, args, kwargs)
 
-    def cumsum(self, axis=None):  # type: ignore[override]
-        return cumsum(self, axis)
+    def cumsum(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.cumsum, self, args, kwargs)
+
+
+def _by_function(function: Any, a: ExprArray, args: tuple, kwargs: dict) -> Any:
+    return behaviour["function"](function, (a, *args), kwargs)
 
 
 def _unpack_array(table: list, places: list[int], shape: tuple[int, ...]) -> ExprArray:
@@ -133,36 +139,90 @@ def choose(index: Any, choices: Sequence[Any] | np.ndarray) -> Any:
     return chosen
 
 
-def reduced(op: str, a: Any, axis: Any = None, keepdims: bool = False, **unused: Any) -> Any:
-    """The elements along `axis` (all axes: None) joined by `op`, from the first to the last."""
+_IDENTITY = {"add": 0.0, "mul": 1.0}
+
+
+def reduced(
+    op: str, a: Any, axis: Any = None, keepdims: bool = False, initial: Any = None,
+    where: Any = True,
+) -> Any:  # fmt: skip
+    """`initial` (if any) and the elements along `axis` (all axes: None) joined by `op`, from the
+    first to the last; of these only those where the mask `where` holds."""
     a = plain(a)
-    axes = range(a.ndim) if axis is None else np.atleast_1d(axis) % max(a.ndim, 1)
-    axes = tuple(int(i) for i in axes)
-    moved = np.moveaxis(a, axes, range(len(axes)))
+    start = _IDENTITY.get(op, initial)  # what adds nothing
+    if where is not True:
+        if start is None:
+            refuse(f"{op} of some elements, by where=, without initial=", "give initial= too")
+        a = plain(elementwise("where", _mask(where, a.shape), a, start))
+    axes = axes_of(axis, a.ndim)
+    moved = np.moveaxis(a, axes, range(len(axes))) if a.ndim else a
     rest = moved.shape[len(axes) :]
-    flat = moved.reshape((-1, *rest))
-    if len(flat) == 0:
-        if op not in ("add", "mul"):
-            refuse(f"{op} of no elements", "give at least one element")
-        total: Any = np.full(rest, constant(0.0 if op == "add" else 1.0), dtype=object)
-    else:
-        total = flat[0]
-        for part in flat[1:]:
-            total = elementwise(op, total, part)
+    flat = moved.reshape((-1, *rest)) if moved.size else np.empty((0, *rest), dtype=object)
+    parts = list(flat) if initial is None else [np.full(rest, as_expr(initial), object), *flat]
+    if not parts:
+        if start is None:
+            refuse(f"{op} of no elements", "give at least one element, or initial=")
+        parts = [np.full(rest, constant(start), dtype=object)]
+    total: Any = parts[0]
+    for part in parts[1:]:
+        total = elementwise(op, total, part)
     if keepdims:
         total = plain(total).reshape([1 if i in axes else n for i, n in enumerate(a.shape)])
     return scalar_or_array(total)
 
 
-def mean(a: Any, axis: Any = None, **kwargs: Any) -> Any:
-    total = reduced("add", a, axis, **kwargs)
-    return total / (plain(a).size / plain(total).size)
+def axes_of(axis: Any, ndim: int) -> tuple[int, ...]:
+    """The axes meant, from 0; all where None."""
+    if axis is None:
+        return tuple(range(ndim))
+    try:
+        return normalize_axis_tuple(axis, max(ndim, 1))[:ndim]
+    except (ValueError, TypeError) as error:
+        refuse(f"axis={axis!r} of an array of {ndim} dimensions", f"give another axis: {error}")
 
 
-def var(a: Any, axis: Any = None, ddof: int = 0, **kwargs: Any) -> Any:
-    a = array(a)
-    n = a.size / plain(reduced("add", a, axis)).size
-    return reduced("add", (a - mean(a, axis, keepdims=True)) ** 2, axis, **kwargs) / (n - ddof)
+def _mask(where: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A mask, of numbers or of conditions on symbols, in the shape of what it masks."""
+    if not isinstance(where, (Expr, ExprArray)) and np.asarray(where).dtype not in (bool, object):
+        refuse(f"where={where!r}", "a mask holds True and False: compare, as in mask > 0")
+    mask = plain(where)
+    if np.broadcast_shapes(mask.shape, shape) != shape:
+        refuse(f"where= of shape {mask.shape} on an array of shape {shape}", "make it no larger")
+    return np.broadcast_to(mask, shape)
+
+
+def _count(a: Any, axis: Any, where: Any) -> Any:
+    """How many elements a mean is of."""
+    if where is not True:
+        ones = elementwise("where", _mask(where, plain(a).shape), 1.0, 0.0)
+        return reduced("add", ones, axis, keepdims=True)
+    shape = plain(a).shape
+    return float(np.prod([shape[i] for i in axes_of(axis, len(shape))]))
+
+
+def _divided(total: Any, n: Any, what: str, keepdims: bool, axis: Any) -> Any:
+    """total, of kept dimensions, over n, where n is positive."""
+    if any(as_expr(e).op == "const" and as_expr(e).data <= 0.0 for e in plain(n).flat):
+        refuse(f"{what} of too few elements", "give more elements, or a smaller ddof")
+    out = plain(total / n)
+    return scalar_or_array(out if keepdims else np.squeeze(out, axes_of(axis, out.ndim)))
+
+
+def mean(a: Any, axis: Any = None, keepdims: bool = False, where: Any = True) -> Any:
+    total = reduced("add", a, axis, keepdims=True, where=where)
+    return _divided(total, _count(a, axis, where), "the mean", keepdims, axis)
+
+
+def var(
+    a: Any, axis: Any = None, ddof: float | None = None, keepdims: bool = False, where: Any = True,
+    correction: float | None = None,
+) -> Any:  # fmt: skip
+    if ddof is not None and correction is not None:
+        refuse("var with both ddof and correction", "give one of them")
+    less = ddof if ddof is not None else correction if correction is not None else 0
+    away = array(a) - mean(a, axis, keepdims=True, where=where)
+    total = reduced("add", away**2, axis, keepdims=True, where=where)
+    return _divided(total, _count(a, axis, where) - less, "the variance", keepdims, axis)
 
 
 def matmul(a: Any, b: Any) -> Any:
@@ -193,23 +253,51 @@ def _zero(e: Any) -> bool:
 
 
 def dot(a: Any, b: Any) -> Any:
+    """Over the last axis of a and the last but one of b, where np.matmul pairs stacks."""
     a, b = plain(a), plain(b)
-    return array(a) * array(b) if a.ndim == 0 or b.ndim == 0 else matmul(a, b)
+    if a.ndim == 0 or b.ndim == 0:
+        return array(a) * array(b)
+    if b.ndim < 3:
+        return matmul(a, b)
+    columns = np.moveaxis(b, -2, 0)
+    return _reshaped(matmul(a, columns.reshape(len(columns), -1)), a.shape[:-1] + columns.shape[1:])
 
 
-def clip(a: Any, a_min: Any = None, a_max: Any = None, **bounds: Any) -> Any:
-    lower, upper = bounds.get("min", a_min), bounds.get("max", a_max)
-    a = a if lower is None else elementwise("maximum", a, lower)
+def vdot(a: Any, b: Any) -> Any:
+    return dot(plain(a).reshape(-1), plain(b).reshape(-1))
+
+
+def inner(a: Any, b: Any) -> Any:
+    """Over the last axis of both."""
+    a, b = plain(a), plain(b)
+    if a.ndim == 0 or b.ndim == 0:
+        return array(a) * array(b)
+    return _reshaped(matmul(a, b.reshape(-1, b.shape[-1]).T), a.shape[:-1] + b.shape[:-1])
+
+
+def _reshaped(a: Any, shape: tuple[int, ...]) -> Any:
+    return scalar_or_array(plain(a).reshape(shape))
+
+
+def clip(
+    a: Any, a_min: Any = None, a_max: Any = None, min: Any = np._NoValue, max: Any = np._NoValue
+) -> Any:
+    lower, upper = a_min, a_max
+    if min is not np._NoValue or max is not np._NoValue:
+        if not (a_min is None and a_max is None):
+            refuse("np.clip with min= or max= beside a_min and a_max", "give each bound once")
+        lower, upper = (None if b is np._NoValue else b for b in (min, max))
+    a = scalar_or_array(a) if lower is None else elementwise("maximum", a, lower)
     return a if upper is None else elementwise("minimum", a, upper)
 
 
-def trace(a: Any, **unused: Any) -> Any:
-    return reduced("add", np.diagonal(plain(a)))
+def trace(a: Any, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Any:
+    return reduced("add", np.diagonal(plain(a), offset, axis1, axis2), -1)
 
 
-def cumsum(a: Any, axis: Any = None, **unused: Any) -> Any:
-    a = plain(a).reshape(-1) if axis is None else plain(a)
-    out = np.moveaxis(a.copy(), axis or 0, 0)
+def cumsum(a: Any, axis: Any = None) -> Any:
+    a, axis = (plain(a).reshape(-1), 0) if axis is None else (plain(a), operator.index(axis))
+    out = np.moveaxis(a.copy(), axis, 0)
     for i in range(1, len(out)):
         out[i] = plain(elementwise("add", out[i - 1], out[i]))
-    return array(np.moveaxis(out, 0, axis or 0))
+    return array(np.moveaxis(out, 0, axis))

@@ -52,8 +52,13 @@ def _is_diagonal(a: Any) -> bool:
     )
 
 
-def cholesky(a: Any) -> ExprArray:
-    """Lower Cholesky factor of a symmetric positive definite matrix (its lower half is read)."""
+def cholesky(a: Any, upper: bool = False) -> ExprArray:
+    """Lower Cholesky factor of a symmetric positive definite matrix (its lower half is read).
+
+    upper : the upper factor, of which the upper half is read.
+    """
+    if upper:
+        return array(plain(cholesky(square_matrix(a, "linalg.cholesky").T)).T)
     a = square_matrix(a, "linalg.cholesky")
     if _is_diagonal(a):
         return array(np.diag(array([apply("sqrt", d) for d in np.diagonal(a)])))
@@ -118,8 +123,10 @@ def slogdet(a: Any) -> Slogdet:
     return Slogdet(apply("sign", det(a)), size)
 
 
-def norm(a: Any, ord: Any = None, **unused: Any) -> Any:
-    """Euclidean norm of a vector."""
-    if ord not in (None, 2) or plain(a).ndim != 1:
-        refuse("np.linalg.norm other than the Euclidean norm of a vector", "write it out")
-    return apply("sqrt", reduced("add", elementwise("mul", a, a)))
+def norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
+    """Euclidean norm, of a vector, along an axis, or of all entries."""
+    along = axis is None or np.ndim(axis) == 0
+    euclidean = ord is None or (isinstance(ord, (int, float)) and ord == 2)
+    if not along or not euclidean or (ord == 2 and axis is None and plain(x).ndim != 1):
+        refuse("np.linalg.norm other than the Euclidean norm of vectors", "write it out")
+    return elementwise("sqrt", reduced("add", elementwise("mul", x, x), axis, keepdims))

@@ -8,7 +8,9 @@ by name, with the nearest that exist.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from functools import cache, partial
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ from ssmppl.expressions.arrays import (
     cumsum,
     dot,
     elementwise,
+    inner,
     matmul,
     mean,
     plain,
@@ -30,6 +33,7 @@ from ssmppl.expressions.arrays import (
     scalar_or_array,
     trace,
     var,
+    vdot,
 )
 from ssmppl.expressions.expr import TERNARY, UNARY, Expr, apply, as_expr
 from ssmppl.expressions.linear import cholesky, det, inverse, norm, slogdet
@@ -76,20 +80,23 @@ _DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "wher
 def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
     """A NumPy ufunc on symbols: called, reduced (np.add.reduce) or as an outer product."""
     name = ufunc.__name__
-    if any(v is not None for k, v in kwargs.items() if k in ("out", "where")):
-        refuse(f"np.{name} with out= or where=, and assignment in place on an array of numbers",
+    called = name if method == "__call__" else f"{name}.{method}"
+    if any(a is not None for a in kwargs.pop("out", ())):
+        refuse(f"np.{called} with out=, and assignment in place on an array of numbers",
                 "write the new array as an expression, a + b instead of a += b")  # fmt: skip
+    if method == "reduce" and name in ("add", "multiply", "maximum", "minimum"):
+        given = _meant(called, {"axis": 0, **kwargs}, _REDUCING)
+        return reduced(_RENAMED.get(name, name), inputs[0], **given)
+    if method == "accumulate" and name == "add":
+        return cumsum(inputs[0], **_meant(called, {"axis": 0, **kwargs}, ("axis",)))
+    _meant(called, kwargs, ())
     if name == "matmul" and method == "__call__":
         return matmul(*inputs)
-    if method == "reduce" and name in ("add", "multiply", "maximum", "minimum"):
-        return reduced(_RENAMED.get(name, name), inputs[0], kwargs.get("axis", 0))
-    if method == "accumulate" and name == "add":
-        return cumsum(inputs[0], kwargs.get("axis", 0))
     if method == "outer":
         a, b = (plain(i) for i in inputs)
         inputs = (a.reshape(a.shape + (1,) * b.ndim), b)
     elif method != "__call__":
-        refuse(f"np.{name}.{method}", "write it out")
+        refuse(f"np.{called}", "write it out")
     if name in _COMPOSED:
         arrays = np.broadcast_arrays(*(plain(i) for i in inputs))
         out = np.empty(arrays[0].shape, dtype=object)
@@ -106,65 +113,154 @@ def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> An
 behaviour["ufunc"] = apply_ufunc
 
 
-def _where(condition: Any, *branches: Any) -> Any:
-    if len(branches) != 2:
-        refuse("np.where with a condition only", "give both branches: np.where(c, a, b)")
-    return elementwise("where", condition, *branches)
+# Of no consequence for values, whatever they are.
+_IRRELEVANT = frozenset({"order", "subok", "optimize", "device"})
+_DEFAULTS: dict[str, tuple[Any, ...]] = {
+    "out": (None,), "keepdims": (False,), "where": (True,), "mode": ("raise",), "axis": (None,),
+    "casting": ("same_kind", "safe"), "signature": (None,), "axes": (None,), "initial": (None,),
+    "mean": (None,), "correction": (None,),
+}  # fmt: skip
+_REDUCING = ("axis", "keepdims", "initial", "where")
 
 
-def _take(a: Any, index: Any, axis: int | None = None, **unused: Any) -> Any:
-    if isinstance(index, Expr):
-        return choose(index, np.ravel(plain(a)) if axis is None else np.moveaxis(plain(a), axis, 0))
-    return scalar_or_array(np.take(plain(a), np.asarray(index, dtype=int), axis))
+def _meant(called: str, given: dict[str, Any], known: Collection[str]) -> dict[str, Any]:
+    """Of the arguments given those that are known; all others must be as NumPy has them anyway."""
+    out = {}
+    for name, value in given.items():
+        if value is np._NoValue:
+            continue
+        if name in known:
+            out[name] = value
+        elif not _changes_nothing(name, value):
+            refuse(
+                f"np.{called} with {name}={_shown(value)}", _FIXES.get(name, f"leave {name} out")
+            )
+    return out
 
 
-def _copyto(target: Any, source: Any, **kwargs: Any) -> None:
-    if np.asarray(target).dtype != object:  # np.full(shape, symbol) comes with an object array
-        refuse("copying symbols into an array of numbers", "build the array by np.stack([...])")
-    np.copyto(np.asarray(target).view(np.ndarray), plain(source))
-
-
-def _like(value: float) -> Callable[..., Any]:
-    return lambda a, *unused, **unused_too: scalar_or_array(np.full(plain(a).shape, value))
-
-
-FUNCTIONS: dict[Callable[..., Any], Callable[..., Any]] = {
-    np.where: _where,
-    np.sum: lambda a, axis=None, **kw: reduced("add", a, axis, **kw),
-    np.prod: lambda a, axis=None, **kw: reduced("mul", a, axis, **kw),
-    np.max: lambda a, axis=None, **kw: reduced("maximum", a, axis, **kw),
-    np.min: lambda a, axis=None, **kw: reduced("minimum", a, axis, **kw),
-    np.mean: mean,
-    np.var: var,
-    np.std: lambda a, axis=None, **kw: elementwise("sqrt", var(a, axis, **kw)),
-    np.cumsum: cumsum,
-    np.dot: dot,
-    np.vdot: dot,
-    np.inner: lambda a, b: dot(a, plain(b).T),
-    np.outer: lambda a, b: elementwise("mul", plain(a).reshape(-1, 1), plain(b).reshape(1, -1)),
-    np.kron: lambda a, b: scalar_or_array(np.kron(plain(a), plain(b))),
-    np.einsum: lambda spec, *ops, optimize=False: scalar_or_array(
-        np.einsum(spec, *map(plain, ops))
-    ),
-    np.clip: clip,
-    np.trace: trace,
-    np.take: _take,
-    np.choose: lambda index, choices, **kw: choose(index, choices),
-    np.diff: lambda a, **kw: scalar_or_array(np.diff(plain(a), **kw)),
-    np.copyto: _copyto,
-    np.zeros_like: _like(0.0),
-    np.ones_like: _like(1.0),
-    np.full_like: lambda a, value, **kw: scalar_or_array(np.full(plain(a).shape, value)),
-    np.shape: lambda a: plain(a).shape,
-    np.ndim: lambda a: plain(a).ndim,
-    np.size: lambda a: plain(a).size,
-    np.linalg.inv: inverse,
-    np.linalg.det: det,
-    np.linalg.slogdet: slogdet,
-    np.linalg.cholesky: cholesky,
-    np.linalg.solve: lambda a, b: matmul(inverse(a), b),
-    np.linalg.norm: norm,
+_FIXES = {
+    "out": "write the new array as an expression",
+    "where": "use np.where(condition, a, b)",
+    "dtype": "leave dtype out: symbols are real numbers; round by np.floor or np.ceil",
 }
+
+
+def _changes_nothing(name: str, value: Any) -> bool:
+    if name == "dtype":
+        return value is None or value is float or value is object or value == np.dtype(float)
+    if isinstance(value, np.bool):
+        value = bool(value)
+    return name in _IRRELEVANT or any(
+        type(value) is type(d) and value == d for d in _DEFAULTS.get(name, ())
+    )
+
+
+def _shown(value: Any) -> str:
+    text = value.__name__ if isinstance(value, type) else repr(value)
+    return text if len(text) < 60 else f"{text[:56]} ..."
+
+
+def _where(*branches: Any) -> Any:
+    if len(branches) != 3:
+        refuse("np.where with a condition only", "give both branches: np.where(c, a, b)")
+    return elementwise("where", *branches)
+
+
+def _std(
+    a: Any, axis: Any = None, ddof: float | None = None, keepdims: bool = False, where: Any = True,
+    correction: float | None = None,
+) -> Any:  # fmt: skip
+    return elementwise("sqrt", var(a, axis, ddof, keepdims, where, correction))
+
+
+def _outer(a: Any, b: Any) -> Any:
+    return elementwise("mul", plain(a).reshape(-1, 1), plain(b).reshape(1, -1))
+
+
+def _einsum(*operands: Any) -> Any:
+    return scalar_or_array(np.einsum(*_strip(operands)))
+
+
+def _take(a: Any, indices: Any, axis: int | None = None, mode: Any = "raise") -> Any:
+    if isinstance(indices, Expr):
+        if mode != "raise":
+            refuse(f"np.take by a symbol with mode={mode!r}", "leave mode out, and bound the index")
+        return choose(
+            indices, np.ravel(plain(a)) if axis is None else np.moveaxis(plain(a), axis, 0)
+        )
+    return scalar_or_array(np.take(plain(a), np.asarray(indices, dtype=int), axis, mode=mode))
+
+
+def _choose(a: Any, choices: Any) -> Any:
+    wrong = [i for i in array(a).flat if i.op == "const" and i.data not in range(len(choices))]
+    if wrong:
+        refuse(f"np.choose by {wrong[0]!r} from {len(choices)}", "give an index from 0 below that")
+    return choose(a, choices)
+
+
+def _diff(
+    a: Any, n: int = 1, axis: int = -1, prepend: Any = np._NoValue, append: Any = np._NoValue
+) -> Any:
+    ends = _strip((prepend, append))
+    return scalar_or_array(np.diff(plain(a), n, axis, *ends))
+
+
+def _copyto(dst: Any, src: Any, casting: str = "", where: Any = True) -> None:
+    if np.asarray(dst).dtype != object:  # np.full(shape, symbol) comes with an object array
+        refuse("copying symbols into an array of numbers", "build the array by np.stack([...])")
+    if isinstance(where, (Expr, ExprArray)):
+        refuse("np.copyto where a symbol decides", "use np.where(condition, a, b)")
+    np.copyto(np.asarray(dst).view(np.ndarray), plain(src), where=where)
+
+
+def _full(a: Any, value: Any, shape: Any) -> Any:
+    out = np.empty(plain(a).shape if shape is None else shape, dtype=object)
+    out[...] = plain(value)
+    return scalar_or_array(out)
+
+
+_ALL = "a axis dtype out keepdims initial where"
+_SPREAD = "a axis dtype out ddof keepdims where mean correction"
+_LIKE = "dtype order subok shape device"
+# What each does on symbols, and NumPy's arguments in their order; "" where any number are operands.
+# Arguments that it does not have are refused, unless they say what NumPy does anyway.
+FUNCTIONS: dict[Callable[..., Any], tuple[Callable[..., Any], str]] = {
+    np.where: (_where, ""),
+    np.sum: (partial(reduced, "add"), _ALL),
+    np.prod: (partial(reduced, "mul"), _ALL),
+    np.max: (partial(reduced, "maximum"), "a axis out keepdims initial where"),
+    np.min: (partial(reduced, "minimum"), "a axis out keepdims initial where"),
+    np.mean: (mean, "a axis dtype out keepdims where"),
+    np.var: (var, _SPREAD),
+    np.std: (_std, _SPREAD),
+    np.cumsum: (cumsum, "a axis dtype out"),
+    np.dot: (dot, "a b out"),
+    np.vdot: (vdot, "a b"),
+    np.inner: (inner, "a b"),
+    np.outer: (_outer, "a b out"),
+    np.kron: (lambda a, b: scalar_or_array(np.kron(plain(a), plain(b))), "a b"),
+    np.einsum: (_einsum, ""),
+    np.clip: (clip, "a a_min a_max out min max"),
+    np.trace: (trace, "a offset axis1 axis2 dtype out"),
+    np.take: (_take, "a indices axis out mode"),
+    np.choose: (_choose, "a choices out mode"),
+    np.diff: (_diff, "a n axis prepend append"),
+    np.copyto: (_copyto, "dst src casting where"),
+    np.zeros_like: (lambda a, shape=None: _full(a, 0.0, shape), f"a {_LIKE}"),
+    np.ones_like: (lambda a, shape=None: _full(a, 1.0, shape), f"a {_LIKE}"),
+    np.full_like: (
+        lambda a, fill_value, shape=None: _full(a, fill_value, shape), f"a fill_value {_LIKE}"
+    ),
+    np.shape: (lambda a: plain(a).shape, "a"),
+    np.ndim: (lambda a: plain(a).ndim, "a"),
+    np.size: (lambda a, axis=None: np.size(plain(a), axis), "a axis"),
+    np.linalg.inv: (inverse, "a"),
+    np.linalg.det: (det, "a"),
+    np.linalg.slogdet: (slogdet, "a"),
+    np.linalg.cholesky: (cholesky, "a upper"),
+    np.linalg.solve: (lambda a, b: matmul(inverse(a), b), "a b"),
+    np.linalg.norm: (norm, "x ord axis keepdims"),
+}  # fmt: skip
 # Functions that move elements and compute nothing run as NumPy has them, on object arrays.
 STRUCTURAL = {
     np.concatenate, np.stack, np.hstack, np.vstack, np.column_stack, np.block, np.append,
@@ -177,14 +273,30 @@ STRUCTURAL = {
 
 def apply_function(func: Callable[..., Any], args: tuple, kwargs: dict) -> Any:
     """A NumPy array function on symbols."""
+    name = func.__name__
     if func in FUNCTIONS:
-        return FUNCTIONS[func](*args, **kwargs)
+        does, order = FUNCTIONS[func]
+        if not order:
+            _meant(name, kwargs, ())
+            return does(*args)
+        names = order.split()
+        if len(args) > len(names):
+            refuse(f"np.{name} with {len(args)} arguments", f"it takes {', '.join(names)}")
+        given = {**dict(zip(names, args, strict=False)), **kwargs}
+        return does(**_meant(name, given, _parameters(does)))
     if func in STRUCTURAL:
         result = func(*_strip(args), **_strip(kwargs))
-        return [array(r) for r in result] if isinstance(result, list) else scalar_or_array(result)
+        if isinstance(result, (list, tuple)):
+            return type(result)(array(r) for r in result)
+        return scalar_or_array(result)
     known = {f.__name__ for f in [*FUNCTIONS, *STRUCTURAL]}
-    name = func.__name__
     refuse(f"np.{name}", f"supported are {', '.join(nearest_first(name, known))}")
+
+
+@cache
+def _parameters(does: Callable[..., Any]) -> Collection[str]:
+    """The arguments that are implemented."""
+    return signature(does).parameters
 
 
 def _strip(value: Any) -> Any:

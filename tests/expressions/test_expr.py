@@ -309,7 +309,7 @@ def _while():
 REFUSED = {
     _if: "np.where", _and: "&", _chain: "&", _float: "np.exp", _math: "np.exp",
     _fft: "supported are", _in_place: "a + b", _assign: "np.stack", _out: "a + b",
-    _where_keyword: "a + b", _min: "np.minimum", _range: "np.choose", _int: "np.choose",
+    _where_keyword: "np.where(", _min: "np.minimum", _range: "np.choose", _int: "np.choose",
     _as_floats: "np.stack", _astype: "np.stack", _one_argument_where: "both branches",
     _sort: "supported are", _slice: "np.choose", _take_from_numbers: "np.choose",
     _compare_object_array: "np.stack",

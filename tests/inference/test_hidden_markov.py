@@ -150,22 +150,62 @@ def of(transition, initial=None):
 
 
 def test_which_states_are_finite():
+    begin = {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(0.0)}
     two = of(lambda z: {"z": ssm.Truncated(ssm.Poisson(2.0 + z), lower=1, upper=3)})
     assert two.values.ravel().tolist() == [0.0, 1.0, 2.0, 3.0]
     counter = of(
         lambda z, d: {
             "z": ssm.Bernoulli(0.3), "d": ssm.Dirac(np.where(z, 0.0, np.minimum(d + 1, 4))),
         },
-        {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(0.0)},
+        begin,
     )  # fmt: skip
     assert np.unique(counter.values[:, 1]).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     reasons = {
         "continuum": of(lambda z: {"z": ssm.Normal(z, sd=1)}),
         "infinitely many": of(lambda z: {"z": ssm.Poisson(z + 1)}),
         "depend on a": of(lambda z, a: {"z": ssm.Dirac(z + a)}),
-        "go on and on": of(lambda z: {"z": ssm.Dirac(z + 1)}),
+        "'z' takes more than 64 values": of(lambda z: {"z": ssm.Dirac(z + 1)}),
+        "'d' takes so many values": of(
+            lambda z, d: {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(np.where(z, d + 0.1, 0.0))}, begin
+        ),
+        "'d' takes no value": of(
+            lambda z, d: {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(d + 1)},
+            {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(np.inf)},
+        ),
+        "8192 combinations": of(
+            lambda z, d: {"z": ssm.Bernoulli(0.5 + np.zeros(13)), "d": ssm.Dirac(np.sum(z))},
+            {"z": ssm.Bernoulli(0.5 + np.zeros(13)), "d": ssm.Dirac(0.0)},
+        ),
         f"more than {MOST}": of(lambda z: {"z": ssm.Binomial(100, 0.5)}),
     }
     for words, found in reasons.items():
         assert isinstance(found, NotApplicable)
         assert words in found.reason
+
+
+@pytest.mark.parametrize("cap", [16, 17, 20, 31])
+def test_durations_count_up_to_where_they_saturate(cap):
+    """A renewal whose probability depends on the time since the last, by hand."""
+
+    def chance(d):
+        return 0.02 + 0.4 * d / cap
+
+    model = ssm.Model("durations")
+    model.initial(lambda: {"z": ssm.Bernoulli(0.5), "d": ssm.Dirac(0.0)})
+    model.transition(lambda z, d: {
+        "z": ssm.Bernoulli(chance(d)), "d": ssm.Dirac(np.where(z, 0.0, np.minimum(d + 1, cap))),
+    })  # fmt: skip
+    model.observation(lambda z, d: {"y": ssm.Normal(z + 0.1 * d, sd=1)})
+    y = np.random.default_rng(seed_of("durations", cap)).normal(1.0, 1.0, 3 * cap)
+
+    law = {(0, 0): 0.5, (1, 0): 0.5}
+    for t, value in enumerate(y):
+        if t:
+            before, law = law, {}
+            for (z, d), p in before.items():
+                now = 0 if z else min(d + 1, cap)
+                for new, share in ((0, 1.0 - chance(d)), (1, chance(d))):
+                    law[new, now] = law.get((new, now), 0.0) + p * share
+        law = {(z, d): p * stats.norm.pdf(value, z + 0.1 * d) for (z, d), p in law.items()}
+    found = ssm.log_likelihood(model, {"y": y}, {}, proposal="auto")
+    assert found.tolist() == pytest.approx([np.log(sum(law.values()))], rel=1e-12)
