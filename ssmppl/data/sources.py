@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.data.times import label_text
+from ssmppl.data.times import as_dates, label_text
 from ssmppl.data.values import Fault, as_numbers, short
 from ssmppl.errors import DataError
 from ssmppl.language.model import Model
@@ -238,9 +238,21 @@ def _informative(index: Any) -> bool:
     return not plain
 
 
+def _read_dates(values: Any, name: str, source: Source) -> Any:
+    """Labels that are texts or objects: as dates, where they are that."""
+    code = "data.index" if name == "index" else f"data[{source.time_name!r}]"
+    try:
+        dates = as_dates(values, f"the {name}", code)
+    except DataError as error:
+        raise DataError(error.found, fix=error.fix, where=source.place()) from None
+    return values if dates is None else dates
+
+
 def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
     """Labels of the rows as an array, increasing where they have an order."""
     where = source.place()
+    if getattr(values, "dtype", np.asarray(values).dtype).kind in "OUT":
+        values = _read_dates(values, name, source)
     dates: Any = getattr(values, "dt", None) if hasattr(values, "iloc") else values
     if getattr(dates, "tz", None) is not None:
         source.zone, values = str(dates.tz), dates.tz_convert(None)
