@@ -104,6 +104,12 @@ def _not_a_data_set(data: Any, label: str, argument: str, named: list[str]) -> D
     elif getattr(getattr(data, "dtype", None), "names", None):
         found = f"{label} is a structured array with the fields {', '.join(data.dtype.names)}"
         fix = f"make a table of it: pd.DataFrame({argument})"
+    elif hasattr(data, "name") and hasattr(data, "__array__"):  # a Series, an Index or a DataArray
+        kind, own = type(data).__name__, data.name
+        found = f"{label} is a {kind}, one variable" + ("" if own is None else f" named {own!r}")
+        fix = (
+            f"give a mapping of variables by name: {{{some if own is None else own!r}: {argument}}}"
+        )
     elif isinstance(data, (np.ndarray, list, tuple)) or hasattr(data, "__array__"):
         found = f"{label} is {short(data)} of type {type(data).__name__}, which names no variable"
         fix = f"name it: {{{some!r}: {argument}}}"
@@ -177,7 +183,8 @@ def _from_dataset(data: Any, label: str) -> Source:
         dims = ", ".join(map(str, data.dims)) or "none"
         raise DataError(
             f"the Dataset has no dimension 'time'; its dimensions are: {dims}",
-            fix='rename the one that counts the rows, data.rename({"step": "time"})',
+            fix="rename the one that counts the rows, data.rename("
+            f"{{{str(next(iter(data.dims), 'step'))!r}: 'time'}})",
             where=source.place(),
         )
     for name, variable in data.data_vars.items():
@@ -275,7 +282,7 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
             row = int(np.argmax(absent))
             raise DataError(
                 f"the {name} is {labels[row]} in row {row + 1}",
-                fix=f"give every row a {name}, or drop the {name} altogether",
+                fix=f"give every row its {name}, or drop the {name} altogether",
                 where=where,
             )
     first: dict[Any, int] = {}

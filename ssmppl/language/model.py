@@ -6,6 +6,7 @@ needs the model, and raises there what is wrong with them.
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import linecache
 import textwrap
@@ -15,13 +16,23 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ssmppl import markup
-from ssmppl.errors import Location, ModelError
+from ssmppl.errors import Location, ModelError, UnknownName
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.reading import digest_of_code, plain_function
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
 _MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
+VERBS = ("compile", "diagnose", "evidence", "explain", "forecast", "forward_filter",
+         "kalman_filter", "leave_future_out", "log_likelihood", "maximize", "particle_filter",
+         "plot_likelihood", "predict", "sample", "score", "simulate", "smooth")  # fmt: skip
+_ELSEWHERE = {  # decorators of other libraries
+    **dict.fromkeys(("emission", "emissions", "measurement", "likelihood", "obs"), "observation"),
+    **dict.fromkeys(("dynamics", "process", "motion", "state"), "transition"),
+    **dict.fromkeys(("init", "start", "initial_state"), "initial"),
+    **dict.fromkeys(("parameters", "params", "priors"), "prior"),
+    "importance": "proposal",
+}
 
 
 class Model:
@@ -168,6 +179,21 @@ class Model:
         function : itself, so that the name stays what it was.
         """
         return self._declare("proposal", function)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # what Python and notebooks ask every object for
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        near = difflib.get_close_matches(name.lower(), [*ROLES, *VERBS, *_ELSEWHERE], 1)
+        meant = _ELSEWHERE.get(near[0], near[0]) if near else ""
+        if meant in VERBS:
+            fix = f"the verbs are functions: write ssm.{meant}(model, ...)"
+        elif meant:
+            fix = f"write @model.{meant}"
+        else:
+            fix = (
+                f"its decorators are {', '.join(ROLES)}; the verbs are functions, ssm.sample(model)"
+            )
+        raise UnknownName(f"a model has no {name!r}", fix=fix, where=user_location())
 
     def _declare(self, role: str, function: Law) -> Law:
         if not (inspect.isfunction(function) or inspect.ismethod(function)):
