@@ -102,6 +102,10 @@ class UnsupportedOperation(ModelError, TypeError):
     """An operation on symbols that has no symbolic meaning (a Python `if`, `float(x)`, ...)."""
 
 
+class UnknownName(ModelError, AttributeError):
+    """A decorator or attribute that a model does not have."""
+
+
 class DataError(SSMError):
     """The data do not fit the model."""
 

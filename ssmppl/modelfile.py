@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.data.times import as_dates
 from ssmppl.errors import ArgumentError, DataError, Location, ModelError, SSMError, listing
 from ssmppl.language.model import Model
 
@@ -24,12 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["labelled", "load_model", "parse_assignments", "parse_settings", "read_csv"]
 
-# 04.01.2021, 1/4/21, 4 Jan 2021, Jan 4, 2021: which is day and which is month is not guessed
-MONTH = r"(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\.?"
-OTHER_DATES = (
-    r"(?i)\s*(?:\d{1,2}([./-])\d{1,2}\1(?:\d{4}|\d{2})"
-    rf"|\d{{1,2}}[. -]+{MONTH}[ -]+\d{{2,4}}|{MONTH} \d{{1,2}},? \d{{4}})(?:\s.*)?$"
-)
 DATA_SUFFIXES = (".csv", ".tsv", ".txt", ".parquet", ".pq", ".nc")
 
 
@@ -195,30 +190,22 @@ def labelled(table: pd.DataFrame) -> pd.DataFrame:
     if label not in table.columns and len(table.columns):
         # text that is dates can be no observation and no input, whatever its name
         if table[first].dtype.kind not in "biuf" and table[first].notna().any():
-            label = first if _dates(table[first]).dtype.kind == "M" else label
+            label = first if _dates(table[first]) is not None else label
     if label in table.columns and table[label].dtype.kind not in "iufM":
-        table[label] = _dates(table[label])
+        dates = _dates(table[label])
+        if dates is not None:
+            table[label] = dates
     if label != "time" and label in table.columns:
         table = table.set_index(label).rename_axis("time")
     return table
 
 
-def _dates(labels: pd.Series) -> pd.Series:
-    import pandas as pd
-
-    try:
-        return pd.to_datetime(labels, format="ISO8601")
-    except (ValueError, TypeError):
-        pass
-    written = labels.dropna().astype(str)
-    if len(written) and written.str.match(OTHER_DATES).all():
-        raise DataError(
-            f"the column {labels.name!r} holds dates in another form than ISO's: its first entry "
-            f"is {written.iloc[0]!r}",
-            fix="write them year first, 2021-01-04: in Python pd.to_datetime(table["
-            f"{labels.name!r}], format='%d.%m.%Y'), with the order of day and month that is meant",
-        )
-    return labels  # text, then
+def _dates(labels: pd.Series) -> pd.Series | None:
+    """A column's dates, None where it holds something else."""
+    if labels.dtype.kind == "M":
+        return labels
+    dates = as_dates(labels, f"the column {labels.name!r}", f"table[{labels.name!r}]")
+    return None if dates is None else dates.set_axis(labels.index)
 
 
 def parse_assignments(texts: Iterable[str], option: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Data sets and parameter values as arrays over the symbols; test_errors.py: what is refused."""
 
 import decimal
+from datetime import date
 from types import SimpleNamespace
 
 import numpy as np
@@ -253,6 +254,63 @@ def test_a_column_of_dates_named_time():
         assert e.time.dtype.kind == "M"
         assert e.zone == zone
         assert str(e.time[0])[:13] == ("2019-12-31T23" if zone else "2020-01-01T00")
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        ["2021-03-28", "2021-03-29", "2021-03-30"],
+        [date(2021, 3, 28), date(2021, 3, 29), date(2021, 3, 30)],
+        ["20210328", "20210329", "20210330"],
+        ["2021-03-28 00:00", "2021-03-29 00:00", "2021-03-30 00:00"],
+        pd.Categorical(["2021-03-28", "2021-03-29", "2021-03-30"]),
+        ["2021-03-28T01:00+01:00", "2021-03-29T02:00+02:00", "2021-03-30T02:00+02:00"],
+        [pd.Timestamp(f"2021-03-{d}T00:00+0{h}:00") for d, h in ((28, 1), (29, 2), (30, 2))],
+    ],
+    ids=["text", "dates", "digits", "clocks", "categories", "offsets", "stamps with offsets"],
+)
+@pytest.mark.parametrize("as_index", [True, False])
+def test_dates_written_as_text_or_objects_are_dates_and_have_an_order(labels, as_index):
+    """As pd.read_csv(file, index_col="date") has them without parse_dates."""
+
+    def table(order):
+        own = pd.Series(labels, dtype=object).iloc[order].to_list()
+        columns = {"y": [1.0, 2.0, 3.0]}
+        if as_index:
+            return pd.DataFrame(columns, index=pd.Index(own, dtype=object))
+        return {**columns, "time": own}
+
+    e = one(scalar(), table([0, 1, 2]))
+    assert e.time.dtype.kind == "M"
+    exact = pd.to_datetime(pd.Series(labels, dtype=object), utc=True, format="ISO8601")
+    assert_array_equal(e.time, exact.dt.tz_convert(None))
+    with pytest.raises(DataError, match="is not increasing: 2021-03-2"):
+        bind(scalar(), table([2, 1, 0]))
+
+
+@pytest.mark.parametrize(
+    ("labels", "told"),
+    [
+        (["04.01.2021", "05.01.2021"], "another form.*'04.01.2021'\n.*data.index, dayfirst=True"),
+        (["2021-01-04T00:00", "2021-01-05T00:00+01:00"], "with and without.*'2021-01-04T00:00'"),
+        (["2021-01-04", None], "is NaT in row 2"),
+    ],
+)
+def test_dates_that_can_be_read_in_two_ways_are_refused(labels, told):
+    with pytest.raises(DataError, match=told):
+        bind(scalar(), pd.DataFrame({"y": [1.0, 2.0]}, index=pd.Index(labels, dtype=object)))
+
+
+def test_text_that_is_no_date_has_no_order():
+    for labels in (["north", "south"], ["1200", "1100"], ["2021-W02", "2021-W01"]):
+        e = one(scalar(), pd.DataFrame({"y": [1.0, 2.0]}, index=labels))
+        assert e.time.tolist() == labels
+
+
+def test_what_the_fix_for_dates_says_reads_them():
+    for text in ("04.01.2021", "04/01/2021", "4/1/21", "4 Jan 2021"):
+        found = pd.to_datetime(pd.Series([text]), dayfirst=True)
+        assert found[0] == pd.Timestamp("2021-01-04")
 
 
 def test_embedded_series_bind_as_they_are():

@@ -813,7 +813,7 @@ BAD_DATA = {
     "path": ("counts", "run.csv", ["the text 'run.csv'", "pd.read_csv('run.csv')"]),
     "model": ("counts", Model("m"), ["the model 'm'", "data second"]),
     "array": ("counts", np.zeros(3), ["of type ndarray", "{'rain': data}"]),
-    "Series": ("counts", pd.Series([1.0, 2.0]), ["of type Series", "{'rain': data}"]),
+    "Series": ("counts", pd.Series([1.0, 2.0]), ["is a Series, one variable", "{'rain': data}"]),
     "list of numbers": ("counts", [1.0, 2.0], ["of type list", "{'rain': data}"]),
     "number": ("counts", 3, ["data is 3", "pandas DataFrame"]),
     "no data sets": ("counts", [], ["empty list", "at least one data set"]),

@@ -26,7 +26,7 @@ ALLOWED["gap"] = ALLOWED["inference"] | {"inference"}
 ALLOWED["plots"] = ALLOWED["gap"] | {"gap", "tables"}
 # What the command line is made of: the demonstration, written as a user would, and files read.
 ALLOWED["demo"] = {PACKAGE, "datasets", "results"}
-ALLOWED["modelfile"] = {"errors", "language"}
+ALLOWED["modelfile"] = {"data", "errors", "language"}
 OWN = {"plots", "datasets", "demo", "modelfile", "tables", PACKAGE}
 ALLOWED["cli"] = ALLOWED["plots"] | OWN
 ALLOWED["__main__"] = {"cli"}

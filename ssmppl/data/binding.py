@@ -244,8 +244,10 @@ def _check_observation(
         )
     fault = outside(site.distribution, values, env, support)
     if fault is not None:
+        whole = fault.found.startswith("the ")  # "the shares [...] sum to 0.9"
+        found = fault.found if whole else f"the observation {fault.found}"
         raise DataError(
-            f"the observation {fault.found} (declared at {site.distribution.location})",
+            f"{found} (declared at {site.distribution.location})",
             fix=f"give {fault.fix}; NaN where nothing was measured; or give the channel a "
             "distribution that allows the value",
             where=source.place(site.name, fault.index),

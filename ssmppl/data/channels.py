@@ -115,6 +115,10 @@ def _left_out(
     fix += repr(wanted_name)
     if role == "observation":
         fix += " (a column of NaN, if nothing of it was measured)"
+    if index is None and shape and source.kind == "DataFrame":  # no column has that shape
+        names = ", ".join(_column_names(name, i)[0] for i in np.ndindex(*shape))
+        found = f"{_a(role)} named {name!r} is missing from the DataFrame; needed are {names}"
+        fix = f"its columns are: {listing(name, source.known)}; rename them to {names}"
     if not source.known:
         found = f"the {source.kind} holds no {things}, and needs {_a(role)} named {name!r}{wanted}"
         fix = f"give an array for {name!r}"

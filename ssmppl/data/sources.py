@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.data.times import label_text
+from ssmppl.data.times import as_dates, label_text
 from ssmppl.data.values import Fault, as_numbers, short
 from ssmppl.errors import DataError
 from ssmppl.language.model import Model
@@ -104,6 +104,12 @@ def _not_a_data_set(data: Any, label: str, argument: str, named: list[str]) -> D
     elif getattr(getattr(data, "dtype", None), "names", None):
         found = f"{label} is a structured array with the fields {', '.join(data.dtype.names)}"
         fix = f"make a table of it: pd.DataFrame({argument})"
+    elif hasattr(data, "name") and hasattr(data, "__array__"):  # a Series, an Index or a DataArray
+        kind, own = type(data).__name__, data.name
+        found = f"{label} is a {kind}, one variable" + ("" if own is None else f" named {own!r}")
+        fix = (
+            f"give a mapping of variables by name: {{{some if own is None else own!r}: {argument}}}"
+        )
     elif isinstance(data, (np.ndarray, list, tuple)) or hasattr(data, "__array__"):
         found = f"{label} is {short(data)} of type {type(data).__name__}, which names no variable"
         fix = f"name it: {{{some!r}: {argument}}}"
@@ -177,7 +183,8 @@ def _from_dataset(data: Any, label: str) -> Source:
         dims = ", ".join(map(str, data.dims)) or "none"
         raise DataError(
             f"the Dataset has no dimension 'time'; its dimensions are: {dims}",
-            fix='rename the one that counts the rows, data.rename({"step": "time"})',
+            fix="rename the one that counts the rows, data.rename("
+            f"{{{str(next(iter(data.dims), 'step'))!r}: 'time'}})",
             where=source.place(),
         )
     for name, variable in data.data_vars.items():
@@ -238,9 +245,21 @@ def _informative(index: Any) -> bool:
     return not plain
 
 
+def _read_dates(values: Any, name: str, source: Source) -> Any:
+    """Labels that are texts or objects: as dates, where they are that."""
+    code = "data.index" if name == "index" else f"data[{source.time_name!r}]"
+    try:
+        dates = as_dates(values, f"the {name}", code)
+    except DataError as error:
+        raise DataError(error.found, fix=error.fix, where=source.place()) from None
+    return values if dates is None else dates
+
+
 def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
     """Labels of the rows as an array, increasing where they have an order."""
     where = source.place()
+    if getattr(values, "dtype", np.asarray(values).dtype).kind in "OUT":
+        values = _read_dates(values, name, source)
     dates: Any = getattr(values, "dt", None) if hasattr(values, "iloc") else values
     if getattr(dates, "tz", None) is not None:
         source.zone, values = str(dates.tz), dates.tz_convert(None)
@@ -263,7 +282,7 @@ def _labels(values: Any, source: Source, name: str = "time") -> np.ndarray:
             row = int(np.argmax(absent))
             raise DataError(
                 f"the {name} is {labels[row]} in row {row + 1}",
-                fix=f"give every row a {name}, or drop the {name} altogether",
+                fix=f"give every row its {name}, or drop the {name} altogether",
                 where=where,
             )
     first: dict[Any, int] = {}

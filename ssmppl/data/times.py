@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import datetime
+import re
+import warnings
 from typing import Any
 
 import numpy as np
 
-__all__ = ["label_text", "spacing"]
+from ssmppl.errors import DataError
 
+__all__ = ["as_dates", "label_text", "spacing"]
+
+# 04.01.2021, 1/4/21, 4 Jan 2021, Jan 4, 2021: which is day and which is month is not guessed
+_MONTH = r"(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\.?"
+_OTHER_DATES = re.compile(
+    r"(?i)\s*(?:\d{1,2}([./-])\d{1,2}\1(?:\d{4}|\d{2})"
+    rf"|\d{{1,2}}[. -]+{_MONTH}[ -]+\d{{2,4}}|{_MONTH} \d{{1,2}},? \d{{4}})(?:\s.*)?$"
+)
+_NUMERAL = re.compile(r"\s*(?!\d{8}\s*$)\d+\s*$")  # 1200 is a name or a number, 20210104 a date
+_OFFSET = re.compile(r"(?i)\d(?:Z|[+-]\d\d(?::?\d\d)?)\s*$")  # behind a clock
 EVEN = 1.2  # months and years are not all as long as each other, and are even all the same
 
 
@@ -20,6 +33,56 @@ def label_text(label: Any) -> str:
     if "." in clock:
         text = text.rstrip("0").rstrip(".")
     return text.removesuffix("T00:00:00").removesuffix("T00:00")
+
+
+def as_dates(labels: Any, what: str, code: str) -> Any:
+    """Texts and dates of Python as a pandas Series of dates, in UTC where their offsets differ;
+    None where they are something else.
+
+    what, code : the labels in words, and in Python.
+
+    Raises
+    ------
+    DataError : they are dates that could be read in two ways.
+    """
+    import pandas as pd
+
+    entries = np.asarray(labels, dtype=object)
+    if entries.ndim != 1:
+        return None
+    present = [v for v in entries if not (v is None or v is pd.NA or v != v)]
+    written = [v for v in present if isinstance(v, str)]
+    if not present or not all(isinstance(v, str | datetime.date | np.datetime64) for v in present):
+        return None
+    if any(map(_NUMERAL.match, written)):
+        return None
+    series = pd.Series(entries, dtype=object)
+    for utc in (False, True):
+        try:
+            with warnings.catch_warnings():  # older pandas warn of differing offsets
+                warnings.simplefilter("error", FutureWarning)
+                dates = pd.to_datetime(series, format="ISO8601", utc=utc)
+        except (ValueError, TypeError, FutureWarning):
+            continue
+        if utc and (bare := [v for v in present if not _has_zone(v)]):
+            raise DataError(
+                f"{what} has dates with and without a time zone: {str(bare[0])!r} has none",
+                fix="give all of them an offset, 2021-01-04T12:00+01:00, or none",
+            )
+        return dates if dates.dtype.kind == "M" else None
+    if len(written) == len(present) and all(map(_OTHER_DATES.match, written)):
+        raise DataError(
+            f"{what} holds dates in another form than ISO's: its first entry is {written[0]!r}",
+            fix=f"write them year first, 2021-01-04: in Python pd.to_datetime({code}, "
+            "dayfirst=True), or dayfirst=False where the month stands first",
+        )
+    return None
+
+
+def _has_zone(date: Any) -> bool:
+    if isinstance(date, str):
+        return ":" in date and _OFFSET.search(date) is not None
+    return getattr(date, "tzinfo", None) is not None
 
 
 def spacing(time: np.ndarray) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import numbers
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -232,14 +233,22 @@ def _predictions(
     }
 
 
-def quantile_levels(quantiles: tuple[float, ...]) -> np.ndarray:
-    """Levels in increasing order, checked.
+def quantile_levels(quantiles: Iterable[float] | float) -> np.ndarray:
+    """Levels in increasing order, checked; a number is one level.
 
     Raises
     ------
     ArgumentError : some level is not between 0 and 1.
     """
-    levels = np.asarray(sorted(quantiles), dtype=float)
-    if levels.ndim != 1 or np.any((levels <= 0) | (levels >= 1)):
-        raise ArgumentError(f"quantiles={quantiles!r}", fix="give levels between 0 and 1")
-    return levels
+    given: Any = [quantiles] if isinstance(quantiles, numbers.Real) else quantiles
+    try:
+        entries: list[Any] = list(given)
+    except TypeError:
+        entries = [given]
+    if isinstance(given, str) or not all(isinstance(v, numbers.Real) for v in entries) or not all(
+        0 < v < 1 for v in entries
+    ):  # fmt: skip
+        raise ArgumentError(
+            f"quantiles={quantiles!r}", fix="give levels between 0 and 1: quantiles=(0.05, 0.95)"
+        )
+    return np.array(sorted(map(float, entries)))

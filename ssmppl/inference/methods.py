@@ -37,9 +37,9 @@ class MetropolisHastings:
 
 @dataclass(frozen=True)
 class Gibbs:
-    """Gibbs sampling of a linear Gaussian model (Schön et al. 2015, section 4.2): trajectories by
-    exact backward sampling (Frühwirth-Schnatter 1994; Carter and Kohn 1994), parameters by the
-    updates that were derived for them.
+    """Gibbs sampling of a model that is linear and Gaussian or has finitely many states (Schön et
+    al. 2015, section 4.2): trajectories by exact backward sampling (Frühwirth-Schnatter 1994;
+    Carter and Kohn 1994), parameters by the updates that were derived for them.
 
     Parameters
     ----------
@@ -140,9 +140,9 @@ class DirectOptimization:
     """Quasi-Newton ascent of the log-likelihood on the unconstrained scale (Schön et al. 2015,
     section on direct optimisation).
 
-    On linear Gaussian models with the exact likelihood and score of the Kalman filter; else, for
-    one scalar state, over a particle filter with common random numbers that is continuous in the
-    parameters (Malik and Pitt 2011).
+    With the exact likelihood and score on linear Gaussian models, on those of finitely many states
+    and where states have no noise; else, for one scalar state, over a particle filter with common
+    random numbers that is continuous in the parameters (Malik and Pitt 2011).
 
     Parameters
     ----------
@@ -161,8 +161,9 @@ class DirectOptimization:
 
 @dataclass(frozen=True)
 class EM:
-    """Expectation maximisation of linear Gaussian models, with exact expectations (Shumway and
-    Stoffer 1982; Schön et al. 2015, section on EM) and the M-step that was derived.
+    """Expectation maximisation of models that are linear and Gaussian or have finitely many states,
+    with exact expectations (Shumway and Stoffer 1982; Schön et al. 2015, section on EM) and the
+    M-step that was derived.
 
     Parameters
     ----------

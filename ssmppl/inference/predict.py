@@ -79,15 +79,26 @@ def predict(
             fix="declare the law of y_t with @model.observation",
             where=model.location,
         )
+    posterior = None
+    if idata is not None:
+        posterior = posterior_of(
+            idata,
+            "give what ssm.sample returns, or None to draw from the prior; data come third, "
+            "ssm.predict(model, None, data)",
+        )
+    if data is None and steps is None:
+        raise ArgumentError(
+            "neither data nor steps tell how many rows to predict",
+            fix="pass the data, ssm.predict(model, idata, data), or steps=100",
+        )
     experiments = bind(traced, data, need_observations=False, steps=steps)
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     labels = Labels(experiments)
     attrs: dict[str, Any] = {
         "model": traced.name, "seed": str(root.entropy), "observes": observes(traced),
     }  # fmt: skip
-    if idata is None:
+    if posterior is None:
         return _from_prior(traced, program, experiments, labels, draws, root, attrs)
-    posterior = posterior_of(idata, "give what ssm.sample returns, or None to draw from the prior")
     theta = parameters_of(traced, posterior)
     lead = theta.shape[:2]
     predicted: dict[str, np.ndarray] = {}

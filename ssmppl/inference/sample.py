@@ -92,7 +92,8 @@ def sample(
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
-        of finitely many states, `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
+        of finitely many states, `ssm.MetropolisHastings(...)` where states have no noise too,
+        `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
         None: for the former Gibbs if every parameter has a closed-form conditional (with
         `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
         while the parameters are few; for the others PGAS, likewise with `interweave="auto"`, or
@@ -124,9 +125,9 @@ def sample(
         Groups:
 
         * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
-        * sample_stats: lp, acceptance_rate, and log_likelihood (MetropolisHastings: exact; PMMH:
-          the estimate at the draw) or update_rate and ess (PGAS: share of the trajectory that a
-          sweep changed, ESS / N);
+        * sample_stats (not of SMC2): lp, acceptance_rate, and log_likelihood (MetropolisHastings:
+          exact; PMMH: the estimate at the draw) or update_rate and ess (PGAS: share of the
+          trajectory that a sweep changed, ESS / N);
         * log_likelihood (PMMH; PGAS on request): log p(y_t | y_1:t-1, theta), for
           leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
         * observed_data, constant_data (inputs).

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dis
 import inspect
 import re
-import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from types import CodeType, TracebackType
@@ -17,7 +16,8 @@ from ssmppl.errors import Location, ModelError, SSMError
 from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
 from ssmppl.language.elsewhere import advice
-from ssmppl.language.model import location_of, outer_values, plain_function
+from ssmppl.language.model import location_of
+from ssmppl.language.reading import INSTALLED, outer_values, plain_function
 
 Law = Callable[..., Any]
 Known = Mapping[str, str]  # name of a quantity -> its role
@@ -68,10 +68,6 @@ _ASKED_OF_SYMBOLS = tuple(
          "asks a symbol for {0!r}, which it does not have",
          "use NumPy's functions on it, such as np.exp(x); " + _BUILD),
     )
-)  # fmt: skip
-_INSTALLED = tuple(
-    path for key in ("stdlib", "platstdlib", "purelib", "platlib")
-    if (path := sysconfig.get_path(key))
 )  # fmt: skip
 
 
@@ -184,7 +180,7 @@ def _at_users_line(error: SSMError, function: Law) -> SSMError:
     if not isinstance(where, Location) or where.file == file:
         return error
     frames = _frames(function, error.__traceback__)
-    if not where.file.startswith(_INSTALLED) or not frames:
+    if not where.file.startswith(INSTALLED) or not frames:
         return error
     last = frames[-1]
     place = Location(file, last.lineno or 0, last.name)

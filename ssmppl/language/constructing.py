@@ -7,6 +7,8 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from ssmppl.errors import Location, ModelError, nearest_first
 from ssmppl.expressions.expr import user_location
 
@@ -54,7 +56,8 @@ def misfit(
         fix = f"the arguments of {name} are {nearest}"
     elif by_name and len(args) > len(positional):
         found = f"{name} takes its {called} by name: {options}"
-        own = [str(a) for a in args] if len(args) == len(positional) + 1 else []
+        arrays = any(np.ndim(a) for a in args if isinstance(a, np.ndarray))  # print as no Python
+        own = [str(a) for a in args] if len(args) == len(positional) + 1 and not arrays else []
         if not own or kwargs or max(map(len, own)) > WIDEST:
             own = [*positional, "..."]
         fix = f"write {name}({', '.join([*own[:-1], f'{by_name[0]}={own[-1]}'])})"

@@ -14,8 +14,9 @@ from ssmppl.expressions.expr import user_location
 from ssmppl.language.agreement import Agreement, agreement
 from ssmppl.language.constructing import misfit
 from ssmppl.language.forms import form
-from ssmppl.language.model import Declared, fingerprint, location_of, outer_values
+from ssmppl.language.model import location_of
 from ssmppl.language.packing import holder_of
+from ssmppl.language.reading import Declared, digest_of_code
 from ssmppl.language.written import Bounds, Forms, Origin, Pattern, Written, written_class
 
 Function = Callable[..., Any]
@@ -57,14 +58,10 @@ class DeclaredDistribution(Declared):
                 )
 
     @property
-    def signature(self) -> tuple:  # type: ignore[override]
-        outer = [
-            (part, id(f), name, fingerprint(value))
-            for part, f in self.functions.items()
-            for name, value in outer_values(f).items()
-            if value is not self
-        ]
-        return (id(self), *((p, id(f)) for p, f in self.functions.items()), *outer)
+    def signature(self) -> tuple:
+        """Changes with the functions, and with what they read from outside."""
+        outer = digest_of_code(self.functions.values())
+        return (*((p, id(f)) for p, f in self.functions.items()), outer)
 
     # -- what else is known of the law
     def sampler(self, function: Function = _MISSING) -> Function:

@@ -63,6 +63,11 @@ WRITTEN: dict[str, str] = {
     "discreteuniform": "ssm.Categorical(np.full(n, 1 / n)), whose values begin at 0",
     "loguniform": "ssm.Uniform(lower, upper) for the logarithm as the parameter, and np.exp of it "
     "where it acts",
+    "filter": "ssm.particle_filter(model, data, parameters), or ssm.kalman_filter for linear "
+    "Gaussian models",
+    **dict.fromkeys(["mcmc", "nuts"], "ssm.sample(model, data)"),
+    "fit": "ssm.sample(model, data) for a posterior, ssm.maximize(model, data) for an estimate",
+    **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
     **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
 }
 CLOSE = 0.6  # least similarity of a misspelling

@@ -79,7 +79,8 @@ class _Content:
         for wrapped in ("py_func", "__wrapped__", "__func__", "fget", "func"):
             inner = getattr(value, wrapped, None)
             if callable(inner):  # Numba's, a cache, a method, a property, a partial
-                rest = [getattr(value, n, None) for n in ("__self__", "args", "keywords")]
+                own = ("__self__", "args", "keywords", "targetoptions")  # fastmath changes digits
+                rest = [getattr(value, n, None) for n in own]
                 return self.of(inner, names), self.of(rest, names)
         return self._object(value, names)
 

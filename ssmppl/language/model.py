@@ -6,33 +6,33 @@ needs the model, and raises there what is wrong with them.
 
 from __future__ import annotations
 
-import dis
+import difflib
 import inspect
 import linecache
-import numbers
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
-from types import CodeType, FunctionType
 from typing import Any, TypeVar
 
 import numpy as np
 
 from ssmppl import markup
-from ssmppl.errors import Location, ModelError
+from ssmppl.errors import Location, ModelError, UnknownName
 from ssmppl.expressions.expr import user_location
+from ssmppl.language.reading import digest_of_code, plain_function
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
 _MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
-
-
-class Declared:
-    """What laws may read under a name and that can change without being another object.
-
-    signature : changes when it does.
-    """
-
-    signature: tuple
+VERBS = ("compile", "diagnose", "evidence", "explain", "forecast", "forward_filter",
+         "kalman_filter", "leave_future_out", "log_likelihood", "maximize", "particle_filter",
+         "plot_likelihood", "predict", "sample", "score", "simulate", "smooth")  # fmt: skip
+_ELSEWHERE = {  # decorators of other libraries
+    **dict.fromkeys(("emission", "emissions", "measurement", "likelihood", "obs"), "observation"),
+    **dict.fromkeys(("dynamics", "process", "motion", "state"), "transition"),
+    **dict.fromkeys(("init", "start", "initial_state"), "initial"),
+    **dict.fromkeys(("parameters", "params", "priors"), "prior"),
+    "importance": "proposal",
+}
 
 
 class Model:
@@ -180,6 +180,21 @@ class Model:
         """
         return self._declare("proposal", function)
 
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # what Python and notebooks ask every object for
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        near = difflib.get_close_matches(name.lower(), [*ROLES, *VERBS, *_ELSEWHERE], 1)
+        meant = _ELSEWHERE.get(near[0], near[0]) if near else ""
+        if meant in VERBS:
+            fix = f"the verbs are functions: write ssm.{meant}(model, ...)"
+        elif meant:
+            fix = f"write @model.{meant}"
+        else:
+            fix = (
+                f"its decorators are {', '.join(ROLES)}; the verbs are functions, ssm.sample(model)"
+            )
+        raise UnknownName(f"a model has no {name!r}", fix=fix, where=user_location())
+
     def _declare(self, role: str, function: Law) -> Law:
         if not (inspect.isfunction(function) or inspect.ismethod(function)):
             found = f"@{role} of model {self.name!r} stands on {function!r}, which is no function"
@@ -205,12 +220,8 @@ class Model:
     def signature(self) -> tuple:
         """What traces of this model are cached by: changes when a function is declared, and when a
         variable that one reads from outside gets another value."""
-        outer = tuple(
-            (name, fingerprint(value))
-            for functions in self.functions.values()
-            for function in functions
-            for name, value in outer_values(function).items()
-        )
+        functions = [f for role in ROLES for f in self.functions[role]]
+        outer = digest_of_code(functions)
         return (self.name, tuple(self.inputs.items()), *map(tuple, self.functions.values()), outer)
 
     def __repr__(self) -> str:
@@ -253,12 +264,6 @@ def _source(function: Callable[..., Any]) -> str:
         return ""
 
 
-def plain_function(function: Any) -> FunctionType:
-    """The function of a bound method; functions as they are."""
-    plain: FunctionType = getattr(function, "__func__", function)
-    return plain
-
-
 def location_of(function: Callable[..., Any]) -> Location:
     """Where a function is defined: the line of its `def`, below its decorators."""
     code = plain_function(function).__code__
@@ -270,38 +275,3 @@ def location_of(function: Callable[..., Any]) -> Location:
             line = candidate
             break
     return Location(code.co_filename, line, function.__name__)
-
-
-def outer_values(function: Callable[..., Any]) -> dict[str, Any]:
-    """The variables that a function reads from its module or from enclosing functions."""
-    plain = plain_function(function)
-    found = {}
-    for name, cell in zip(plain.__code__.co_freevars, plain.__closure__ or (), strict=True):
-        try:
-            found[name] = cell.cell_contents
-        except ValueError:  # assigned later
-            continue
-    for name in _global_names(plain.__code__):
-        if name in plain.__globals__:
-            found[name] = plain.__globals__[name]
-    return found
-
-
-def _global_names(code: CodeType) -> set[str]:
-    loads = ("LOAD_GLOBAL", "LOAD_NAME")
-    names = {i.argval for i in dis.get_instructions(code) if i.opname in loads}
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            names |= _global_names(inner)
-    return names
-
-
-def fingerprint(value: Any) -> Any:
-    """Equal for equal numbers, texts, arrays and plain containers of them, else by identity."""
-    if isinstance(value, Declared):
-        return value.signature
-    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
-        return value.shape, value.tobytes()
-    if isinstance(value, (numbers.Number, str, list, tuple, dict)):
-        return repr(value)
-    return id(value)

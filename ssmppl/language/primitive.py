@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -34,7 +35,8 @@ class Primitive:
         self.location = location_of(function)
         self.arguments = _arguments(function)
         self.compiled = _compile(function, len(self.arguments))
-        self.name = f"{function.__name__}_{fingerprint(function)[:8]}"
+        word = re.sub(r"\W+", "_", function.__name__).strip("_")  # <lambda> is no identifier
+        self.name = f"{word}_{fingerprint(function)[:8]}"
         self.__name__, self.__doc__ = function.__name__, function.__doc__
         REGISTRY[self.name] = self.compiled
 

@@ -159,6 +159,11 @@ def _pair(problem: Problem, walked: dict[str, np.ndarray], var_names: Any) -> li
     found = pick(known, var_names, "the parameters of the model")
     if var_names is None:
         found = [k for k in found if not walked or k in walked][:2]
+    if len(known) < 2:
+        raise ArgumentError(
+            f"a surface is over two parameters, and the model has {len(known)}",
+            fix="draw the curve of the values of ssm.log_likelihood over a grid of it",
+        )
     if len(found) != 2:
         raise ArgumentError(
             f"a surface is over two parameters, and {len(found)} "

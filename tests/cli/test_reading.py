@@ -57,6 +57,20 @@ def test_dates_in_another_form_are_told_and_never_guessed(dated, name, first):
         read_table(dated(f"{name},y\n{first},1\n{first.replace('4', '5')},2\n"))
 
 
+@pytest.mark.parametrize("name", ["date", "time"])
+def test_offsets_that_change_with_summer_time_are_one_clock(dated, name):
+    path = dated(f"{name},y\n2021-03-28T01:00+01:00,1\n2021-03-28T03:00+02:00,2\n")
+    table = read_table(path)
+    found = pd.DatetimeIndex(table["time"] if name == "time" else table.index)
+    assert list(found) == list(pd.to_datetime(["2021-03-28T00:00Z", "2021-03-28T01:00Z"]))
+    walk = ssm.Model("walk")
+    walk.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    walk.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    walk.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    times = ssm.kalman_filter(walk, table, {})["time"].values
+    assert list(times) == [np.datetime64("2021-03-28T00:00"), np.datetime64("2021-03-28T01:00")]
+
+
 def test_text_that_only_resembles_a_date_stays_text(dated):
     table = read_table(dated("date,y\n3 plot 12,1\n4 plot 12,2\n"))
     assert list(table["y"]) == [1, 2]
