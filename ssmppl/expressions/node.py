@@ -224,19 +224,19 @@ class Expr:
         return _binary("ne", self, other)
 
     def __and__(self, other):
-        return _binary("and", self, other)
+        return _binary("and", *conditions("&", self, other))
 
     def __rand__(self, other):
-        return _binary("and", other, self)
+        return _binary("and", *conditions("&", other, self))
 
     def __or__(self, other):
-        return _binary("or", self, other)
+        return _binary("or", *conditions("|", self, other))
 
     def __ror__(self, other):
-        return _binary("or", other, self)
+        return _binary("or", *conditions("|", other, self))
 
     def __invert__(self):
-        return _apply("not", self)
+        return _apply("not", *conditions("~", self))
 
     def __bool__(self) -> bool:
         raise UnsupportedOperation(
@@ -296,6 +296,20 @@ def _binary(op: str, a: Any, b: Any) -> Any:
         if isinstance(error, UnsupportedOperation):
             raise
         return NotImplemented
+
+
+def conditions(sign: str, *operands: Any) -> tuple[Any, ...]:
+    """The operands of &, | or ~, which of numbers would be bitwise: what holds or does not hold."""
+    for operand in operands:
+        numbers = not isinstance(operand, Expr | bool | np.bool_ | np.ndarray)
+        known = isinstance(operand, Expr) and operand.op not in (*BOOLEAN, "where", "const")
+        if numbers or known:
+            raise UnsupportedOperation(
+                f"{sign} of {operand!r}, a number: it is bitwise in NumPy, and not on symbols",
+                fix="compare it first: (k == 1) & (x > 0); the last bit of k is k % 2",
+                where=user_location(),
+            )
+    return operands
 
 
 def constant(value: float) -> Expr:

@@ -37,7 +37,7 @@ from ssmppl.expressions.arrays import (
 )
 from ssmppl.expressions.expr import TERNARY, UNARY, Expr, apply, as_expr
 from ssmppl.expressions.linear import cholesky, det, inverse, norm, slogdet
-from ssmppl.expressions.node import behaviour
+from ssmppl.expressions.node import behaviour, conditions
 
 # NumPy's and scipy.special's ufuncs by name: each an operation on the operands.
 _RENAMED = {
@@ -103,6 +103,8 @@ def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> An
         for index in np.ndindex(out.shape):
             out[index] = _COMPOSED[name](*(as_expr(a[index]) for a in arrays))
         return scalar_or_array(out)
+    if sign := {"bitwise_and": "&", "bitwise_or": "|", "invert": "~"}.get(name):
+        conditions(sign, *(e for i in inputs for e in plain(i).ravel()))
     op = _RENAMED.get(name, name if name in _DIRECT else None)
     if op is None:
         known = {*_RENAMED, *_COMPOSED, *_DIRECT}

@@ -8,6 +8,7 @@ import scipy.special as sp
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
+from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
@@ -245,3 +246,21 @@ def test_an_out_of_range_symbol_takes_the_last():
     at = {symbol("state", "v", (i,)): float(i) for i in range(3)}
     picked = v[symbol("state", "k")]
     assert evaluate(picked, {**at, symbol("state", "k"): 7.0}) == 2.0
+
+
+@pytest.mark.parametrize(
+    "bitwise",
+    [lambda k: k & 1, lambda k: 1 | k, lambda k: ~k, lambda k: np.bitwise_and(k, 2),
+     lambda k: np.stack([k, k]) | 1, lambda k: (k > 2) & k, lambda k: np.invert(np.stack([k]))],
+)  # fmt: skip
+def test_bits_of_numbers_are_refused(bitwise):
+    with pytest.raises(UnsupportedOperation, match="it is bitwise in NumPy") as caught:
+        bitwise(symbol("state", "k"))
+    assert "k % 2" in caught.value.fix
+
+
+def test_conditions_may_be_true_and_false_themselves():
+    k = symbol("state", "k")
+    assert ((k > 2) & True) is ((k > 2) & np.bool_(True))
+    assert evaluate(np.where(~(k > 2) | np.where(k > 5, True, False), 1.0, 0.0), {k: 7.0}) == 1.0
+    assert evaluate(np.where(np.logical_and(k, 1), 1.0, 0.0), {k: 2.0}) == 1.0
