@@ -43,7 +43,10 @@ class Fieller:
 
 @dataclass(frozen=True)
 class Gain:
-    """Log predictive density gained over the base model, in nats, with its standard error."""
+    """Log predictive density gained over the base model, in nats, with its standard error.
+
+    nats_per_sample : over the rows with data.
+    """
 
     nats: float
     error: float
@@ -129,7 +132,9 @@ def closed(
     total = mean.sum(axis=1)
     q = float(stdtrit(blocks - 1.0, 0.5 + 0.5 * level))
     error = np.sqrt(np.diagonal(covariance))
-    gain = [Gain(float(v), float(e), float(v) / rows) for v, e in zip(total, error, strict=True)]
+    with_data = np.any(np.concatenate([l0, lk, lc]) != 0.0, axis=0)
+    samples = max(int(with_data.sum()), 1)
+    gain = [Gain(float(v), float(e), float(v) / samples) for v, e in zip(total, error, strict=True)]
     low = total[1] - q * error[1]
     if not low > 0.0:
         nan = float("nan")
