@@ -31,6 +31,7 @@ from ssmppl.language.trace import Trace
 CLEARLY = 2.0  # standard errors
 MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
 LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows bear it out
+UNLIKE = "none of these"
 
 
 @dataclass
@@ -112,10 +113,13 @@ def answer(r: Results, seconds: float) -> GapReport:
         if r.far.rows:
             share = tabulate("closed", r.far.rows)
             # Few held-out rows leave the share open where the test of the effect does not; what
-            # gains nothing on them was chance.
+            # gains nothing on them was chance, and what curves gain beyond it is as open.
             open_, gained = not np.isfinite(share["F"].iloc[0]), share["nats_per_sample"].iloc[0]
-            if not r.blocks and open_ and (verdict != "effect" or gained <= 0.0):
-                verdict, missing = "no measurable gap", None
+            if not r.blocks and open_:
+                if gained <= 0.0 or (verdict == UNLIKE and r.chosen is None):
+                    verdict, missing = "no measurable gap", None
+                elif verdict == UNLIKE:
+                    verdict, missing = _effect(r, where)
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}
     if r.chosen is not None and verdict == "effect":
@@ -184,18 +188,23 @@ def _verdict(r: Results, where: Any) -> tuple[str, Any]:
         tried = list(best.candidates) if best else []
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= r.alpha and key is not None:
-            return "none of these", _curve(r.screen, key, tried)
+            return UNLIKE, _curve(r.screen, key, tried)
     if r.chosen is not None or (least <= r.alpha and not asked):
-        head = where.iloc[0] if len(where) else None
-        if head is not None and head["moment"] == "mean":
-            return "effect", _curve(r.screen, (head["equation"], "mean"), ())
-        return "effect", None
+        return _effect(r, where)
     if not asked:  # nothing is held out: what all of the catalogue leaves
         tried = tables.catalogue(r.screen)
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= LEFT * r.alpha and key is not None:
-            return "none of these", _curve(r.screen, key, tried)
+            return UNLIKE, _curve(r.screen, key, tried)
     return "no measurable gap", None
+
+
+def _effect(r: Results, where: Any) -> tuple[str, Any]:
+    """That verdict, with the curve of the equation where most is missing."""
+    head = where.iloc[0] if len(where) else None
+    if head is not None and head["moment"] == "mean":
+        return "effect", _curve(r.screen, (head["equation"], "mean"), ())
+    return "effect", None
 
 
 def _curves_beat(far: HowFar, chosen: bool) -> bool:

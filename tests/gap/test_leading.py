@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.gap import tables
 from ssmppl.gap.answer import Results, answer, labels
 from ssmppl.gap.attribute import Attribution
 from ssmppl.gap.checkpoint import Checkpoint
+from ssmppl.gap.closed import Gain
 from ssmppl.gap.naming import leaders
 from ssmppl.gap.parts import GAP, head, three_parts
 from ssmppl.gap.printed import cause_rows
@@ -168,6 +170,22 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     assert "No row served twice" not in str(report)
     assert "took no part" not in str(report)
     assert "decided on held-out rows" in " ".join(how_sure(report))
+
+
+@pytest.mark.slow
+def test_an_effect_that_gained_is_not_denied_where_the_share_is_open(loaded, monkeypatch):
+    """Curves predict better still, but it is not known how large the gap is in all."""
+    monkeypatch.setattr(tables, "residual_group", lambda *_: (1e-4, ("v1", "mean")))
+    e = loaded.experiments[0]
+    run = SimpleNamespace(mean=e.y, low=e.y, high=e.y)
+    row = {"effect": "x", "F_low": np.nan, "F_high": np.nan}
+    verdicts = {}
+    for share, gained in ((np.nan, 0.4), (np.nan, -0.1), (0.5, 0.4)):
+        far = HowFar([{**row, "F": share, "nats_per_sample": gained}], Gain(9.0, 1.0, 0.1), [run])
+        report = answer(dataclasses.replace(loaded, far=far), 1.0)
+        verdicts[share, gained] = report.verdict
+        assert (report.model is not None) == (report.verdict == "effect")
+    assert list(verdicts.values()) == ["effect", "no measurable gap", "none of these"]
 
 
 @pytest.mark.slow
