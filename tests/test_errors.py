@@ -16,7 +16,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.linalg
+import scipy.special
 import xarray as xr
+from scipy import stats
 
 from ssmppl.data import bind, bind_inputs, check_parameters, check_values
 from ssmppl.errors import (
@@ -506,7 +508,31 @@ def loop_over_a_symbol():
     return declare(transition=transition)
 
 
-@bad("np.sort", "supported are", error=UnsupportedOperation)
+@bad("cdf() of a library takes numbers", "scipy.special.ndtr(z)", error=UnsupportedOperation)
+def distribution_function_of_scipy():
+    def transition(x):
+        return {"x": ssm.Normal(stats.norm.cdf(x), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("logsumexp() of a library takes numbers", "np.logaddexp(a, b)")
+def sum_of_exponentials_of_scipy():
+    def transition(x):
+        return {"x": ssm.Normal(scipy.special.logsumexp([x, 1.0]), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("np.round", "np.floor(x + 0.5)", error=UnsupportedOperation)
+def rounding_by_numpy():
+    def transition(x):
+        return {"x": ssm.Normal(np.round(x), sd=1)}  # HERE
+
+    return declare(transition=transition)
+
+
+@bad("np.sort", "np.minimum and np.maximum", error=UnsupportedOperation)
 def function_without_meaning():
     def transition(x):
         return {"x": ssm.Normal(np.sort(np.stack([x, x]))[0], sd=1)}  # HERE
@@ -523,7 +549,7 @@ def library_on_symbols():
     return declare(transition=transition)
 
 
-@bad("asked of a symbol", error=UnsupportedOperation)
+@bad("expm() of a library takes numbers", "closed form", error=UnsupportedOperation)
 def scipy_on_symbols():
     def transition(x):
         step = scipy.linalg.expm(np.stack([np.stack([x, 0.0]), np.stack([0.0, x])]))  # HERE

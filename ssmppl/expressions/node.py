@@ -262,7 +262,7 @@ class Expr:
         raise UnsupportedOperation(
             "a whole number was asked of a symbol (int(), range(), an index into an array of "
             "numbers)",
-            fix=INDEX_BY_SYMBOL,
+            fix=f"write np.floor(x) for int(x) of a positive number; {INDEX_BY_SYMBOL}",
             where=user_location(),
         )
 

@@ -14,8 +14,8 @@ from inspect import signature
 from typing import Any
 
 import numpy as np
+from scipy import special
 
-from ssmppl.errors import nearest_first
 from ssmppl.expressions.arrays import (
     ExprArray,
     array,
@@ -36,6 +36,7 @@ from ssmppl.expressions.arrays import (
     vdot,
 )
 from ssmppl.expressions.expr import TERNARY, UNARY, Expr, apply, as_expr
+from ssmppl.expressions.instead import fix_for
 from ssmppl.expressions.linear import cholesky, det, inverse, norm, slogdet
 from ssmppl.expressions.node import behaviour, conditions
 
@@ -76,6 +77,9 @@ _DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "wher
     "gammainccinv",
 }  # fmt: skip
 
+# What a user can call, by a ufunc of NumPy's or of scipy.special's.
+_CALLABLE = {n for n in (*_RENAMED, *_COMPOSED, *_DIRECT) if hasattr(np, n) or hasattr(special, n)}
+
 
 def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
     """A NumPy ufunc on symbols: called, reduced (np.add.reduce) or as an outer product."""
@@ -107,8 +111,7 @@ def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> An
         conditions(sign, *(e for i in inputs for e in plain(i).ravel()))
     op = _RENAMED.get(name, name if name in _DIRECT else None)
     if op is None:
-        known = {*_RENAMED, *_COMPOSED, *_DIRECT}
-        refuse(f"the function {name}", f"supported are {', '.join(nearest_first(name, known))}")
+        refuse(f"the function {name}", fix_for(name, _CALLABLE))
     return elementwise(op, *inputs)
 
 
@@ -292,7 +295,7 @@ def apply_function(func: Callable[..., Any], args: tuple, kwargs: dict) -> Any:
             return type(result)(array(r) for r in result)
         return scalar_or_array(result)
     known = {f.__name__ for f in [*FUNCTIONS, *STRUCTURAL]}
-    refuse(f"np.{name}", f"supported are {', '.join(nearest_first(name, known))}")
+    refuse(f"np.{name}", fix_for(name, known))
 
 
 @cache

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dis
 import inspect
+import itertools
+import os
 import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -12,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import Location, ModelError, SSMError
+from ssmppl.errors import Location, ModelError, SSMError, UnsupportedOperation
 from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
+from ssmppl.expressions.instead import INSTEAD
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
 from ssmppl.language.elsewhere import advice
 from ssmppl.language.model import location_of
@@ -21,6 +24,7 @@ from ssmppl.language.reading import INSTALLED, outer_values, plain_function
 
 Law = Callable[..., Any]
 Known = Mapping[str, str]  # name of a quantity -> its role
+_OWN = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 # NumPy's messages about object arrays, which np.array makes of symbols
 _OBJECT_ARRAY = re.compile(r"has no callable|dtype\('O'\)|not supported for the input types")
 _BUILD = (
@@ -98,6 +102,8 @@ def once(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
         return function(*bound.args, **bound.kwargs)
     except SSMError as error:
         told = _at_users_line(error, function)
+        if told is error and isinstance(error, UnsupportedOperation):
+            told = _of_a_library(error, function)
         if told is error:  # not its own cause: what packs errors follows causes to their end
             raise
         raise told from error
@@ -191,6 +197,26 @@ def _at_users_line(error: SSMError, function: Law) -> SSMError:
     )
 
 
+def _library_function(function: Law, trace: TracebackType | None) -> str:
+    """The name of the function of an installed library that the law called and that failed; ""
+    where it was none."""
+    file, called = plain_function(function).__code__.co_filename, ""
+    for frame, after in itertools.pairwise(traceback.extract_tb(trace)):
+        if frame.filename == file:
+            there = after.filename.startswith(INSTALLED) and not after.filename.startswith(_OWN)
+            called = after.name if there else ""
+    return called.strip("_<>")
+
+
+def _of_a_library(error: UnsupportedOperation, function: Law) -> UnsupportedOperation:
+    """What a library's function for numbers asked of a symbol, told by the function's name."""
+    name = _library_function(function, error.__traceback__)
+    if name not in INSTEAD:
+        return error
+    return UnsupportedOperation(f"{name}() of a library takes numbers, not symbols",
+                                fix=f"write {INSTEAD[name]}", where=error.where)  # fmt: skip
+
+
 def _wrapped(
     error: Exception, function: Law, role: str, arguments: dict[str, Any], known: Known
 ) -> ModelError:
@@ -208,6 +234,9 @@ def _wrapped(
     if isinstance(error, NameError) and (role_of := known.get(str(error.name))):
         fix = f"add {error.name!r}, {role_of} of the model, to the arguments of "
         fix += function.__name__
+    elif (called := _library_function(function, error.__traceback__)) in INSTEAD:
+        found = f"{called}() of a library takes numbers, not symbols"
+        fix = f"write {INSTEAD[called]}"
     elif told := _of_a_symbol(error):
         found, fix = f"@{role} {function.__name__} {told[0]}", told[1]
     elif _OBJECT_ARRAY.search(str(error)):

@@ -308,14 +308,14 @@ def _while():
 
 REFUSED = {
     _if: "np.where", _and: "&", _chain: "&", _float: "np.exp", _math: "np.exp",
-    _fft: "supported are", _in_place: "a + b", _assign: "np.stack", _out: "a + b",
-    _where_keyword: "np.where(", _min: "np.minimum", _range: "np.choose", _int: "np.choose",
+    _fft: "@ssm.primitive", _in_place: "a + b", _assign: "np.stack", _out: "a + b",
+    _where_keyword: "np.where(", _min: "np.minimum", _range: "np.choose", _int: "np.floor(x)",
     _as_floats: "np.stack", _astype: "np.stack", _one_argument_where: "both branches",
-    _sort: "supported are", _slice: "np.choose", _take_from_numbers: "np.choose",
+    _sort: "np.minimum and np.maximum", _slice: "np.choose", _take_from_numbers: "np.choose",
     _compare_object_array: "np.stack",
     _maximum_of_an_object_array: "np.stack", _choose_from_nothing: "one element",
     _wrong_shapes: "dimensions agree",
-    _not_square: "one square matrix", _unknown_ufunc: "supported are",
+    _not_square: "one square matrix", _unknown_ufunc: "@ssm.primitive",
     _scipy_function: "NumPy's function", _while: "np.where",
 }  # fmt: skip
 
