@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.data.sources import FILE
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.modelfile import labelled, read_csv
 from ssmppl.results import arviz
@@ -37,6 +38,8 @@ def read_data(paths: Sequence[Path]) -> Any:
     DataError : a file is no table, or holds several simulations.
     """
     tables = [read_table(path) for path in paths]
+    for path, table in zip(paths, tables, strict=True):
+        table.attrs[FILE] = str(path)
     return tables[0] if len(tables) == 1 else tables
 
 

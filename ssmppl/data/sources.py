@@ -17,12 +17,14 @@ from ssmppl.data.values import Fault, as_numbers, short
 from ssmppl.errors import DataError
 from ssmppl.language.model import Model
 
+FILE = "ssmppl_file"  # key of `attrs` for the name of the file that a table was read from
+
 
 @dataclass
 class Source:
     """One data set: its columns as the user holds them, and the labels of its rows.
 
-    label : "data", or "data set 2" where there are several.
+    label : "data", or "data set 2" where there are several, with the name of its file if known.
     time : labels of the rows, None where the data have none; of dates with a zone those of UTC.
     zone : name of the zone that dates were given in; empty where they have none.
     """
@@ -69,10 +71,19 @@ def sources(data: Any, named: Iterable[str], argument: str = "data") -> list[Sou
         if all(isinstance(d, (int, float, np.number)) or d is None for d in data):
             raise _not_a_data_set(data, argument, argument, named)
         return [
-            _source(d, f"{argument} set {i}" if len(data) > 1 else argument, argument, named)
+            _source(
+                d, f"{argument} set {i}{_file(d)}" if len(data) > 1 else argument, argument, named
+            )
             for i, d in enumerate(data, start=1)
         ]
     return [_source(data, argument, argument, named)]
+
+
+def _file(data: Any) -> str:
+    """Of a table that came with the name of its file, that name in brackets."""
+    attrs = getattr(data, "attrs", None)
+    name = attrs.get(FILE) if isinstance(attrs, Mapping) else None
+    return f" ({name})" if isinstance(name, str) else ""
 
 
 def _source(data: Any, label: str, argument: str, named: list[str]) -> Source:

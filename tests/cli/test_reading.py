@@ -384,3 +384,13 @@ def test_several_files_of_several_kinds(series):
     found = answer("log-likelihood", "walk.py", "sim.csv", "short.nc", *Q)["log_likelihood"]
     assert found == list(expected)
     assert found[0] == pytest.approx(log_likelihood("sim.csv") + log_likelihood("short.nc"))
+
+
+def test_of_several_files_the_one_at_fault_is_named(folder):
+    Path("a.csv").write_text("y\n1\n2\n")
+    Path("b.csv").write_text("y\n1\ntext\n")
+    xr.Dataset({"z": ("time", [1.0, 2.0])}).to_netcdf("c.nc")
+    said = fails("log-likelihood", "walk.py", "a.csv", "b.csv", *Q)
+    assert "In data set 2 (b.csv), 'y', row 2" in said
+    assert "In data set 2 (c.nc)" in fails("log-likelihood", "walk.py", "a.csv", "c.nc", *Q)
+    assert "data set 1" not in fails("log-likelihood", "walk.py", "b.csv", *Q)
