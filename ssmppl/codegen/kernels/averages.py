@@ -17,7 +17,7 @@ def weighted_statistics(
     None.
     """
     for m in range(paths.shape[0]):
-        some = weights[m] > 0.0  # else it adds nothing, be it undefined
+        some = weights[m] != 0.0  # else it adds nothing, be it undefined; weights may be negative
         if each is None and not some:
             continue
         statistics(theta, y, seen, u, paths[m], part)
