@@ -55,7 +55,7 @@ def cancels(parts: Sequence[Expr]) -> bool:
         values = _values(bound, conditions)
         if values is None:
             return False
-        seen = _seen(*values)
+        seen = _seen(values[0])
         if not seen.any() or not _vanishes(*(v[seen] for v in values)):
             return False
         bound = [p for p, s in zip(bound, seen, strict=True) if not s]
@@ -94,8 +94,8 @@ def _values(parts: list[Expr], conditions: list[Expr]) -> tuple[np.ndarray, np.n
     return (at_near, at_wide[:, finite]) if np.all(np.isfinite(at_near)) else None
 
 
-def _seen(near: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """(parts,) whether it would be missed at some near point."""
+def _seen(near: np.ndarray) -> np.ndarray:
+    """(parts,) whether each of the summands (parts, points) would be missed at some point."""
     sizes = np.abs(near)
     with np.errstate(invalid="ignore"):
         share = sizes / sizes.sum(axis=0)
