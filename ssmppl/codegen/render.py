@@ -13,14 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 
 from ssmppl.errors import Location
-from ssmppl.expressions.expr import (
-    BOOLEAN,
-    MATRIX_OPS,
-    Expr,
-    symbol_text,
-    to_text,
-    topological,
-)
+from ssmppl.expressions.expr import MATRIX_OPS, Expr, symbol_text, to_text, topological
 
 # Precedence of Python's operators, to set parentheses only where they are needed.
 _TERNARY, _OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _ATOM = range(9)
@@ -257,4 +250,4 @@ def depends(nodes: Iterable[Expr], level_of: Callable[[Expr], int]) -> dict[Expr
     return level
 
 
-__all__ = ["BOOLEAN", "Names", "Writer", "comment", "depends", "identifier", "symbol_name"]
+__all__ = ["Names", "Writer", "comment", "depends", "identifier", "symbol_name"]

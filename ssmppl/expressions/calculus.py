@@ -15,7 +15,7 @@ import numpy as np
 
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import ExprArray, array
-from ssmppl.expressions.expr import Expr, apply, constant, dependent, topological
+from ssmppl.expressions.expr import BOOLEAN, Expr, apply, constant, dependent, topological
 from ssmppl.expressions.linear import inverse
 
 Partial = Callable[..., Sequence[Expr | float | None]]
@@ -95,7 +95,7 @@ PARTIALS: dict[str, Partial] = {
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
 }
 # Piecewise constant: derivative zero wherever there is one.
-FLAT = frozenset(["sign", "floor", "ceil", "lt", "le", "eq", "ne", "and", "or", "not"])
+FLAT = BOOLEAN | {"sign", "floor", "ceil"}
 
 
 class NotDifferentiable(SSMError):

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ssmppl.expressions.conditions import affirmed, conditions_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     MATRIX_OPS,
@@ -127,21 +128,10 @@ def _conditions_as_symbols(parts: list[Expr]) -> tuple[list[Expr], list[Expr]]:
     """(the summands with a symbol for each condition, these symbols)."""
     names: dict[Expr, Expr] = {}
     leaves: dict[Expr, Expr] = {}
-
-    def named(node: Expr) -> Expr:
-        return names.setdefault(node, symbol("condition", str(len(names))))
-
-    waiting = [n.args[0] for n in topological(parts) if n.op == "where"]
-    while waiting:
-        node = waiting.pop()
-        if node.op in ("and", "or", "not"):
-            waiting += node.args
-        elif node.op == "ne":
-            leaves[node] = 1.0 - named(Expr("eq", node.args))
-        elif node.op == "le":  # a <= b is not b < a
-            leaves[node] = 1.0 - named(Expr("lt", node.args[::-1]))
-        elif node.op != "const":
-            leaves[node] = named(node)
+    for condition in conditions_of(parts):
+        asked, opposite = affirmed(condition)
+        name = names.setdefault(asked, symbol("condition", str(len(names))))
+        leaves[condition] = 1.0 - name if opposite else name
     return substitute(parts, leaves), list(names.values())
 
 

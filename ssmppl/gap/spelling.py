@@ -14,7 +14,7 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
+from ssmppl.expressions.expr import BOOLEAN, MATRIX_OPS, Expr, topological
 
 WIDTH = 73  # of one expression, which may stand behind `concentration=` of a law in a law
 
@@ -340,7 +340,7 @@ def _name(node: Expr) -> str:
     if len(node.args) == 1 and node.args[0].op == "symbol":
         _, name, index = node.args[0].data
         return "_".join([node.op, name, *map(str, index)])
-    if node.op in ("lt", "le", "eq", "ne", "and", "or", "not"):
+    if node.op in BOOLEAN:
         return "holds"
     return {"where": "chosen", "add": "total", "sub": "total", "mul": "product",
             "div": "ratio"}.get(node.op, "term")  # fmt: skip

@@ -12,11 +12,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from ssmppl.expressions.conditions import affirmed, conditions_of
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, apply, constant, symbols_of, topological
+from ssmppl.expressions.expr import BOOLEAN, Expr, apply, constant, symbols_of, topological
 
 Places = dict[Expr, np.ndarray]
-COMPARISONS = ("lt", "le", "eq", "ne")
 PLAIN, CASES, WIDE = 4, 64, 512  # how many, moderate ones without and with conditions, wide ones
 LEAST, MOST = -6.0, 5.0  # powers of ten of wide values
 AROUND = (-1.0, -0.1, 0.0, 0.1, 1.0)  # a number that is compared with, in parts of it
@@ -46,7 +46,7 @@ def moderate(forms: list[Expr]) -> Places:
     forms : as `with_cases` has them.
     """
     rng, compared = np.random.default_rng(20), _compared(forms)
-    size = CASES if _conditions(forms) else PLAIN
+    size = CASES if conditions_of(forms) else PLAIN
     values = {s: rng.uniform(0.2, 0.9, size) for s in _symbols(forms)}
     return _decided(forms, _crossed(values, compared, rng), rng)
 
@@ -65,26 +65,13 @@ def _symbols(forms: list[Expr]) -> list[Expr]:
     return [n for n in topological(forms) if n.op == "symbol"]
 
 
-def _conditions(forms: list[Expr]) -> list[Expr]:
-    """What is asked, without the words between: a comparison, or a number that is 0 or not."""
-    found: dict[Expr, None] = {}
-    waiting = [n.args[0] for n in topological(forms) if n.op == "where"]
-    while waiting:
-        node = waiting.pop()
-        if node.op in ("and", "or", "not"):
-            waiting += node.args
-        elif node.op != "const":
-            found[node] = None
-    return list(found)
-
-
 def _compared(forms: list[Expr]) -> dict[Expr, list[float]]:
     """The numbers in the conditions that a symbol stands in."""
     found: dict[Expr, list[float]] = {}
-    for condition in _conditions(forms):
+    for condition in conditions_of(forms):
         numbers = [n.data for n in topological([condition])
                    if n.op == "const" and np.isfinite(n.data)]  # fmt: skip
-        if condition.op not in COMPARISONS:
+        if condition.op not in BOOLEAN:
             numbers += [0.0, 1.0]
         for s in symbols_of(condition):
             found[s] = found.get(s, []) + numbers
@@ -105,24 +92,17 @@ def _crossed(values: Places, compared: dict[Expr, list[float]], rng: np.random.G
 
 def _decided(forms: list[Expr], values: Places, rng: np.random.Generator) -> Places:
     """With truth values for the conditions that are the same everywhere."""
-    conditions = _conditions(forms)
+    conditions = conditions_of(forms)
     size = len(next(iter(values.values()))) if values else PLAIN
     truth: dict[Expr, np.ndarray] = {}
     for condition, found in zip(conditions, evaluate(conditions, values), strict=True):
         holds = np.broadcast_to(found != 0.0, size)
         if holds.all() or not holds.any():
-            name, negated = _positive(condition)
+            name, opposite = affirmed(condition)
             own = truth.setdefault(name, rng.integers(0, 2, size).astype(float))
-            own = 1.0 - own if negated else own
+            own = 1.0 - own if opposite else own
             values[condition] = np.where(np.arange(size) < PLAIN, holds, own)
     return values
-
-
-def _positive(condition: Expr) -> tuple[Expr, bool]:
-    """(the comparison that this one is, or is the opposite of; whether it is the opposite)."""
-    if condition.op == "le":  # a <= b is not b < a
-        return Expr("lt", condition.args[::-1]), True
-    return (Expr("eq", condition.args), True) if condition.op == "ne" else (condition, False)
 
 
 def numbers_at(forms: list[Expr], places: Places) -> np.ndarray:
