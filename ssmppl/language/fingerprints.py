@@ -6,21 +6,20 @@ in it. What other installed packages give goes by its name, as their versions ar
 
 from __future__ import annotations
 
-import dis
 import hashlib
 import inspect
 import pickle
 import re
 import sys
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from ssmppl.errors import Location
+from ssmppl.language.reading import PLAIN, names_in, outer_values
 
-PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...))
 CALLED = ("__init__", "__call__")  # the methods of a class that act without being named
 PACKAGE = "ssmppl"
 
@@ -94,13 +93,8 @@ class _Content:
 
     def _function(self, function: types.FunctionType) -> Any:
         code = function.__code__
-        names = frozenset(n for c in _codes(code) for n in c.co_names)
-        asked = {i.argval for c in _codes(code) for i in dis.get_instructions(c)
-                 if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")}  # fmt: skip
-        outside = {n: v for n, v in function.__globals__.items() if n in asked}
-        for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
-            outside[name] = _filled(cell)
-        found = [(n, self.of(outside[n], names)) for n in sorted(outside)]
+        names = names_in(code)
+        found = [(n, self.of(v, names)) for n, v in sorted(outer_values(function).items())]
         defaults = function.__defaults__, function.__kwdefaults__
         return self._code(code), found, self.of(defaults, names)
 
@@ -132,21 +126,6 @@ class _Content:
         if own is None:
             own = {n: getattr(value, n, None) for n in getattr(kind, "__slots__", ())}
         return self.of(kind, names), [(n, self.of(own[n], names)) for n in sorted(own)]
-
-
-def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    """Of a function, and of those within it."""
-    yield code
-    for inner in code.co_consts:
-        if isinstance(inner, types.CodeType):
-            yield from _codes(inner)
-
-
-def _filled(cell: types.CellType) -> Any:
-    try:
-        return cell.cell_contents
-    except ValueError:  # of a name that has no value yet
-        return None
 
 
 def _root(module: str | None) -> str:

@@ -28,9 +28,17 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["INSTALLED", "Declared", "digest_of_code", "outer_values", "plain_function"]
+__all__ = [
+    "INSTALLED",
+    "PLAIN",
+    "Declared",
+    "digest_of_code",
+    "names_in",
+    "outer_values",
+    "plain_function",
+]
 
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented), range)
+PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented), range)
 _CORE = ("numpy", "numba", "ssmppl", "scipy")
 _STDLIB = sysconfig.get_path("stdlib")
 INSTALLED = tuple(
@@ -63,7 +71,7 @@ def outer_values(function: Callable[..., Any]) -> dict[str, Any]:
             found[name] = cell.cell_contents
         except ValueError:  # assigned later
             continue
-    for name in _global_names(plain.__code__):
+    for name in _outer_names(plain.__code__):
         if name in plain.__globals__:
             found[name] = plain.__globals__[name]
     return found
@@ -99,7 +107,7 @@ class _Reading:
 
     def value(self, v: Any, names: frozenset[str]) -> None:
         """names : that the code around it looks up."""
-        if type(v) in _PLAIN:
+        if type(v) in PLAIN:
             self.put(type(v).__name__, repr(v))
         elif isinstance(v, CodeType):
             self.code(v)
@@ -151,7 +159,7 @@ class _Reading:
         if self.again(f):
             return
         self.code(f.__code__)
-        names = _names(f.__code__)
+        names = names_in(f.__code__)
         self.value(f.__defaults__, names)
         self.value(f.__kwdefaults__, names)
         for name, outer in sorted(outer_values(f).items()):
@@ -179,7 +187,7 @@ class _Reading:
             found = getattr(found, "fget", None) or getattr(found, "__func__", found)
             self.value(found, frozenset(names))
             if name in shared and isinstance(found, FunctionType):  # reads the object in its turn
-                self.attributes(thing, _names(found.__code__), shared)
+                self.attributes(thing, names_in(found.__code__), shared)
 
     def thing(self, v: Any, names: frozenset[str]) -> None:
         """An object: what is behind it if it is a function's wrapper, else what is read of it."""
@@ -198,7 +206,7 @@ class _Reading:
         if isinstance(v, MethodType):
             self.value(v.__func__, names)
             code = getattr(v.__func__, "__code__", None)
-            self.value(v.__self__, names | (_names(code) if code else frozenset()))
+            self.value(v.__self__, names | (names_in(code) if code else frozenset()))
             return
         if isinstance(v, functools.partial):
             for part in (v.func, v.args, v.keywords):
@@ -264,20 +272,20 @@ class _Reading:
 
 
 @functools.lru_cache(4096)
-def _names(code: CodeType) -> frozenset[str]:
+def names_in(code: CodeType) -> frozenset[str]:
     """All that a code looks up by name, nested code included, and texts that may be names."""
     found = {*code.co_names, *(c for c in code.co_consts if isinstance(c, str))}
     for inner in code.co_consts:
         if isinstance(inner, CodeType):
-            found |= _names(inner)
+            found |= names_in(inner)
     return frozenset(found)
 
 
 @functools.lru_cache(4096)
-def _global_names(code: CodeType) -> frozenset[str]:
+def _outer_names(code: CodeType) -> frozenset[str]:
     loads = ("LOAD_GLOBAL", "LOAD_NAME")
     names = {i.argval for i in dis.get_instructions(code) if i.opname in loads}
     for inner in code.co_consts:
         if isinstance(inner, CodeType):
-            names |= _global_names(inner)
+            names |= _outer_names(inner)
     return frozenset(names)

@@ -75,6 +75,12 @@ def of_module(c):
     return globally("def f(v, strength): return -strength * np.tanh(v / own.V0)", own=own)
 
 
+def of_module_by_text(c):
+    own = types.ModuleType("own_constants")
+    own.V0 = c
+    return globally("def f(v, strength): return -strength * v / getattr(own, 'V0')", own=own)
+
+
 def of_array(c):
     table = np.zeros(5000)
     table[2500] = c * 1e-9
@@ -115,8 +121,8 @@ def of_primitive(c):
 
 WAYS = [
     of_closure, of_default, of_keyword, of_function_within, of_global_within, of_called,
-    of_called_at_once, of_partial, of_module, of_array, of_mapping, of_object, of_method, of_class,
-    of_primitive,
+    of_called_at_once, of_partial, of_module, of_module_by_text, of_array, of_mapping, of_object,
+    of_method, of_class, of_primitive,
 ]  # fmt: skip
 
 
