@@ -146,7 +146,7 @@ def summary(
         ssmppl summary posterior.nc
         ssmppl summary posterior.nc --var-names phi,tau -o parameters.csv
     """
-    new_file(output, [posterior])
+    new_file(output, [posterior], netcdf=False)
     idata = read_posterior(posterior)
     table = ssm.summary(idata, var_names)
     attrs = idata["posterior"].attrs
@@ -198,7 +198,7 @@ def maximize(
         ssmppl maximize model.py data.csv --seed 1
         ssmppl maximize model.py data.csv --method em --fixed mass=1.2 -o estimate.csv
     """
-    new_file(output, data)
+    new_file(output, data, netcdf=False)
     estimate = ssm.maximize(
         load_model(model), read_data(data), method_of(CLIMBERS, method, settings),
         objective=objective, seed=drawn_seed(seed), fixed=parse_assignments(fixed, "--fixed"),

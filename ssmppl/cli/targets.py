@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ssmppl.cli.reading import PARQUET, TABLES, has_posterior, pyarrow
+from ssmppl.cli.reading import NETCDF, PARQUET, TABLES, has_posterior, pyarrow
 
 __all__ = ["file_of_model", "new_file", "numbered", "target"]
 
@@ -42,8 +42,12 @@ def target(
     return output
 
 
-def new_file(output: Path | None, read: Iterable[Path], table: bool = True) -> Path | None:
+def new_file(
+    output: Path | None, read: Iterable[Path], table: bool = True, netcdf: bool = True
+) -> Path | None:
     """`output`, which is none of the files that are read.
+
+    table, netcdf : whether the result can be written as one.
 
     Raises
     ------
@@ -56,6 +60,8 @@ def new_file(output: Path | None, read: Iterable[Path], table: bool = True) -> P
         raise click.UsageError(
             f"-o {output}: draws of several shapes fit into no table. Name a file .nc."
         )
+    if output is not None and not netcdf and output.suffix.lower() in NETCDF:
+        raise click.UsageError(f"-o {output}: the result is a table. Name a file .csv or .parquet.")
     if output is not None and output.suffix.lower() in PARQUET:
         pyarrow()  # found out now that it is missing, and not after the work
     return output

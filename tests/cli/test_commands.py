@@ -299,6 +299,17 @@ def test_a_suffix_that_draws_do_not_fit_is_refused_at_once(series, monkeypatch, 
         assert not Path(f"post{suffix}").exists()
 
 
+@pytest.mark.parametrize("verb", ["maximize", "summary"])
+def test_a_table_is_no_netcdf_file(series, monkeypatch, verb):
+    """A table in CSV was written under the name of one."""
+    monkeypatch.setattr(ssm, verb, lambda *a, **k: pytest.fail("it was run"))
+    given = ["walk.py", series] if verb == "maximize" else ["posterior.nc"]
+    Path("posterior.nc").touch()
+    said = fails(verb, *given, "-o", "table.nc", code=2)
+    assert "Name a file .csv or .parquet" in said
+    assert not Path("table.nc").exists()
+
+
 @pytest.mark.parametrize("verb", ["smooth", "maximize", "simulate", "leave-future-out"])
 def test_a_form_that_cannot_be_written_is_refused_at_once(series, monkeypatch, verb):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
