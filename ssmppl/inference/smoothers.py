@@ -161,7 +161,7 @@ def by_ffbsi(call: Call, method: FFBSi) -> list[Found]:
         }  # fmt: skip
         over_time = {"distinct": distinct(paths), "ess": system.ess}
         if not marginal:
-            report |= collapse(over_time["distinct"], system.particles, draws, e, COLLAPSED)
+            report |= collapse(over_time["distinct"], system, draws, e, COLLAPSED)
         out.append(Found(report, paths=paths, over_time=over_time))
     return out
 
@@ -188,7 +188,7 @@ def by_fixed_lag(call: Call, method: FixedLag) -> list[Found]:
         moments = m.mean, m.covariance, m.cross, m.quantiles
         over_time = {"distinct": m.distinct, "ess": system.ess}
         n = settings.particles
-        report |= collapse(m.distinct, system.particles, n, e, COLLAPSED)
+        report |= collapse(m.distinct, system, n, e, COLLAPSED)
         out.append(Found(report, moments=moments, over_time=over_time))
     return out
 

@@ -206,3 +206,18 @@ def test_few_values_are_no_collapse():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ssm.smooth(model, {"y": np.zeros(10)}, {}, "ffbsi", particles=300, seed=1)
+
+
+def test_a_count_that_the_data_tell_is_no_collapse():
+    """Of many counts among the particles, measurements that are nearly exact leave one."""
+    model = ssm.Model("counted animals")
+    model.initial(lambda: {"n": ssm.Poisson(2000.0)})
+    model.transition(lambda n: {"n": ssm.Poisson(n)})
+    model.observation(lambda n: {"y": ssm.Normal(n, sd=0.05)})
+    counts = np.array([2011.0, 1987.0, 1990.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = ssm.smooth(
+            model, {"y": counts}, {}, "ffbsi", particles=3000, trajectories=300, seed=1
+        )
+    assert np.all(found["n"].values == counts)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.data.times import label_text
+from ssmppl.inference.particles.backward import ParticleSystem
 
 FEW = 0.01  # of the values that there could be, below which the spread of the draws means little
 
@@ -21,15 +22,15 @@ def distinct(paths: np.ndarray) -> np.ndarray:
 
 
 def collapse(
-    found: np.ndarray, particles: np.ndarray, draws: int, experiment: Experiment, fix: str
+    found: np.ndarray, system: ParticleSystem, draws: int, experiment: Experiment, fix: str
 ) -> dict[str, Any]:
     """What goes to the attributes: nothing, or the warning, which is also given.
 
-    found : (T,) distinct values that are left. particles (T, D, N) : of the filter, for how many
-    values there could be, since a discrete state or a known start has few of its own. draws : M.
+    found : (T,) distinct values that are left. system : of the filter, for how many values there
+    could be, since a discrete state or a known start has few of its own. draws : M.
     """
-    suspect = np.flatnonzero(found < FEW * min(draws, particles.shape[2]))
-    rows = [t for t in suspect if found[t] < FEW * len(np.unique(particles[t], axis=1).T)]
+    suspect = np.flatnonzero(found < FEW * min(draws, system.particles.shape[2]))
+    rows = [t for t in suspect if found[t] < FEW * _values(system.particles[t], system.weights[t])]
     if not rows:
         return {}
     worst = min(rows, key=lambda t: found[t])
@@ -42,3 +43,16 @@ def collapse(
     )
     warnings.warn(text, stacklevel=4)
     return {"smoothing_warning": text}
+
+
+def _values(particles: np.ndarray, weights: np.ndarray) -> float:
+    """How many values there are among particles (D, N), by the weights (N,) where they are shared.
+
+    A value that many particles have can be all that the data leave; of values that one particle
+    has each, a single one with all the weight is what is warned of.
+    """
+    values, which = np.unique(particles, axis=1, return_inverse=True)
+    count = values.shape[1]
+    if 2 * count > len(weights):
+        return count
+    return float(1.0 / np.sum(np.bincount(which.ravel(), weights) ** 2))
