@@ -16,7 +16,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaln
 
 from ssmppl.analysis.density import terms
 from ssmppl.counts import check_count
@@ -25,7 +24,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains import smc2
-from ssmppl.inference.chains.bridge import Bridge, bridge, importance
+from ssmppl.inference.chains.bridge import Bridge, Student, bridge, importance
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.models import exact_log_likelihood, exact_model, filter_of
 from ssmppl.inference.executors import check_executor
@@ -47,7 +46,6 @@ from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.language.transforms import unconstrain
 
-DEGREES = 7.0  # of freedom of the law bridged to: tails heavier than a posterior's
 TASKS = 16
 TARGET_SD = 1.0
 FEW = 20  # draws of a chain that was interrupted, half of which fit the law bridged to
@@ -159,7 +157,7 @@ def evidence(
     if interrupted and z.shape[1] < FEW:
         raise KeyboardInterrupt(f"interrupted after {z.shape[1]} draws of each chain: too few")
     half = z.shape[1] // 2
-    law = _Student.fitted(z[:, :half].reshape(-1, z.shape[-1]))
+    law = Student.fitted(z[:, :half].reshape(-1, z.shape[-1]))
     own_ratio = own[:, half:] - law.log_density(z[:, half:])
     generator = np.random.default_rng(_child(root, 1))
     points = law.draw(generator, own_ratio.size)
@@ -325,32 +323,3 @@ def _report(method: PMMH | MetropolisHastings, own: np.ndarray, check: Bridge) -
 
 def _child(root: np.random.SeedSequence, *path: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 11, *path))
-
-
-@dataclass(frozen=True)
-class _Student:
-    """A multivariate t law: location (d,), factor (d, d) of its scale matrix."""
-
-    location: np.ndarray
-    factor: np.ndarray
-
-    @classmethod
-    def fitted(cls, points: np.ndarray) -> _Student:
-        """The one with the mean and covariance of points (n, d), a little wider."""
-        covariance = np.atleast_2d(np.cov(points.T))
-        scale = covariance + 1e-10 * np.diag(np.diag(covariance) + 1e-300)
-        return cls(points.mean(axis=0), np.linalg.cholesky(scale))
-
-    def log_density(self, points: np.ndarray) -> np.ndarray:
-        d = len(self.location)
-        u = np.linalg.solve(self.factor, (points - self.location).reshape(-1, d).T)
-        with np.errstate(over="ignore"):  # so far off that the density is zero
-            square = np.sum(u**2, axis=0).reshape(points.shape[:-1])
-        log_norm = gammaln((DEGREES + d) / 2) - gammaln(DEGREES / 2)
-        log_norm -= 0.5 * d * np.log(DEGREES * np.pi) + np.log(np.diag(self.factor)).sum()
-        return log_norm - 0.5 * (DEGREES + d) * np.log1p(square / DEGREES)
-
-    def draw(self, generator: np.random.Generator, n: int) -> np.ndarray:
-        normal = generator.standard_normal((n, len(self.location)))
-        mixing = np.sqrt(DEGREES / generator.chisquare(DEGREES, n))
-        return self.location + mixing[:, None] * (normal @ self.factor.T)

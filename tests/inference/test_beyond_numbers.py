@@ -10,8 +10,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.gap.scales import Scale
+from ssmppl.inference.chains.bridge import Student
 from ssmppl.inference.chains.parameter_steps import log_joint
-from ssmppl.inference.evidence import _Student
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
 from ssmppl.inference.particles import backward
@@ -57,7 +57,7 @@ def test_the_evidence_of_impossible_data():
 
 
 def test_a_t_law_far_away():
-    law = _Student(np.zeros(1), np.eye(1))
+    law = Student(np.zeros(1), np.eye(1))
     assert law.log_density(np.array([[1e200]])) == [-np.inf]
     assert np.isfinite(law.log_density(np.array([[1e100]])))
 

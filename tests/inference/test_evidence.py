@@ -138,3 +138,16 @@ def test_a_method_without_likelihoods_is_refused():
         ssm.evidence(models.lgss, {"y": [0.1]}, ssm.PGAS())
     with pytest.raises(ssm.ArgumentError, match=r"correlation=0\.99"):
         ssm.evidence(models.lgss, {"y": [0.1]}, ssm.PMMH(correlation=0.99))
+
+
+def test_chains_that_do_not_move_have_no_evidence():
+    """A law without width was fitted to them, and log p(y) was off by hundreds."""
+    model = ssm.Model("stuck")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(np.tanh(x), sd=1)})
+    model.observation(lambda x, a: {"y": ssm.Normal(x + a, sd=0.1)})
+    y = np.random.default_rng(1).normal(size=100)
+    method = ssm.PMMH(particles=3, proposal="bootstrap")
+    with pytest.raises(ssm.SamplingError, match="1 differ, in 1 free parameter"):
+        ssm.evidence(model, {"y": y}, method, draws=20, warmup=5, chains=1, seed=1)

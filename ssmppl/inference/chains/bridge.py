@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import gammaln, logsumexp
 
+from ssmppl.errors import SamplingError
 from ssmppl.inference.particles.filtering import log_of_mean
 
 TOLERANCE = 1e-10
 MOST_ITERATIONS = 1000
+DEGREES = 7.0  # of freedom of the law bridged to: tails heavier than a posterior's
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,49 @@ def bridge(own: np.ndarray, other: np.ndarray) -> Bridge:
 def importance(other: np.ndarray) -> Bridge:
     """The same constant from the draws of q alone: exp(log_constant) is unbiased for r."""
     return Bridge(*log_of_mean(other))
+
+
+@dataclass(frozen=True)
+class Student:
+    """The law bridged to, a multivariate t: location (d,), factor (d, d) of its scale matrix."""
+
+    location: np.ndarray
+    factor: np.ndarray
+
+    @classmethod
+    def fitted(cls, points: np.ndarray) -> Student:
+        """The one with the mean and covariance of points (n, d), a little wider.
+
+        Raises
+        ------
+        SamplingError : the points span no volume, as those of chains that did not move.
+        """
+        n, d = points.shape
+        distinct = len(np.unique(points, axis=0))
+        if distinct <= d or not np.all(np.ptp(points, axis=0) > 0.0):
+            raise SamplingError(
+                f"the law that the draws are compared with cannot be fitted: among the first {n} of "
+                f"them, {distinct} differ, in {d} free parameter{'s' if d > 1 else ''}",
+                fix="give more draws= and warmup=, or more particles; or method=ssm.SMC2(), which "
+                "needs no such law",
+            )
+        covariance = np.atleast_2d(np.cov(points.T))
+        scale = covariance + 1e-10 * np.diag(np.diag(covariance) + 1e-300)
+        return cls(points.mean(axis=0), np.linalg.cholesky(scale))
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        d = len(self.location)
+        u = np.linalg.solve(self.factor, (points - self.location).reshape(-1, d).T)
+        with np.errstate(over="ignore"):  # so far off that the density is zero
+            square = np.sum(u**2, axis=0).reshape(points.shape[:-1])
+        log_norm = gammaln((DEGREES + d) / 2) - gammaln(DEGREES / 2)
+        log_norm -= 0.5 * d * np.log(DEGREES * np.pi) + np.log(np.diag(self.factor)).sum()
+        return log_norm - 0.5 * (DEGREES + d) * np.log1p(square / DEGREES)
+
+    def draw(self, generator: np.random.Generator, n: int) -> np.ndarray:
+        normal = generator.standard_normal((n, len(self.location)))
+        mixing = np.sqrt(DEGREES / generator.chisquare(DEGREES, n))
+        return self.location + mixing[:, None] * (normal @ self.factor.T)
 
 
 def _relative_variance(values: np.ndarray) -> float:
