@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,18 +14,26 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["quantiles_of", "state_table", "summary", "summary_text", "wide_table"]
+__all__ = [
+    "component_label",
+    "quantiles_of",
+    "state_table",
+    "summary",
+    "summary_text",
+    "wide_table",
+]
 
 SUMMARY_COLUMNS = ["mean", "sd", "mcse_mean", "mcse_sd", "ess_bulk", "ess_tail", "r_hat"]
 
 
-def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
+def summary(idata: Any, var_names: str | Iterable[str] | None = None) -> pd.DataFrame:
     """Mean, sd, their Monte Carlo errors, bulk and tail ESS, and R-hat; one row per scalar.
 
     Parameters
     ----------
     idata : what `sample` returned.
-    var_names : names of variables; None: all of the posterior that have no time, the parameters.
+    var_names : names of variables, or one name; None: all of the posterior that have no time, the
+        parameters.
 
     Returns
     -------
@@ -41,7 +49,7 @@ def summary(idata: Any, var_names: Iterable[str] | None = None) -> pd.DataFrame:
     if var_names is None:
         names = [name for name, v in posterior.data_vars.items() if not time_axes(v.dims)]
     else:
-        names = list(var_names)
+        names = [var_names] if isinstance(var_names, str) else list(var_names)
         unknown = [name for name in names if name not in posterior.data_vars]
         if unknown:
             known = listing(str(unknown[0]), map(str, posterior.data_vars))
@@ -62,6 +70,12 @@ def quantiles_of(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
     return found
 
 
+def component_label(name: str, index: Sequence[int], others: Container[Any]) -> str:
+    """`x_0`, as data files call it too, or `x[0]` where another quantity has that name."""
+    plain = "_".join(map(str, (name, *index)))
+    return f"{name}[{','.join(map(str, index))}]" if index and plain in others else plain
+
+
 def state_table(dataset: xr.Dataset) -> pd.DataFrame:
     """Mean and standard deviation of each state over time, of a result of `smooth`; time its rows.
 
@@ -78,7 +92,7 @@ def state_table(dataset: xr.Dataset) -> pd.DataFrame:
         else:
             continue
         for index in np.ndindex(*mean.shape[1:]):
-            label = "_".join(map(str, (name, *index)))
+            label = component_label(str(name), index, dataset)
             columns[f"{label} mean"] = mean[(slice(None), *index)]
             columns[f"{label} sd"] = sd[(slice(None), *index)]
     return pd.DataFrame(columns, index=pd.Index(dataset["time"].values, name="time"))
@@ -99,7 +113,7 @@ def wide_table(dataset: xr.Dataset) -> pd.DataFrame:
             values = np.repeat(values[:, None], steps, axis=1)
         values = values.reshape(draws * steps, *values.shape[2:])
         for index in np.ndindex(*values.shape[1:]):
-            columns["_".join(map(str, (name, *index)))] = values[(slice(None), *index)]
+            columns[component_label(str(name), index, dataset)] = values[(slice(None), *index)]
     return pd.DataFrame(columns)
 
 

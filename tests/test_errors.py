@@ -257,6 +257,23 @@ def name_is_t():
     return declare(prior=prior)
 
 
+@bad("'x_dim_0', which is in results a dimension of the state 'x'", "'x_0_dim'")
+def name_of_a_dimension_of_a_vector():
+    def prior():
+        return {"x_dim_0": ssm.Normal(0, sd=1)}  # HERE
+
+    def initial():
+        return {"x": ssm.Normal(np.zeros(2), sd=1)}
+
+    def transition(x):
+        return {"x": ssm.Normal(x, sd=1)}
+
+    def observation(x):
+        return {"y": ssm.Normal(x[0], sd=1)}
+
+    return declare(prior=prior, initial=initial, transition=transition, observation=observation)
+
+
 @bad("named 'draw'", "dimension of draws")
 def name_of_a_dimension():
     def observation(x):

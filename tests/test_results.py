@@ -189,6 +189,7 @@ def test_summary_is_of_the_parameters_and_agrees_with_numpy(idata, arrays):
 
 def test_summary_of_named_variables(idata):
     assert len(tables.summary(idata, ["x"])) == T
+    assert list(tables.summary(idata, "phi").index) == ["phi"]
     with pytest.raises(ArgumentError, match=r"no variable 'psi'.*\n.*it has phi,"):
         tables.summary(idata, ["psi"])
 

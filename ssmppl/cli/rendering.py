@@ -20,7 +20,7 @@ from ssmppl.cli.group import AS_JSON, INTERRUPTED
 from ssmppl.cli.reading import PARQUET, TABLES, pyarrow
 from ssmppl.errors import ArgumentError
 from ssmppl.results import save
-from ssmppl.tables import quantiles_of, state_table, summary_text
+from ssmppl.tables import component_label, quantiles_of, state_table, summary_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -129,7 +129,8 @@ def columns_of(dataset: xr.Dataset) -> dict[str, Any]:
         if f"{name}_quantile" in dataset:
             told = dataset[f"{name}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
             for *index, j in np.ndindex(*told.shape[1:]):
-                label = "_".join(map(str, (name.removesuffix("_predicted"), *index)))
+                plain = name.removesuffix("_predicted")
+                label = component_label(name, index, own).replace(name, plain, 1)
                 level = f"{100 * float(told['quantile'][j]):.6g}"
                 found["predicted"][label][f"q{level.zfill(2)}"] = told.values[:, *index, j]
     return found
@@ -146,7 +147,7 @@ def spread(variables: Mapping[str, xr.DataArray], over: tuple[str, ...]) -> dict
     for name, variable in variables.items():
         values = variable.stack(sample_=over).transpose("sample_", ...).values
         for index in np.ndindex(*values.shape[2:]):
-            label = "_".join(map(str, (name, *index)))
+            label = component_label(name, index, variables)
             own = values[(slice(None), slice(None), *index)]
             with np.errstate(invalid="ignore"):  # of infinite draws
                 found[label] = {"mean": own.mean(axis=0), "sd": own.std(axis=0, ddof=1)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,7 @@ class Estimate:
     iterates : Dataset with dim `iteration`, the way to the estimate; of `IF2` with dim `start` too,
         and with `perturbed_log_likelihood`, what the swarm's particle filter made of each pass. Of
         exact methods with `objective`, the log-likelihood, with the log prior density where the
-        posterior was maximised.
+        posterior was maximised. Where a parameter has such a name, an underscore follows theirs.
     attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random
         numbers were used, `monte_carlo_errors`: the estimate's own standard errors by component.
     """
@@ -174,6 +174,11 @@ def _edges(trace: Trace, theta: np.ndarray, errors: np.ndarray) -> dict[str, flo
     return found
 
 
+def beside(parameters: Collection[str], name: str) -> str:
+    """What iterates call a dimension or a figure, where a parameter may have the name."""
+    return f"{name}_" if name in parameters else name
+
+
 def make_estimate(
     trace: Trace, theta: np.ndarray, covariance: np.ndarray, log_likelihood: float,
     iterates: np.ndarray, held: dict[str, np.ndarray], attrs: dict[str, Any],
@@ -184,7 +189,7 @@ def make_estimate(
 
     Rows and columns of fixed parameters are left out of the covariance.
     """
-    dims = ("start", "iteration")[3 - iterates.ndim :]
+    dims = [beside(trace.parameters, n) for n in ("start", "iteration")[3 - iterates.ndim :]]
     free = free_components(trace, held)
     labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
     errors = np.full(len(theta), np.nan)
@@ -193,7 +198,7 @@ def make_estimate(
     edges = _edges(trace, theta, errors)
     attrs = {**attrs, "at_edge": edges} if edges else attrs
     variables = unpack_parameters(trace, iterates) if len(theta) else {}
-    variables |= figures or {}
+    variables |= {beside(trace.parameters, n): v for n, v in (figures or {}).items()}
     return Estimate(
         parameters=by_name(trace, theta),
         covariance=table(labels, covariance[np.ix_(free, free)]),
@@ -201,7 +206,7 @@ def make_estimate(
         log_likelihood=log_likelihood,
         iterates=to_dataset(
             variables,
-            sample_dim=dims,
+            sample_dim=tuple(dims),
             over_time=(),
             coords={d: np.arange(n) for d, n in zip(dims, iterates.shape, strict=False)},
             attrs={k: v for k, v in attrs.items() if v is not None},

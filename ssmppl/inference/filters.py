@@ -13,7 +13,6 @@ import numpy as np
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.exact.models import EXACT
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.labels import component_dims, observes, with_data
 from ssmppl.inference.likelihood import settle
@@ -26,7 +25,7 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
 from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.problem import EXACT, Problem, pose
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 from ssmppl.results import to_dataset

@@ -13,12 +13,7 @@ from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.exact.models import (
-    EXACT,
-    NEEDED,
-    exact_log_likelihood,
-    form_of,
-)
+from ssmppl.inference.exact.models import NEEDED, exact_log_likelihood, form_of
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -28,7 +23,7 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.particles.on_device import check_device
 from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.problem import EXACT, Problem, pose
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 
@@ -154,7 +149,7 @@ def settle(
                 fix='use proposal="auto"',
             )
     else:
-        problem.proposal(proposal, integrate)
+        problem.proposal(proposal, integrate, EXACT)
     return settings
 
 

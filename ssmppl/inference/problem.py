@@ -18,6 +18,9 @@ from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model import Model
 from ssmppl.language.trace import Trace, trace
 
+# What filters without particles are called where a proposal is asked for.
+EXACT = ("kalman", "forward", "deterministic")
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -32,10 +35,12 @@ class Problem:
         """Of all data sets together."""
         return sum(e.steps for e in self.experiments)
 
-    def proposal(self, name: str, integrate: bool = False) -> Proposal:
+    def proposal(self, name: str, integrate: bool = False, others: Sequence[str] = ()) -> Proposal:
         """A derived proposal.
 
-        integrate : whether it may integrate states out, so that particles are of the others only.
+        integrate : whether it may integrate states out, so that particles are of the others only,
+            or look ahead by a guide.
+        others : what else the caller takes under this name, for the error.
 
         Raises
         ------
@@ -43,15 +48,14 @@ class Problem:
         """
         found = self.program.proposal(name) if isinstance(name, str) else None
         if found is None:
-            known = [
-                "auto",
-                "kalman",
-                "forward",
-                "deterministic",
-                *self.program.proposals,
-                *MARGINAL,
-                "tempered",
-            ]
+            if name in EXACT:
+                raise ArgumentError(
+                    f"proposal={name!r} is an exact filter, without particles",
+                    fix="leave method= out, or take a method whose likelihood is exact, as "
+                    "MetropolisHastings, Gibbs, EM and DirectOptimization do where there is one",
+                )
+            known = [n for n in self.program.proposals if integrate or n != "twisted"]
+            known = ["auto", *known, *((*MARGINAL, "tempered") if integrate else ()), *others]
             raise ArgumentError(
                 f"proposal={name!r} is not known for this model",
                 fix=f"use one of: {listing(name, known)}",

@@ -14,7 +14,7 @@ from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.estimate import by_name, free_components, table
 from ssmppl.inference.exact.exact_score import ExactScore, exact_score
-from ssmppl.inference.exact.models import EXACT, exact_model
+from ssmppl.inference.exact.models import exact_model
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.complete_score import complete_scores
@@ -26,7 +26,7 @@ from ssmppl.inference.particles.particle_score import (
     run_weights,
     several_runs,
 )
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.problem import EXACT, Problem, pose
 from ssmppl.language.model import Model
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from ssmppl.inference.chains import pgas
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.exact.models import EXACT
 from ssmppl.inference.likelihood import settle
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
@@ -27,7 +26,7 @@ from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.marginal_backward import marginal_paths, may_integrate
 from ssmppl.inference.particles.pilot import space_of
 from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.problem import EXACT, Problem
 from ssmppl.inference.runner import run_chains
 from ssmppl.inference.singular import need_density
 from ssmppl.inference.smoothing_methods import (

@@ -47,6 +47,21 @@ def check_name(name: Any, role: str, where: Location) -> None:
         )
 
 
+def check_dims(
+    known: Mapping[str, tuple[str, tuple[int, ...]]], where: Mapping[str, Location]
+) -> None:
+    """No name is that of a dimension of another quantity in results; known : role and shape."""
+    for name, (role, shape) in known.items():
+        for k in range(len(shape)):
+            if (own := f"{name}_dim_{k}") in known:
+                raise ModelError(
+                    f"{a(known[own][0])} is named {own!r}, which is in results a dimension of the "
+                    f"{role} {name!r}",
+                    fix=f"choose another name, for example '{name}_{k}_dim'",
+                    where=where.get(own),
+                )
+
+
 def check_returned(
     returned: Any, role: str, function: str, where: Location
 ) -> dict[str, Distribution]:

@@ -35,6 +35,7 @@ from ssmppl.language.packing import Known, digest_of, packed, unpacked
 from ssmppl.language.rules import (
     RESERVED,
     a,
+    check_dims,
     check_law,
     check_name,
     check_returned,
@@ -186,6 +187,7 @@ class _Tracer:
             transition = self._sites("transition", "state")
             proposal = self._sites("proposal", "state")
         check_states(initial, transition, proposal)
+        check_dims(self.known, self.owner)
         self._check_outer_names()
         return Trace(
             name=model.name,

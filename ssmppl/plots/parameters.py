@@ -8,7 +8,7 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError
 from ssmppl.gap.numerals import with_error
-from ssmppl.inference.estimate import Estimate
+from ssmppl.inference.estimate import Estimate, beside
 from ssmppl.inference.posterior_draws import group
 from ssmppl.language.model import Model
 from ssmppl.plots.density import Prior, estimated, prior_draws, priors_of, window
@@ -199,15 +199,15 @@ def iterates_of(estimate: Estimate) -> tuple[dict[str, np.ndarray], dict[str, np
     paths: dict[str, np.ndarray] = {}
     for name, variable in estimate.iterates.data_vars.items():
         if str(name) in estimate.parameters and str(name) not in held:
-            own = variable if "start" in variable.dims else variable.expand_dims("start")
-            values = own.transpose("start", "iteration", ...).values
-            paths |= components(str(name), values, 2)
+            values, shape = variable.values, np.shape(estimate.parameters[str(name)])
+            one = values.ndim == 1 + len(shape)  # of a single start
+            paths |= components(str(name), values[None] if one else values, 2)
     figures: dict[str, np.ndarray] = {}
     objective = str(estimate.attrs.get("objective", "likelihood"))
     for name, label in (("objective", OBJECTIVES.get(objective, objective)),
                         ("perturbed_log_likelihood", "perturbed\nlog-likelihood")):  # fmt: skip
-        if name in estimate.iterates and name not in estimate.parameters:
-            values = estimate.iterates[name].values
+        if (own := beside(estimate.parameters, name)) in estimate.iterates:
+            values = estimate.iterates[own].values
             figures[label] = values if values.ndim == 2 else values[None]
     return paths, figures
 

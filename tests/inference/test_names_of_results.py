@@ -7,6 +7,7 @@ import ssmppl as ssm
 from ssmppl.plots.density import prior_draws
 from ssmppl.plots.parameters import parameter_draws
 from ssmppl.results import time_axes
+from ssmppl.tables import wide_table
 
 rng = np.random.default_rng(0)
 U = np.ones(12)
@@ -152,3 +153,50 @@ def test_an_improper_prior_is_told_what_the_call_has():
     for fix, call in calls.items():
         with pytest.raises(ssm.ArgumentError, match=f"'q' a proper prior, or {fix}"):
             call()
+
+
+# -- iterates of estimates
+
+
+@pytest.mark.parametrize("method", [ssm.EM(), ssm.DirectOptimization(), ssm.IF2(20, 3)])
+@pytest.mark.parametrize(
+    "name", ["iteration", "start", "objective", "perturbed_log_likelihood", "theta"]
+)
+def test_iterates_of_a_parameter_named_as_they_are(name, method):
+    """The climb was lost at its end, or the parameter's iterates were those of the objective."""
+    found = ssm.maximize(model(name), DATA[:1], method, seed=1, progress=False)
+    values = found.iterates[name].values
+    assert np.all(values > 0)
+    if not isinstance(method, ssm.IF2):
+        assert values[-1] == pytest.approx(found.parameters[name], rel=1e-3, abs=1e-4)
+    ssm.plot_maximization(found)
+
+
+def test_components_and_a_parameter_of_one_name_in_a_table():
+    """The parameter had the state's values."""
+    made = ssm.Model("names")
+    made.prior(lambda: {"x_0": ssm.Normal(0, sd=1)})
+    made.initial(lambda x_0: {"x": ssm.Normal(np.stack([x_0, x_0]), sd=1)})
+    made.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    made.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
+    found = ssm.simulate(made, steps=3, seed=1)
+    table = wide_table(found)
+    assert list(table["x_0"]) == [float(found["x_0"].values[0])] * 3
+    assert np.array_equal(table["x[0]"], found["x"].values[0, :, 0])
+    assert np.array_equal(table["x_1"], found["x"].values[0, :, 1])
+
+
+# -- names of proposals
+
+
+def test_the_proposals_that_are_told_are_taken():
+    for method, beside in ((ssm.PMMH, "twisted"), (ssm.PGAS, None)):
+        with pytest.raises(ssm.ArgumentError, match="exact filter") as found:
+            ssm.sample(model("p"), DATA[:1], method(proposal="kalman"), **SHORT)
+        assert "kalman" not in found.value.fix
+        with pytest.raises(ssm.ArgumentError, match="'foo' is not known") as found:
+            ssm.sample(model("p"), DATA[:1], method(proposal="foo"), **SHORT)
+        assert ("twisted" in found.value.fix) == (beside == "twisted")
+        assert "kalman" not in found.value.fix
+    with pytest.raises(ssm.ArgumentError, match="kalman"):
+        ssm.log_likelihood(model("p"), DATA[:1], {"p": 1.0, "q": 1.0}, proposal="foo")

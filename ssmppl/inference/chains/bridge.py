@@ -79,8 +79,8 @@ class Student:
         distinct = len(np.unique(points, axis=0))
         if distinct <= d or not np.all(np.ptp(points, axis=0) > 0.0):
             raise SamplingError(
-                f"the law that the draws are compared with cannot be fitted: among the first {n} of "
-                f"them, {distinct} differ, in {d} free parameter{'s' if d > 1 else ''}",
+                "the law that the draws are compared with cannot be fitted: among the first "
+                f"{n} of them, {distinct} differ, in {d} free parameter{'s' if d > 1 else ''}",
                 fix="give more draws= and warmup=, or more particles; or method=ssm.SMC2(), which "
                 "needs no such law",
             )

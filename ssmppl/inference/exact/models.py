@@ -11,13 +11,14 @@ from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.deterministic import Deterministic, deterministic_model
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.problem import EXACT
 from ssmppl.language.trace import Trace
 
 ExactModel = KalmanModel | HiddenMarkov | Deterministic
 
 # What the filter behind each is called where a proposal is asked for, and in words; the kind of
 # model; and what finds it.
-FILTER = {KalmanModel: "kalman", HiddenMarkov: "forward", Deterministic: "deterministic"}
+FILTER = dict(zip((KalmanModel, HiddenMarkov, Deterministic), EXACT, strict=True))
 FILTER_NAME = {
     KalmanModel: "the Kalman filter",
     HiddenMarkov: "the forward algorithm",
@@ -33,7 +34,6 @@ NEEDED = {
     "forward": "model of finite states",
     "deterministic": "model without noise in its states",
 }
-EXACT = tuple(FILTER.values())
 _FORMS: dict[str, Callable[[Trace], ExactModel | NotApplicable]] = {
     "kalman": kalman_model,
     "forward": hidden_markov,

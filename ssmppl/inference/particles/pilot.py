@@ -19,14 +19,14 @@ from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.exact.models import EXACT, exact_log_likelihood
+from ssmppl.inference.exact.models import exact_log_likelihood
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     log_likelihood_estimate,
     random_state,
     repeated_estimates,
 )
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.problem import EXACT, Problem
 from ssmppl.language.trace import Site
 from ssmppl.language.transforms import transforms, unconstrain
 
