@@ -8,8 +8,9 @@ from types import ModuleType
 
 from ssmppl.analysis.update import Update
 from ssmppl.codegen import cache
-from ssmppl.codegen.module import Layout, time_sum
+from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
+from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
 from ssmppl.language.trace import Trace
 

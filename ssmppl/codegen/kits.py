@@ -10,16 +10,9 @@ from ssmppl.analysis.channels import channel_draws, observation_draws, of_compon
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.moves import Proposal
 from ssmppl.analysis.structure import deterministic
-from ssmppl.codegen.module import (
-    PARTICLE,
-    Layout,
-    Section,
-    Target,
-    level_of,
-    scalar_function,
-    time_sum,
-)
+from ssmppl.codegen.module import PARTICLE, Layout, Section, Target, level_of
 from ssmppl.codegen.render import Names, Writer, depends
+from ssmppl.codegen.sums import scalar_function, time_sum
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant

@@ -9,9 +9,10 @@ from types import ModuleType
 from ssmppl.analysis.score import CompleteScore, Sums
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.averages import sums_of_paths
-from ssmppl.codegen.module import Layout, time_sum
+from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.specialise import specialise
+from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
 from ssmppl.expressions.calculus import NotDifferentiable
 

@@ -7,9 +7,10 @@ from types import ModuleType
 from ssmppl.analysis.mstep import MStep
 from ssmppl.codegen import cache
 from ssmppl.codegen.kernels.averages import weighted_statistics
-from ssmppl.codegen.module import Layout, time_sum
+from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.specialise import specialise
+from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
 
 

@@ -1,11 +1,12 @@
-"""Scalar expressions, for the rest of the project: every name of node, simplify, graph and text.
+"""Scalar expressions, for the rest of the project: every name of the modules below.
 
-    node.py      Expr: one interned, immutable node type; where the user wrote it
-    simplify.py  apply: an operation, simplified
-    graph.py     walking the nodes under an expression: order, dependence, substitution
-    text.py      how a person writes it
+    provenance.py  where the user wrote a node
+    node.py        Expr: one interned, immutable node type
+    simplify.py    apply: an operation, simplified
+    graph.py       walking the nodes under an expression: order, dependence, substitution
+    text.py        how a person writes it
 
-Import from here; the four modules are how it is made.
+Import from here; the five modules are how it is made.
 """
 
 from ssmppl.expressions.graph import (
@@ -30,14 +31,12 @@ from ssmppl.expressions.node import (
     UNARY,
     Expr,
     as_expr,
-    attributed,
     constant,
     item,
     matrix_op,
-    recording,
     symbol,
-    user_location,
 )
+from ssmppl.expressions.provenance import attributed, recording, user_location
 from ssmppl.expressions.simplify import apply, split_constant
 from ssmppl.expressions.text import symbol_text, to_text
 

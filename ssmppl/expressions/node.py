@@ -12,18 +12,15 @@ What an operation means is defined by `evaluate.py`, how it is spelled in genera
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import Location, UnsupportedOperation
+from ssmppl.errors import UnsupportedOperation
+from ssmppl.expressions.provenance import PLACES, note, user_location
 
 _UNARY = """neg exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
     arccosh arctanh abs sign floor ceil gammaln digamma trigamma ndtr log_ndtr ndtri erf erfc i0e
@@ -70,17 +67,6 @@ behaviour: dict[str, Callable[..., Any]] = {}
 
 _interned: weakref.WeakValueDictionary[tuple, Expr] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
-_locations: ContextVar[dict[Expr, Location] | None] = ContextVar("locations", default=None)
-_attributed: ContextVar[Location | None] = ContextVar("attributed", default=None)
-# Frames of these folders are never the place "where the user wrote it".
-_OWN = tuple(
-    os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
-    for d in ("expressions", "language")
-)
-_OWN += tuple(  # SciPy lies beside NumPy
-    os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(np.__file__))), d) + os.sep
-    for d in ("numpy", "scipy")
-)
 
 
 def _apply(op: str, *operands: Any) -> Expr:
@@ -120,9 +106,9 @@ class Expr:
                 object.__setattr__(node, "data", data)
                 object.__setattr__(node, "_symbols", None)
                 _interned[key] = node
-        places = _locations.get()
-        if places is not None and args and node not in places:  # symbols are not written there
-            places[node] = _attributed.get() or user_location()
+        places = PLACES.get()
+        if places is not None and args:  # symbols are not written there
+            note(node, places)
         return node
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -341,36 +327,3 @@ def as_expr(value: Any) -> Expr:
     if isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating)):
         return constant(float(value))
     raise TypeError(f"no expression can be made of {value!r} of type {type(value).__name__}")
-
-
-@contextmanager
-def recording() -> Iterator[dict[Expr, Location]]:
-    """Within the block, the first place where the user wrote each node is kept in the result."""
-    places: dict[Expr, Location] = {}
-    token = _locations.set(places)
-    try:
-        yield places
-    finally:
-        _locations.reset(token)
-
-
-@contextmanager
-def attributed(places: dict[Expr, Location], location: Location) -> Iterator[None]:
-    """Within the block, nodes that have no place in `places` yet get this one.
-
-    For what is derived from a line of the user's rather than written there.
-    """
-    tokens = _locations.set(places), _attributed.set(location)
-    try:
-        yield
-    finally:
-        _locations.reset(tokens[0])
-        _attributed.reset(tokens[1])
-
-
-def user_location() -> Location:
-    """The innermost frame that is neither ours nor NumPy's: where the user wrote it."""
-    frame = sys._getframe(1)
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(_OWN):
-        frame = frame.f_back
-    return Location(frame.f_code.co_filename, frame.f_lineno, frame.f_code.co_name)

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 import ssmppl.language.distributions as D
 from ssmppl.codegen.kernels import elementary, incomplete, laws, scalars, special
 from ssmppl.codegen.kernels.flags import exact, kernel
-from ssmppl.codegen.module import Layout, Section, Target, scalar_function
+from ssmppl.codegen.module import Layout, Section, Target
 from ssmppl.codegen.render import CALLS, INFIX, MATRIX_CALLS
+from ssmppl.codegen.sums import scalar_function
 from ssmppl.expressions import evaluate as interpreter
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
