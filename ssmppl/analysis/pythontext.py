@@ -34,6 +34,8 @@ _TEXT = {
     "arctanh": "math.atanh({0})", "arctan2": "math.atan2({0}, {1})",
     **{n: f"math.{n}({{0}})" for n in _SAME_NAME},
 }  # fmt: skip
+_NEVER_RAISE = {"add", "sub", "mul", "neg", "not", "and", "or", "lt", "le", "eq", "ne", "where",
+                "abs", "maximum", "minimum"}  # fmt: skip
 
 
 def python_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
@@ -55,24 +57,57 @@ def python_sum(
 def straight_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
     """As `python_function`, each shared subexpression computed once, statement by statement.
 
-    For larger graphs, whose text would repeat what is shared. Both cases of a condition are
-    computed.
+    For larger graphs, whose text would repeat what is shared. What one case of a condition needs,
+    and could raise, is computed where it is asked for: sqrt(b) of `where(b > 0, sqrt(b), b)`.
     """
     done = {a: f"v[{i}]" for i, a in enumerate(arguments)}
     lines = ["def run(v):"]
+    always = _always(expressions)
+    later: set[Expr] = set()
     for node in topological(expressions):
         if node in done:
             continue
         text = _spelled(node, [done[a] for a in node.args], simple=True)
         if node.op == "const":
             done[node] = text
+            continue
+        name = f"a{len(lines)}"
+        waits = node.op not in _NEVER_RAISE or not later.isdisjoint(node.args)
+        if waits and node not in always:
+            later.add(node)
+            lines.append(f"    {name} = once(lambda: {text})")
+            done[node] = f"{name}()"
         else:
-            done[node] = f"a{len(lines)}"
-            lines.append(f"    {done[node]} = {text}")
+            lines.append(f"    {name} = {text}")
+            done[node] = name
     lines.append("    return (" + "".join(f"{done[e]}, " for e in expressions) + ")")
     names = _names(expressions)
     exec("\n".join(lines), names)
     return names["run"]
+
+
+def _always(expressions: Sequence[Expr]) -> set[Expr]:
+    """The nodes whose values are needed whatever conditions hold."""
+    found: set[Expr] = set()
+    waiting = list(expressions)
+    while waiting:
+        node = waiting.pop()
+        if node not in found:
+            found.add(node)
+            waiting += node.args[:1] if node.op in ("where", "and", "or") else node.args
+    return found
+
+
+def _once(function: Callable[[], Any]) -> Callable[[], Any]:
+    """The function's value, computed when it is first asked for."""
+    kept: list[Any] = []
+
+    def value() -> Any:
+        if not kept:
+            kept.append(function())
+        return kept[0]
+
+    return value
 
 
 def _text(root: Expr, places: dict[Expr, str]) -> str:
@@ -121,6 +156,7 @@ def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
     """What the texts refer to."""
     return {
         "math": math,
+        "once": _once,
         "meaning": MEANING,
         "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
         "matrix_cholesky": _matrix(np.linalg.cholesky),

@@ -250,3 +250,18 @@ def test_refuses_settings_without_sense():
     for method, found in ((ssm.EM(iterations=0), "iterations=0"), (ssm.EM(tolerance=0.0), "toler")):
         with pytest.raises(ssm.ArgumentError, match=found):
             ssm.maximize(models.lgss, data, method, progress=False)
+
+
+def test_a_root_that_a_condition_guards():
+    """EM stood still where the other case holds, and called the start its maximum."""
+    model = ssm.Model("guarded")
+    model.prior(lambda: {"b": ssm.Uniform(-0.95, 0.9), "s": ssm.HalfNormal(sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, b, s: {"x": ssm.Normal(np.where(b > 0, np.sqrt(b), b) * x, sd=s)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=0.3)})
+    y = ssm.simulate(model, parameters={"b": -0.7, "s": 0.5}, steps=100, seed=3)["y"].values[0]
+    found = [
+        ssm.maximize(model, {"y": y}, method, start={"b": -0.3, "s": 0.9}, seed=1, progress=False)
+        for method in (ssm.EM(), ssm.DirectOptimization())
+    ]
+    assert found[0].parameters == pytest.approx(found[1].parameters, rel=1e-4)
