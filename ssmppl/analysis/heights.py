@@ -51,9 +51,13 @@ _MAXIMISERS: dict[type, dict[str, Estimate]] = {
         "p": lambda d, v: ew("minimum", ew("maximum", array(v / d.n), TINY), 1.0 - TINY)
     },
 }
-# law -> parameters whose smallest value gives the highest density at the centre
-_SPREADS = {laws.Normal: ("sd", "variance"), laws.StudentT: ("scale",), laws.Laplace: ("scale",),
-            laws.Cauchy: ("scale",), laws.LogNormal: ("sd",)}  # fmt: skip
+# law -> its centre, and parameters of its spread: the density at a distance from the centre is
+# highest where the spread is that distance, and at the centre where it is smallest
+_SPREADS = {
+    laws.Normal: ("mean_", ("sd", "variance")), laws.StudentT: ("loc", ("scale",)),
+    laws.Laplace: ("loc", ("scale",)), laws.Cauchy: ("loc", ("scale",)),
+    laws.LogNormal: ("mean_", ("sd",)),
+}  # fmt: skip
 
 
 def transition_height(trace: Trace) -> Expr | NotApplicable:
@@ -98,11 +102,8 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     for name in sorted(free, key=lambda n: n in known):  # spreads first
         if name in known:
             best = array(known[name](d, site.value))
-        elif (
-            name in _SPREADS.get(kind, ())
-            and (low := _lowest(d.parameters[name], prev)) is not None
-        ):
-            best = low
+        elif (spread := _spread(site, name, prev)) is not None:
+            best = spread
         else:
             reason = f"{_plain(name)} of {site.name} ({kind.__name__}) depends on the state before"
             return NotApplicable(reason, where)
@@ -166,6 +167,26 @@ def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     if lowest is None:
         return NotApplicable(f"the width of {site.name} depends on the state before", d.location)
     return array(np.sum(-array(ew("log", lowest))))[()]
+
+
+def _spread(site: Site, name: str, prev: Sequence[Expr]) -> ExprArray | None:
+    """The value of a parameter of the spread that maximises the density, entry by entry.
+
+    None where the parameter is none of these, or has no positive number below it.
+    """
+    d = site.distribution
+    centre, spreads = _SPREADS.get(type(d), ("", ()))
+    lowest = _lowest(d.parameters[name], prev) if name in spreads else None
+    if lowest is None:
+        return None
+    value = array(ew("log", site.value)) if isinstance(d, laws.LogNormal) else site.value
+    best = np.empty(site.shape, dtype=object)
+    for i in np.ndindex(site.shape):
+        best[i], place = lowest[i], d.parameters[centre][i]
+        if not depends_on(place, prev):
+            away = apply("abs", value[i] - place)
+            best[i] = apply("maximum", best[i], away**2 if name == "variance" else away)
+    return array(best)
 
 
 def _lowest(spread: ExprArray, prev: Sequence[Expr]) -> ExprArray | None:

@@ -24,7 +24,12 @@ LAWS = {
     "normal": (lambda x: ssm.Normal(0.7 * x, sd=0.4), REAL, True),
     "normal by precision": (lambda x: ssm.Normal(np.sin(x), precision=3), [0.5], True),
     "normal with a floor": (lambda x: ssm.Normal(x, sd=0.3 + np.exp(0.1 * x)), REAL, False),
-    "spread alone": (lambda x: ssm.Normal(0, variance=0.5 + x**2), [0.0], True),
+    "spread alone": (lambda x: ssm.Normal(0, variance=0.5 + x**2), REAL, True),
+    "deviation alone": (lambda x: ssm.Normal(0.3, sd=0.5 + np.abs(x)), REAL, True),
+    "student's scale": (lambda x: ssm.StudentT(4, 1, scale=0.3 + x**2), REAL, True),
+    "laplace's scale": (lambda x: ssm.Laplace(-0.2, scale=0.3 + x**2), REAL, True),
+    "cauchy's scale": (lambda x: ssm.Cauchy(0, scale=0.3 + x**2), REAL, True),
+    "log-normal's spread": (lambda x: ssm.LogNormal(0.1, sd=0.2 + x**2), POSITIVE, True),
     "log-normal": (lambda x: ssm.LogNormal(x, sd=0.5), POSITIVE, True),
     "student": (lambda x: ssm.StudentT(4, 0.5 * x, scale=0.7), REAL, True),
     "laplace": (lambda x: ssm.Laplace(x, scale=2), REAL, True),
@@ -124,6 +129,20 @@ def test_vector_of_which_one_component_depends():
             before = dict(zip(t.state_prev_symbols, [GRID, 0.0], strict=True))
             top = np.max(evaluate([term.log_density], known | before)[0])
             assert top <= evaluate([h], known)[0] + 1e-9
+
+
+def test_a_vector_of_which_one_spread_depends():
+    """Each entry's own way: a spread at a centre that is fixed, and at one that moves."""
+    traced = model_of(
+        lambda x: ssm.Normal(np.stack([x[0], 0.4]), sd=0.2 + np.abs(x[0]) * np.ones(2)), (2,)
+    )
+    height, (term,) = transition_height(traced), terms(traced, "transition")
+    rng = np.random.default_rng(seed_of("heights", "spread of a vector"))
+    for value in 3 * rng.normal(size=(20, 2)):
+        known = dict(zip(traced.state_symbols, value, strict=True))
+        before = dict(zip(traced.state_prev_symbols, [GRID, 0.0], strict=True))
+        top = np.max(evaluate([term.log_density], known | before)[0])
+        assert top <= evaluate([height], known)[0] + 1e-9
 
 
 def test_memory_of_a_deterministic_component():
