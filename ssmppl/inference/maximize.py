@@ -15,7 +15,7 @@ from ssmppl.analysis.structure import noisy_start
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
 from ssmppl.inference.estimate import Estimate, free_components, make_estimate
-from ssmppl.inference.exact.exact_score import exact_score
+from ssmppl.inference.exact.exact_score import ExactScore, exact_score
 from ssmppl.inference.exact.models import kind_of
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.maximum import (
@@ -209,7 +209,7 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
         return nothing
     if information is None:
         information = _information(setup, ascent.theta, None)
-    found = None
+    found = score = None
     if information is not None and not isinstance(setup.exact, NotApplicable):
         found = edges(setup, ascent.theta, information)
     if found is not None:
@@ -219,10 +219,12 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
             attrs["covariance"] = "every parameter is at an edge of what it can be"
             return nothing
         information = _information(setup, ascent.theta, found)
+        if found.moving:
+            score = _score_of(setup, found).score(ascent.theta)[1]
     if information is None:
         attrs["covariance"] = "none: no second derivatives of the log-likelihood"
         return nothing
-    covariance = natural_covariance(setup, ascent.theta, information, found)
+    covariance = natural_covariance(setup, ascent.theta, information, found, score)
     if isinstance(covariance, NotApplicable):
         attrs["covariance"] = f"none: {covariance.reason}"
         return nothing
@@ -234,11 +236,7 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
 
 def _information(setup: Setup, theta: np.ndarray, found: Edges | None) -> np.ndarray | None:
     if not isinstance(setup.exact, NotApplicable):
-        free = free_components(setup.problem.trace, setup.held)
-        free[[] if found is None else list(found.components)] = False
-        return exact_score(
-            setup.exact, setup.problem.experiments, free, setup.space.theta
-        ).information(theta)
+        return _score_of(setup, found).information(theta)
     try:
         scores = complete_scores(setup.problem, setup.held)
         settings = FilterSettings(PARTICLES, choose(setup.problem, theta, exact=False).name)
@@ -251,15 +249,28 @@ def _information(setup: Setup, theta: np.ndarray, found: Edges | None) -> np.nda
     return combine(runs).information
 
 
+def _score_of(setup: Setup, found: Edges | None) -> ExactScore:
+    """Of an exact likelihood, in what is free and not held at an edge that stays where it is."""
+    assert not isinstance(setup.exact, NotApplicable), setup.exact
+    free = free_components(setup.problem.trace, setup.held)
+    free[[] if found is None else [i for i in found.components if i not in found.moving]] = False
+    return exact_score(setup.exact, setup.problem.experiments, free, setup.space.theta)
+
+
 def natural_covariance(
-    setup: Setup, theta: np.ndarray, information: np.ndarray, found: Edges | None = None
+    setup: Setup,
+    theta: np.ndarray,
+    information: np.ndarray,
+    found: Edges | None = None,
+    score: np.ndarray | None = None,
 ) -> np.ndarray | NotApplicable:
     """The delta method: J (J' I J - d2 log prior)^-1 J' over all components of theta.
 
     At a maximum the gradient in theta vanishes, so that the second derivatives of theta(z) drop out
     of the likelihood's part. The prior counts for objective "posterior" only.
 
-    found : parameters at an edge, which are held there and have NaN.
+    found : parameters at an edge, which are held there and have NaN. score : (P,) the gradient of
+    the likelihood where it does not vanish, as such an edge moves with other parameters.
     """
     try:
         z = setup.space_at(theta) if found is None else found.z
@@ -270,10 +281,12 @@ def natural_covariance(
     jacobian = point.jacobian[:, kept]
     with np.errstate(all="ignore"):
         curvature = jacobian.T @ information @ jacobian
-    if setup.with_prior:
-        slope = point.inverse().T @ point.d_log_prior
+    if setup.with_prior or score is not None:
+        slope = point.inverse().T @ point.d_log_prior if score is None else -score
         second = setup.chart.curvature(z, slope)
-        curvature = curvature + (second.theta - second.log_prior)[np.ix_(kept, kept)]
+        curvature = curvature + second.theta[np.ix_(kept, kept)]
+    if setup.with_prior:
+        curvature = curvature - second.log_prior[np.ix_(kept, kept)]
     if not np.all(np.isfinite(curvature)):
         return NotApplicable("the observed information is not finite at the estimate")
     scale = np.sqrt(np.abs(np.diagonal(curvature)))

@@ -268,3 +268,29 @@ def test_constant_data_of_states_without_noise():
     assert found.parameters["s"] == pytest.approx(
         np.sqrt(np.mean((data["y"] - 1.0) ** 2)), rel=1e-5
     )
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+@pytest.mark.parametrize("method", [ssm.DirectOptimization(), ssm.EM()])
+def test_an_edge_that_another_parameter_moves(power, method):
+    """What the data tell of the bound, by way of the parameter that lies on it, was left out."""
+    model = ssm.Model("bounded")
+    model.prior(lambda: {"b": ssm.Gamma(3, rate=2)})
+    model.prior(lambda b: {"r": ssm.Uniform(0, b**power)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=0.5)})
+    model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
+    data = {"y": ssm.simulate(model, parameters={"b": 1.0, "r": 1.0}, steps=60, seed=3)["y"][0]}
+    found = ssm.maximize(model, data, method, objective="posterior", seed=1, progress=False)
+    assert set(found.attrs["held_at_edge"]) == {"r"}
+
+    def density(b):  # of b where r = b**power; the density of r is one over that
+        return ssm.log_likelihood(model, data, {"b": b, "r": b**power}) + np.log(
+            b ** (2.0 - power)
+        ) - 2.0 * b  # fmt: skip
+
+    b, h = found.parameters["b"], 1e-3
+    slope = (density(b + h) - density(b - h)) / (2 * h)
+    information = -(density(b + h) - 2 * density(b) + density(b - h)) / h**2
+    assert abs(slope) < 1e-3 * information
+    assert found.standard_errors["b"] == pytest.approx(information**-0.5, rel=1e-3)

@@ -19,7 +19,7 @@ from ssmppl.data import unpack_parameters
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.language.trace import Site
 from ssmppl.language.transforms import Transform, transforms, unconstrain
@@ -44,11 +44,13 @@ class Edges:
 
     z : (F,) an estimate inside the support. kept : (F,) bool, the numbers that are not held there.
     components : index of each component of theta at an edge -> the value of that edge.
+    moving : those of them whose edge is where other free parameters put it.
     """
 
     z: np.ndarray
     kept: np.ndarray
     components: dict[int, float]
+    moving: frozenset[int] = frozenset()
 
 
 def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.ndarray:
@@ -92,15 +94,20 @@ def edges(setup: Setup, theta: np.ndarray, information: np.ndarray) -> Edges | N
         return None
     place = {s: i for i, s in enumerate(setup.problem.trace.parameter_symbols)}
     known = dict(zip(place, theta, strict=True))
-    kept, components, first = found == 0.0, {}, 0
+    held = {s for s in place if s.data[1] in setup.held}
+    kept, components, moving, first = found == 0.0, {}, set(), 0
     for t in transforms(setup.problem.trace):
         if t.site.name in setup.held:
             continue
         own = slice(first, first + len(t.free))
         first += len(t.free)
+        support = t.site.distribution.support()
+        bounds = [e for end in (support.lower, support.upper) for e in array(end).ravel()]
         for i, edge in _reached(t, found[own], kept[own], known):
             components[place[t.components[i]]] = edge
-    return Edges(z, kept, components) if components else None
+            if symbols_of(bounds) - held:
+                moving.add(place[t.components[i]])
+    return Edges(z, kept, components, frozenset(moving)) if components else None
 
 
 def _reached(

@@ -16,9 +16,6 @@ import scipy
 
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.expressions.arrays import array
-from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.models import exact_log_likelihood
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -26,8 +23,8 @@ from ssmppl.inference.particles.filtering import (
     random_state,
     repeated_estimates,
 )
+from ssmppl.inference.particles.ordinary import ordinary_values
 from ssmppl.inference.problem import EXACT, Problem
-from ssmppl.language.trace import Site
 from ssmppl.language.transforms import transforms, unconstrain
 
 PILOT_PARTICLES = 200
@@ -78,42 +75,13 @@ class Space:
 def space_of(problem: Problem, fixed: dict[str, np.ndarray], start: dict[str, np.ndarray]) -> Space:
     """The unconstrained space, at moderate values of the parameters where `start` gives none."""
     trace = problem.trace
-    values: dict[str, np.ndarray] = {}
-    known: dict[Expr, float] = {}
-    for site in trace.parameters.values():
-        value = fixed.get(site.name, start.get(site.name))
-        if value is None:
-            value = _moderate(site, known)
-        values[site.name] = np.asarray(value, dtype=float)
-        known.update(zip(site.value.ravel(), values[site.name].ravel(), strict=True))
-    theta = np.array([known[s] for s in trace.parameter_symbols])
+    values = ordinary_values(trace, fixed, start)
+    theta = np.array([values[s.data[1]][s.data[2]] for s in trace.parameter_symbols])
     z = unconstrain(trace, theta, values)
     free = np.array([name not in fixed for name in trace.parameters], dtype=bool)
     sizes = [len(t.free) for t in transforms(trace)]
     where = np.flatnonzero(np.repeat(free, sizes))
     return Space(problem, theta, z, free, where)
-
-
-def _moderate(site: Site, known: dict[Expr, float]) -> np.ndarray:
-    """A value inside the support: the prior's mean where it has one, else an ordinary number."""
-    d = site.distribution
-    mean = np.broadcast_to(evaluate(array(d.mean()), known), site.shape).astype(float)
-    support = d.support()
-    if support.kind == "positive definite":
-        usable = bool(np.all(np.isfinite(mean))) and bool(np.all(np.linalg.eigvalsh(mean) > 0))
-        return mean if usable else np.eye(site.shape[0])
-    lower = np.broadcast_to(evaluate(array(support.lower), known), site.shape)
-    upper = np.broadcast_to(evaluate(array(support.upper), known), site.shape)
-    half_way = np.array([_between(a, b) for a, b in zip(lower.flat, upper.flat, strict=True)])
-    half_way = half_way.reshape(site.shape)
-    inside = np.isfinite(mean) & (mean > lower) & (mean < upper) & (np.abs(mean) < 1e6)
-    return np.where(inside, mean, half_way)
-
-
-def _between(lower: float, upper: float) -> float:
-    if np.isfinite(lower):
-        return 0.5 * (lower + upper) if np.isfinite(upper) else lower + 1.0
-    return upper - 1.0 if np.isfinite(upper) else 0.0
 
 
 @dataclass(frozen=True)
