@@ -7,6 +7,7 @@ import sys
 import sysconfig
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from keyword import iskeyword
 from pathlib import Path
 
 from ssmppl.errors import ArgumentError, Location
@@ -106,13 +107,23 @@ def import_lines(found: Iterable[Import], before: list[str]) -> list[str]:
     lines, own, folders = before, [], []
     for wanted in found:
         module, folder = _home(wanted)
-        own.append(f"from {module} import {wanted.name}")
+        if all(part.isidentifier() and not iskeyword(part) for part in module.split(".")):
+            own.append(f"from {module} import {wanted.name}")
+        else:  # dc-motor.py
+            own.append(f'{wanted.name} = importlib.import_module("{module}").{wanted.name}')
+            lines = lines if "import importlib" in lines else ["import importlib", "", *lines]
         folders += [folder] if folder else []
     if folders:
-        lines = ["import sys", "", *lines]
+        lines = ["import sys", *([] if "import importlib" in lines else [""]), *lines]
         own = [*(f"sys.path.append({f!r})" for f in dict.fromkeys(folders)),
                *(f"{line}  # noqa: E402" for line in own)]  # fmt: skip
     return [*lines, *([""] if own else []), *own]
+
+
+def in_memory(i: Import) -> object | None:
+    """The thing itself, where its module is there and has it under its name."""
+    held = getattr(sys.modules.get(i.module), i.name, None) if i.path == i.name else None
+    return held if getattr(held, "location", None) == i.location else None
 
 
 def _home(i: Import) -> tuple[str, str]:
@@ -141,5 +152,11 @@ def _home(i: Import) -> tuple[str, str]:
     if any(file.is_relative_to(p) for p in _INSTALLED):
         return i.module, ""
     if "." not in i.module or i.module == "__main__":  # a file by itself, whatever it was run as
+        if "." in file.stem:
+            raise ArgumentError(
+                f"the {i.kind} {i.name!r} is defined in {file.name}, which cannot be imported",
+                fix="take the dots out of the file's name",
+                where=i.location,
+            )
         return file.stem, str(file.parent)
     return i.module, str(file.parents[i.module.count(".")])

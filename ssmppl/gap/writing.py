@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import linecache
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import slug
-from ssmppl.gap.imports import import_lines, imports, nodes_of
+from ssmppl.gap.imports import import_lines, imports, in_memory, nodes_of
 from ssmppl.gap.laws import bounds_of, infinite
 from ssmppl.gap.spelling import Lines
 from ssmppl.gap.terms import parts_of, terms_with
@@ -59,13 +59,16 @@ def model_text(
 def to_model(trace: Trace) -> Model:
     """An ordinary `Model` with the laws of a trace: what `model_text` gives, executed.
 
-    Errors and explanations show the lines of that text.
+    Errors and explanations show the lines of that text. What the user's own modules define is
+    taken from them, as they may be scripts that would run again if they were imported.
     """
-    text = model_text(trace)
+    writer = _Writer(trace, {})
+    found = {n: o for n, i in writer.imports.items() if (o := in_memory(i)) is not None}
+    text = writer.file(trace.name, (), known=found)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     file = f"<{slug(trace.name)} {digest}>"
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
-    names: dict[str, Any] = {"__name__": f"{slug(trace.name)}_{digest}"}
+    names: dict[str, Any] = {"__name__": f"{slug(trace.name)}_{digest}", **found}
     exec(compile(text, file, "exec"), names)
     model: Model = names["model"]
     return model
@@ -89,19 +92,23 @@ class _Writer:
         laws = [s.distribution for role in roles for s in getattr(trace, role).values()]
         self.imports = imports(laws, {*self.names, *_TAKEN})
 
-    def file(self, title: str, notes: Sequence[str]) -> str:
+    def file(self, title: str, notes: Sequence[str], known: Collection[str] = ()) -> str:
+        """known : names of what needs no import."""
         laws = [self._law("prior", group) for group in self._priors()]
         for role in ("initial", "transition", "observations", "proposal"):
             if group := list(getattr(self.trace, role).values()):
                 laws.append(self._law(role.rstrip("s"), group))
         body = "\n\n\n".join(_numbered(laws))
         doc = "\n".join([title, *(["", *notes] if notes else [])])
-        doc = doc.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
+        doc = doc.replace("\\", "\\\\")
+        stem, quote = doc.rstrip('"'), '\\"'
+        doc = stem.replace('"""', 3 * quote) + (len(doc) - len(stem)) * quote
         close = "\n" if notes else ""
-        known = ["import numpy as np"]
-        known += ["from scipy import special"] if self.special else []
-        known += ["", "import ssmppl as ssm"]
-        lines = [f'"""{doc}{close}"""', "", *import_lines(self.imports.values(), known), ""]
+        before = ["import numpy as np"]
+        before += ["from scipy import special"] if self.special else []
+        before += ["", "import ssmppl as ssm"]
+        own = [i for n, i in self.imports.items() if n not in known]
+        lines = [f'"""{doc}{close}"""', "", *import_lines(own, before), ""]
         return "\n".join([*lines, f"model = ssm.Model({self._arguments()})", "", "", body, ""])
 
     def _arguments(self) -> str:

@@ -2,6 +2,8 @@
 
 import ast
 import linecache
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -213,18 +215,67 @@ def test_a_primitive_that_no_file_can_import_is_refused():
         model_text(t)
 
 
-def test_a_primitive_of_a_loose_file_is_found_by_its_folder(tmp_path):
-    (tmp_path / "loose_friction.py").write_text(
+@pytest.mark.parametrize("name", ["loose_friction", "dc-motor", "01_motor", "class"])
+def test_a_primitive_of_a_loose_file_is_found_by_its_folder(tmp_path, name):
+    """`from dc-motor import rub` is no Python, at the end of a whole diagnosis."""
+    (tmp_path / f"{name}.py").write_text(
         "import ssmppl as ssm\n\n@ssm.primitive\ndef rub(v):\n    return -0.5 * v\n\n"
         'model = ssm.Model("loose")\n\n'
         "@model.initial\ndef initial():\n    return {'x': ssm.Normal(0, sd=1)}\n\n"
         "@model.transition\ndef transition(x):\n    return {'x': ssm.Normal(rub(x), sd=1)}\n\n"
         "@model.observation\ndef observation(x):\n    return {'y': ssm.Normal(x, sd=1)}\n"
     )
-    t = trace(load_model(str(tmp_path / "loose_friction.py")))
-    assert "import rub" in model_text(t)
+    t = trace(load_model(str(tmp_path / f"{name}.py")))
+    assert ("import rub" in model_text(t)) == (name == "loose_friction")
     assert f"sys.path.append({str(tmp_path)!r})" in model_text(t)
     assert model_text(trace(to_model(t))) == model_text(t)
+    (tmp_path / "written.py").write_text(model_text(t))
+    again = trace(load_model(str(tmp_path / "written.py")))
+    assert model_text(again) == model_text(t)
+
+
+def test_a_file_that_cannot_be_imported_is_refused(tmp_path):
+    file = tmp_path / "dc.motor.py"
+    text = "import ssmppl as ssm\n\n@ssm.primitive\ndef rub(v):\n    return -0.5 * v\n"
+    file.write_text(text)
+    space = {"__name__": "__main__"}
+    exec(compile(text, str(file), "exec"), space)
+    rub = space["rub"]
+    t = trace(model_of(lambda x, z, a, P: rub(x)))
+    with pytest.raises(ArgumentError, match=r"dc\.motor\.py, which cannot be imported"):
+        model_text(t)
+
+
+def test_a_script_does_not_run_again(tmp_path):
+    """Its import ran the whole of it, a diagnosis at its end included."""
+    (tmp_path / "script.py").write_text(
+        "import ssmppl as ssm\nfrom ssmppl.gap.writing import to_model\n"
+        "from ssmppl.language.trace import trace\n\n"
+        "print('begun')\n\n@ssm.primitive\ndef rub(v):\n    return -0.5 * v\n\n"
+        'model = ssm.Model("loose")\n'
+        "model.initial(lambda: {'x': ssm.Normal(0, sd=1)})\n"
+        "model.transition(lambda x: {'x': ssm.Normal(rub(x), sd=1)})\n"
+        "model.observation(lambda x: {'y': ssm.Normal(x, sd=1)})\n"
+        "to_model(trace(model))\nprint('ended')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["begun", "ended"]
+
+
+@pytest.mark.parametrize("name", ['motor "A"', '"', 'it\'s "A"', '"""', "C:\\", '\\"', 'a"""b""'])
+def test_names_with_quotes(name):
+    model = ssm.Model(name)
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(0.5 * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    assert to_model(trace(model)).name == name
+    space = {}
+    exec(model_text(trace(model), notes=["fitted"]), space)
+    assert space["model"].name == name
+    exec(model_text(trace(model)), space)
+    assert space["__doc__"] == name
 
 
 def test_names_that_the_file_needs_are_refused():
