@@ -49,3 +49,37 @@ def test_values_that_contradict_each_other(given, said):
     for verb in (ssm.sample, ssm.maximize):
         with pytest.raises(ssm.ArgumentError, match=said):
             verb(between(), DATA, **given, progress=False)
+
+
+def test_smc2_with_a_fixed_value_outside_of_bounds_that_were_drawn():
+    """b given r is r plus an exponential number, where the data say nothing of b."""
+    model = ssm.Model("below")
+    model.prior(lambda: {"b": ssm.Gamma(2, rate=2)})
+    model.prior(lambda b: {"r": ssm.Uniform(0, b)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=0.5)})
+    model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
+    data, call = {"y": DATA["y"][:15]}, {"fixed": {"r": 0.5}, "seed": 1, "progress": False}
+    method = ssm.SMC2(parameters=400)
+    b = ssm.sample(model, data, method, draws=400, chains=4, **call)["posterior"]["b"].values
+    assert b.min() > 0.5
+    means = b.mean(axis=1)  # of independent runs
+    assert abs(means.mean() - 1.0) < 4 * max(means.std(ddof=1) / 2, 0.5 / np.sqrt(4 * 400))
+    by_bridge = ssm.evidence(model, data, **call)
+    found = ssm.evidence(model, data, method, **call)
+    error = np.hypot(found.standard_error, by_bridge.standard_error)
+    assert abs(found.log_evidence - by_bridge.log_evidence) < 4 * error
+
+
+def test_em_under_a_prior_with_a_root_that_a_condition_guards():
+    model = ssm.Model("guarded prior")
+    model.prior(lambda: {"h": ssm.Uniform(-2, 2)})
+    model.prior(lambda h: {"mu": ssm.Normal(0, sd=np.where(h > 0, np.sqrt(h), 1.0))})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, mu: {"x": ssm.Normal(0.5 * x + mu, sd=0.5)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    found = [
+        ssm.maximize(model, DATA, m, objective="posterior", fixed={"h": -1.0}, progress=False)
+        for m in (ssm.EM(), ssm.DirectOptimization())
+    ]
+    assert found[0].parameters["mu"] == pytest.approx(found[1].parameters["mu"], rel=1e-5)

@@ -160,9 +160,9 @@ def begin(filters: Filters, setup: Setup, run: int) -> State:
     assert method.parameters is not None
     generator, stream = setup.streams(run)
     theta = draw_prior(trace, generator, method.parameters, setup.held)
-    made = transforms(trace)
-    points = [unconstrain(trace, t, unpack_parameters(trace, t), made) for t in theta]
-    z = np.array(points)[:, space.where]
+    # a fixed one may lie outside of bounds that were drawn: these have no weight
+    made = [t for t, free in zip(transforms(trace), space.free, strict=True) if free]
+    z = np.array([unconstrain(trace, t, unpack_parameters(trace, t), made) for t in theta])
     log_prior = np.array([space.parameters(v)[1] for v in z])
     m = len(theta)
     state = State(
