@@ -83,3 +83,49 @@ def test_em_under_a_prior_with_a_root_that_a_condition_guards():
         for m in (ssm.EM(), ssm.DirectOptimization())
     ]
     assert found[0].parameters["mu"] == pytest.approx(found[1].parameters["mu"], rel=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e3, 1e6, 1e9])
+def test_units_make_no_difference(scale):
+    """A prior mean above a million was not believed, and the climb went to a variance of zero."""
+
+    def made(s):
+        model = ssm.Model("noisy")
+        model.prior(
+            lambda: {
+                "a": ssm.Beta(8, 2),
+                "q": ssm.HalfNormal(sd=2 * s),
+                "r": ssm.HalfNormal(sd=2 * s),
+            }
+        )
+        model.initial(lambda: {"x": ssm.Normal(0, sd=s)})
+        model.transition(lambda x, a, q: {"x": ssm.Normal(a * x, sd=q)})
+        model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
+        return model
+
+    parameters = {"a": 0.7, "q": 0.5, "r": 0.5}
+    y = ssm.simulate(made(1.0), parameters=parameters, steps=150, seed=4)["y"].values[0]
+    plain = ssm.maximize(made(1.0), {"y": y}, seed=1, progress=False)
+    scaled = ssm.maximize(made(scale), {"y": scale * y}, seed=1, progress=False)
+    assert scaled.log_likelihood + 150 * np.log(scale) == pytest.approx(
+        plain.log_likelihood, abs=0.01
+    )
+    assert scaled.parameters["q"] / scale == pytest.approx(plain.parameters["q"], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("law", "value"),
+    [
+        (lambda: ssm.HalfCauchy(scale=2e6), 2e6),
+        (lambda: ssm.Normal(3e6, sd=1e5), 3e6),
+        (lambda: ssm.LogNormal(0, sd=8), 1.0),  # its mean is 1e14
+        (lambda: ssm.InverseGamma(0.01, scale=0.01), 1.0),  # and its median 1e30
+        (lambda: ssm.Gamma(0.01, rate=0.01), 1.0),
+        (lambda: ssm.StudentT(1, 4.0, scale=2), 4.0),
+        (lambda: ssm.HalfFlat(), 1.0),
+    ],
+)
+def test_ordinary_values(law, value):
+    model = between()
+    model.prior(lambda: {"c": law()})
+    assert ordinary_values(trace(model), {}, {})["c"] == pytest.approx(value)

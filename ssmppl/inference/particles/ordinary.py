@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 from ssmppl.data.values import number
-from ssmppl.errors import ArgumentError, listing
+from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.language.distribution import Distribution
 from ssmppl.language.trace import Site, Trace
 
 __all__ = ["ordinary_values"]
 
 Values = dict[str, np.ndarray]
+# From here on a centre tells of the scale only if the spread is not much wider: that of a law that
+# is to say nothing does not.
+LARGE, WIDE = 1e6, 10.0
 DOUBLINGS = 40  # of the distance from an ordinary value that is looked at
 
 
 def ordinary_values(
     trace: Trace, fixed: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]
 ) -> Values:
-    """Each parameter's value, float64 of its shape: given, or the prior's mean where that is
-    inside, or else such that what was given is within bounds that depend on it.
+    """Each parameter's value, float64 of its shape: given, or the prior's mean, or median where it
+    has no mean, or else such that what was given is within bounds that depend on it.
 
     Raises
     ------
@@ -110,8 +116,29 @@ def _moderate(site: Site, known: dict[Expr, float]) -> np.ndarray:
     upper = np.broadcast_to(evaluate(array(support.upper), known), site.shape)
     half_way = np.array([_between(a, b) for a, b in zip(lower.flat, upper.flat, strict=True)])
     half_way = half_way.reshape(site.shape)
-    inside = np.isfinite(mean) & (mean > lower) & (mean < upper) & (np.abs(mean) < 1e6)
-    return np.where(inside, mean, half_way)
+    for centre, spread in _centres(d, mean, known):
+        tells = (np.abs(centre) < LARGE) | (spread <= WIDE * np.abs(centre))
+        inside = np.isfinite(centre) & (centre > lower) & (centre < upper) & tells
+        half_way = np.where(inside, centre, half_way)
+    return half_way
+
+
+def _centres(
+    d: Distribution, mean: np.ndarray, known: dict[Expr, float]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Centre and spread of a law, each of the mean's shape: by quartiles, then by moments."""
+
+    def numbers(values: Any) -> np.ndarray:
+        return np.broadcast_to(evaluate(array(values), known), mean.shape).astype(float)
+
+    with np.errstate(all="ignore"):
+        with contextlib.suppress(AttributeError, SSMError):  # has no quantiles
+            low, median, high = (numbers(d.quantile(array(p))) for p in (0.25, 0.5, 0.75))
+            yield median, high - low
+        spread = np.full(mean.shape, np.inf)
+        with contextlib.suppress(AttributeError, SSMError):  # has no variance
+            spread = np.sqrt(numbers(d.variance()))
+        yield mean, spread
 
 
 def _between(lower: float, upper: float) -> float:
