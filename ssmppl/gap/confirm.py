@@ -24,7 +24,8 @@ class Predictions:
     """One-step predictions of the rows that count, all experiments in a row (T rows, K channels).
 
     log_density : (R, T) of R runs. mean, variance : (T, K), over the runs. observed : (T, K), NaN
-    where missing. starts : first row of each experiment that has rows that count.
+    where missing. starts : first row of each experiment that has rows that count. covariance : (T,
+    K, K) of the channels of a row, where it is exact.
     """
 
     log_density: np.ndarray
@@ -32,6 +33,7 @@ class Predictions:
     variance: np.ndarray
     observed: np.ndarray
     starts: tuple[int, ...]
+    covariance: np.ndarray | None = None
 
 
 def predict(
@@ -71,13 +73,16 @@ def predict(
     starts = tuple(np.cumsum([0, *lengths[:-1]]).tolist())
     if repeats < runs:  # exact: no spread between runs
         density = np.repeat(density, runs, axis=0)
-    return Predictions(density, means.mean(axis=0), spread.mean(axis=0), y, starts)
+    together = [p.covariance for p in passes[0] if p.covariance is not None]
+    covariance = kept(together) if len(together) == len(counts) else None
+    return Predictions(density, means.mean(axis=0), spread.mean(axis=0), y, starts, covariance)
 
 
 def stretches(
     fitter: Fitter, fit: Fit, e: Experiment, counts: np.ndarray, stream: np.ndarray
 ) -> np.ndarray:
-    """(T,) log predictive densities of stretches of the rows that count, spread evenly over each.
+    """(T,) log predictive densities of stretches of the rows that count, spread evenly over those
+    of each that have data.
 
     The twisted filter tells log p(y_{1:t}) well for the t up to which it looks ahead, and for no
     other: so it is run up to the end of every stretch.
@@ -90,7 +95,9 @@ def stretches(
         log_z = [fitter.estimate(_until(e, end), fit.theta, stream) if end else 0.0
                  for end in ends]  # fmt: skip
         for (a, b), gained in zip(pairwise(ends), np.diff(log_z), strict=True):
-            out[a:b] = gained / (b - a)
+            measured = np.flatnonzero(e.seen[a:b].any(axis=1))
+            own = a + (measured if len(measured) else np.arange(1))
+            out[own] = gained / len(own)
     return out
 
 
@@ -99,10 +106,29 @@ def _until(e: Experiment, end: int) -> list[Experiment]:
 
 
 def gain_of_mean(base: Predictions, other: Predictions) -> float:
-    """Nats that the predictive means gain under the base model's variances: the mean's share."""
+    """Nats that the predictive means gain under the base model's variances: the mean's share.
+
+    NaN where several channels were measured at once and it is not known how they vary together.
+    """
+    errors = np.stack([base.observed - base.mean, other.observed - other.mean])
     with np.errstate(all="ignore"):
-        squares = (base.observed - base.mean) ** 2 - (other.observed - other.mean) ** 2
-        return float(np.nansum(0.5 * squares / base.variance))
+        scaled = errors / np.sqrt(
+            base.variance
+        )  # NaN where missing, or before a flat start is known
+    told = np.isfinite(scaled).all(axis=0)
+    scaled = np.where(told, scaled, 0.0)
+    if base.covariance is None:
+        if np.any(told.sum(axis=1) > 1):
+            return float("nan")
+        squares = np.sum(scaled**2, axis=(1, 2))
+    else:
+        sd = np.sqrt(np.where(told, base.variance, 1.0))
+        both = told[:, :, None] & told[:, None, :]
+        alike = np.where(
+            both, base.covariance / (sd[:, :, None] * sd[:, None, :]), np.eye(sd.shape[1])
+        )
+        squares = np.einsum("rtj,tjk,rtk->r", scaled, np.linalg.pinv(alike, hermitian=True), scaled)
+    return float(0.5 * (squares[0] - squares[1]))
 
 
 @dataclass(frozen=True)

@@ -286,10 +286,8 @@ class _Diagnosis:
         with announced("diagnose", stage, shown=self.kept.progress):
             fit = base.restored(experiments, self.kept.of(stage, numbers))
         if not fit.converged:
-            self.notes.append(
-                f"the fit of the model did not settle ({stage}): about {fit.distance:.1f} nats may "
-                "be left"
-            )
+            left = f": about {fit.distance:.1f} nats may be left" if fit.distance > 0.0 else ""
+            self.notes.append(f"the fit of the model did not settle ({stage}){left}")
         return fit
 
     def _tell_time(

@@ -127,7 +127,8 @@ class Question:
     @cached_property
     def sided(self) -> np.ndarray:
         """(K,) the sign that each strength must have."""
-        return np.array([1 if c.effect.lower == 0.0 else 0 for c in self.candidates])
+        bounds = [(c.effect.lower, c.effect.upper) for c in self.candidates]
+        return np.array([int(low >= 0.0) - int(high <= 0.0) for low, high in bounds], dtype=int)
 
     @cached_property
     def _sums(self) -> np.ndarray:

@@ -51,12 +51,14 @@ class Pass:
     log_increments : (T,) log p(y_t | y_{1:t-1}). rows : (T, F) smoothed scores, row by row.
     prediction : (T, 4, K) mean, variance, P(Y <= y), P(Y < y) given y_{1:t-1}.
     ahead : (O, H, K) CRPS of predictions further ahead (`crps_ahead`), where it was asked for.
+    covariance : (T, K, K) of the prediction, where it is exact.
     """
 
     log_increments: np.ndarray
     rows: np.ndarray
     prediction: np.ndarray
     ahead: np.ndarray | None = None
+    covariance: np.ndarray | None = None
 
 
 class Smoother:
@@ -109,9 +111,10 @@ class Smoother:
         rows = np.empty((e.steps, len(self.columns.later)))
         prediction = np.full((e.steps, 4, e.y.shape[1]), np.nan)
         known: tuple[np.ndarray, np.ndarray] | None = None
+        together = None
         if isinstance(self.kalman, KalmanModel):
             moments = self.kalman.filter(e, own)
-            increments = _exact(moments, e, prediction)
+            increments, together = _exact(moments, e, prediction), moments.observation_covariance
             if ahead:
                 known = _drawn(moments.mean, moments.covariance, stream)
             # Antithetic: scores that are linear in the states come out exact.
@@ -135,7 +138,7 @@ class Smoother:
         if ahead and known is not None:
             feedback = feeds_back(self.columns.base)
             scores = crps_ahead(self.program, e, own, *known, stream, feedback)
-        return Pass(increments, rows, prediction, scores)
+        return Pass(increments, rows, prediction, scores, together)
 
     def system(
         self, e: Experiment, theta: np.ndarray, stream: np.ndarray

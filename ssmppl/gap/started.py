@@ -23,7 +23,7 @@ from ssmppl.inference.particles.filtering import random_state
 from ssmppl.language.distributions import Normal
 from ssmppl.language.trace import Trace
 
-WIDE = 5.0  # times how far the states go from where they start, root mean square
+WIDE = 5.0  # times how far the states go, root mean square, or the starts lie apart in all
 KEPT = 64  # means of x_1 at a time
 DIGITS = 2  # of the spread, which a reader of the model sees
 
@@ -68,7 +68,9 @@ def start_of(
         return None
     mean = np.mean(starts, axis=0)
     away = np.concatenate([np.reshape(x, (-1, x.shape[-1])) for x in states]) - mean
-    spread = WIDE * np.sqrt(np.mean(away**2, axis=0))
+    # each start that is d from the mean costs d^2 / (2 s^2) nats: 1/50 for all of them together
+    apart = np.sum((np.asarray(starts) - mean) ** 2, axis=0)
+    spread = WIDE * np.sqrt(np.fmax(np.mean(away**2, axis=0), apart))
     spread = np.where(np.isfinite(spread) & (spread > 0.0), spread, 1.0)
     laws = {}
     for site in flat:

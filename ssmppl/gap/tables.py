@@ -209,6 +209,8 @@ def causes_table(
             strength, error = own.strengths[0], own.errors[c.strength]
             if sided and abs(strength) < least:  # the search runs towards the bound for ever
                 strength, error = 0.0, np.nan
+        elif sided * strength < 0.0:  # the screen knows no bounds
+            strength, error = 0.0, np.nan
         shaped = own.candidates[0].shape if own is not None else c.shape
         shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in shaped)
         p = tested.get(k, np.nan)

@@ -10,7 +10,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.errors import SamplingError
 from ssmppl.gap import diagnose
-from ssmppl.gap.confirm import FreeRun, predict, rmse
+from ssmppl.gap.confirm import FreeRun, Predictions, gain_of_mean, predict, rmse, stretches
 from ssmppl.gap.fit import Fitter
 from ssmppl.gap.parts import three_parts, without
 from ssmppl.gap.smoothing import Settings
@@ -130,3 +130,59 @@ def test_effects_stay_together_where_held_out_rows_cannot_be_predicted(monkeypat
     assert found.notes == ["drag and friction fit better together, and whether they predict "
                            "held-out rows better is not known: all weights are zero at t=301"
                            ][:which]  # fmt: skip
+
+
+def sensors(n, together):
+    """A walk that n sensors see, one channel each or one vector."""
+    model = ssm.Model("sensors")
+    model.prior(lambda: {"q": ssm.HalfNormal(sd=1), "b": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=2)})
+    model.transition(lambda x, q, b: {"x": ssm.Normal(x + b, sd=q)})
+    if together:
+        noise = 0.01 * np.eye(n) + 0.005
+        model.observation(lambda x: {"y": ssm.MvNormal(x + np.zeros(n), covariance=noise)})
+    else:
+        model.observation(lambda x: {f"y{k}": ssm.Normal(x, sd=0.1 * (k + 1)) for k in range(n)})
+    return model
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_channels_that_go_together_count_as_one(together):
+    """Of three sensors of one state, errors that they have in common counted three times.
+
+    Of a linear Gaussian model a change of the mean alone is all that the density gains.
+    """
+    rng = np.random.default_rng(seed_of("sensors", together))
+    x = np.cumsum(0.3 + 0.5 * rng.standard_normal(60))
+    values = x[:, None] + 0.1 * rng.standard_normal((60, 3))
+    values[10:13, 1] = values[20, :] = np.nan
+    data = {"y": values} if together else {f"y{k}": values[:, k] for k in range(3)}
+    problem = pose(sensors(3, together), data)
+    counts = [np.ones(60, bool)]
+    seed = np.random.SeedSequence(1)
+    base, other = (
+        predict(*fitted(problem, [0.5, b]), problem.experiments, counts, seed) for b in (0.0, 0.3)
+    )
+    whole = other.log_density[0].sum() - base.log_density[0].sum()
+    assert abs(whole) > 5.0
+    assert gain_of_mean(base, other) == pytest.approx(whole, rel=1e-9)
+
+
+def test_channels_whose_covariance_nobody_knows_have_no_share_of_the_mean():
+    two, none = np.ones((4, 2)), np.full((4, 2), np.nan)
+    base, other = (Predictions(none, m * two, two, 1.0 * two, (0,)) for m in (0.0, 0.5))
+    assert np.isnan(gain_of_mean(base, other))
+    alone = np.array([[1.0, np.nan], [np.nan, 1.0]] * 2)
+    base, other = (Predictions(none, m * two, two, alone, (0,)) for m in (0.0, 0.5))
+    assert gain_of_mean(base, other) == pytest.approx(4 * 0.5 * (1.0 - 0.25))
+
+
+def test_a_stretch_is_shared_out_over_rows_with_data():
+    """Missing rows had their part of the nats, and counted as samples."""
+    data = levels(40)
+    data["y"][np.arange(40) % 4 != 1] = np.nan
+    (e,) = pose(level(), data).experiments
+    counts, fit = np.arange(40) >= 20, SimpleNamespace(theta=None)
+    fitter = SimpleNamespace(estimate=lambda own, theta, stream: -2.0 * own[0].seen.sum())
+    found = stretches(fitter, fit, e, counts, np.empty(0))
+    np.testing.assert_allclose(found, np.where(e.seen.any(axis=1) & counts, -2.0, 0.0))

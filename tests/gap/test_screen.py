@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import ssmppl as ssm
 from ssmppl.data import bind, check_parameters
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.gap.checkpoint import Checkpoint
@@ -135,3 +136,30 @@ def test_false_alarms_at_the_rate_that_is_asked_for():
         found = ask(question, experiments, fit.theta, 100, seed, Checkpoint(None, {}))
         alarms += bool(found.family.p.min() <= 0.05)
     assert stats.binom.sf(alarms - 1, sets, 0.05) > LEVEL, alarms
+
+
+@ssm.effect(on="x", name="suction", lower=-2, upper=0)
+def suction(x, strength):
+    return strength
+
+
+@ssm.effect(on="x", name="lift", lower=0)
+def lift(x, strength):
+    return strength
+
+
+@pytest.mark.parametrize("rise", [0.05, -0.05])
+def test_a_strength_has_the_sign_that_its_bounds_leave(rise):
+    """One that may only be negative was found with a positive strength."""
+    data = {"y": levels(80)["y"] + rise * np.arange(80)}
+    found = asked(data, seed_of("suction"), names=[suction, lift])
+    by_name = {c.effect.name: k for k, c in enumerate(found.question.candidates)}
+    for name, sign in (("suction", -1), ("lift", 1)):
+        k = by_name[name]
+        assert found.question.sided[k] == sign
+        right = sign * rise > 0
+        if right:  # z is the score over sqrt(V), 2.6 for the drift and the noise of these data
+            assert found.found.gain[k] > 1.0
+        else:
+            assert found.found.gain[k] == 0.0
+            assert found.significant[k] > 0.5

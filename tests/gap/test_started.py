@@ -184,3 +184,22 @@ def test_drag_is_refitted_though_the_model_starts_flat():
     given = {n: v for n, v in found.fit.values().items() if not n.startswith("size")}
     told = ssm.log_likelihood(model, data, given, particles=2000, seed=1)[0] + start.height
     assert told == pytest.approx(found.fit.log_likelihood, abs=4.0 * (found.fit.error + 0.1))
+
+
+@pytest.mark.parametrize("places", [(100.0, -100.0), (100.0, *[0.0] * 19)])
+def test_starts_that_lie_apart_lose_nothing(places):
+    """Where states come to rest, these say little of where experiments begin."""
+    rng = np.random.default_rng(seed_of("apart", len(places)))
+    data = []
+    for first in places:
+        x, u = np.full(200, first), np.zeros(200)
+        for t in range(1, 200):
+            x[t] = 0.9 * x[t - 1] + 0.2 * rng.standard_normal()
+        data.append({"y": x + 0.1 * rng.standard_normal(200), "u": u})
+    problem = pose(driven(), data)
+    flat, theta = kalman_model(problem.trace), np.array([0.2, 0.1, 0.9, 0.5])
+    es = problem.experiments
+    start = start_of(problem.trace, [e.y[0] for e in es], [e.y for e in es])
+    other = kalman_model(start.given(problem.trace)).log_likelihood(es, theta)
+    lost = other + len(es) * start.height - flat.log_likelihood(es, theta)
+    assert -0.03 < lost < 0.0
