@@ -16,7 +16,7 @@ from itertools import compress
 import numpy as np
 import scipy
 
-from ssmppl.analysis.pythontext import DOMAIN, Function, straight_function
+from ssmppl.analysis.pythontext import DOMAIN, Function, python_function
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
 from ssmppl.expressions.expr import Expr, apply, substitute
@@ -61,7 +61,7 @@ class Unconstrained:
             return partial(_whole, t, symbols)
         lower, upper = (array(b).ravel() for b in (support.lower, support.upper))
         limits = zip(t.components, lower, upper, strict=True)
-        return straight_function([_free(*b) for b in limits if b[0] in self.members], symbols)
+        return python_function([_free(*b) for b in limits if b[0] in self.members], symbols)
 
 
 class Climber:
@@ -83,7 +83,7 @@ class Climber:
             pairs = zip(t.components, values, strict=True)
             mapping |= {c: value for c, value in pairs if c in members}
         self.arguments = [*self.z, *statistics, *trace.parameter_symbols]
-        self.back = straight_function([mapping[c] for c in components], self.arguments)
+        self.back = python_function([mapping[c] for c in components], self.arguments)
         self.value_of, self.order = self._derivatives(substitute([value], mapping)[0])
 
     def _derivatives(self, value: Expr) -> tuple[Function, int]:
@@ -96,9 +96,9 @@ class Climber:
                 second = hessian(value, self.z)
                 curvatures = [second[i, j] for i in range(len(self.z)) for j in range(i + 1)]
                 order = 2
-            return straight_function([value, *slopes, *curvatures], self.arguments), order
+            return python_function([value, *slopes, *curvatures], self.arguments), order
         except NotDifferentiable:
-            return straight_function([value], self.arguments), 0
+            return python_function([value], self.arguments), 0
 
     def climb(self, s: Sequence[float], theta: np.ndarray) -> np.ndarray:
         """theta with the members moved to where the function is largest, going up from here."""

@@ -35,7 +35,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.describe import Explanation, joined
 from ssmppl.analysis.families import Family
 from ssmppl.analysis.modes import mode
-from ssmppl.analysis.pythontext import DOMAIN, Function, straight_function
+from ssmppl.analysis.pythontext import DOMAIN, Function, python_function
 from ssmppl.analysis.search import Found, Search, kind_of
 from ssmppl.analysis.sufficient import (
     NOTHING_MISSING,
@@ -218,7 +218,7 @@ def derive_m_step(
     )
     moved = frozenset(c for g in groups for c in g.components)
     idle = tuple(c for c in free if c not in moved)
-    prior = straight_function(form.coefficients["prior"], trace.parameter_symbols)
+    prior = python_function(form.coefficients["prior"], trace.parameter_symbols)
     return MStep(trace, update, groups, idle, prior)
 
 
@@ -310,8 +310,8 @@ def _group(
             ClosedForm(
                 np.array([place[c] for c in found.components]),
                 found.family,
-                straight_function(totals, arguments),
-                straight_function(bounds, arguments),
+                python_function(totals, arguments),
+                python_function(bounds, arguments),
                 exact=not found.correction,
             )
         )
@@ -320,7 +320,7 @@ def _group(
         objective = objective + statistics[i] * form.functions[i]
     return Group(
         q, components, np.array([place[c] for c in components]), indices,
-        straight_function([form.functions[i] for i in indices], arguments),
+        python_function([form.functions[i] for i in indices], arguments),
         tuple(blocks), tuple(reasons), objective, tuple(statistics),
     )  # fmt: skip
 

@@ -40,34 +40,38 @@ _NEVER_RAISE = {"add", "sub", "mul", "neg", "not", "and", "or", "lt", "le", "eq"
 
 def python_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
     """A function of the arguments' values (in one sequence `v`) giving a tuple of values."""
-    places = {a: f"v[{i}]" for i, a in enumerate(arguments)}
-    texts = [_text(e, places) for e in expressions]
-    return _compiled("lambda v: (" + "".join(t + "," for t in texts) + ")", expressions)
+    return _function(
+        "v", expressions, arguments, lambda parts: f"({''.join(f'{p}, ' for p in parts)})"
+    )
 
 
 def python_sum(
     functions: Sequence[Expr], arguments: Sequence[Expr]
 ) -> Callable[[Sequence[float], Sequence[float]], float]:
     """(v, c) -> sum_i c_i functions_i(v)."""
-    places = {a: f"v[{i}]" for i, a in enumerate(arguments)}
-    terms = [f"c[{i}]*{_text(f, places)}" for i, f in enumerate(functions)]
-    return _compiled("lambda v, c: " + (" + ".join(terms) or "0.0"), functions)
+    return _function(
+        "v, c", functions, arguments,
+        lambda parts: " + ".join(f"c[{i}]*{p}" for i, p in enumerate(parts)) or "0.0",
+    )  # fmt: skip
 
 
-def straight_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
-    """As `python_function`, each shared subexpression computed once, statement by statement.
+def _function(
+    signature: str, expressions: Sequence[Expr], arguments: Sequence[Expr],
+    result: Callable[[list[str]], str],
+) -> Callable[..., Any]:  # fmt: skip
+    """Statement by statement, each shared subexpression computed once.
 
-    For larger graphs, whose text would repeat what is shared. What one case of a condition needs,
-    and could raise, is computed where it is asked for: sqrt(b) of `where(b > 0, sqrt(b), b)`.
+    What one case of a condition needs, and could raise, is computed where it is asked for: sqrt(b)
+    of `where(b > 0, sqrt(b), b)`. result : the text of the result, from those of the values.
     """
     done = {a: f"v[{i}]" for i, a in enumerate(arguments)}
-    lines = ["def run(v):"]
+    lines = [f"def run({signature}):"]
     always = _always(expressions)
     later: set[Expr] = set()
     for node in topological(expressions):
         if node in done:
             continue
-        text = _spelled(node, [done[a] for a in node.args], simple=True)
+        text = _spelled(node, [done[a] for a in node.args])
         if node.op == "const":
             done[node] = text
             continue
@@ -80,10 +84,11 @@ def straight_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) ->
         else:
             lines.append(f"    {name} = {text}")
             done[node] = name
-    lines.append("    return (" + "".join(f"{done[e]}, " for e in expressions) + ")")
+    lines.append(f"    return {result([done[e] for e in expressions])}")
     names = _names(expressions)
     exec("\n".join(lines), names)
-    return names["run"]
+    run: Callable[..., Any] = names["run"]
+    return run
 
 
 def _always(expressions: Sequence[Expr]) -> set[Expr]:
@@ -110,17 +115,8 @@ def _once(function: Callable[[], Any]) -> Callable[[], Any]:
     return value
 
 
-def _text(root: Expr, places: dict[Expr, str]) -> str:
-    done: dict[Expr, str] = dict(places)
-    for node in topological([root]):
-        if node not in done:
-            simple = bool(node.args) and node.args[0] in places
-            done[node] = _spelled(node, [done[a] for a in node.args], simple)
-    return done[root]
-
-
-def _spelled(node: Expr, parts: list[str], simple: bool) -> str:
-    """The text of one operation on these texts; simple: the first of them is a name."""
+def _spelled(node: Expr, parts: list[str]) -> str:
+    """The text of one operation on the texts of its operands, which are short."""
     if node.op == "const":
         return f"({node.data!r})" if math.isfinite(node.data) else f"float('{node.data}')"
     if node.op == "symbol":
@@ -132,7 +128,7 @@ def _spelled(node: Expr, parts: list[str], simple: bool) -> str:
     if node.op == "call":
         return f"calls[{id(node.data)}]({', '.join(parts)})"
     if node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
-        return f"({parts[0]}*{parts[0]})" if simple else f"math.pow({parts[0]}, 2.0)"
+        return f"({parts[0]}*{parts[0]})"
     if node.op in _TEXT:
         return _TEXT[node.op].format(*parts)
     return f"float(meaning[{node.op!r}]({', '.join(parts)}))"
@@ -146,10 +142,6 @@ def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], 
             raise ValueError(str(error)) from None
 
     return run
-
-
-def _compiled(text: str, expressions: Sequence[Expr]) -> Callable[..., Any]:
-    return eval(text, _names(expressions))
 
 
 def _names(expressions: Sequence[Expr]) -> dict[str, Any]:

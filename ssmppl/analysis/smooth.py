@@ -10,7 +10,7 @@ from ssmppl.analysis.structure import deterministic
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import BOOLEAN, dependent, topological
-from ssmppl.language.distributions import Draws
+from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
 from ssmppl.language.trace import Trace
 from ssmppl.language.written import Written
 
@@ -30,6 +30,9 @@ def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
             return NotApplicable(f"{site.name} is discrete", d.location)
         if deterministic([site]):
             continue
+        if isinstance(d, Mixture | ZeroInflated):
+            kind = type(d).__name__
+            return NotApplicable(f"draws of {kind} jump from one part to the other", d.location)
         draw = list(array(d.sample(Draws(site.name))).ravel())
         random = [n for n in topological(draw) if n.op == "random"]
         jumps = dependent(draw, random) if isinstance(d, Written) else set()
