@@ -2,6 +2,7 @@
 
 import ctypes
 import re
+from functools import partial
 
 import numpy as np
 
@@ -48,6 +49,18 @@ def copied(values):
     return {k: v if isinstance(v, int) else v.copy() for k, v in values.items()}
 
 
+def rounded(function, names, values, wanted):
+    """What a function leaves in an argument if its numbers are a rounding off."""
+    rng, twin = np.random.default_rng(1), copied(values)
+    for name, value in twin.items():
+        if not isinstance(value, int) and value.dtype == float and not name.endswith("_data"):
+            off = np.where(value == np.round(value), 0, rng.choice((-1, 1), value.shape))
+            value *= 1.0 + 2.0**-52 * off  # whole numbers may be of discrete states
+    with np.errstate(all="ignore"):
+        function(*(twin[n] for n in names))
+    return twin[wanted]
+
+
 def sections(traced, gaps):
     """A model's generated module in plain Python, and (name, section, text) of each part."""
     program = compile_trace(traced, Missing(none=not gaps))
@@ -62,7 +75,8 @@ def sections(traced, gaps):
 
 
 def both_ways(plain, name, section, text, numbers, rng):
-    """For every function of a section (what it is, native numbers, plain numbers), by argument."""
+    """For every function of a section (what it is, native numbers, plain numbers, a function that
+    gives plain numbers again, of arguments that are a rounding off), by argument."""
     found = addresses(name, text)
     for t in (0, STEPS - 1):
         values = arguments(numbers, t, rng)
@@ -71,9 +85,10 @@ def both_ways(plain, name, section, text, numbers, rng):
             names = section.roles[role].split(", ")
             if t == 0 and "states_prev" in names:
                 continue
-            twin = copied(values)
+            before, twin = copied(values), copied(values)
             called(found[section.name(role)], names, values)
             with np.errstate(all="ignore"):
                 getattr(plain, section.name(role))(*(twin[n] for n in names))
             for n in set(names) - {"t"}:
-                yield f"{section.name(role)}, {n}, t={t}", values[n], twin[n]
+                near = partial(rounded, getattr(plain, section.name(role)), names, before, n)
+                yield f"{section.name(role)}, {n}, t={t}", values[n], twin[n], near

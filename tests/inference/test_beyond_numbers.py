@@ -237,3 +237,21 @@ def test_the_information_at_an_infinite_parameter_is_no_number(objective):
     setup = Setup(problem, space_of(problem, {}, {}), objective, {}, {}, np.random.SeedSequence(0))
     assert np.isnan(setup.natural(np.array([800.0, 0.0]), np.eye(2))).all()
     assert np.isfinite(setup.natural(np.array([1.0, 0.0]), np.eye(2))).all()
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_pairs_too_far_apart_for_a_square():
+    """Backwards, a particle whose next state would be 1e200 is no ancestor of any other."""
+    model = ssm.Model("explosive")
+    model.initial(lambda: {"x": ssm.Normal(1.01, sd=1), "z": ssm.Normal(0, sd=1)})
+    model.transition(
+        lambda x, z: {
+            "x": ssm.Normal(-0.64 * x**400, sd=0.6), "z": ssm.Normal(0.5 * z + 0.1 * x, sd=0.3)
+        }
+    )  # fmt: skip
+    model.observation(lambda z: {"y": ssm.Normal(z, sd=1)})
+    for seed in range(6):
+        found = ssm.smooth(
+            model, {"y": np.zeros(4)}, {}, "ffbsi", particles=10, trajectories=5, seed=seed
+        )
+        assert np.all(np.isfinite(found["z"].values))

@@ -42,8 +42,9 @@ from ssmppl.language.distributions import Dirac
 from ssmppl.language.trace import previous
 
 MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time
-WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore"}
-"""Particles without weight may lie where the laws are infinite or undefined."""
+WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}
+"""Particles without weight may lie where the laws are infinite or undefined, and others so far from
+what follows them that their density is zero."""
 NEGLIGIBLE = 1e-12  # of a variance, what rounding leaves of it
 
 
