@@ -294,3 +294,24 @@ def test_an_edge_that_another_parameter_moves(power, method):
     information = -(density(b + h) - 2 * density(b) + density(b - h)) / h**2
     assert abs(slope) < 1e-3 * information
     assert found.standard_errors["b"] == pytest.approx(information**-0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("scale", [1e4, 1e8])
+def test_a_flat_stretch_on_the_way_is_no_edge(scale):
+    """From r = 1 the likelihood of data of 1e8 is flat in r: it was said to be at 0."""
+    model = ssm.Model("local level")
+    model.prior(lambda: {"q": ssm.HalfFlat(), "r": ssm.HalfFlat(), "m": ssm.Flat()})
+    model.initial(lambda m, q: {"x": ssm.Normal(m, sd=q)})
+    model.transition(lambda x, q: {"x": ssm.Normal(x, sd=q)})
+    model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
+    rng = np.random.default_rng(0)
+    y = np.cumsum(rng.normal(size=40)) + rng.normal(size=40)
+    plain = ssm.maximize(model, {"y": y}, seed=1, progress=False)
+    found = ssm.maximize(model, {"y": scale * y}, seed=1, progress=False)
+    assert found.attrs["converged"]
+    assert "held_at_edge" not in found.attrs
+    for name in ("q", "r", "m"):
+        assert found.parameters[name] / scale == pytest.approx(plain.parameters[name], rel=1e-5)
+        assert found.standard_errors[name] / scale == pytest.approx(
+            plain.standard_errors[name], rel=1e-3
+        )

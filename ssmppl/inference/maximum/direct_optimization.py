@@ -8,6 +8,7 @@ exact, and Newton steps with the observed information polish the result; for one
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +23,7 @@ from ssmppl.inference.exact.models import ExactModel, filter_name
 from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
-from ssmppl.inference.maximum.edges import edges
+from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.progress import announced
 
@@ -30,6 +31,7 @@ NEWTON_STEPS = 8
 GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
 FAR = 1e30  # what the minimiser sees where the likelihood is zero
 EXACT_RESTARTS = 2
+FLATS = 3  # that a climb leaves
 
 
 def climb(setup: Setup, method: DirectOptimization) -> Ascent:
@@ -88,6 +90,7 @@ class ExactClimb:
                 if len(self.best):
                     self._check(self.setup.chart.at(self.best).theta)
             if len(self.best):
+                self._leave_flats()
                 gap = self._polish()
         except KeyboardInterrupt:
             if not np.isfinite(self.best_value):
@@ -155,6 +158,22 @@ class ExactClimb:
             options={"maxiter": self.method.steps, "ftol": 1e-13, "gtol": 1e-7},
         )  # fmt: skip
         return str(found.message)
+
+    def _leave_flats(self) -> None:
+        """Climb again from the other side of a flat stretch: a spread that is a millionth of the
+        others counts for nothing, and nothing tells that it should be larger."""
+        for _ in range(FLATS):
+            z, before = self.best, self.best_value
+            curvature = np.diagonal(_curvature(self.setup, self.exact, z))
+            for j in np.flatnonzero(curvature < FLAT):
+                for step in (sign * s for s in INWARDS for sign in (-1.0, 1.0)):
+                    there = z.copy()
+                    there[j] += step
+                    with contextlib.suppress(SamplingError, _WithoutMaximum):
+                        self.value(there)
+            if not self.best_value > before + AT_MOST:
+                break
+            self._quasi_newton(self.best)
 
     def _polish(self) -> float:
         """Newton's steps while they climb; how far the quadratic says that the top still is.

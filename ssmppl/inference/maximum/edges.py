@@ -4,8 +4,8 @@ There the score need not vanish, nor is there an interval about the estimate; th
 have their usual law given that one (Self and Liang 1987, "Asymptotic properties of maximum
 likelihood estimators and likelihood ratio tests under nonstandard conditions", *JASA* 82). An edge
 lies at infinity on the unconstrained scale. So an estimate is taken to be there if the objective
-nowhere falls on the way out, is not much higher at its end, and falls inwards, which tells it from
-a parameter that is not identified.
+nowhere falls on the way out, is not much higher at its end, and falls inwards without rising
+before, which tells it from a parameter that is not identified.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FARTHEST = (
     15.0,
     8.0,
 )  # the last of them: nothing is left inside, nor is it rounded to nothing
-INWARDS = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+INWARDS = tuple(np.arange(2.0, 65.0, 2.0).tolist())  # so close that no hill lies between
 ROUNDING = 1e-9  # of the objective, relative
 AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb is not finished
 FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
@@ -73,7 +73,8 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
             outwards = (last, *(moved(j, sign * s) for s in OUTWARDS))
             if not all(-loss <= change <= AT_MOST for change in outwards):
                 continue
-            if any(not moved(j, -sign * s) > -FALL for s in INWARDS):
+            inwards = [moved(j, -sign * s) for s in INWARDS]
+            if max(inwards) <= AT_MOST and not min(inwards) > -FALL:
                 out[j] = sign
     return out
 
