@@ -49,6 +49,7 @@ from ssmppl.language.transforms import unconstrain
 TASKS = 16
 TARGET_SD = 1.0
 FEW = 20  # draws of a chain that was interrupted, half of which fit the law bridged to
+POINTS = 5  # that the law is fitted to, for each number and one more
 PARAMETERS = 500  # particles of SMC^2
 REPEATS = 200  # estimates of the likelihood where there is no parameter to integrate out
 
@@ -126,7 +127,8 @@ def evidence(
 
     Raises
     ------
-    ArgumentError : a free parameter has an improper prior, so that p(y) has no meaning.
+    ArgumentError : a free parameter has an improper prior, so that p(y) has no meaning; or there
+        are too few draws for the number of parameters.
     SamplingError : the likelihood is zero wherever the law bridged to puts its points.
     """
     for name, value, least in (("draws", draws, 4), ("warmup", warmup, 0), ("chains", chains, 1)):
@@ -146,8 +148,15 @@ def evidence(
     chosen = _chosen(problem, method)
     if isinstance(chosen, PMMH):
         chosen = _settled(problem, space, chosen, root)
-    if not space.where.size:
+    d = space.where.size
+    if not d:
         return _without_parameters(problem, space, chosen, root)
+    if draws * chains < 2 * POINTS * (d + 1):
+        raise ArgumentError(
+            f"draws={draws} of each of {chains} chain{'s' if chains > 1 else ''}: half of them are "
+            f"too few to fit a law of {d} number{'s' if d > 1 else ''} to",
+            fix=f"give at least {-(-2 * POINTS * (d + 1) // chains)} draws",
+        )
     result = sample(
         model, data, chosen, draws=draws, warmup=warmup, chains=chains, start=start, fixed=fixed,
         states=False, seed=seed, executor=executor, progress=progress,

@@ -151,3 +151,12 @@ def test_chains_that_do_not_move_have_no_evidence():
     method = ssm.PMMH(particles=3, proposal="bootstrap")
     with pytest.raises(ssm.SamplingError, match="1 differ, in 1 free parameter"):
         ssm.evidence(model, {"y": y}, method, draws=20, warmup=5, chains=1, seed=1)
+
+
+def test_too_few_draws_for_a_law():
+    """Ten draws of four numbers gave an evidence that was off by 45, with an error of 0.2."""
+    data = {"y": load("lgss_main_text")["y"]}
+    for draws, chains, least in ((19, 1, 20), (9, 2, 10)):
+        with pytest.raises(ssm.ArgumentError, match="too few to fit a law of 1 number") as found:
+            ssm.evidence(models.lgss, data, fixed={"c": 0.5}, draws=draws, chains=chains)
+        assert f"at least {least} draws" in found.value.fix

@@ -453,6 +453,7 @@ def test_an_interrupt_keeps_the_passes_made(monkeypatch):
     setup = setup_of(models.lgss, LGSS, {"c": 0.5}, {"theta": 1.0})
     found = climb(setup, ssm.IF2(particles=50, starts=2, iterations=1000))
     assert found.interrupted
+    assert found.report["converged"] is None
     assert 1 < found.iterates.shape[1] < 70
     assert np.all(np.isfinite(found.theta))
 

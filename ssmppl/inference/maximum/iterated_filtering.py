@@ -76,10 +76,12 @@ def climb(setup: Setup, method: IF2) -> Ascent:
     drawn, stats = stack(chains)
     averaged = min(method.averaged, drawn["z"].shape[1])
     ends = drawn["z"][:, -averaged:].mean(axis=1)
-    interrupted = any(c.interrupted for c in chains)
+    interrupted = cut_short = any(c.interrupted for c in chains)
     top = summit(setup, method, ends)
     found, interrupted = _beyond(setup, method, top, len(ends), interrupted)
     report = _report(setup, model, scales, ends, top, averaged)
+    if cut_short:  # swarms that have hardly left their starts agree by these
+        report["converged"] = None
     if stats["impossible"][top.best, -averaged:].any():
         report["impossible_rows"] = int(stats["impossible"][top.best, -averaged:].sum())
     z, error, information, none = top.z, None, None, ""
