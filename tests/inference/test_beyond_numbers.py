@@ -255,3 +255,13 @@ def test_pairs_too_far_apart_for_a_square():
             model, {"y": np.zeros(4)}, {}, "ffbsi", particles=10, trajectories=5, seed=seed
         )
         assert np.all(np.isfinite(found["z"].values))
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_data_so_far_off_that_their_densities_have_no_sum():
+    model = ssm.Model("counts")
+    model.initial(lambda: {"k": ssm.Poisson(3.0)})
+    model.transition(lambda k: {"k": ssm.Poisson(1.0 + k)})
+    model.observation(lambda k: {"y": ssm.Normal(k, sd=1)})
+    found = ssm.smooth(model, {"y": np.full(4, 1.2e154)}, {}, "ffbsi", particles=20, seed=1)
+    assert found.attrs["log_likelihood"] == -np.inf

@@ -64,7 +64,8 @@ class ParticleSystem:
 
     @property
     def log_Z(self) -> float:
-        return float(self.log_increments.sum())
+        with np.errstate(over="ignore"):  # densities below what their logarithms can be
+            return float(self.log_increments.sum())
 
 
 def particle_system(
