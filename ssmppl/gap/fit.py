@@ -30,6 +30,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, random_state
 from ssmppl.inference.particles.pilot import Space, at, climb_to_mode, space_of
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.tasks import run_tasks
+from ssmppl.inference.totals import total_of
 
 LARGEST = 1e100  # of a score: what is beyond is an overflow
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
@@ -217,7 +218,7 @@ class Fitter:
         slope = point.pull(score) + point.d_log_prior
         if not np.all(np.isfinite(slope)):
             return None
-        value = sum(float(p.log_increments.sum()) for p in passes)
+        value = sum(total_of(p.log_increments) for p in passes)
         return value + point.log_prior, slope
 
     def _climb(

@@ -35,6 +35,7 @@ from ssmppl.inference.smoothing_methods import (
     KalmanSmoother,
     SmoothingMethod,
 )
+from ssmppl.inference.totals import total_of
 
 PARTICLES, TRAJECTORIES = 1000, 1000
 PGAS_WARMUP = 100  # sweeps that are dropped
@@ -85,7 +86,7 @@ def by_exact_passes(
         streams = [random_state(call.root, i) for i in range(len(experiments))]
         drawn = model.draw_each(experiments, theta, streams, call.trajectories)
         if isinstance(model, HiddenMarkov):
-            values = [float(f.log_increments.sum()) for f in model.filter_each(experiments, theta)]
+            values = [total_of(f.log_increments) for f in model.filter_each(experiments, theta)]
         else:
             values = [model.log_likelihood([e], theta) for e in experiments]
         pairs = zip(drawn, values, strict=True)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError
+from ssmppl.inference.totals import total_of
 from ssmppl.plots.drawing import few, handed, key, only_below, panels, shown_time, styled
 from ssmppl.plots.reading import components, is_dataset, pick, wrong_kind
 from ssmppl.plots.style import DATA, FAINT, MAIN, OTHER, bare
@@ -84,7 +85,7 @@ def plot_filter(result: Any, *, ax: Any = None) -> Any:
             column[-1].plot(x, shown, color=MAIN, linewidth=1.0, alpha=_fading(len(increments)),
                             marker="." if len(x) <= 60 else None, markersize=3)  # fmt: skip
         column[-1].set_ylabel("log-likelihood\nincrement")
-        total = np.mean(increments.sum(axis=1))
+        total = np.mean([total_of(row) for row in increments])
         what = "log-likelihood" if len(increments) == 1 else "mean log-likelihood"
         sign = "−" if total < 0 else ""
         told = f"{what} {sign}{abs(total):.6g}"

@@ -258,10 +258,20 @@ def test_pairs_too_far_apart_for_a_square():
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_data_so_far_off_that_their_densities_have_no_sum():
-    model = ssm.Model("counts")
-    model.initial(lambda: {"k": ssm.Poisson(3.0)})
-    model.transition(lambda k: {"k": ssm.Poisson(1.0 + k)})
-    model.observation(lambda k: {"y": ssm.Normal(k, sd=1)})
-    found = ssm.smooth(model, {"y": np.full(4, 1.2e154)}, {}, "ffbsi", particles=20, seed=1)
-    assert found.attrs["log_likelihood"] == -np.inf
+@pytest.mark.parametrize("mean", [np.sin, lambda x: 0.5 * x])
+def test_data_so_far_off_that_their_log_densities_have_no_sum(mean):
+    model = ssm.Model("far off")
+    model.prior(lambda: {"a": ssm.Normal(0, sd=1)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, a: {"x": ssm.Normal(mean(a * x), sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    data, at = {"y": np.full(20, 1.2e154)}, {"a": 0.5}
+    assert np.all(ssm.log_likelihood(model, data, at) == -np.inf)
+    assert np.all(ssm.log_likelihood(model, data, at, proposal="bootstrap") == -np.inf)
+    ssm.plot_filter(ssm.particle_filter(model, data, at, seed=1))
+    for method in (ssm.FFBSi(), ssm.FixedLag()):
+        found = ssm.smooth(model, data, at, method, particles=20, seed=1)
+        assert found.attrs["log_likelihood"] == -np.inf
+    if mean is np.sin:
+        with pytest.raises(ssm.SamplingError, match="too small for their logarithms"):
+            ssm.score(model, data, at, seed=1)

@@ -23,6 +23,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, failure, run_fi
 from ssmppl.inference.particles.marginal import draw_given
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.totals import total_of
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class ParticleLikelihood:
             if status != OK:
                 raise failure(self.problem, theta, status, t, e)
             ancestral_path(particles, kept[2], draw_index(weights[-1], uniform(stream)), path)
-            total += float(increment.sum())
+            total += total_of(increment)
             paths.append(path)
             increments.append(increment)
         return Run(total, tuple(paths), tuple(increments))

@@ -29,6 +29,7 @@ from ssmppl.inference.exact.scored import Scored
 from ssmppl.inference.particles.complete_score import CompleteScores, complete_scores
 from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state, run_filter
 from ssmppl.inference.problem import Problem, missing_of
+from ssmppl.inference.totals import total_of
 from ssmppl.language.trace import Trace, once_per_trace
 
 
@@ -87,7 +88,7 @@ class Deterministic(Scored):
         """
         run = self.filter(experiment, theta)
         none = np.zeros((experiment.steps, run.path.shape[1], run.path.shape[1]))
-        return SmoothedMoments(run.path, none, none.copy(), float(run.log_increments.sum()))
+        return SmoothedMoments(run.path, none, none.copy(), total_of(run.log_increments))
 
     def observation_variances(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
         """(T, K) of each component of y_t given the states; NaN where there is none."""

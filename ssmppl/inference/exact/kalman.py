@@ -30,6 +30,7 @@ from ssmppl.inference.exact.kalman_moments import (
 )
 from ssmppl.inference.exact.kalman_score import Slopes, check_free, score, slopes
 from ssmppl.inference.exact.scored import Scored
+from ssmppl.inference.totals import total_of
 from ssmppl.language.trace import Trace, once_per_trace
 
 __all__ = [
@@ -64,7 +65,7 @@ class KalmanMoments:
 
     @property
     def log_likelihood(self) -> float:
-        return float(self.log_increments.sum())
+        return total_of(self.log_increments)
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class KalmanModel(Scored):
                     return -np.inf
                 continue
             exact_entry("kalman_filter")(*model, e.y, e.seen, increments, *nothing)
-            total += float(increments.sum())
+            total += total_of(increments)
         return total
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> KalmanMoments:

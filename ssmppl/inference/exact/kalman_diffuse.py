@@ -19,6 +19,7 @@ from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.data import Experiment
 from ssmppl.errors import SamplingError
 from ssmppl.inference.exact.kalman_moments import Stopped
+from ssmppl.inference.totals import total_of
 from ssmppl.language.trace import Trace
 
 AGREEMENT = 1e-6  # of log p(y) by two roads; what is worse was lost to rounding
@@ -83,7 +84,7 @@ def start_of(trace: Trace, flat: tuple[int, ...], model: Matrices, experiment: E
                 fix="give it a proper law in @initial, or data that depend on it",
                 where=site.distribution.location,
             )
-    total = float(increments.sum())
+    total = total_of(increments)
     root = scipy.linalg.solve_triangular(factor, np.eye(len(flat)))
     columns = np.zeros((len(mean), 1 + len(flat)))
     columns[:, :1] = mean

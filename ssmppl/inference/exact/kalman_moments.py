@@ -13,6 +13,7 @@ from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.kalman import OK
 from ssmppl.codegen.kernels.kalman_steps import Matrices
 from ssmppl.data import Experiment
+from ssmppl.inference.totals import total_of
 
 
 class Stopped(Exception):
@@ -71,7 +72,7 @@ def smoothed(
     )
     if status != OK:
         raise Stopped(status, t)
-    return SmoothedMoments(*moments, float(increments.sum())), disturbances
+    return SmoothedMoments(*moments, total_of(increments)), disturbances
 
 
 def drawn(
@@ -85,4 +86,4 @@ def drawn(
     )
     if status != OK:
         raise Stopped(status, t)
-    return float(increments.sum()), out
+    return total_of(increments), out

@@ -24,6 +24,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.kalman_matrices import values_of
 from ssmppl.inference.exact.kalman_moments import Stopped
+from ssmppl.inference.totals import total_of
 from ssmppl.language.trace import Trace
 
 LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",
@@ -123,7 +124,7 @@ def score(
     values = evaluate([s.expression for s in found.known], values_of(trace, experiment, theta))
     for slope, value in zip(found.known, values, strict=True):
         gradient[slope.parameter] += _product(slope, np.asarray(value), adjoint, experiment.steps)
-    return float(increments.sum()), gradient
+    return total_of(increments), gradient
 
 
 def _product(slope: Slope, value: np.ndarray, adjoint: Matrices, steps: int) -> float:

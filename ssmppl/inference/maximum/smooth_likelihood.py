@@ -23,6 +23,7 @@ from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.totals import total_of
 
 SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of the likelihood
 CURVE_STEP = 0.5  # of those for second derivatives
@@ -54,7 +55,7 @@ class SmoothLikelihood:
             )  # fmt: skip
             if status != OK:
                 return -np.inf
-            total += float(increments.sum())
+            total += total_of(increments)
         return total
 
 

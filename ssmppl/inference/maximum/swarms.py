@@ -16,6 +16,7 @@ from ssmppl.inference.draws import Block
 from ssmppl.inference.particles.filtering import failure
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.totals import total_of
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def swarm_block(swarms: Swarms, state: State, n: int) -> tuple[State, Block]:
     for k in range(state.done + 1, state.done + n + 1):
         mean, log_increment = swarms.one_pass(swarm, k, stream)
         z.append(mean)
-        totals.append(log_increment.sum())
+        totals.append(total_of(log_increment))
         impossible.append(np.sum(log_increment == -np.inf))
     stats = {"perturbed_log_likelihood": np.array(totals), "impossible": np.array(impossible)}
     return State(swarm, stream, state.done + n), Block({"z": np.array(z)}, stats)

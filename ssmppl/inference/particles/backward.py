@@ -31,6 +31,7 @@ from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.totals import total_of
 
 __all__ = [
     "KERNELS",
@@ -64,8 +65,7 @@ class ParticleSystem:
 
     @property
     def log_Z(self) -> float:
-        with np.errstate(over="ignore"):  # densities below what their logarithms can be
-            return float(self.log_increments.sum())
+        return total_of(self.log_increments)
 
 
 def particle_system(

@@ -22,6 +22,7 @@ from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.ranges import DOMAIN, out_of_range
+from ssmppl.inference.totals import total_of
 
 SCHEMES = {
     "systematic": SYSTEMATIC,
@@ -164,7 +165,7 @@ def log_likelihood_estimate(
             return -np.inf
         if status != OK:
             raise failure(problem, theta, status, t, experiment)
-        total += float(increments.sum())
+        total += total_of(increments)
     return total
 
 

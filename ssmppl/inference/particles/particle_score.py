@@ -84,6 +84,12 @@ def one_run(
         scores.problem, theta, smoothing.settings, smoothing.trajectories,
         random_state(seed, number), smoothing.kernel,
     )  # fmt: skip
+    if log_z == -np.inf:
+        raise SamplingError(
+            "the densities of the data are too small for their logarithms to be added up, at "
+            f"{spelled(scores.problem.trace, theta)}",
+            fix="give parameters under which the data are possible, or look for outliers in them",
+        )
     s = scores.gradient(theta, paths)
     if not np.all(np.isfinite(s)):
         names = scores.problem.trace.parameter_symbols
