@@ -151,6 +151,12 @@ def read_csv(path: Path) -> pd.DataFrame:
             f"the rows of {path} have more values than its first line has names, {len(names)}",
             fix="give each column a name, and write decimal numbers with points",
         ) from error
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{path} is no text in UTF-8: {error}",
+            fix=f"save it as UTF-8; in Python pd.read_csv({str(path)!r}, encoding='latin-1'), or "
+            "'utf-16', reads it",
+        ) from error
     except Exception as error:  # pandas', and what each form of compression raises
         raise DataError(
             f"{path} cannot be read as a CSV file: {str(error).strip() or type(error).__name__}",
@@ -182,11 +188,13 @@ def _check_separator(path: Path, names: pd.Series) -> None:
 
 
 def labelled(table: pd.DataFrame) -> pd.DataFrame:
-    """A table as it was read, with the labels of its rows recognised: a first column without a
-    name, `time`, or else a first column of dates. Text becomes dates where it is of such."""
+    """A table as it was read, with the labels of its rows recognised: `time`, or else a first
+    column of dates or without a name. Text becomes dates where it is of such."""
     table.columns = table.columns.map(lambda name: str(name).strip())
+    if _numbers_rows(table):  # of a table that was sorted or cut before it was written
+        table = table.drop(columns=table.columns[0])
     first = table.columns[0] if len(table.columns) else ""
-    label = first if first.startswith("Unnamed:") or first == "" else "time"
+    label = first if _unnamed(first) else "time"
     if label not in table.columns and len(table.columns):
         # text that is dates can be no observation and no input, whatever its name
         if table[first].dtype.kind not in "biuf" and table[first].notna().any():
@@ -198,6 +206,22 @@ def labelled(table: pd.DataFrame) -> pd.DataFrame:
     if label != "time" and label in table.columns:
         table = table.set_index(label).rename_axis("time")
     return table
+
+
+def _unnamed(column: str) -> bool:
+    return column.startswith("Unnamed:") or column == ""
+
+
+def _numbers_rows(table: pd.DataFrame) -> bool:
+    """Whether a first column without a name numbers rows that another column labels: `time`, or the
+    one that follows, with dates."""
+    names = list(table.columns)
+    if len(names) < 2 or not _unnamed(names[0]):
+        return False
+    following = table[names[1]]
+    dated = following.dtype.kind not in "biuf" and following.notna().any()
+    numbers = table[names[0]].dtype.kind in "iu"
+    return "time" in names or (numbers and dated and _dates(following) is not None)
 
 
 def _dates(labels: pd.Series) -> pd.Series | None:

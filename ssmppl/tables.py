@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+import contextlib
+import logging
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,8 +60,23 @@ def summary(idata: Any, var_names: str | Iterable[str] | None = None) -> pd.Data
             )
     if not names:
         return pd.DataFrame(columns=SUMMARY_COLUMNS, dtype=float)
-    table = arviz().summary(idata, var_names=names, round_to="none", kind="all")
+    with _unlogged():
+        table = arviz().summary(idata, var_names=names, round_to="none", kind="all")
     return pd.DataFrame(table)[SUMMARY_COLUMNS].astype(float)
+
+
+@contextlib.contextmanager
+def _unlogged() -> Iterator[None]:
+    """Without what ArviZ logs of R-hat where there is one chain; it is NaN then."""
+    loggers = [logging.getLogger(name) for name in ("arviz", "arviz_stats")]
+    levels = [one.level for one in loggers]
+    for one in loggers:
+        one.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        for one, level in zip(loggers, levels, strict=True):
+            one.setLevel(level)
 
 
 def quantiles_of(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:

@@ -900,6 +900,12 @@ BAD_DATA = {
     "matrix as vector": ("vectors", vectors_with(S=np.ones((5, 4))), ["(5, 4)", "(T, 2, 2)"]),
     "ragged": ("vectors", vectors_with(y=[[1, 2], [1]]), ["no rectangular array", "same number"]),
     # values that are no numbers
+    "a decimal comma": (
+        "counts", at("rain", 3, "1,5"), ["'rain', row 3", "the text '1,5'", "points"],
+    ),
+    "a thousand": (
+        "counts", at("rain", 3, "1,000"), ["'rain', row 3", "the text '1,000'", "thousands="],
+    ),
     "text": (
         "counts", at("rain", 3, "n/a"), ["'rain', row 3", "the text 'n/a'", "pd.to_numeric"],
     ),
@@ -1032,7 +1038,7 @@ def test_the_good_data_are_good(model):
 
 
 BAD_INPUTS = {
-    "none given": ("counts", None, 10, ["has inputs, and none were given", "{'u': array}"]),
+    "none given": ("counts", None, 10, ["has inputs, and none were given", "{'u': ...}"]),
     "not declared": ("none", {"u": np.ones(3)}, 3, ["declares no inputs", "inputs=('u',)"]),
     "no steps": ("none", None, None, ["neither steps nor inputs", "steps=100"]),
     "steps of zero": ("none", None, 0, ["steps=0", "at least 1"]),

@@ -125,6 +125,7 @@ def simulate(
         driving = as_table(given)
         for name in (n for n in driving.columns if n not in table.columns):
             table[name] = list(driving[name]) * draws
+            dataset[name] = ("time", driving[name].to_numpy())
     write(dataset, path, table.set_index(str(table.columns[0])))
     say(f"Wrote {len(table)} rows to {path}: {', '.join(table.columns)}")
     answer(model=loaded.name, rows=len(table), columns=list(table.columns), draws=draws, seed=seed,

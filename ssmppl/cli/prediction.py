@@ -97,7 +97,8 @@ def predict(
     experiments = []
     for axis in time_axes(drawn.dims):
         time = drawn[axis].values
-        own = {str(n): v for n, v in drawn.data_vars.items() if axis in v.dims}
+        mark = axis.removeprefix("time")  # that follows the names of one of several experiments
+        own = {str(n).removesuffix(mark): v for n, v in drawn.data_vars.items() if axis in v.dims}
         spreads = spread(own, ("chain", "draw"))
         say(table_text(spread_table(spreads, time)))
         experiments.append({"time": time, "observations": spreads})

@@ -150,7 +150,8 @@ def spread(variables: Mapping[str, xr.DataArray], over: tuple[str, ...]) -> dict
             label = component_label(name, index, variables)
             own = values[(slice(None), slice(None), *index)]
             with np.errstate(invalid="ignore"):  # of infinite draws
-                found[label] = {"mean": own.mean(axis=0), "sd": own.std(axis=0, ddof=1)}
+                sd = own.std(axis=0, ddof=1) if len(own) > 1 else np.full(own.shape[1:], np.nan)
+                found[label] = {"mean": own.mean(axis=0), "sd": sd}
             quantiles = quantiles_of(own, LEVELS)
             found[label] |= {
                 f"q{round(100 * p):02d}": q for p, q in zip(LEVELS, quantiles, strict=True)

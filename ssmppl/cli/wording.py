@@ -15,7 +15,7 @@ VALUE = r"""\{[^}]*\}|"[^"]*"|'[^']*'|[-+\w.]+"""
 KEYWORD = re.compile(rf"(?<![\w.'-])([a-z_]+)=({VALUE})?(?![(\[{{])")
 METHOD = re.compile(r"(?:method=)?ssm\.([A-Z]\w*)\(([^()]*)\)")
 VERB = re.compile(r"ssm\.([a-z_]+)\b(?:\(([^()]*)\))?")
-PARAMETERS = re.compile(r"\{('\w+': \.\.\.(?:, '\w+': \.\.\.)*)\}")
+PARAMETERS = re.compile(r"(?<!=)\{('\w+': \.\.\.(?:, '\w+': \.\.\.)*)\}")
 PAIR = re.compile(r"'?(\w+)'?: ((?:\[[^]]*\]|[^,}])+)")  # of a mapping
 
 
@@ -36,6 +36,9 @@ def in_words_of(parameters: Iterable[click.Parameter], verbs: Collection[str], f
         name = max(option.opts, key=len)
         if value == "None":
             return f"no {name}"
+        if isinstance(option.type, click.Path) and value and value.startswith("{"):
+            columns = [column for column, _ in PAIR.findall(value)]
+            return f"{name} FILE, with the column{'s' * (len(columns) > 1)} {', '.join(columns)}"
         if option.is_flag:
             off = option.secondary_opts[0] if option.secondary_opts else f"no {name}"
             return off if value == "False" else name
@@ -58,6 +61,8 @@ def in_words_of(parameters: Iterable[click.Parameter], verbs: Collection[str], f
     if "parameters" in options:
         fix = PARAMETERS.sub(lambda m: f"--parameters {_assigned(m[0])}", fix)
     fix = KEYWORD.sub(keyword, fix)
+    if "seed" in options:
+        fix = fix.replace("or None for a random one", "or leave --seed out for a random one")
     return re.sub(r"\bor None\b", "or none of them", fix) if "--method" in fix else fix
 
 

@@ -99,7 +99,7 @@ def bind_inputs(
         check_count("steps", steps, 1)
     if inputs is None:
         if trace.inputs:
-            names = ", ".join(f"{n!r}: array" for n in trace.inputs)
+            names = ", ".join(f"{n!r}: ..." for n in trace.inputs)
             raise ArgumentError(
                 f"the model {trace.name!r} has inputs, and none were given",
                 fix=f"pass inputs={{{names}}} with one row for each step",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
@@ -76,6 +77,10 @@ def as_numbers(value: Any) -> np.ndarray | Fault:
     return _objects(plain)
 
 
+# 1,5 or 1,000,000: numbers of a file that was written elsewhere
+_WITH_COMMA = re.compile(r"[+-]?\d+(,\d+)+(\.\d+)?(e[+-]?\d+)?", re.IGNORECASE)
+
+
 def _objects(plain: np.ndarray) -> np.ndarray | Fault:
     odd = _no_number(plain)
     if odd is not None:
@@ -93,6 +98,14 @@ def _objects(plain: np.ndarray) -> np.ndarray | Fault:
                 return Fault(index, found, "give it in larger units")
         else:
             text = isinstance(entry, (str, bytes))
+            if isinstance(entry, str) and _WITH_COMMA.fullmatch(entry.strip()):
+                return Fault(
+                    index,
+                    f"the text {short(entry)} stands where a number is expected",
+                    "write decimal numbers with points, and thousands without a mark; "
+                    "pd.read_csv(file, decimal=',') reads decimal commas, and thousands=',' commas "
+                    "between thousands",
+                )
             return Fault(
                 index,
                 f"{'the text ' if text else ''}{short(entry)} stands where a number is expected",

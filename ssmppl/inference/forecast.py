@@ -13,6 +13,7 @@ from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.counts import check_room
 from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
 from ssmppl.data.parameters import pack
+from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
@@ -76,7 +77,8 @@ def forecast(
 
     Raises
     ------
-    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix; inputs
+        with labels of the data's rows among them.
     """
     traced, posterior = trace(model), posterior_of(idata, KNOWN)
     check_samplers(traced)
@@ -107,6 +109,7 @@ def forecast(
     states, observed = _continued(program, theta, paths, y, u, feedback, root)
     check_finite(traced, states, observed)
     zone = zone_of(posterior.attrs, axis)
+    _check_after(posterior[axis].values, labels)
     if labels is None:
         labels = after(posterior[axis].values, steps, zone)
     over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
@@ -123,6 +126,22 @@ def forecast(
         }
         | ({TIME_ZONES: {"time": zone}} if zone else {}),
     )
+
+
+def _check_after(time: np.ndarray, labels: np.ndarray | None) -> None:
+    """Labels of the inputs follow those of the data, where both have an order."""
+    if labels is None or time.dtype.kind not in "iufM" or labels.dtype.kind not in "iufM":
+        return
+    if (time.dtype.kind == "M") != (labels.dtype.kind == "M"):
+        return
+    early = int(np.sum(labels <= time[-1]))
+    if early:
+        last, first = label_text(time[-1]), label_text(labels[0])
+        raise ArgumentError(
+            f"inputs begin at {first}, and the data end at {last}: {early} of their {len(labels)} "
+            "rows are not after the data",
+            fix=f"give the inputs of the rows after {last} only, or without labels",
+        )
 
 
 def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:

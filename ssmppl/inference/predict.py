@@ -89,7 +89,7 @@ def predict(
     if data is None and steps is None:
         raise ArgumentError(
             "neither data nor steps tell how many rows to predict",
-            fix="pass the data, ssm.predict(model, idata, data), or steps=100",
+            fix="give data, or steps=100",
         )
     experiments = bind(traced, data, need_observations=False, steps=steps)
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)

@@ -335,3 +335,23 @@ def test_plain_values():
         "a": 0.5, "b": [1.0, None, None], "3": [2, True], "t": ["2024-01-01"],
         "s": "2024-02-03T04:05:00", "p": "x/y", "n": None, "z": 2.5, "m": [["a"], ["b"]],
     }  # fmt: skip
+
+
+def test_predict_of_several_experiments_and_of_one_draw(series, recwarn):
+    """Channels had the experiment's number behind their names, as components of a vector have."""
+    run("simulate", "walk.py", "--steps", 12, *Q, "--seed", 2, "-o", "other.csv")
+    run("sample", "walk.py", series, "other.csv", *QUICK, "--chains", 1, "-o", "two.nc")
+    words = ("walk.py", series, "other.csv", "--posterior", "two.nc", "--seed", 1, "-o", "p.nc")
+    found = told("predict", *words)
+    assert [list(one["observations"]) for one in found["experiments"]] == [["y"], ["y"]]
+    assert [len(one["observations"]["y"]["mean"]) for one in found["experiments"]] == [20, 12]
+    one = told("predict", "walk.py", "--steps", 4, "--draws", 1, "--seed", 1, "-o", "one.nc")
+    assert one["experiments"][0]["observations"]["y"]["sd"] == [None] * 4
+    assert not [w for w in recwarn if "Degrees of freedom" in str(w.message)]
+
+
+def test_a_summary_of_one_chain_is_silent(series, caplog):
+    run("sample", "walk.py", series, *QUICK, "--chains", 1, "-o", "alone.nc")
+    with caplog.at_level("WARNING"):
+        told("summary", "alone.nc")
+    assert not caplog.records

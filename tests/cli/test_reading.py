@@ -48,6 +48,31 @@ def test_what_is_no_date_labels_nothing_and_time_goes_before_a_date(dated):
     assert list(both.columns) == ["date", "time", "y"]
 
 
+@pytest.mark.parametrize("name", ["time", "date"])
+def test_row_numbers_of_a_table_that_was_cut_or_sorted_label_nothing(dated, name):
+    """The numbers that pandas writes before the rows went before the dates beside them."""
+    days = ["2021-01-01", "2021-01-02", "2021-01-04"]
+    for numbers in ([0, 1, 2], [5, 7, 9], [2, 1, 0]):
+        lines = [f",{name},y", *(f"{k},{d},{k}.5" for k, d in zip(numbers, days, strict=True))]
+        table = read_table(dated("\n".join(lines)))
+        if name == "time":
+            assert list(table["time"]) == list(pd.to_datetime(days))
+        else:
+            assert list(table.index) == list(pd.to_datetime(days))
+        assert list(table["y"]) == [k + 0.5 for k in numbers]
+    plain = read_table(dated(",y,z\n3,1,2\n4,5,6\n"))
+    assert list(plain.index) == [3, 4]
+    assert list(plain.columns) == ["y", "z"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_an_encoding_that_is_not_utf_8_is_told(tmp_path, encoding):
+    path = tmp_path / "d.csv"
+    path.write_text("time,y\n1,2\n2,é\n", encoding=encoding)
+    with pytest.raises(DataError, match=r"no text in UTF-8.*\n.*save it as UTF-8"):
+        read_table(path)
+
+
 @pytest.mark.parametrize(
     "first", ["04.01.2021", "1/4/2021", "04-01-21", "4 Jan 2021", "may 4 2021"]
 )
@@ -284,6 +309,15 @@ def test_vectors_are_columns_or_dimensions(folder):
     from_csv = answer("log-likelihood", "plane.py", "from_csv.csv", *words)["log_likelihood"]
     assert from_nc == pytest.approx(from_csv, rel=1e-12)
     assert list(as_table(whole).columns) == ["time", "x_0", "x_1", "y_0", "y_1", "u"]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "nc"])
+def test_a_simulation_with_its_inputs_is_data(folder, suffix):
+    """A netCDF file was without them."""
+    Path("u.csv").write_text("u\n1\n-1\n0.5\n2\n", encoding="utf-8")
+    run("simulate", "plane.py", "--inputs", "u.csv", "--seed", 3, "-o", f"d.{suffix}")
+    found = answer("log-likelihood", "plane.py", f"d.{suffix}", "-p", "beta=[1, 2]")
+    assert np.isfinite(found["log_likelihood"]).all()
 
 
 def test_a_netcdf_file_of_several_simulations(folder):

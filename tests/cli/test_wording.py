@@ -31,6 +31,10 @@ TOLD = [  # the command, the fix as Python has it, and as the command line has i
      "leave --resampling and --ess-threshold out"),
     ("summary", "run it with ssm.particle_filter(..., history=True)",
      "run it with `ssmppl particle-filter --history`"),
+    ("simulate", "pass inputs={'u': ..., 'v': ...} with one row for each step",
+     "pass --inputs FILE, with the columns u, v with one row for each step"),
+    ("sample", "give a whole number of at least 0, or None for a random one",
+     "give a whole number of at least 0, or leave --seed out for a random one"),
     ("predict", "give all the data sets, or conditional=False",
      "give all the data sets, or --free-run"),
 ]  # fmt: skip

@@ -239,3 +239,22 @@ def test_what_cannot_be_continued_is_said():
                      inputs={"u": FUTURE})  # fmt: skip
     with pytest.raises(ArgumentError, match="has inputs"):
         ssm.forecast(model(), made(), 3)
+
+
+@pytest.mark.parametrize(
+    ("time", "wrong", "right"),
+    [
+        (np.arange(ROWS) + 1.0, np.arange(5) + 1.0, np.arange(5) + ROWS + 1.0),
+        (
+            pd.date_range("2024-01-01", periods=ROWS), pd.date_range("2024-01-02", periods=5),
+            pd.date_range("2025-01-01", periods=5),
+        ),
+    ],
+)  # fmt: skip
+def test_inputs_of_rows_of_the_data_drive_no_forecast(time, wrong, right):
+    """Of all inputs, past and future, the first drove the first row ahead, under its own label."""
+    with pytest.raises(ArgumentError, match=r"are not after the data\n.*rows after"):
+        ssm.forecast(model(), made(time=np.asarray(time)), inputs={"u": FUTURE, "time": wrong})
+    found = ssm.forecast(model(), made(time=np.asarray(time)), inputs={"u": FUTURE, "time": right})
+    assert np.array_equal(found["time"].values, np.asarray(right))
+    ssm.forecast(model(), made(time=np.asarray(time)), inputs={"u": FUTURE})
