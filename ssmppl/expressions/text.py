@@ -14,10 +14,12 @@ LONGEST = 10_000
 
 
 def symbol_text(node: Expr) -> str:
-    """The name of a symbol as a person writes it: `x`, `x_prev`, `beta[2]`."""
+    """The name of a symbol as a person writes it: `x`, `x_prev`, `beta[2]`; `measured(y[0])` of
+    what is 1 where y[0] is in the data."""
     kind, name, index = node.data
     suffix = "_prev" if kind.endswith("_prev") else ""
-    return name + suffix + (f"[{', '.join(map(str, index))}]" if index else "")
+    text = name + suffix + (f"[{', '.join(map(str, index))}]" if index else "")
+    return f"measured({text})" if kind.startswith("seen") else text
 
 
 def _matrix_name(node: Expr) -> str | None:

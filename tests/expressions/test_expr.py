@@ -374,3 +374,9 @@ def test_text_of_an_expression_that_shares_its_parts_is_cut():
     assert tails[0] != tails[1], "though they begin alike as far as they are written"
     assert max(map(len, texts)) < 11_000
     assert to_text(nested(x, 80), longest=50).startswith("sin(sin(sin(")
+
+
+def test_what_was_measured_is_told_from_the_measurement():
+    """`1 - y[0]` stood in reasons for what is 1 where y[0] is missing."""
+    assert to_text(symbol("seen", "y", (0,))) == "measured(y[0])"
+    assert to_text(symbol("observation", "y", (0,))) == "y[0]"
