@@ -111,10 +111,8 @@ def gain_of_mean(base: Predictions, other: Predictions) -> float:
     NaN where several channels were measured at once and it is not known how they vary together.
     """
     errors = np.stack([base.observed - base.mean, other.observed - other.mean])
-    with np.errstate(all="ignore"):
-        scaled = errors / np.sqrt(
-            base.variance
-        )  # NaN where missing, or before a flat start is known
+    with np.errstate(all="ignore"):  # NaN where missing, or before a flat start is known
+        scaled = errors / np.sqrt(base.variance)
     told = np.isfinite(scaled).all(axis=0)
     scaled = np.where(told, scaled, 0.0)
     if base.covariance is None:
