@@ -170,7 +170,8 @@ class ExactClimb:
                     there = z.copy()
                     there[j] += step
                     with contextlib.suppress(SamplingError, _WithoutMaximum):
-                        self.value(there)
+                        if self.setup.exact_objective(there) > self.best_value:  # no slope yet
+                            self.value(there)
             if not self.best_value > before + AT_MOST:
                 break
             self._quasi_newton(self.best)
