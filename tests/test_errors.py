@@ -900,6 +900,10 @@ BAD_DATA = {
     "matrix as vector": ("vectors", vectors_with(S=np.ones((5, 4))), ["(5, 4)", "(T, 2, 2)"]),
     "ragged": ("vectors", vectors_with(y=[[1, 2], [1]]), ["no rectangular array", "same number"]),
     # values that are no numbers
+    "words": (
+        "counts", counts_with(rain=["one", "two", "three", "four", "five"]),
+        ["'rain', row 1", "the text 'one'", "give numbers, NaN where"],
+    ),
     "a decimal comma": (
         "counts", at("rain", 3, "1,5"), ["'rain', row 3", "the text '1,5'", "points"],
     ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+import numpy as np
 
 import ssmppl as ssm
 from ssmppl.cli.group import command
@@ -21,6 +22,8 @@ from ssmppl.cli.options import (
 from ssmppl.cli.reading import as_table, read_data, read_table
 from ssmppl.cli.rendering import answer, say, write
 from ssmppl.cli.targets import file_of_model, target
+from ssmppl.data.channels import column_names
+from ssmppl.language.trace import trace
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.tables import wide_table
 
@@ -122,8 +125,10 @@ def simulate(
     dataset = ssm.simulate(loaded, values, steps=steps, inputs=given, draws=draws, seed=seed)
     table = wide_table(dataset)
     if given is not None:
-        driving = as_table(given)
-        for name in (n for n in driving.columns if n not in table.columns):
+        driving, own = as_table(given), set[str]()  # the file may have columns of other things
+        for n, shape in trace(loaded).inputs.items():
+            own |= {c for index in np.ndindex(*shape) for c in (n, *column_names(n, index))}
+        for name in (n for n in driving.columns if n in own and n not in table.columns):
             table[name] = list(driving[name]) * draws
             dataset[name] = ("time", driving[name].to_numpy())
     write(dataset, path, table.set_index(str(table.columns[0])))

@@ -102,7 +102,7 @@ def bind_inputs(
             names = ", ".join(f"{n!r}: ..." for n in trace.inputs)
             raise ArgumentError(
                 f"the model {trace.name!r} has inputs, and none were given",
-                fix=f"pass inputs={{{names}}} with one row for each step",
+                fix=f"pass inputs={{{names}}}, one row for each step",
             )
         inputs = {}
     elif not trace.inputs and isinstance(inputs, dict) and set(inputs) - {"time"}:

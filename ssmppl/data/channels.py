@@ -11,7 +11,7 @@ from ssmppl.data.values import Fault, as_numbers, number
 from ssmppl.errors import DataError, listing
 
 
-def _column_names(name: str, index: tuple[int, ...]) -> tuple[str, ...]:
+def column_names(name: str, index: tuple[int, ...]) -> tuple[str, ...]:
     inside = list(map(str, index))
     return (f"{name}_{'_'.join(inside)}", f"{name}[{','.join(inside)}]",
             f"{name}[{', '.join(inside)}]")  # fmt: skip
@@ -23,7 +23,7 @@ def holds(source: Source, name: str, shape: tuple[int, ...]) -> bool:
         return True
     return any(
         c in source.columns for index in np.ndindex(*shape) if shape
-        for c in _column_names(name, index)
+        for c in column_names(name, index)
     )  # fmt: skip
 
 
@@ -42,7 +42,7 @@ def channel(source: Source, name: str, shape: tuple[int, ...], role: str) -> np.
         raise _left_out(source, name, shape, role)
     parts = {}
     for index in np.ndindex(*shape):
-        column = next((c for c in _column_names(name, index) if c in source.columns), None)
+        column = next((c for c in column_names(name, index) if c in source.columns), None)
         if column is None:
             raise _left_out(source, name, shape, role, index)
         check_single(source.columns[column], name, source)
@@ -89,7 +89,7 @@ def _wrong_shape(
     elif len(shape) == 1 and array.shape[:-1] == shape and array.ndim == 2:
         fix = f"rows come first, shape {wanted}: transpose it, data[{name!r}].T"
     elif shape and array.ndim == 1 and source.kind == "DataFrame":
-        names = ", ".join(_column_names(name, i)[0] for i in np.ndindex(*shape))
+        names = ", ".join(column_names(name, i)[0] for i in np.ndindex(*shape))
         fix = f"give one column for each component: {names}"
     else:
         fix = f"give an array of shape {wanted}, or the model's {role} the shape {array.shape[1:]}"
@@ -107,16 +107,16 @@ def _left_out(
     wanted = f" of shape (T, {', '.join(map(str, shape))})" if shape else ""
     found = f"{_a(role)} named {name!r}{wanted} is missing from the {source.kind}"
     if index is not None:
-        names = ", ".join(_column_names(name, i)[0] for i in np.ndindex(*shape))
-        first = _column_names(name, index)[0]
+        names = ", ".join(column_names(name, i)[0] for i in np.ndindex(*shape))
+        first = column_names(name, index)[0]
         found = f"{_a(role)} named {name!r} lacks its component {first!r}; needed are {names}"
-    wanted_name = name if index is None else _column_names(name, index)[0]
+    wanted_name = name if index is None else column_names(name, index)[0]
     fix = f"its {things} are: {listing(wanted_name, source.known)}; rename one, or add "
     fix += repr(wanted_name)
     if role == "observation":
         fix += " (a column of NaN, if nothing of it was measured)"
     if index is None and shape and source.kind == "DataFrame":  # no column has that shape
-        names = ", ".join(_column_names(name, i)[0] for i in np.ndindex(*shape))
+        names = ", ".join(column_names(name, i)[0] for i in np.ndindex(*shape))
         found = f"{_a(role)} named {name!r} is missing from the DataFrame; needed are {names}"
         fix = f"its columns are: {listing(name, source.known)}; rename them to {names}"
     if not source.known:

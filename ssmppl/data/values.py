@@ -106,12 +106,14 @@ def _objects(plain: np.ndarray) -> np.ndarray | Fault:
                     "pd.read_csv(file, decimal=',') reads decimal commas, and thousands=',' commas "
                     "between thousands",
                 )
+            # where no entry is a number, errors='coerce' would leave nothing of the column
+            some = any(not isinstance(v, str) or _spells_number(v) for v in plain.ravel())
             return Fault(
                 index,
                 f"{'the text ' if text else ''}{short(entry)} stands where a number is expected",
                 "convert the column, for example by pd.to_numeric(column, errors='coerce'), "
                 "which writes NaN for what is no number"
-                if text
+                if text and some
                 else "give numbers, NaN where a value is missing",
             )
     return out

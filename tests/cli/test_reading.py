@@ -313,8 +313,8 @@ def test_vectors_are_columns_or_dimensions(folder):
 
 @pytest.mark.parametrize("suffix", ["csv", "nc"])
 def test_a_simulation_with_its_inputs_is_data(folder, suffix):
-    """A netCDF file was without them."""
-    Path("u.csv").write_text("u\n1\n-1\n0.5\n2\n", encoding="utf-8")
+    """A netCDF file was without them; and of both kinds what else the file of inputs has is not."""
+    Path("u.csv").write_text("u,y\n1,9\n-1,9\n0.5,9\n2,9\n", encoding="utf-8")
     run("simulate", "plane.py", "--inputs", "u.csv", "--seed", 3, "-o", f"d.{suffix}")
     found = answer("log-likelihood", "plane.py", f"d.{suffix}", "-p", "beta=[1, 2]")
     assert np.isfinite(found["log_likelihood"]).all()
