@@ -37,6 +37,15 @@ class Transform:
     values: tuple[Expr, ...]
     log_jacobian: Expr
 
+    @property
+    def on_the_line(self) -> tuple[bool, ...]:
+        """For each free number whether it has the parameter's own unit and may be any number."""
+        if self.site.distribution.support().kind == "positive definite":
+            return tuple(i != j for i, j in _lower(self.site.shape[0]))
+        if len(self.free) != len(self.values):
+            return (False,) * len(self.free)
+        return tuple(z is value for z, value in zip(self.free, self.values, strict=True))
+
     def inverse(self, value: np.ndarray, known: dict[Expr, float]) -> np.ndarray:
         """The unconstrained numbers of a value (the site's shape), numerically."""
         support = self.site.distribution.support()

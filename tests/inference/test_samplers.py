@@ -15,7 +15,8 @@ import scipy.stats as st
 import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import chart, coordinates
 from ssmppl.inference.chains.curvature import fitted_covariance
-from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.chains.smc2 import _factor
+from ssmppl.inference.particles.pilot import find_mode, space_of
 from ssmppl.inference.problem import pose
 from tests.statistics.checks import some
 
@@ -224,6 +225,39 @@ def test_chart_gives_derivatives_of_the_change_of_scale():
     # log prior of a is -a^2 / 2; that of v = 1 / q with q ~ Gamma(2, 1) is -3 log v - 1 / v
     np.testing.assert_allclose(found.slope, [-0.4, -3 / v + 1 / v**2], atol=1e-5)
     np.testing.assert_allclose(found.curvature, [[-1, 0], [0, 3 / v**2 - 2 / v**3]], atol=1e-4)
+
+
+def in_units_of(c):
+    """A model of which every number has the unit of the data."""
+    model = ssm.Model("units")
+    model.prior(lambda: {"m": ssm.StudentT(4, 0, scale=10 * c), "s": ssm.HalfNormal(sd=10 * c)})
+    model.initial(lambda m, s: {"x": ssm.Normal(m, sd=s)})
+    model.transition(lambda x, m, s: {"x": ssm.Normal(m + 0.5 * (x - m), sd=s)})
+    model.observation(lambda x, s: {"y": ssm.Normal(x, sd=s)})
+    return model
+
+
+@pytest.mark.parametrize("c", [1e-10, 1e-6, 1e6, 1e10, 1e100])
+def test_the_pilot_finds_the_same_mode_and_scale_in_any_unit(c):
+    """Climbing in steps of one, and measuring no scale above 5 or below 1e-4, it stayed at the
+    start with scales of its own limits: chains of data in pounds did not mix."""
+    y = np.random.default_rng(1).normal(0.3, 1.0, 40)
+
+    def pilot(unit):
+        space = space_of(pose(in_units_of(unit), {"y": y * unit}), {}, {})
+        found = find_mode(space, np.random.SeedSequence(3), "kalman")
+        theta, _ = space.parameters(found.z)
+        return theta / unit, found.scale / [unit, 1.0]
+
+    (here, scale), (expected, known) = pilot(c), pilot(1.0)
+    assert np.all(np.abs(here - expected) < 0.5 * known * [1.0, expected[1]])
+    np.testing.assert_allclose(scale, known, rtol=0.4)
+
+
+def test_the_factor_of_particles_has_their_unit():
+    z = np.random.default_rng(2).standard_normal((50, 2))
+    w, units = np.full(50, 0.02), np.array([1e-9, 1e9])
+    np.testing.assert_allclose(_factor(z * units, w), units[:, None] * _factor(z, w), rtol=1e-6)
 
 
 def test_fitted_covariance_is_that_of_a_gaussian():
