@@ -223,6 +223,6 @@ def test_what_is_predicted_exactly_and_not_seen_has_no_rank():
     model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
     y, r = np.array([np.nan, 1.0, np.nan, 2.0]), np.array([0.0, 0.0, 0.0, 1.0])
     found = ssm.kalman_filter(model, {"y": y, "r": r}, {})
-    np.testing.assert_allclose(found["y_predicted_sd"].values, [0.0, 1.0, 1.0, np.sqrt(3.0)])
+    np.testing.assert_allclose(found["y_predicted_sd"].values[0], [0.0, 1.0, 1.0, np.sqrt(3.0)])
     expected = [np.nan, stats.norm.cdf(1.0), np.nan, stats.norm.cdf(1.0 / np.sqrt(3.0))]
-    np.testing.assert_allclose(found["y_pit"].values, expected)
+    np.testing.assert_allclose(found["y_pit"].values[0], expected)
