@@ -288,6 +288,8 @@ class Beta(Distribution):
     a, b : positive; the larger a + b, the narrower.
     """
 
+    open_above = True
+
     def __init__(self, a: Any, b: Any):
         self._set(a=a, b=b)
         self._require("a", 0.0)

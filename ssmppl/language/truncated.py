@@ -45,7 +45,6 @@ class Truncated(Distribution):
     lower, upper : the bounds, one of them or both; of discrete distributions they are included.
     """
 
-    closed = True
     by_name = "bounds"
     base: Distribution
 
@@ -91,6 +90,8 @@ class Truncated(Distribution):
             self.parameters["lower"] = array(ew("ceil", self.lower))
             self.parameters["upper"] = array(ew("floor", self.upper))
         self.base, self.discrete = dist, dist.discrete
+        whole = dist.open_sides(self.lower, self.upper)  # where nothing is cut off
+        self.closed, self.open_above = dist.closed or not whole[0], dist.open_above and whole[1]
         for a, b in zip(self.lower.ravel(), self.upper.ravel(), strict=True):
             if a.op == b.op == "const" and not (
                 a.data < b.data or (dist.discrete and a.data == b.data)
