@@ -17,10 +17,10 @@ import numpy as np
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
+from ssmppl.language.positive import LEAST_SHARE
 from ssmppl.language.trace import Site, Trace
 
 ZERO = constant(0.0)
-LEAST_SHARE = np.finfo(float).tiny  # whose logarithm still has an exponential
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.inflated import ZeroInflated
 from ssmppl.language.mixtures import Mixture
-from ssmppl.language.positive import Exponential
+from ssmppl.language.positive import Beta, Exponential, within_unit
 from ssmppl.language.symmetric import HalfNormal, Laplace
 from ssmppl.language.truncated_moments import (
     exponential_moments,
@@ -229,7 +229,8 @@ class Truncated(Distribution):
             above = self.base.sample_above(draws, lower)
             if above is not None:
                 return above
-        return self.quantile(_each(self, lambda i: draws.uniform()))
+        drawn = self.quantile(_each(self, lambda i: draws.uniform()))
+        return array(within_unit(drawn)) if isinstance(self.base, Beta) else drawn
 
     # -- moments
     def mean(self):
