@@ -6,11 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ssmppl.analysis.moves import drawn
 from ssmppl.errors import ArgumentError
-from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.distributions import Draws
 from ssmppl.language.trace import Trace
 
 
@@ -42,7 +41,7 @@ def draw_prior(
             )
         if not d.drawable:
             raise d.undrawable(f"the prior of {site.name!r} has to be drawn from here")
-        sample = evaluate(array(d.sample(Draws(site.name))), values, source)
+        sample = evaluate(drawn(site), values, source)
         flat = np.broadcast_to(
             sample.reshape(site.value.size, -1), (site.value.size, draws)
         )  # a sampler without randomness has no axis of draws

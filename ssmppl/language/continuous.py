@@ -17,7 +17,14 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import apply
 from ssmppl.expressions.signs import never_negative
 from ssmppl.language.constructing import one_of
-from ssmppl.language.distribution import INFINITY, Distribution, Draws, Support, log_difference
+from ssmppl.language.distribution import (
+    INFINITY,
+    Distribution,
+    Draws,
+    Support,
+    in_order,
+    log_difference,
+)
 
 LOG_2PI = math.log(2.0 * math.pi)
 _NAN = math.nan
@@ -262,6 +269,9 @@ class Uniform(Distribution):
 
     def support(self):
         return Support("interval", self.lower, self.upper)
+
+    def in_range(self) -> ExprArray | None:
+        return in_order("le", self.lower, self.upper)  # equal ones are a law at one point
 
     def log_densities(self, value):
         return array(np.broadcast_to(array(-ew("log", self.upper - self.lower)), self.shape))

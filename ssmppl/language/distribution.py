@@ -340,6 +340,15 @@ def log_difference(a: Any, b: Any) -> ExprArray:
     return array(a + elementwise("log1p", -array(elementwise("exp", array(b) - a))))
 
 
+def in_order(op: str, lower: ExprArray, upper: ExprArray) -> ExprArray | None:
+    """Whether lower op upper, "lt" or "le", element by element; None where it surely is so."""
+    for pair in zip(lower.ravel(), upper.ravel(), strict=True):
+        numbers = [e.data for e in pair if e.op == "const"]
+        if len(numbers) < 2 and not any(map(math.isinf, numbers)):
+            return array(elementwise(op, lower, upper))
+    return None
+
+
 def _never_above(a: Expr, b: Expr) -> bool:
     """Whether a <= b is known without values for symbols."""
     return a is b or (a.op == b.op == "const" and a.data <= b.data)

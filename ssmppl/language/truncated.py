@@ -19,9 +19,10 @@ from ssmppl.expressions.expr import symbols_of, user_location
 from ssmppl.language.circular import VonMises
 from ssmppl.language.continuous import Flat, Normal, Uniform, _each, _where
 from ssmppl.language.discrete import Dirac
-from ssmppl.language.distribution import Distribution, Support
+from ssmppl.language.distribution import Distribution, Support, in_order
 from ssmppl.language.inflated import ZeroInflated
 from ssmppl.language.mixtures import Mixture
+from ssmppl.language.nested import holding
 from ssmppl.language.positive import Beta, Exponential, within_unit
 from ssmppl.language.symmetric import HalfNormal, Laplace
 from ssmppl.language.truncated_moments import (
@@ -137,8 +138,9 @@ class Truncated(Distribution):
         return Support(kind, lower, _tighter("minimum", base.upper, self.upper))
 
     def in_range(self) -> ExprArray | None:
-        # bounds in the wrong order leave quantiles of no probability at all: no number
-        return self.base.in_range()
+        # quantiles between bounds in the wrong order are numbers, of no law
+        ordered = in_order("le" if self.discrete else "lt", *self._bounds())
+        return holding([self.base.in_range(), ordered])
 
     def _bounds(self) -> tuple[ExprArray, ExprArray]:
         s = self.support()
