@@ -232,6 +232,9 @@ def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, 
         zeros = [node.args[0]]  # 0 ** b is 0 for every b above 0
     elif op == "sqrt" or (op == "pow" and not _at_least_one(node.args[1])):
         zeros = _fixed_factors(argument, tangent)
+    elif op == "exp" and _divides(value):
+        # exp(-k / u) at u = 0 is 0 sooner than the slope of k / u is infinite
+        slope = slope.only(apply("ne", node, 0.0))
     for zero in zeros:
         if not _never_zero(zero):
             slope = slope.only(apply("ne", zero, 0.0))
@@ -267,6 +270,15 @@ def _fixed_factors(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
     if node.op == "mul":
         return [f for a in node.args for f in _fixed_factors(a, tangent)]
     return _fixed_factors(node.args[0], tangent) if node.op in ("neg", "div") else []
+
+
+def _divides(node: Expr) -> bool:
+    """Whether it has a denominator that is no number."""
+    return any(
+        (n.op == "div" and n.args[1].op != "const")
+        or (n.op == "pow" and n.args[1].op == "const" and n.args[1].data < 0.0)
+        for n in topological([node])
+    )
 
 
 def _never_zero(node: Expr) -> bool:

@@ -310,6 +310,17 @@ def test_slopes_where_a_factor_under_a_root_is_zero():
     assert evaluate(shifted, {X: 0.0}) == 0.0
 
 
+@pytest.mark.parametrize("value", [0.0, 1e-160, 0.3, -0.3])
+def test_slopes_of_exponentials_of_quotients(value):
+    """exp(-a / u**2) is 0 at u = 0, and so are its slopes in both."""
+    node = np.exp(-X / Y**2)
+    with np.errstate(all="ignore"):
+        found = evaluate(differentiate([node], X) + differentiate([node], Y), {X: 1.5, Y: value})
+    there = np.exp(-1.5 / value**2) if abs(value) > 0.1 else 0.0
+    wanted = [-there / value**2, 3.0 * there / value**3] if there else [0.0, 0.0]
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
 def test_ties_of_a_maximum_take_one_slope_only():
     node = np.maximum(2.0 * X, 3.0 * X)
     assert evaluate(gradient(node, [X])[0], {X: np.array([-1.0, 0.0, 1.0])}).tolist() == [2, 2, 3]
