@@ -74,11 +74,14 @@ class ZeroInflated(Distribution):
     def log_densities(self, value):
         v, p = array(value), self._share()
         at_zero, rest = array(ew("log", p)), array(ew("log1p", -p))
-        if all(e.data > 0.0 for e in self.base.support().lower.ravel()):  # a hurdle
-            return _where(ew("eq", v, 0.0), at_zero, rest + cut(self.base, v))
-        law_zero = array(self.base.log_densities(array(np.zeros(v.shape))))
+        law_zero = self._of_base(array(np.zeros(v.shape)))
         at_zero = array(ew("logaddexp", at_zero, rest + law_zero))
-        return _where(ew("eq", v, 0.0), at_zero, rest + self.base.log_densities(v))
+        return _where(ew("eq", v, 0.0), at_zero, rest + self._of_base(v))
+
+    def _of_base(self, value: ExprArray) -> ExprArray:
+        """The law's own log density from 0 on; -inf at zeros that it does not have."""
+        from_zero = all(e.data == 0.0 for e in self.base.support().lower.ravel())
+        return array(self.base.log_densities(value) if from_zero else cut(self.base, value))
 
     def sample(self, draws):
         u = _each(self, lambda i: draws.uniform())

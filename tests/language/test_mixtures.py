@@ -239,6 +239,18 @@ def test_a_hurdle_is_inflation_of_a_law_without_zeros():
     assert at(later.log_density(X), [1.0]) == -math.inf
 
 
+def test_zeros_are_added_to_a_vector_of_laws_with_and_without():
+    lower, k = [0, 1, 2], np.arange(0.0, 5.0)
+    law = D.ZeroInflated(D.Truncated(D.Poisson(2.0), lower=lower), P)
+    for i, least in enumerate(lower):
+        mass = 0.7 * st.poisson.pmf(k, 2.0) / st.poisson.sf(least - 1, 2.0) * (k >= least)
+        mass[0] += 0.3
+        for own in (law, law.element((i,))):
+            found = own.log_densities(array([X] * 3 if own is law else X)).ravel()
+            density = evaluate(found[i if own is law else 0], {X: k, P: 0.3})
+            np.testing.assert_allclose(np.exp(density), mass, rtol=1e-10)
+
+
 def test_truncated_zero_inflated():
     law = D.Truncated(D.ZeroInflated(D.Poisson(3.0), 0.3), lower=0, upper=4)
     mass = 0.7 * st.poisson.pmf(np.arange(5), 3.0)
