@@ -74,16 +74,16 @@ def _begins_with_positive(a: Expr, op: str) -> bool:
     return _begins_with_number(a, op) and a.args[0].data > 0
 
 
-def _without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
+def without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
     """(b, e) with a = b exp(e), for products and quotients; no e where no factor is an exp."""
     if a.op == "exp":
         return constant(1.0), a.args[0]
     if a.op == "neg":
-        rest, exponent = _without_exponentials(a.args[0])
+        rest, exponent = without_exponentials(a.args[0])
         return (-rest, exponent) if exponent is not None else (a, None)
     if a.op not in ("mul", "div"):
         return a, None
-    (left, up), (right, down) = map(_without_exponentials, a.args)
+    (left, up), (right, down) = map(without_exponentials, a.args)
     if up is None and down is None:
         return a, None
     if down is not None and a.op == "div":
@@ -93,7 +93,7 @@ def _without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
 
 
 def _log_without_exponentials(a: Expr) -> Expr:
-    rest, exponent = _without_exponentials(a)
+    rest, exponent = without_exponentials(a)
     assert exponent is not None
     return apply("log", rest) + exponent
 
@@ -142,7 +142,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
     "log": (
         ("log(exp x) = x", lambda a: a.op == "exp", lambda a: a.args[0]),
         ("log(b exp(x)) = log b + x, also where exp(x) under- or overflows",
-         lambda a: _without_exponentials(a)[1] is not None, _log_without_exponentials),
+         lambda a: without_exponentials(a)[1] is not None, _log_without_exponentials),
         ("log(c x) = log c + log x, c > 0",
          lambda a: _begins_with_positive(a, "mul"),
          lambda a: math.log(a.args[0].data) + apply("log", a.args[1])),

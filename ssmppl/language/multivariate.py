@@ -209,6 +209,15 @@ class Dirichlet(_Joint):
             total = total + np.sum((a - 1.0) * ew("log", array(v))) - norm
         return array(total)
 
+    def guarded_log_densities(self, value):
+        """-inf also where a share is 0 whose concentration may be below 1: the formula has +inf."""
+        pairs = zip(self.concentration.ravel(), array(value).ravel(), strict=True)
+        steep = [v for a, v in pairs if not (a.op == "const" and a.data >= 1.0)]
+        density = self.log_densities(value)
+        if not steep:
+            return density
+        return array(ew("where", ew("lt", 0.0, np.min(array(steep))), density[()], -math.inf))
+
     def sample(self, draws):
         rows = [self._draw(a, draws) for a in self._rows()]
         return array(np.concatenate([r.view(np.ndarray) for r in rows]).reshape(self.shape))

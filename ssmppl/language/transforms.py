@@ -164,7 +164,7 @@ def _stick(z: list[Expr]) -> tuple[list[Expr], Expr]:
         tails = -apply("logaddexp", 0.0, at) - apply("logaddexp", 0.0, -at)
         log_jacobian = log_jacobian + tails + apply("log", left)
         values.append(left * share)
-        left = left - left * share
+        left = left * (1.0 / (1.0 + apply("exp", at)))  # 1 - share, however near 1 that is
     return [*values, left], log_jacobian
 
 
