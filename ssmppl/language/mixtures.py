@@ -1,7 +1,6 @@
 """Mixture: one of several laws by a hidden choice, which is summed out.
 
-McLachlan and Peel (2000), "Finite mixture models". The logarithm of the sum is taken from its
-larger term (`logaddexp`), so that no component is lost to underflow.
+McLachlan and Peel (2000), "Finite mixture models".
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import INFINITY, Distribution, Support
 from ssmppl.language.draws import Draws
 from ssmppl.language.nested import cut, exists, holding
-from ssmppl.language.shares import sum_holds, wrong_sum
+from ssmppl.language.shares import log_sum, sum_holds, wrong_sum
 
 
 class Mixture(Distribution):
@@ -133,11 +132,7 @@ class Mixture(Distribution):
         return out
 
     def log_densities(self, value):
-        total = None
-        for weight, part in zip(self.weights, self._parts(array(value)), strict=True):
-            term = array(ew("log", weight)) + part
-            total = term if total is None else array(ew("logaddexp", total, term))
-        return total
+        return log_sum(self.weights, self._parts(array(value)))
 
     def guarded_log_densities(self, value):
         density = super().guarded_log_densities(value)

@@ -107,7 +107,8 @@ class Truncated(Distribution):
         base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
         bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
         kept = {n: b for n, b in bounds.items() if not is_infinite(b)}
-        return self._at_place(Truncated(base, **kept))
+        # one law of several may have infinite bounds alone, which it is given as they are
+        return self._at_place(Truncated(base, **(kept or bounds)))
 
     def _refuse_empty(self) -> None:
         """Numbers that leave (nearly) nothing of the base."""
@@ -240,6 +241,8 @@ class Truncated(Distribution):
     def _moments(self) -> tuple[ExprArray, ExprArray]:
         """Mean and variance: in closed form, else by quadrature; infinite where they diverge."""
         lower, upper = self._bounds()
+        if all(self.base.open_sides(lower, upper)):
+            return self.base.mean(), self.base.variance()
         if isinstance(self.base, Normal):
             return normal_moments(self.base, lower, upper)
         if isinstance(self.base, HalfNormal):
