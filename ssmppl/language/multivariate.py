@@ -22,7 +22,7 @@ from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.draws import Draws
-from ssmppl.language.positive import log_gamma, log_gamma_draw, needs_log_gamma
+from ssmppl.language.positive import LEAST_SHARE, log_gamma, log_gamma_draw, needs_log_gamma
 
 
 class _Joint(Distribution):
@@ -229,7 +229,7 @@ class Dirichlet(_Joint):
             return array(g / np.sum(g))
         log_g = array([log_gamma_draw(draws, a) for a in concentration])
         g = array(ew("exp", log_g - np.max(log_g)))
-        return array(g / np.sum(g))
+        return array(ew("maximum", LEAST_SHARE, g / np.sum(g)))  # none was rounded to 0
 
     def mean(self):
         return array(self.concentration / np.sum(self.concentration, axis=-1, keepdims=True))

@@ -22,7 +22,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.inflated import ZeroInflated
 from ssmppl.language.mixtures import Mixture
-from ssmppl.language.positive import Exponential
+from ssmppl.language.positive import Beta, Exponential, within_unit
 from ssmppl.language.symmetric import HalfNormal, Laplace
 from ssmppl.language.truncated_moments import (
     exponential_moments,
@@ -45,7 +45,6 @@ class Truncated(Distribution):
     lower, upper : the bounds, one of them or both; of discrete distributions they are included.
     """
 
-    closed = True
     by_name = "bounds"
     base: Distribution
 
@@ -91,6 +90,8 @@ class Truncated(Distribution):
             self.parameters["lower"] = array(ew("ceil", self.lower))
             self.parameters["upper"] = array(ew("floor", self.upper))
         self.base, self.discrete = dist, dist.discrete
+        whole = dist.open_sides(self.lower, self.upper)  # where nothing is cut off
+        self.closed, self.open_above = dist.closed or not whole[0], dist.open_above and whole[1]
         for a, b in zip(self.lower.ravel(), self.upper.ravel(), strict=True):
             if a.op == b.op == "const" and not (
                 a.data < b.data or (dist.discrete and a.data == b.data)
@@ -229,7 +230,8 @@ class Truncated(Distribution):
             above = self.base.sample_above(draws, lower)
             if above is not None:
                 return above
-        return self.quantile(_each(self, lambda i: draws.uniform()))
+        drawn = self.quantile(_each(self, lambda i: draws.uniform()))
+        return array(within_unit(drawn)) if isinstance(self.base, Beta) else drawn
 
     # -- moments
     def mean(self):

@@ -214,6 +214,27 @@ def test_coordinates_are_one_to_one_with_their_jacobian():
     assert w.parameters(np.array([0.4, 0.0]))[1] == -np.inf
 
 
+def test_a_chain_goes_nowhere_that_the_prior_density_is_infinite():
+    """It would never leave: 1 - p is 0 from 37 on of the unconstrained scale."""
+
+    @ssm.distribution(lower=0, upper=1, closed=True)
+    def Steep(p):
+        return np.log(0.5) - 0.5 * np.log(1.0 - p)
+
+    model = ssm.Model("steep")
+    model.prior(lambda: {"p": Steep()})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, p: {"x": ssm.Normal(p * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    space = space_of(pose(model, {"y": np.array([0.3, 0.1])}), {}, {})
+    natural = coordinates(space, "natural", None)
+    for parameters, inside, end in ((space.parameters, 3.0, 40.0), (natural.parameters, 0.9, 1.0)):
+        assert np.isfinite(parameters(np.array([inside]))[1])
+        theta, log_density = parameters(np.array([end]))
+        assert theta == [1.0]
+        assert log_density == -np.inf
+
+
 def test_chart_gives_derivatives_of_the_change_of_scale():
     space = space_of(pose(chosen, {"y": np.array([0.3, 0.1])}), {}, {"a": 0.4, "q": 1.7})
     w = coordinates(space, "unconstrained", {"q": "reciprocal"})

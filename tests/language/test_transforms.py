@@ -101,3 +101,26 @@ def test_a_share_of_zero_has_no_infinite_density():
     for concentration, expected in [([2, 1, 0.5], -np.inf), ([2, 3, 1], np.log(60 * 0.4 * 0.36))]:
         density = ssm.Dirichlet(np.array(concentration, float)).log_density(p)
         assert float(evaluate(density, nothing)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "shares",
+    [
+        [0.5, 0.5, 1e-17, 1e-18],
+        [1.0 - 1e-16, 1e-17, 1e-300],
+        [1e-300, 1e-300, 1.0],
+        [0.7, 0.1, 0.1, 0.1],
+        [0.5, 0.0, 0.5],
+        [0.0, 0.0, 1.0],
+        [0.5, 0.5, 0.0],
+        [1.0, 0.0, 0.0],
+    ],
+)
+def test_shares_near_zero_there_and_back(shares):
+    """As far as the least number of full accuracy, which takes the place of zero."""
+    made = shares_of(ssm.Dirichlet(np.ones(len(shares))))
+    z = made.inverse(np.array(shares), {})
+    known = dict(zip(made.free, z, strict=True))
+    back = evaluate(array(list(made.values)), known)
+    least = np.maximum(shares, np.finfo(float).tiny)
+    np.testing.assert_allclose(back, least, rtol=1e-9, atol=0.0)

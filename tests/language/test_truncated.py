@@ -255,6 +255,25 @@ def test_a_mass_that_has_no_number_leaves_no_density():
         assert np.isnan(found) != known
 
 
+@pytest.mark.parametrize(
+    ("law", "at", "expected"),
+    [
+        (D.Beta(0.1, 0.1), 1.0, -np.inf),
+        (D.Truncated(D.Beta(0.1, 0.1), lower=0.5), 1.0, -np.inf),
+        (D.Truncated(D.Beta(0.1, 0.1), upper=0.5), 0.0, -np.inf),
+        (D.Truncated(D.Gamma(0.1, rate=1.0), upper=2.0), 0.0, -np.inf),
+        (D.Truncated(D.Beta(1.0, 1.0), lower=0.5), 0.5, math.log(2.0)),
+        (D.Truncated(D.Beta(1.0, 1.0), upper=0.5), 0.5, math.log(2.0)),
+        (D.Truncated(D.HalfNormal(sd=1.0), upper=9.0), 0.0, math.log(math.sqrt(2 / math.pi))),
+        (D.Mixture([0.5, 0.5], [D.Beta(0.1, 0.1), D.Beta(2.0, 0.5)]), 1.0, -np.inf),
+        (D.Mixture([0.5, 0.5], [D.Beta(0.1, 0.1), D.Uniform(0.0, 1.0)]), 1.0, math.log(0.5)),
+    ],
+)
+def test_an_end_that_the_law_does_not_have(law, at, expected):
+    """There a density may be +inf; an end that was cut belongs to what is left."""
+    assert float(evaluate(law.log_density(X), {X: at})) == pytest.approx(expected)
+
+
 COUNTS = {  # and the law from SciPy
     "poisson": (D.Poisson(2.0), st.poisson(2.0)),
     "negative binomial": (D.NegativeBinomial(2.0, dispersion=3.0), st.nbinom(3.0, 0.6)),

@@ -76,7 +76,7 @@ class Space:
         program = self.problem.program
         log_jacobian = program.entry("constrain")(z, self.free, theta)
         log_prior = program.entry("log_prior")(theta) + log_jacobian
-        if not np.all(np.isfinite(theta)) or np.isnan(log_prior):
+        if not np.all(np.isfinite(theta)) or not log_prior < np.inf:
             return theta, -np.inf
         return theta, float(log_prior)
 
