@@ -53,8 +53,7 @@ def _over(top: Expr, below: Expr, limit: float) -> Expr:
 
 
 def _beta_density(a: Expr, b: Expr, x: Expr) -> Expr:
-    norm = _f("gammaln", a) + _f("gammaln", b) - _f("gammaln", a + b)
-    return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - norm)
+    return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - _f("betaln", a, b))
 
 
 def _vonmises_density(k: Expr, x: Expr) -> Expr:
@@ -83,6 +82,12 @@ PARTIALS: dict[str, Partial] = {
     "abs": lambda d, a: [_f("sign", a)],
     "gammaln": lambda d, a: [_f("digamma", a)],
     "digamma": lambda d, a: [_f("trigamma", a)],
+    "gammaln_rise": lambda d, a, b: [_f("digamma_rise", a, b), _f("digamma", a + b)],
+    "digamma_rise": lambda d, a, b: [
+        _f("trigamma", a + b) - _f("trigamma", a),
+        _f("trigamma", a + b),
+    ],
+    "betaln": lambda d, a, b: [-_f("digamma_rise", a, b), -_f("digamma_rise", b, a)],
     "ndtr": lambda d, a: [_f("exp", -0.5 * a**2) / _ROOT_2PI],
     "log_ndtr": lambda d, a: [_f("exp", -0.5 * a**2 - d) / _ROOT_2PI],
     "ndtri": lambda d, a: [_ROOT_2PI * _f("exp", 0.5 * d**2)],

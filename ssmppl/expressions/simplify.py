@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.expressions import special
 from ssmppl.expressions.node import BOOLEAN, UNARY, Expr, as_expr, behaviour, constant
 
 
@@ -52,6 +53,7 @@ FOLD: dict[str, Callable[..., Any]] = {
     "mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod,
     "maximum": np.maximum, "minimum": np.minimum, "arctan2": np.arctan2,
     "logaddexp": np.logaddexp, "gammaln": _gammaln, "where": np.where,
+    "gammaln_rise": special.gammaln_rise, "betaln": special.betaln,
     "lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne,
     "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
 }  # fmt: skip

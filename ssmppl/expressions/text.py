@@ -85,6 +85,9 @@ def to_text(root: Expr, longest: int = LONGEST) -> str:
             done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
         elif node.op == "gammaln":
             done[node] = (f"gammaln({done[_bare(node.args[0])][0]})", 9)
+        elif node.op in ("gammaln_rise", "digamma_rise"):
+            name, (a, b) = node.op.removesuffix("_rise"), (p[0] for p in parts)
+            done[node] = (f"{name}({a} + {b}) - {name}({a})", 1)
         else:
             name = node.data[0] if node.op == "random" else node.op
             done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)

@@ -205,7 +205,8 @@ class Dirichlet(_Joint):
     def log_densities(self, value):
         total, rows = constant(0.0), array(value).reshape(-1, self.shape[-1]).view(np.ndarray)
         for a, v in zip(self._rows(), rows, strict=True):
-            norm = np.sum(log_gamma(a)) - ew("gammaln", np.sum(a))
+            # the beta functions of sticks that are broken off one by one
+            norm = np.sum([ew("betaln", a[k], np.sum(a[k + 1 :])) for k in range(len(a) - 1)])
             total = total + np.sum((a - 1.0) * ew("log", array(v))) - norm
         return array(total)
 

@@ -307,8 +307,7 @@ class Beta(Distribution):
 
     def log_densities(self, value):
         a, b, v = self.a, self.b, array(value)
-        norm = log_gamma(a) + log_gamma(b) - ew("gammaln", a + b)
-        return (a - 1.0) * ew("log", v) + (b - 1.0) * ew("log1p", -v) - norm
+        return (a - 1.0) * ew("log", v) + (b - 1.0) * ew("log1p", -v) - ew("betaln", a, b)
 
     def sample(self, draws):
         def draw(i):

@@ -74,7 +74,7 @@ def test_first_and_second_derivatives_of_each_operation(name):
         try:
             seconds = [differentiate([first], other)[0] for other in where]
         except NotDifferentiable:
-            assert name == "digamma"  # its derivative, trigamma, has none
+            assert name.startswith("digamma")  # their derivative, trigamma, has none
             continue
         assert len(seconds) == len(where)
         for other in where:
@@ -123,7 +123,8 @@ def test_ties_of_maximum_and_minimum():
 
 
 def _conditioned(names):
-    return [n for n in names if n not in ("ndtri", "tan", "arctanh", "arccosh", "digamma")]
+    ill = ("ndtri", "tan", "arctanh", "arccosh", "digamma", "digamma_rise")
+    return [n for n in names if n not in ill]
 
 
 @settings(max_examples=80, deadline=None)
