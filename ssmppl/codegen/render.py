@@ -29,6 +29,7 @@ CALLS = {
     "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "arcsinh": "arcsinh", "arccosh": "arccosh",
     "arctanh": "arctanh", "abs": "abs", "sign": "sign", "floor": "floor", "ceil": "ceil",
     "gammaln": "lgamma", "digamma": "digamma", "trigamma": "trigamma", "ndtr": "ndtr",
+    "gammaln_rise": "gammaln_rise", "digamma_rise": "digamma_rise", "betaln": "betaln",
     "log_ndtr": "log_ndtr", "ndtri": "ndtri", "erf": "erf", "erfc": "erfc",
     "i0e": "i0e", "i1e": "i1e", "vonmises_cdf": "vonmises_cdf",
     "vonmises_quantile": "vonmises_quantile", "betabinomial_cdf": "betabinomial_cdf",

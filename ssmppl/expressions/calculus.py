@@ -53,8 +53,7 @@ def _over(top: Expr, below: Expr, limit: float) -> Expr:
 
 
 def _beta_density(a: Expr, b: Expr, x: Expr) -> Expr:
-    norm = _f("gammaln", a) + _f("gammaln", b) - _f("gammaln", a + b)
-    return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - norm)
+    return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - _f("betaln", a, b))
 
 
 def _vonmises_density(k: Expr, x: Expr) -> Expr:
@@ -83,6 +82,12 @@ PARTIALS: dict[str, Partial] = {
     "abs": lambda d, a: [_f("sign", a)],
     "gammaln": lambda d, a: [_f("digamma", a)],
     "digamma": lambda d, a: [_f("trigamma", a)],
+    "gammaln_rise": lambda d, a, b: [_f("digamma_rise", a, b), _f("digamma", a + b)],
+    "digamma_rise": lambda d, a, b: [
+        _f("trigamma", a + b) - _f("trigamma", a),
+        _f("trigamma", a + b),
+    ],
+    "betaln": lambda d, a, b: [-_f("digamma_rise", a, b), -_f("digamma_rise", b, a)],
     "ndtr": lambda d, a: [_f("exp", -0.5 * a**2) / _ROOT_2PI],
     "log_ndtr": lambda d, a: [_f("exp", -0.5 * a**2 - d) / _ROOT_2PI],
     "ndtri": lambda d, a: [_ROOT_2PI * _f("exp", 0.5 * d**2)],
@@ -232,6 +237,9 @@ def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, 
         zeros = [node.args[0]]  # 0 ** b is 0 for every b above 0
     elif op == "sqrt" or (op == "pow" and not _at_least_one(node.args[1])):
         zeros = _fixed_factors(argument, tangent)
+    elif op == "exp" and _divides(value):
+        # exp(-k / u) at u = 0 is 0 sooner than the slope of k / u is infinite
+        slope = slope.only(apply("ne", node, 0.0))
     for zero in zeros:
         if not _never_zero(zero):
             slope = slope.only(apply("ne", zero, 0.0))
@@ -267,6 +275,15 @@ def _fixed_factors(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
     if node.op == "mul":
         return [f for a in node.args for f in _fixed_factors(a, tangent)]
     return _fixed_factors(node.args[0], tangent) if node.op in ("neg", "div") else []
+
+
+def _divides(node: Expr) -> bool:
+    """Whether it has a denominator that is no number."""
+    return any(
+        (n.op == "div" and n.args[1].op != "const")
+        or (n.op == "pow" and n.args[1].op == "const" and n.args[1].data < 0.0)
+        for n in topological([node])
+    )
 
 
 def _never_zero(node: Expr) -> bool:

@@ -21,7 +21,8 @@ _NUMPY = """exp log log1p expm1 sqrt sin cos tan sinh cosh tanh arcsin arccos ar
     arctanh abs sign floor ceil maximum minimum arctan2 logaddexp"""
 _SCIPY = """gammaln digamma ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
     betainc betaincinv i0e i1e"""
-_OWN = "betabinomial_cdf betabinomial_quantile vonmises_cdf vonmises_quantile"
+_OWN = """gammaln_rise digamma_rise betaln betabinomial_cdf betabinomial_quantile vonmises_cdf
+    vonmises_quantile"""
 MEANING: dict[str, Callable[..., Any]] = {
     **{n: getattr(np, n) for n in UNARY + BINARY if n in _NUMPY.split()},
     **{n: getattr(sp, n) for n in UNARY + BINARY + TERNARY if n in _SCIPY.split()},

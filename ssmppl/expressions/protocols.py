@@ -73,8 +73,8 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "conjugate": lambda a: a,
 }
 _DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "where")} | {
-    "add", "maximum", "minimum", "arctan2", "logaddexp", "gammainc", "gammaincc", "gammaincinv",
-    "gammainccinv",
+    "add", "maximum", "minimum", "arctan2", "logaddexp", "betaln", "gammainc", "gammaincc",
+    "gammaincinv", "gammainccinv",
 }  # fmt: skip
 
 # What a user can call, by a ufunc of NumPy's or of scipy.special's.

@@ -13,7 +13,7 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.language.continuous import _each, _where
 from ssmppl.language.distribution import INFINITY, Distribution, Support
-from ssmppl.language.positive import Beta, log_gamma
+from ssmppl.language.positive import Beta
 
 
 def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
@@ -116,7 +116,7 @@ class NegativeBinomial(_Counts):
 
     def log_densities(self, value):
         v, m, r = array(value), self.mean_, self.dispersion
-        choose = ew("gammaln", v + r) - log_gamma(r) - ew("gammaln", v + 1.0)
+        choose = array(ew("gammaln_rise", r, v)) - ew("gammaln", v + 1.0)
         return choose - r * ew("log1p", m / r) + _times_log(v, m / (r + m))
 
     def sample(self, draws):
@@ -274,9 +274,8 @@ class BetaBinomial(_OutOf):
 
     def log_densities(self, value):
         v, n, a, b = array(value), self.n, self.a, self.b
-        above = ew("gammaln", v + a) + array(ew("gammaln", n - v + b)) - ew("gammaln", n + a + b)
-        below = log_gamma(a) + log_gamma(b) - ew("gammaln", a + b)
-        return self._log_choose(v) + above - below
+        successes, failures = array(ew("gammaln_rise", a, v)), ew("gammaln_rise", b, n - v)
+        return self._log_choose(v) + successes + failures - ew("gammaln_rise", a + b, n)
 
     def sample(self, draws):
         p = Beta(self.a, self.b).sample(draws)

@@ -60,7 +60,7 @@ class StudentT(_Symmetric):
 
     def log_densities(self, value):
         z, nu = (array(value) - self.loc) / self.scale, self.df
-        norm = ew("gammaln", 0.5 * (nu + 1.0)) - ew("gammaln", 0.5 * nu)
+        norm = ew("gammaln_rise", 0.5 * nu, 0.5)
         spread = 0.5 * ew("log", nu * math.pi) + ew("log", self.scale)
         return norm - spread - 0.5 * (nu + 1.0) * ew("log1p", z**2 / nu)
 

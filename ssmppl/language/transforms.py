@@ -17,6 +17,7 @@ import numpy as np
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
+from ssmppl.language.positive import LEAST_SHARE
 from ssmppl.language.trace import Site, Trace
 
 ZERO = constant(0.0)
@@ -164,17 +165,16 @@ def _stick(z: list[Expr]) -> tuple[list[Expr], Expr]:
         tails = -apply("logaddexp", 0.0, at) - apply("logaddexp", 0.0, -at)
         log_jacobian = log_jacobian + tails + apply("log", left)
         values.append(left * share)
-        left = left - left * share
+        left = left * (1.0 / (1.0 + apply("exp", at)))  # 1 - share, however near 1 that is
     return [*values, left], log_jacobian
 
 
 def _unstick(value: np.ndarray) -> np.ndarray:
-    left, out = 1.0, []
-    for i, p in enumerate(value[:-1]):
-        share = p / left
-        out.append(math.log(share) - math.log1p(-share) + math.log(len(value) - i - 1.0))
-        left -= p
-    return np.array(out)
+    # a search that ran towards an edge ends on a share of zero by rounding
+    shares = np.maximum(value, LEAST_SHARE)
+    left = np.cumsum(shares[::-1])[::-1]  # of each share and those that follow
+    many = np.arange(len(value) - 1.0, 0.0, -1.0)
+    return np.log(shares[:-1]) - np.log(left[1:]) + np.log(many)
 
 
 def _lower(p: int) -> list[tuple[int, int]]:

@@ -74,7 +74,7 @@ def test_first_and_second_derivatives_of_each_operation(name):
         try:
             seconds = [differentiate([first], other)[0] for other in where]
         except NotDifferentiable:
-            assert name == "digamma"  # its derivative, trigamma, has none
+            assert name.startswith("digamma")  # their derivative, trigamma, has none
             continue
         assert len(seconds) == len(where)
         for other in where:
@@ -123,7 +123,8 @@ def test_ties_of_maximum_and_minimum():
 
 
 def _conditioned(names):
-    return [n for n in names if n not in ("ndtri", "tan", "arctanh", "arccosh", "digamma")]
+    ill = ("ndtri", "tan", "arctanh", "arccosh", "digamma", "digamma_rise")
+    return [n for n in names if n not in ill]
 
 
 @settings(max_examples=80, deadline=None)
@@ -308,6 +309,17 @@ def test_slopes_where_a_factor_under_a_root_is_zero():
     assert evaluate(square, {X: 0.0, Y: 3.0}) == 0.0
     (shifted,) = differentiate([(np.exp(X) - 1.0) ** 2], X)
     assert evaluate(shifted, {X: 0.0}) == 0.0
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-160, 0.3, -0.3])
+def test_slopes_of_exponentials_of_quotients(value):
+    """exp(-a / u**2) is 0 at u = 0, and so are its slopes in both."""
+    node = np.exp(-X / Y**2)
+    with np.errstate(all="ignore"):
+        found = evaluate(differentiate([node], X) + differentiate([node], Y), {X: 1.5, Y: value})
+    there = np.exp(-1.5 / value**2) if abs(value) > 0.1 else 0.0
+    wanted = [-there / value**2, 3.0 * there / value**3] if there else [0.0, 0.0]
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
 
 
 def test_ties_of_a_maximum_take_one_slope_only():

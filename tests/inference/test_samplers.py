@@ -16,7 +16,7 @@ import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import chart, coordinates
 from ssmppl.inference.chains.curvature import fitted_covariance
 from ssmppl.inference.chains.smc2 import _factor
-from ssmppl.inference.particles.pilot import find_mode, space_of
+from ssmppl.inference.particles.pilot import find_mode, scale_of, space_of
 from ssmppl.inference.problem import pose
 from tests.statistics.checks import some
 
@@ -214,6 +214,27 @@ def test_coordinates_are_one_to_one_with_their_jacobian():
     assert w.parameters(np.array([0.4, 0.0]))[1] == -np.inf
 
 
+def test_a_chain_goes_nowhere_that_the_prior_density_is_infinite():
+    """It would never leave: 1 - p is 0 from 37 on of the unconstrained scale."""
+
+    @ssm.distribution(lower=0, upper=1, closed=True)
+    def Steep(p):
+        return np.log(0.5) - 0.5 * np.log(1.0 - p)
+
+    model = ssm.Model("steep")
+    model.prior(lambda: {"p": Steep()})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, p: {"x": ssm.Normal(p * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    space = space_of(pose(model, {"y": np.array([0.3, 0.1])}), {}, {})
+    natural = coordinates(space, "natural", None)
+    for parameters, inside, end in ((space.parameters, 3.0, 40.0), (natural.parameters, 0.9, 1.0)):
+        assert np.isfinite(parameters(np.array([inside]))[1])
+        theta, log_density = parameters(np.array([end]))
+        assert theta == [1.0]
+        assert log_density == -np.inf
+
+
 def test_chart_gives_derivatives_of_the_change_of_scale():
     space = space_of(pose(chosen, {"y": np.array([0.3, 0.1])}), {}, {"a": 0.4, "q": 1.7})
     w = coordinates(space, "unconstrained", {"q": "reciprocal"})
@@ -252,6 +273,11 @@ def test_the_pilot_finds_the_same_mode_and_scale_in_any_unit(c):
     (here, scale), (expected, known) = pilot(c), pilot(1.0)
     assert np.all(np.abs(here - expected) < 0.5 * known * [1.0, expected[1]])
     np.testing.assert_allclose(scale, known, rtol=0.4)
+
+
+def test_scales_at_an_edge_are_those_of_the_side_that_there_is():
+    found = scale_of(np.zeros(1), lambda z: -3.0 * z[0] if z[0] >= 0.0 else -np.inf)
+    assert 0.5 < found[0] < 1.0  # log p falls by 8 over 8 / 3
 
 
 def test_the_factor_of_particles_has_their_unit():

@@ -50,6 +50,27 @@ CASES = [
 ]
 
 
+START = np.concatenate([10 ** RNG.uniform(-3, 17, 2 * N), RNG.uniform(8, 30, N)])
+RISE = 10 ** RNG.uniform(-3, 8, START.size)
+DIFFERENCES = {
+    "gammaln_rise": lambda a, b: mp.loggamma(a + b) - mp.loggamma(a),
+    "digamma_rise": lambda a, b: mp.psi(0, a + b) - mp.psi(0, a),
+    "betaln": lambda a, b: mp.log(mp.beta(a, b)),
+}
+
+
+@pytest.mark.parametrize("home", [special, interpreted])
+@pytest.mark.parametrize("name", sorted(DIFFERENCES))
+def test_differences_of_gamma_functions(name, home):
+    """Errors are of the differences' size, also where both functions are 1e18."""
+    with mp.workdps(60):
+        for a, b in zip(START.tolist(), RISE.tolist(), strict=True):
+            expected = float(DIFFERENCES[name](mp.mpf(a), mp.mpf(b)))
+            small = 2e-14 if a < 30 else 1e-13 * abs(expected)
+            found = float(getattr(home, name)(a, b))
+            assert found == pytest.approx(expected, rel=2e-14, abs=small), (a, b)
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c[0].__name__)
 def test_accuracy(case):
     function, reference, arguments, rtol, atol = case
@@ -133,6 +154,10 @@ def test_limits():
     assert laws.vonmises_cdf(2.0, np.pi) == 1.0
     assert laws.vonmises_quantile(2.0, 1.0) == pytest.approx(np.pi)
     assert special.lgamma(0.0) == np.inf
+    for home in (special, interpreted):
+        assert home.gammaln_rise(3.0, 0.0) == home.digamma_rise(30.0, 0.0) == 0.0
+        assert home.gammaln_rise(0.0, 2.0) == -np.inf
+        assert home.betaln(0.0, 2.0) == home.betaln(2.0, 0.0) == np.inf
     assert special.lgamma(-3.0) == np.inf
     assert special.ndtri(0.0) == -np.inf
     assert special.ndtri(1.0) == np.inf
@@ -152,6 +177,9 @@ def test_outside_the_domain_is_nan():
         special.lgamma(np.nan),
         special.digamma(-1.0),
         special.trigamma(0.0),
+        *(f(-0.5, 2.0) for f in (special.gammaln_rise, special.digamma_rise, special.betaln)),
+        *(f(0.5, -2.0) for f in (special.gammaln_rise, special.digamma_rise, special.betaln)),
+        *(f(-0.5, 2.0) for f in (interpreted.gammaln_rise, interpreted.betaln)),
         special.ndtri(-0.1),
         special.ndtri(np.nan),
         incomplete.gammainc(-1.0, 1.0),

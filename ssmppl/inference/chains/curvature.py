@@ -32,7 +32,7 @@ def fitted_covariance(
         values, vectors = np.linalg.eigh(information)
         root = vectors / np.sqrt(np.clip(values, LEAST, MOST**2))
         # its Cholesky factor but for signs; the product itself need not be positive by rounding
-        factor = np.linalg.qr((factor @ root).T, mode="r").T
+        factor = np.linalg.qr((factor @ root).T)[1].T
     return factor @ factor.T
 
 

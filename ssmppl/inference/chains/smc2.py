@@ -272,7 +272,9 @@ def _factor(z: np.ndarray, w: np.ndarray) -> np.ndarray:
     off = z - w @ z
     covariance = (w[:, None] * off).T @ off
     variance = np.diagonal(covariance)  # of parameters in any unit, so that no size is small
-    return np.linalg.cholesky(covariance + np.diag(np.where(variance > 0.0, 1e-8 * variance, 1e-12)))
+    return np.linalg.cholesky(
+        covariance + np.diag(np.where(variance > 0.0, 1e-8 * variance, 1e-12))
+    )
 
 
 @dataclass(frozen=True)
