@@ -183,7 +183,7 @@ class Writer:
 def is_small_power(node: Expr) -> bool:
     """Whether a power is written as a product."""
     e = node.args[1]
-    return e.op == "const" and e.data == int(e.data) and 1 <= abs(e.data) <= 4
+    return e.op == "const" and e.data.is_integer() and 1 <= abs(e.data) <= 4
 
 
 def _must_be_named(node: Expr) -> bool:

@@ -171,10 +171,10 @@ class Expr:
         return _binary("mod", other, self)
 
     def __floordiv__(self, other):
-        return _apply("floor", self / other)
+        return self.__array_ufunc__(np.floor_divide, "__call__", self, other)
 
     def __rfloordiv__(self, other):
-        return _apply("floor", other / self)
+        return self.__array_ufunc__(np.floor_divide, "__call__", other, self)
 
     def __neg__(self):
         return _apply("neg", self)
