@@ -95,9 +95,11 @@ PARTIALS: dict[str, Partial] = {
     "gammaincinv": lambda d, a, p: [None, 1.0 / _gamma_density(a, d)],
     "gammainccinv": lambda d, a, p: [None, -1.0 / _gamma_density(a, d)],
     "betainc": lambda d, a, b, x: [None, None, _beta_density(a, b, x)],
+    "betaincc": lambda d, a, b, x: [None, None, -_beta_density(a, b, x)],
     "vonmises_cdf": lambda d, k, x: [None, _vonmises_density(k, x)],
     "vonmises_quantile": lambda d, k, p: [None, 1.0 / _vonmises_density(k, d)],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
+    "betainccinv": lambda d, a, b, p: [None, None, -1.0 / _beta_density(a, b, d)],
 }
 # Piecewise constant: derivative zero wherever there is one.
 FLAT = BOOLEAN | {"sign", "floor", "ceil"}
