@@ -96,6 +96,26 @@ def test_beta_integrals_with_one_large_shape(small, large):
             assert found == pytest.approx(x, rel=1e-9, abs=0)
 
 
+@pytest.mark.parametrize("a", [1.01e8, 1e9, 1e11, 1e13, 1e15])
+def test_gamma_integrals_of_large_shapes(a):
+    """SciPy's, of which the far tails are wrong; there the continued fraction's."""
+    for z in (6.0, 30.0):
+        x = a + z * np.sqrt(a)
+        tail = special.poisson_density(a, x) * a * incomplete._gamma_fraction(a, x)
+        assert incomplete.gammaincc(a, x) == pytest.approx(tail, rel=1e-11, abs=0.0)
+    near = scipy_special.ndtr(-30.0) * np.exp(-9000.0 / np.sqrt(a))
+    assert incomplete.gammainc(a, a - 30 * np.sqrt(a)) == pytest.approx(near, rel=0.15, abs=0.0)
+    for z in (-1.0, 0.0, 1.0):
+        x = a + z * np.sqrt(a)
+        for name in ("gammainc", "gammaincc"):
+            found, expected = (getattr(m, name)(a, x) for m in (incomplete, scipy_special))
+            assert found == pytest.approx(expected, rel=2e-11, abs=0.0), (name, z)
+    assert incomplete.gammainc(a, a) == pytest.approx(0.5 + 1 / np.sqrt(18 * np.pi * a), rel=1e-14)
+    assert incomplete.gammaincinv(a, 0.25) == pytest.approx(
+        scipy_special.gammaincinv(a, 0.25), rel=2e-13
+    )
+
+
 def test_gamma_quantile():
     for a, p in zip(SHAPE, RNG.uniform(0, 1, SHAPE.size), strict=True):
         x = incomplete.gammaincinv(a, p)

@@ -25,7 +25,7 @@ from ssmppl.codegen.kernels.special import (
 _INF = np.inf
 _EPS = 2.220446049250313e-16
 _TINY = 1e-300
-_STEPS = 1_000_000  # of a series or fraction; about sqrt(max(a, b)) of them are needed
+_STEPS = 1_000_000  # of a series or fraction; some 8 sqrt(max(a, b)) of them are needed
 
 
 @exact
@@ -90,6 +90,24 @@ def _gamma_small(a, x):
 
 
 @exact
+def _gamma_uniform(a, x):
+    """`gamma_tails` for large a: N. M. Temme's uniform expansion, *SIAM J. Math. Anal.* 10 (1979),
+    whose second term is below rounding from a = 1e8 on.
+
+    With a eta^2 / 2 = x - a - a log(x/a): Q = erfc(eta sqrt(a/2)) / 2 + R.
+    """
+    deviance = deviance_part(a, x)
+    eta = math.copysign(math.sqrt(2.0 * deviance / a), x - a)
+    if abs(eta) < 1e-3:
+        first = -1.0 / 3.0 + eta * (1.0 / 12.0 - eta * (2.0 / 135.0 - eta / 864.0))
+    else:
+        first = a / (x - a) - 1.0 / eta
+    rest = first * exp(-deviance) / math.sqrt(2.0 * np.pi * a)
+    root = math.copysign(math.sqrt(deviance), eta)
+    return 0.5 * math.erfc(-root) - rest, 0.5 * math.erfc(root) + rest
+
+
+@exact
 def gamma_tails(a, x):
     """(P, Q): lower and upper regularised incomplete gamma function, each to full accuracy."""
     if not (a > 0.0 and x >= 0.0) or (a == _INF and x == _INF):
@@ -103,6 +121,8 @@ def gamma_tails(a, x):
         # e^t (1 + s) directly, in case it is the small one.
         lower = exp(a * log(x) - x - lgamma(a + 1.0)) * _gamma_series(a, x)
         return lower, upper
+    if a > 1e8:
+        return _gamma_uniform(a, x)
     factor = poisson_density(a, x)
     if x < a + 1.0:
         lower = factor * _gamma_series(a, x)
