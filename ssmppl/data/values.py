@@ -15,7 +15,7 @@ import numpy as np
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distribution import Support
-from ssmppl.language.distributions import Beta, Distribution, Mixture, Truncated
+from ssmppl.language.distributions import Distribution, Truncated
 
 Values = Mapping[Expr, np.ndarray]
 
@@ -188,8 +188,8 @@ def outside(
     closed = support.kind == "integers" or distribution.closed
     with np.errstate(invalid="ignore"):
         bad = (values < lower) | (values > upper)
-        if not closed:
-            bad |= (values == lower) | ((values == upper) & _open_above(distribution))
+        bad |= (values == lower) & (not closed)
+        bad |= (values == upper) & distribution.open_above
         if support.kind == "integers":
             bad |= np.isfinite(values) & (values != np.floor(values))
     if not bad.any():
@@ -201,7 +201,7 @@ def outside(
             f" to {number(high)}" if math.isfinite(high) else ""
         )
     else:
-        left, right = "[" if closed else "(", "]" if closed else ")"
+        left, right = "[" if closed else "(", ")" if distribution.open_above else "]"
         left, right = left if math.isfinite(low) else "(", right if math.isfinite(high) else ")"
         bounds = f"{left}{number(low)}, {number(high)}{right}"
     return Fault(
@@ -209,14 +209,6 @@ def outside(
         f"{number(values[index])} is outside the support of {name_of(distribution)}, {bounds}",
         f"a value in {bounds}" if support.kind == "interval" else f"one of {bounds}",
     )
-
-
-def _open_above(distribution: Distribution) -> bool:
-    """Whether an upper bound that is a number has no density: of Beta, alone or in a mixture, and
-    of a law that says so."""
-    if isinstance(distribution, Mixture):
-        return any(map(_open_above, distribution.components))
-    return distribution.open_above or isinstance(distribution, Beta)
 
 
 def name_of(distribution: Distribution) -> str:

@@ -204,9 +204,13 @@ class Expr:
         return _binary("le", other, self)
 
     def __eq__(self, other):
+        if isinstance(other, list | tuple):  # else Python would compare what they are
+            return self == np.asarray(other)
         return _binary("eq", self, other)
 
     def __ne__(self, other):
+        if isinstance(other, list | tuple):
+            return self != np.asarray(other)
         return _binary("ne", self, other)
 
     def __and__(self, other):

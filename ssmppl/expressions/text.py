@@ -69,7 +69,8 @@ def to_text(root: Expr, longest: int = LONGEST) -> str:
         elif node.op in _INFIX:
             sign, level = _INFIX[node.op]
             (a, la), (b, lb) = parts
-            left = f"({a})" if la < level or (node.op == "pow" and la == level) else a
+            chained = node.op == "pow" or level == 0  # in Python a < b == c is another thing
+            left = f"({a})" if la < level or (chained and la == level) else a
             tight = sign not in "+*" or node.args[1].op == "mod"
             right = f"({b})" if lb < level or (lb == level and tight) else b
             done[node] = (f"{left}{sign}{right}" if level > 1 else f"{left} {sign} {right}", level)

@@ -69,7 +69,8 @@ def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> F
             (exact.observation_mean, exact.observation_covariance),
         )
     ]
-    below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
+    with np.errstate(divide="ignore", invalid="ignore"):  # predicted exactly, or not seen
+        below = ndtr((e.y - exact.observation_mean) / np.sqrt(variance))
     prediction = np.stack([exact.observation_mean, variance, below, below], axis=1)
     return FilterRun(
         exact.log_increments, np.full(e.steps, np.nan), exact.mean, exact.covariance,

@@ -22,7 +22,7 @@ from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.draws import Draws
-from ssmppl.language.positive import log_gamma, log_gamma_draw, needs_log_gamma
+from ssmppl.language.positive import LEAST_SHARE, log_gamma, log_gamma_draw, needs_log_gamma
 
 
 class _Joint(Distribution):
@@ -61,6 +61,14 @@ class _Joint(Distribution):
                     where=self.location,
                 )
         return m
+
+    def _where_definite(self, m: ExprArray, density: ExprArray) -> ExprArray:
+        """A density in which the matrix m stands, and -inf where m is not positive definite: its
+        determinant may be positive all the same."""
+        if _surely_positive(m):
+            return density
+        last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
+        return array(ew("where", ew("lt", 0.0, last), density[()], -math.inf))
 
 
 class MvNormal(_Joint):
@@ -126,10 +134,7 @@ class MvNormal(_Joint):
 
     def guarded_log_densities(self, value):
         density, m = self.log_densities(value), self.parameters[self.spread]
-        if self.spread == "cholesky" or _surely_positive(m):
-            return density
-        last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
-        return array(ew("where", ew("lt", 0.0, last), density[()], -math.inf))
+        return density if self.spread == "cholesky" else self._where_definite(m, density)
 
     def factor(self) -> ExprArray:
         """A matrix L, (d, d), with L L' = covariance."""
@@ -205,6 +210,15 @@ class Dirichlet(_Joint):
             total = total + np.sum((a - 1.0) * ew("log", array(v))) - norm
         return array(total)
 
+    def guarded_log_densities(self, value):
+        """-inf also where a share is 0 whose concentration may be below 1: the formula has +inf."""
+        pairs = zip(self.concentration.ravel(), array(value).ravel(), strict=True)
+        steep = [v for a, v in pairs if not (a.op == "const" and a.data >= 1.0)]
+        density = self.log_densities(value)
+        if not steep:
+            return density
+        return array(ew("where", ew("lt", 0.0, np.min(array(steep))), density[()], -math.inf))
+
     def sample(self, draws):
         rows = [self._draw(a, draws) for a in self._rows()]
         return array(np.concatenate([r.view(np.ndarray) for r in rows]).reshape(self.shape))
@@ -216,7 +230,7 @@ class Dirichlet(_Joint):
             return array(g / np.sum(g))
         log_g = array([log_gamma_draw(draws, a) for a in concentration])
         g = array(ew("exp", log_g - np.max(log_g)))
-        return array(g / np.sum(g))
+        return array(ew("maximum", LEAST_SHARE, g / np.sum(g)))  # none was rounded to 0
 
     def mean(self):
         return array(self.concentration / np.sum(self.concentration, axis=-1, keepdims=True))
@@ -249,6 +263,9 @@ class _WishartFamily(_Joint):
 
     def support(self):
         return Support("positive definite", self._full(-math.inf), self._full(math.inf))
+
+    def guarded_log_densities(self, value):
+        return self._where_definite(self.scale, super().guarded_log_densities(value))
 
     def _bartlett(self, draws: Draws) -> ExprArray:
         """A with A A' ~ Wishart(df, identity)."""

@@ -21,6 +21,8 @@ from ssmppl.language.distribution import INFINITY, Distribution, Draws, Support
 from ssmppl.language.symmetric import cut_exponential
 
 SMALL_SHAPE = 0.1  # below it, gamma draws may be too small for floating point
+LEAST_SHARE = float(np.finfo(float).tiny)  # whose logarithm still has an exponential
+BELOW_ONE = math.nextafter(1.0, 0.0)
 
 
 class _Positive(Distribution):
@@ -280,6 +282,11 @@ def log_gamma_draw(draws: Draws, shape: Expr) -> Expr:
     return apply("log", draws.gamma(shape + 1.0)) + apply("log", draws.uniform()) / shape
 
 
+def within_unit(share: Any) -> Any:
+    """A drawn share that was rounded to 0 or 1, where there is no density, next to it."""
+    return ew("minimum", BELOW_ONE, ew("maximum", LEAST_SHARE, share))
+
+
 class Beta(Distribution):
     """Beta(a, b), on (0, 1): mean a / (a + b).
 
@@ -287,6 +294,8 @@ class Beta(Distribution):
     ----------
     a, b : positive; the larger a + b, the narrower.
     """
+
+    open_above = True
 
     def __init__(self, a: Any, b: Any):
         self._set(a=a, b=b)
@@ -304,9 +313,10 @@ class Beta(Distribution):
         def draw(i):
             a, b = self.a[i], self.b[i]
             if needs_log_gamma(array([a, b])):
-                return 1.0 / (1.0 + ew("exp", log_gamma_draw(draws, b) - log_gamma_draw(draws, a)))
+                log_odds = log_gamma_draw(draws, b) - log_gamma_draw(draws, a)  # of 1 - x
+                return within_unit(1.0 / (1.0 + ew("exp", log_odds)))
             first, second = draws.gamma(a), draws.gamma(b)
-            return first / (first + second)
+            return within_unit(first / (first + second))
 
         return _each(self, draw)
 

@@ -17,6 +17,7 @@ import numpy as np
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
+from ssmppl.language.positive import LEAST_SHARE
 from ssmppl.language.trace import Site, Trace
 
 ZERO = constant(0.0)
@@ -36,6 +37,15 @@ class Transform:
     components: tuple[Expr, ...]
     values: tuple[Expr, ...]
     log_jacobian: Expr
+
+    @property
+    def on_the_line(self) -> tuple[bool, ...]:
+        """For each free number whether it has the parameter's own unit and may be any number."""
+        if self.site.distribution.support().kind == "positive definite":
+            return tuple(i != j for i, j in _lower(self.site.shape[0]))
+        if len(self.free) != len(self.values):
+            return (False,) * len(self.free)
+        return tuple(z is value for z, value in zip(self.free, self.values, strict=True))
 
     def inverse(self, value: np.ndarray, known: dict[Expr, float]) -> np.ndarray:
         """The unconstrained numbers of a value (the site's shape), numerically."""
@@ -155,17 +165,16 @@ def _stick(z: list[Expr]) -> tuple[list[Expr], Expr]:
         tails = -apply("logaddexp", 0.0, at) - apply("logaddexp", 0.0, -at)
         log_jacobian = log_jacobian + tails + apply("log", left)
         values.append(left * share)
-        left = left - left * share
+        left = left * (1.0 / (1.0 + apply("exp", at)))  # 1 - share, however near 1 that is
     return [*values, left], log_jacobian
 
 
 def _unstick(value: np.ndarray) -> np.ndarray:
-    left, out = 1.0, []
-    for i, p in enumerate(value[:-1]):
-        share = p / left
-        out.append(math.log(share) - math.log1p(-share) + math.log(len(value) - i - 1.0))
-        left -= p
-    return np.array(out)
+    # a search that ran towards an edge ends on a share of zero by rounding
+    shares = np.maximum(value, LEAST_SHARE)
+    left = np.cumsum(shares[::-1])[::-1]  # of each share and those that follow
+    many = np.arange(len(value) - 1.0, 0.0, -1.0)
+    return np.log(shares[:-1]) - np.log(left[1:]) + np.log(many)
 
 
 def _lower(p: int) -> list[tuple[int, int]]:

@@ -22,7 +22,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.inflated import ZeroInflated
 from ssmppl.language.mixtures import Mixture
-from ssmppl.language.positive import Exponential
+from ssmppl.language.positive import Beta, Exponential, within_unit
 from ssmppl.language.symmetric import HalfNormal, Laplace
 from ssmppl.language.truncated_moments import (
     exponential_moments,
@@ -45,7 +45,6 @@ class Truncated(Distribution):
     lower, upper : the bounds, one of them or both; of discrete distributions they are included.
     """
 
-    closed = True
     by_name = "bounds"
     base: Distribution
 
@@ -91,6 +90,8 @@ class Truncated(Distribution):
             self.parameters["lower"] = array(ew("ceil", self.lower))
             self.parameters["upper"] = array(ew("floor", self.upper))
         self.base, self.discrete = dist, dist.discrete
+        whole = dist.open_sides(self.lower, self.upper)  # where nothing is cut off
+        self.closed, self.open_above = dist.closed or not whole[0], dist.open_above and whole[1]
         for a, b in zip(self.lower.ravel(), self.upper.ravel(), strict=True):
             if a.op == b.op == "const" and not (
                 a.data < b.data or (dist.discrete and a.data == b.data)
@@ -107,7 +108,8 @@ class Truncated(Distribution):
         base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
         bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
         kept = {n: b for n, b in bounds.items() if not is_infinite(b)}
-        return self._at_place(Truncated(base, **kept))
+        # one law of several may have infinite bounds alone, which it is given as they are
+        return self._at_place(Truncated(base, **(kept or bounds)))
 
     def _refuse_empty(self) -> None:
         """Numbers that leave (nearly) nothing of the base."""
@@ -228,7 +230,8 @@ class Truncated(Distribution):
             above = self.base.sample_above(draws, lower)
             if above is not None:
                 return above
-        return self.quantile(_each(self, lambda i: draws.uniform()))
+        drawn = self.quantile(_each(self, lambda i: draws.uniform()))
+        return array(within_unit(drawn)) if isinstance(self.base, Beta) else drawn
 
     # -- moments
     def mean(self):
@@ -240,6 +243,8 @@ class Truncated(Distribution):
     def _moments(self) -> tuple[ExprArray, ExprArray]:
         """Mean and variance: in closed form, else by quadrature; infinite where they diverge."""
         lower, upper = self._bounds()
+        if all(self.base.open_sides(lower, upper)):
+            return self.base.mean(), self.base.variance()
         if isinstance(self.base, Normal):
             return normal_moments(self.base, lower, upper)
         if isinstance(self.base, HalfNormal):

@@ -6,7 +6,9 @@ import sys
 
 import numpy as np
 import pytest
+from scipy import stats
 
+import ssmppl as ssm
 import ssmppl.language.distributions as D
 from ssmppl import datasets
 from ssmppl.analysis.structure import linear_gaussian
@@ -210,3 +212,17 @@ def test_compiled_once_for_all_processes(tmp_path):
             env={**os.environ, "SSMPPL_CACHE": str(tmp_path)},
         )  # fmt: skip
         assert run.stdout.split() == expected.split()
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_predicted_exactly_and_not_seen_has_no_rank():
+    """Without a warning of NumPy's for 0 / 0."""
+    model = ssm.Model("read exactly", inputs=("r",))
+    model.initial(lambda: {"x": ssm.Dirac(0.0)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(lambda x, r: {"y": ssm.Normal(x, sd=r)})
+    y, r = np.array([np.nan, 1.0, np.nan, 2.0]), np.array([0.0, 0.0, 0.0, 1.0])
+    found = ssm.kalman_filter(model, {"y": y, "r": r}, {})
+    np.testing.assert_allclose(found["y_predicted_sd"].values[0], [0.0, 1.0, 1.0, np.sqrt(3.0)])
+    expected = [np.nan, stats.norm.cdf(1.0), np.nan, stats.norm.cdf(1.0 / np.sqrt(3.0))]
+    np.testing.assert_allclose(found["y_pit"].values[0], expected)

@@ -1,5 +1,7 @@
 """Rao-Blackwellised particle filters and smoothers against exact answers."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -276,6 +278,41 @@ def test_smoothed_paths_are_those_of_the_enumeration(data, exact):
     _agree(np.array([r[0] for r in runs]), mean, least)
     second = covariance + np.einsum("ti,tj->tij", mean, mean)
     _agree(np.array([r[1] for r in runs]), second[:, 1:, 1:])
+
+
+def test_paths_back_from_values_that_a_particle_tells_exactly():
+    """A vehicle that starts at rest: where it is in the second row only one of the two modes leads
+    to. Point masses that miss it counted as much as those that do not."""
+    model = ssm.Model("at rest")
+    model.initial(lambda: {"s": ssm.Bernoulli(0.5), "v": ssm.Dirac(0.0), "p": ssm.Dirac(0.0)})
+    model.transition(
+        lambda s, v, p: {
+            "s": ssm.Bernoulli(np.where(s == 1, 0.9, 0.1)), "v": ssm.Normal(0.5 * v, sd=0.3),
+            "p": ssm.Dirac(p + v + s),
+        }
+    )  # fmt: skip
+    model.observation(lambda p: {"y": ssm.Normal(p, sd=0.3)})
+    y, jump = np.array([0.0, 0.6, 1.4, 2.6]), 0.3 * np.tril(0.5 ** _behind(4))
+    jump[:, 0] = 0.0
+    moved = np.vstack([np.zeros(4), np.cumsum(jump, axis=0)[:-1]])
+    law = stats.multivariate_normal(np.zeros(4), moved @ moved.T + 0.09 * np.eye(4))
+    paths = np.array(list(itertools.product([0, 1], repeat=4)))
+    place = np.hstack([np.zeros((16, 1)), np.cumsum(paths[:, :-1], axis=1)])
+    stays = np.where(np.diff(paths, axis=1) == 0, 0.9, 0.1).prod(axis=1)
+    weights = stays * law.pdf(y - place)
+    expected = weights @ paths / weights.sum()
+    runs = [
+        ssm.smooth(
+            model, {"y": y}, {}, ssm.FFBSi(proposal="marginal"), particles=400, trajectories=300,
+            seed=seed_of("at rest", i),
+        )["s"].values.mean(axis=0)
+        for i in range(24)
+    ]  # fmt: skip
+    _agree(np.array(runs), expected, np.sqrt(expected * (1 - expected) / (24 * 300)))
+
+
+def _behind(n):
+    return np.subtract.outer(np.arange(n), np.arange(n)).clip(min=0)
 
 
 def test_states_that_no_observation_depends_on():

@@ -15,7 +15,8 @@ import scipy.stats as st
 import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import chart, coordinates
 from ssmppl.inference.chains.curvature import fitted_covariance
-from ssmppl.inference.particles.pilot import space_of
+from ssmppl.inference.chains.smc2 import _factor
+from ssmppl.inference.particles.pilot import find_mode, scale_of, space_of
 from ssmppl.inference.problem import pose
 from tests.statistics.checks import some
 
@@ -213,6 +214,27 @@ def test_coordinates_are_one_to_one_with_their_jacobian():
     assert w.parameters(np.array([0.4, 0.0]))[1] == -np.inf
 
 
+def test_a_chain_goes_nowhere_that_the_prior_density_is_infinite():
+    """It would never leave: 1 - p is 0 from 37 on of the unconstrained scale."""
+
+    @ssm.distribution(lower=0, upper=1, closed=True)
+    def Steep(p):
+        return np.log(0.5) - 0.5 * np.log(1.0 - p)
+
+    model = ssm.Model("steep")
+    model.prior(lambda: {"p": Steep()})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, p: {"x": ssm.Normal(p * x, sd=1)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
+    space = space_of(pose(model, {"y": np.array([0.3, 0.1])}), {}, {})
+    natural = coordinates(space, "natural", None)
+    for parameters, inside, end in ((space.parameters, 3.0, 40.0), (natural.parameters, 0.9, 1.0)):
+        assert np.isfinite(parameters(np.array([inside]))[1])
+        theta, log_density = parameters(np.array([end]))
+        assert theta == [1.0]
+        assert log_density == -np.inf
+
+
 def test_chart_gives_derivatives_of_the_change_of_scale():
     space = space_of(pose(chosen, {"y": np.array([0.3, 0.1])}), {}, {"a": 0.4, "q": 1.7})
     w = coordinates(space, "unconstrained", {"q": "reciprocal"})
@@ -224,6 +246,44 @@ def test_chart_gives_derivatives_of_the_change_of_scale():
     # log prior of a is -a^2 / 2; that of v = 1 / q with q ~ Gamma(2, 1) is -3 log v - 1 / v
     np.testing.assert_allclose(found.slope, [-0.4, -3 / v + 1 / v**2], atol=1e-5)
     np.testing.assert_allclose(found.curvature, [[-1, 0], [0, 3 / v**2 - 2 / v**3]], atol=1e-4)
+
+
+def in_units_of(c):
+    """A model of which every number has the unit of the data."""
+    model = ssm.Model("units")
+    model.prior(lambda: {"m": ssm.StudentT(4, 0, scale=10 * c), "s": ssm.HalfNormal(sd=10 * c)})
+    model.initial(lambda m, s: {"x": ssm.Normal(m, sd=s)})
+    model.transition(lambda x, m, s: {"x": ssm.Normal(m + 0.5 * (x - m), sd=s)})
+    model.observation(lambda x, s: {"y": ssm.Normal(x, sd=s)})
+    return model
+
+
+@pytest.mark.parametrize("c", [1e-10, 1e-6, 1e6, 1e10, 1e100])
+def test_the_pilot_finds_the_same_mode_and_scale_in_any_unit(c):
+    """Climbing in steps of one, and measuring no scale above 5 or below 1e-4, it stayed at the
+    start with scales of its own limits: chains of data in pounds did not mix."""
+    y = np.random.default_rng(1).normal(0.3, 1.0, 40)
+
+    def pilot(unit):
+        space = space_of(pose(in_units_of(unit), {"y": y * unit}), {}, {})
+        found = find_mode(space, np.random.SeedSequence(3), "kalman")
+        theta, _ = space.parameters(found.z)
+        return theta / unit, found.scale / [unit, 1.0]
+
+    (here, scale), (expected, known) = pilot(c), pilot(1.0)
+    assert np.all(np.abs(here - expected) < 0.5 * known * [1.0, expected[1]])
+    np.testing.assert_allclose(scale, known, rtol=0.4)
+
+
+def test_scales_at_an_edge_are_those_of_the_side_that_there_is():
+    found = scale_of(np.zeros(1), lambda z: -3.0 * z[0] if z[0] >= 0.0 else -np.inf)
+    assert 0.5 < found[0] < 1.0  # log p falls by 8 over 8 / 3
+
+
+def test_the_factor_of_particles_has_their_unit():
+    z = np.random.default_rng(2).standard_normal((50, 2))
+    w, units = np.full(50, 0.02), np.array([1e-9, 1e9])
+    np.testing.assert_allclose(_factor(z * units, w), units[:, None] * _factor(z, w), rtol=1e-6)
 
 
 def test_fitted_covariance_is_that_of_a_gaussian():

@@ -285,11 +285,30 @@ def test_determinant_of_the_wishart_sampler():
 @pytest.mark.parametrize("shape", [1e-3, 0.02])
 def test_tiny_shapes_give_no_nan(shape):
     x = draws_of(D.Beta(shape, shape), 20_000, 4)
-    assert np.all((x >= 0) & (x <= 1))
     assert np.mean(x > 0.5) == pytest.approx(0.5, abs=0.03)
     z = draws_of(D.Dirichlet([shape, 2 * shape, shape]), 20_000, 5)
     assert np.all(np.isfinite(z))
     np.testing.assert_allclose(z.mean(1), [0.25, 0.5, 0.25], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        D.Beta(0.1, 0.02),
+        D.Beta(0.02, 0.001),
+        D.Truncated(D.Beta(0.1, 0.1), lower=0.5),
+        D.Truncated(D.Beta(0.001, 0.1), upper=0.5),
+        D.Dirichlet([0.001, 0.1, 0.02]),
+    ],
+    ids=repr,
+)
+def test_what_is_drawn_has_a_density(law):
+    """Shares are not rounded to 0 or 1, where it is infinite or there is none."""
+    x = draws_of(law, 20_000, 7)
+    symbols = array([symbol("state", "x", (i,)) for i in range(law.shape[0])]) if law.shape else X
+    known = dict(zip(array(symbols).ravel(), np.atleast_2d(x), strict=True))
+    density = evaluate(law.log_density(symbols), known)
+    assert np.all(np.isfinite(density))
 
 
 # -- what SciPy does not have
@@ -347,3 +366,23 @@ def test_no_density_where_a_matrix_is_not_positive_definite(spread):
     found = evaluate(density, {a: np.array([2.0, -2.0])})  # -2: determinant positive all the same
     assert np.isfinite(found[0])
     assert found[1] == -np.inf
+
+
+@pytest.mark.parametrize("name", ["Wishart", "InverseWishart"])
+def test_no_density_of_a_matrix_whose_law_has_no_covariance_for_its_scale(name):
+    law = getattr(D, name)(6, scale=np.array([[1.0, X], [X, 1.0]], dtype=object))
+    value = np.array([[1.0, 0.2], [0.2, 1.0]])
+    found = evaluate(law.log_density(value), {X: np.array([0.5, 0.99, -2.0, 1.5, 4.0])})
+    reference = {"Wishart": st.wishart, "InverseWishart": st.invwishart}[name]
+    expected = [reference(6, [[1.0, r], [r, 1.0]]).logpdf(value) for r in (0.5, 0.99)]
+    assert found[:2] == pytest.approx(expected, rel=1e-10)
+    assert np.all(found[2:] == -np.inf)
+
+
+def test_no_labels_of_probabilities_that_do_not_sum_to_one():
+    law = D.Categorical([X, X, 0.2])
+    at = {X: np.array([0.4, 0.9, 0.1])}
+    found = evaluate(law.log_density(1.0), at)
+    assert found[0] == pytest.approx(math.log(0.4))
+    assert np.all(np.isnan(found[1:]))
+    assert evaluate(law.in_range()[()], at).tolist() == [1.0, 0.0, 0.0]

@@ -3,10 +3,11 @@
 L. Rabiner, *Proceedings of the IEEE* 77 (1989), sections III A, B and V A (scaling); backward
 sampling: C. Chib, *Journal of Econometrics* 75 (1996).
 
-Notation: S sequences of T rows, K values; `start` (S or 1, K), `move` (S or 1, T or 1, K, K) with
-move[s, t, i, j] = P(x_t = j | x_{t-1} = i) (row 0 without meaning where there are T), log_g
-(S, T, K) of y_t given x_t. What has one row where there are S or T is the same for all. From a
-value i that the data rule out the move need not be defined: its probability 0 is no factor of it.
+Notation: S sequences of T rows, K values; log_start (S or 1, K), log_move (S or 1, T or 1, K, K)
+with exp(log_move[s, t, i, j]) = move[s, t, i, j] = P(x_t = j | x_{t-1} = i) (row 0 without meaning
+where there are T), log_g (S, T, K) of y_t given x_t. What has one row where there are S or T is the
+same for all. From a value i that the data rule out the move need not be defined: its probability 0
+is no factor of it.
 """
 
 from __future__ import annotations
@@ -17,47 +18,72 @@ import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
 
+UNSURE = -2  # stopped where ordinary numbers do not tell
+
 
 @exact
-def forward(start, move, log_g, increments, predicted, filtered, stopped):
+def forward(move, log_start, log_move, log_g, increments, predicted, filtered, stopped):
     """Fill increments (S, T), log p(y_t | y_{1:t-1}), the laws (S, T, K) of x_t given y_{1:t-1} and
     given y_{1:t}, and stopped (S,), the row (from 0) at which no value is possible, -1 if none
-    is."""
+    is, -2 where these laws may lack a value that matters.
+
+    A share below 1e-180 is faint. It does not matter in the next row where the others come to
+    1e-160; where they do not, the value there is dim, of a share below about 1e-160, and it has to
+    be shown that the row of data leaves it faint. In the end what is faint does not matter.
+    """
     n_sequences, n_steps, n = log_g.shape
+    faint, dim = np.empty(n, dtype=np.bool_), np.empty(n, dtype=np.bool_)
     for s in range(n_sequences):
-        first = s if start.shape[0] > 1 else 0
+        first = s if log_start.shape[0] > 1 else 0
         b = s if move.shape[0] > 1 else 0
         stopped[s] = -1
         for t in range(n_steps):
             a = t if move.shape[1] > 1 else 0
             for j in range(n):
                 if t == 0:
-                    predicted[s, 0, j] = start[first, j]
+                    total = math.exp(log_start[first, j])
+                    dim[j] = total < 1e-160 and log_start[first, j] > -np.inf
                 else:
                     total = 0.0
                     for i in range(n):
                         if filtered[s, t - 1, i] > 0.0:
                             total += filtered[s, t - 1, i] * move[b, a, i, j]
-                    predicted[s, t, j] = total
-            top = -np.inf
+                    dim[j] = False
+                    if total < 1e-160:
+                        for i in range(n):
+                            if faint[i] or filtered[s, t - 1, i] > 0.0:
+                                dim[j] = dim[j] or log_move[b, a, i, j] > -np.inf
+                predicted[s, t, j] = total
+            top, hidden = -np.inf, -np.inf
             for j in range(n):
-                if predicted[s, t, j] > 0.0 and log_g[s, t, j] > top:
+                if dim[j] and log_g[s, t, j] > hidden:
+                    hidden = log_g[s, t, j]
+                if not dim[j] and predicted[s, t, j] > 0.0 and log_g[s, t, j] > top:
                     top = log_g[s, t, j]
-            if not top > -np.inf or top == np.inf:
+            if top == np.inf:
                 stopped[s] = t
+                break
+            if not top > -np.inf:
+                stopped[s] = -2 if hidden > -np.inf else t
                 break
             total = 0.0
             for j in range(n):
                 filtered[s, t, j] = 0.0
-                if predicted[s, t, j] > 0.0:
+                if predicted[s, t, j] > 0.0 and not dim[j]:
                     filtered[s, t, j] = predicted[s, t, j] * math.exp(log_g[s, t, j] - top)
                 total += filtered[s, t, j]
             if not 0.0 < total < np.inf:
-                stopped[s] = t
+                # the likeliest by the data may be too unlikely before them
+                stopped[s] = -2 if total == 0.0 else t
+                break
+            increments[s, t] = math.log(total) + top
+            if hidden - increments[s, t] > -46.0:  # log(1e-180 / 1e-160)
+                stopped[s] = -2
                 break
             for j in range(n):
                 filtered[s, t, j] /= total
-            increments[s, t] = math.log(total) + top
+                possible = dim[j] or predicted[s, t, j] > 0.0
+                faint[j] = possible and filtered[s, t, j] < 1e-180 and log_g[s, t, j] > -np.inf
 
 
 @exact

@@ -92,7 +92,7 @@ class Coordinates:
         program = space.problem.program
         log_jacobian += program.entry("constrain")(z, self.by_z, theta)
         log_density = program.entry("log_prior")(theta) + log_jacobian
-        if not np.all(np.isfinite(theta)) or np.isnan(log_density):
+        if not np.all(np.isfinite(theta)) or not log_density < np.inf:
             return theta, -np.inf
         return theta, float(log_density)
 

@@ -31,7 +31,8 @@ def fitted_covariance(
         information = fitted_information(log_density, w, factor, rng)
         values, vectors = np.linalg.eigh(information)
         root = vectors / np.sqrt(np.clip(values, LEAST, MOST**2))
-        factor = np.linalg.cholesky(factor @ root @ root.T @ factor.T)
+        # its Cholesky factor but for signs; the product itself need not be positive by rounding
+        factor = np.linalg.qr((factor @ root).T)[1].T
     return factor @ factor.T
 
 

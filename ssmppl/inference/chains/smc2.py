@@ -271,8 +271,10 @@ def _factor(z: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Cholesky factor (F, F) of the particles' covariance, never singular."""
     off = z - w @ z
     covariance = (w[:, None] * off).T @ off
-    least = 1e-12 + 1e-8 * np.diag(np.diagonal(covariance))
-    return np.linalg.cholesky(covariance + least * np.eye(len(covariance)))
+    variance = np.diagonal(covariance)  # of parameters in any unit, so that no size is small
+    return np.linalg.cholesky(
+        covariance + np.diag(np.where(variance > 0.0, 1e-8 * variance, 1e-12))
+    )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
 The laws (`finite_laws.py`) of data sets of one shape (`histories.py`) are handed all at once to the
-compiled passes of `codegen/kernels/hidden_markov.py`.
+compiled passes (`finite_passes.py`).
 """
 
 from __future__ import annotations
@@ -14,38 +14,17 @@ import numpy as np
 
 from ssmppl.analysis.channels import Channel, channels
 from ssmppl.analysis.finite import FiniteStates, finite_states
-from ssmppl.codegen.exact import exact_entry
 from ssmppl.codegen.kernels.random import fill_uniform
 from ssmppl.codegen.kits import predictive
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.finite_laws import FiniteLaws
+from ssmppl.inference.exact.finite_passes import Filtered, forward
 from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.mixtures import inverted
 from ssmppl.language.trace import Trace, once_per_trace
-
-
-@dataclass(frozen=True)
-class Filtered:
-    """What the forward pass tells of one experiment (T rows, K values).
-
-    log_increments : (T,) log p(y_t | y_{1:t-1}). predicted, filtered : (T, K) laws of x_t given
-    y_{1:t-1} and y_{1:t}. move : (T or 1, K, K) as of the kernels.
-
-    Of S histories at once every array has one axis more, the first.
-    """
-
-    log_increments: np.ndarray
-    predicted: np.ndarray
-    filtered: np.ndarray
-    move: np.ndarray
-
-    def of(self, s: int) -> Filtered:
-        """What it tells of history s."""
-        move = self.move[s if len(self.move) > 1 else 0]
-        return Filtered(self.log_increments[s], self.predicted[s], self.filtered[s], move)
 
 
 @dataclass(frozen=True)
@@ -85,7 +64,7 @@ class HiddenMarkov(FiniteLaws):
     def probabilities(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
         """(T, K) of each combination of values given all data."""
         _, found = next(self._passes([experiment], theta))
-        return self._smoothed(found, pairs=False)[0][0]
+        return found.smoothed(pairs=False)[0][0]
 
     def laws(
         self, experiments: Sequence[Experiment], theta: np.ndarray
@@ -98,7 +77,7 @@ class HiddenMarkov(FiniteLaws):
         SamplingError : as of `filter_each`.
         """
         passes = self._passes(experiments, theta)
-        return [(h, *self._smoothed(found, pairs=True)) for h, found in passes]
+        return [(h, *found.smoothed(pairs=True)) for h, found in passes]
 
     def smooth(self, experiment: Experiment, theta: np.ndarray) -> SmoothedMoments:
         """Moments of the states given all data.
@@ -120,7 +99,7 @@ class HiddenMarkov(FiniteLaws):
         """
         out = []
         for h, found in self._passes(experiments, theta):
-            law, pairs = self._smoothed(found, pairs=True)
+            law, pairs = found.smoothed(pairs=True)
             value = found.log_increments.sum(axis=1)
             each = [
                 (self._moments(law[s], pairs[s], float(value[s])), law[s]) for s in range(h.size)
@@ -169,8 +148,7 @@ class HiddenMarkov(FiniteLaws):
         out: list[np.ndarray] = [np.empty(0)] * len(experiments)
         for h, found in self._passes(experiments, theta):
             own = np.concatenate([uniforms[i] for i in h.members]).reshape(-1, h.steps)
-            paths, which = np.empty(own.shape, dtype=np.int64), np.repeat(h.which, draws)
-            exact_entry("finite_draw")(found.move, found.filtered, which, own, paths)
+            paths = found.paths(np.repeat(h.which, draws), own)
             drawn = self.values[paths.reshape(-1, draws, h.steps)]
             for i, x in zip(h.members, drawn, strict=True):
                 out[i] = x
@@ -268,7 +246,7 @@ class HiddenMarkov(FiniteLaws):
             found, stopped = self._forward(h, theta)
             if np.any(stopped >= 0):
                 return -np.inf, np.where(wanted, np.nan, 0.0)
-            law, pairs = self._smoothed(found, pairs=True)
+            law, pairs = found.smoothed(pairs=True)
             total += float(h.weights @ found.log_increments.sum(axis=1))
             for role in ("initial", "transition", "observation"):
                 own = pairs if role == "transition" else law
@@ -279,17 +257,11 @@ class HiddenMarkov(FiniteLaws):
     # -- the pieces
     def _forward(self, h: Histories, theta: np.ndarray) -> tuple[Filtered, np.ndarray]:
         """The forward pass, and (S,) the row at which it came to an end, -1 if at none."""
-        shape = h.size, h.steps, len(self.values)
-        start = np.exp(self.over_values(self.density("initial", h), h, theta, "initial")[:, 0])
-        move = np.exp(self.over_values(self.density("transition", h), h, theta, "transition"))
+        start = self.over_values(self.density("initial", h), h, theta, "initial")[:, 0]
+        move = self.over_values(self.density("transition", h), h, theta, "transition")
         log_g = self.over_values(self.density("observation", h), h, theta, "observation")
-        log_g = np.ascontiguousarray(np.broadcast_to(log_g, shape))
-        out = Filtered(np.empty(shape[:2]), np.empty(shape), np.empty(shape), move)
-        stopped = np.empty(h.size, dtype=np.int64)
-        exact_entry("finite_forward")(
-            start, move, log_g, out.log_increments, out.predicted, out.filtered, stopped
-        )
-        return out, stopped
+        log_g = np.broadcast_to(log_g, (h.size, h.steps, len(self.values)))
+        return forward(np.ascontiguousarray(start), move, np.ascontiguousarray(log_g))
 
     def _passes(
         self, experiments: Sequence[Experiment], theta: np.ndarray
@@ -310,12 +282,6 @@ class HiddenMarkov(FiniteLaws):
                     where=site.distribution.location,
                 )
             yield h, found
-
-    def _smoothed(self, found: Filtered, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
-        shape = found.filtered.shape
-        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
-        exact_entry("finite_backward")(found.move, found.predicted, found.filtered, law, both)
-        return law, both
 
 
 def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:

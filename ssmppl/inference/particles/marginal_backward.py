@@ -46,6 +46,7 @@ WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over
 """Particles without weight may lie where the laws are infinite or undefined, and others so far from
 what follows them that their density is zero."""
 NEGLIGIBLE = 1e-12  # of a variance, what rounding leaves of it
+ROUNDING, TINY = 1e-13, 1e-300  # of a value, likewise; a variance, so that none is zero
 
 
 def may_integrate(problem: Problem, method: FFBSi) -> bool:
@@ -199,6 +200,7 @@ class _Step:
         self.mean, self.covariance, self.cross = mean, covariance, cross
         self.predicted = predicted
         self.factor, self.pivots = _factorised(spread)
+        self.variances = np.einsum("jjn->jn", spread)
 
     def _following(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
         return np.concatenate([x[list(self.law.columns.coupled)], z])
@@ -213,11 +215,19 @@ class _Step:
             for i, earlier in enumerate(residuals):
                 e = e - self.factor[j, i][:, None] * earlier
             residuals.append(e)
-            pivot = self.pivots[j]
-            known = pivot > 0.0
-            safe = np.where(known, pivot, 1.0)
-            own = -0.5 * np.log(safe)[:, None] - 0.5 * e**2 / safe[:, None]
-            total += np.where(known[:, None], own, 0.0)
+            own = self.pivots[j][:, None]
+            known = own == 0.0
+            if known.any():
+                # Where a particle tells the component exactly the width is that of rounding, not
+                # none: one that tells another value did not lead here.
+                size = np.abs(v[j]) + np.abs(self.predicted[j])[:, None]
+                rounding = NEGLIGIBLE * self.variances[j][:, None] + (ROUNDING * size) ** 2 + TINY
+                height = np.where(known, rounding, 0.0).max(axis=0)  # of point masses all alike
+                total += -0.5 * np.log(np.where(known, height, own))
+                own = np.where(known, rounding, own)
+            else:
+                total += -0.5 * np.log(own)
+            total += -0.5 * e**2 / own
         if self.law.free:
             values = dict(self.values)
             for i, s in enumerate(self.law.found.trace.state_symbols):

@@ -32,6 +32,9 @@ TRIES = 200  # random points looked at for one with a finite likelihood
 TUNING_REPEATS = 40
 SCALE_REPEATS = 8
 FALL = 8.0  # how far log p falls where its scale is measured
+MOST_STEP = 1e150
+FINEST, WIDEST = 1e-2, 5.0  # scales that a climb in steps of one does well with
+UNITS = 5  # climbs, each in steps of the scales where the last one ended
 MOST_PARTICLES = 1_000_000
 
 
@@ -58,6 +61,12 @@ class Space:
     free: np.ndarray
     where: np.ndarray
 
+    @property
+    def on_the_line(self) -> np.ndarray:
+        """(free numbers,) which are values of the whole line, neither logarithms nor shares."""
+        found = [x for t in transforms(self.problem.trace) for x in t.on_the_line]
+        return np.array(found, dtype=bool)[self.where]
+
     def parameters(self, z_free: np.ndarray) -> tuple[np.ndarray, float]:
         """(theta, log prior + log Jacobian) at unconstrained values of the free parameters."""
         if not self.problem.trace.parameters:
@@ -67,7 +76,7 @@ class Space:
         program = self.problem.program
         log_jacobian = program.entry("constrain")(z, self.free, theta)
         log_prior = program.entry("log_prior")(theta) + log_jacobian
-        if not np.all(np.isfinite(theta)) or np.isnan(log_prior):
+        if not np.all(np.isfinite(theta)) or not log_prior < np.inf:
             return theta, -np.inf
         return theta, float(log_prior)
 
@@ -108,7 +117,7 @@ def find_mode(
     if not len(best):
         return Pilot(best, best, value)
     averaged = averaged_density(space, seed, proposal, SCALE_REPEATS, rescue)
-    return Pilot(best, scale_of(best, averaged), value)
+    return Pilot(best, scale_of(best, averaged, space.on_the_line), value)
 
 
 def climb_to_mode(
@@ -131,17 +140,33 @@ def climb_to_mode(
         return z, log_density(z)
     z = finite_point(z, log_density, np.random.default_rng(seed))
     best, value = z, log_density(z)
-    size = 1.0
+    unit = np.ones(len(z))
+    for _ in range(UNITS):
+        best, value = _simplex(best, value, unit, log_density)
+        # Parameters of the whole line have the units of the data, and may be of any size.
+        scale = scale_of(best, log_density, space.on_the_line)
+        fitting = np.where((scale < FINEST) | (scale > WIDEST), 2.0 * scale, 1.0)
+        if np.all((fitting < 8.0 * unit) & (unit < 8.0 * fitting)):
+            break
+        unit = fitting
+    return best, value
+
+
+def _simplex(
+    z: np.ndarray, value: float, unit: np.ndarray, log_density: Callable[[np.ndarray], float]
+) -> tuple[np.ndarray, float]:
+    """Nelder and Mead's climb from z, where log p is `value`, in steps of unit (free,)."""
+    best, size = z, 1.0
     for _ in range(4):  # restarts, as a simplex may collapse early on a ragged function
-        simplex = np.vstack([best, best + size * np.eye(len(z))])
         found = scipy.optimize.minimize(
-            lambda v: min(-log_density(v), 1e300), best, method="Nelder-Mead",
-            options={"initial_simplex": simplex, "maxfev": 80 * len(z), "fatol": 0.1,
-                     "xatol": 1e-3},
+            lambda v, centre=best: min(-log_density(centre + unit * v), 1e300), np.zeros(len(z)),
+            method="Nelder-Mead",
+            options={"initial_simplex": np.vstack([np.zeros(len(z)), size * np.eye(len(z))]),
+                     "maxfev": 80 * len(z), "fatol": 0.1, "xatol": 1e-3},
         )  # fmt: skip
         gain = -found.fun - value
         if gain > 0:
-            best, value = found.x, -float(found.fun)
+            best, value = best + unit * found.x, -float(found.fun)
         if gain < 1.0:
             break
         size = 0.5
@@ -213,21 +238,46 @@ def finite_point(
     )
 
 
-def scale_of(z: np.ndarray, log_density: Callable[[np.ndarray], float]) -> np.ndarray:
+def scale_of(
+    z: np.ndarray, log_density: Callable[[np.ndarray], float], on_the_line: np.ndarray | None = None
+) -> np.ndarray:
     """Per coordinate the standard deviation of a Gaussian that falls as log p does.
 
-    Measured where log p has fallen by several units, as the estimates are noisy.
+    Measured where log p has fallen by several units, as the estimates are noisy, or where neither
+    side has any.
+
+    on_the_line : (d,) which coordinates may be of any size; the others, logarithms and the like,
+        are at most 5.
     """
     out, top = np.empty(len(z)), log_density(z)
+    anywhere = np.zeros(len(z), dtype=bool) if on_the_line is None else on_the_line
     for i, unit in enumerate(np.eye(len(z))):
-        step, drop = 1e-3, 0.0
-        while step < 30.0:
-            drop = top - 0.5 * (log_density(z + step * unit) + log_density(z - step * unit))
-            if not drop < FALL:  # -inf beyond counts as a fall
-                break
-            step *= 1.5
+
+        def drop_at(step: float, unit: np.ndarray = unit) -> float:
+            ends = np.array([log_density(z + step * unit), log_density(z - step * unit)])
+            within = ends > -np.inf  # at an edge of the support the one side has to tell
+            return top - float(ends[within].mean()) if within.any() else np.inf
+
+        step, drop = _small_step(drop_at, abs(z[i]))
+        while drop < FALL and step < (MOST_STEP if anywhere[i] else 30.0):
+            step *= 1.5 if step < 30.0 else 4.0
+            drop = drop_at(step)
+        while not drop < 4.0 * FALL and step > 45.0:  # the last stride was a long one
+            step /= 1.5
+            drop = drop_at(step)
         out[i] = step / np.sqrt(2.0 * (drop if FALL <= drop < 4.0 * FALL else FALL))
-    return np.clip(out, 1e-4, 5.0)
+    return np.clip(out, 0.0, np.where(anywhere, MOST_STEP, 5.0))
+
+
+def _small_step(drop_at: Callable[[float], float], size: float) -> tuple[float, float]:
+    """A step over which log p does not fall far yet, and its fall there."""
+    step, drop = 1e-3, drop_at(1e-3)
+    while not drop < FALL and step > max(1e-13 * size, 1e-300):
+        nearer = drop_at(step / 4.0)
+        if nearer > 0.5 * drop and np.isfinite(drop):
+            break  # noise of the estimate does not fall with the step
+        step, drop = step / 4.0, nearer
+    return step, drop
 
 
 def dispersed(
