@@ -37,6 +37,7 @@ CALLS = {
     "maximum": "maximum", "minimum": "minimum", "arctan2": "arctan2", "logaddexp": "logaddexp",
     "gammainc": "gammainc", "gammaincinv": "gammaincinv", "betainc": "betainc",
     "gammaincc": "gammaincc", "gammainccinv": "gammainccinv",
+    "betaincc": "betaincc", "betainccinv": "betainccinv",
     "betaincinv": "betaincinv", "poisson_quantile": "poisson_quantile",
     "binomial_quantile": "binomial_quantile", "negbinomial_quantile": "negbinomial_quantile",
     "poisson_survival_quantile": "poisson_survival_quantile",

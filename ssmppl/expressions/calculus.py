@@ -109,9 +109,11 @@ PARTIALS: dict[str, Partial] = {
     "gammaincinv": lambda d, a, p: [None, 1.0 / _gamma_density(a, d)],
     "gammainccinv": lambda d, a, p: [None, -1.0 / _gamma_density(a, d)],
     "betainc": lambda d, a, b, x: [None, None, _beta_density(a, b, x)],
+    "betaincc": lambda d, a, b, x: [None, None, -_beta_density(a, b, x)],
     "vonmises_cdf": lambda d, k, x: [None, _vonmises_density(k, x)],
     "vonmises_quantile": lambda d, k, p: [None, 1.0 / _vonmises_density(k, d)],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
+    "betainccinv": lambda d, a, b, p: [None, None, -1.0 / _beta_density(a, b, d)],
 }
 # What is one of its two arguments: where it is the first.
 CHOICES: dict[str, Callable[[Expr, Expr], Expr]] = {

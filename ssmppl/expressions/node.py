@@ -29,7 +29,7 @@ _BINARY = """add sub mul div pow mod maximum minimum arctan2 logaddexp lt le eq 
     gammaln_rise digamma_rise betaln gammainc gammaincc gammaincinv gammainccinv poisson_quantile
     poisson_survival_quantile vonmises_cdf vonmises_quantile"""
 UNARY, BINARY = _UNARY.split(), _BINARY.split()
-_TERNARY = """where betainc betaincinv binomial_quantile negbinomial_quantile
+_TERNARY = """where betainc betaincc betaincinv betainccinv binomial_quantile negbinomial_quantile
     negbinomial_survival_quantile"""
 TERNARY = _TERNARY.split()
 QUATERNARY = ["betabinomial_cdf", "betabinomial_quantile"]

@@ -101,18 +101,37 @@ def betabinomial_quantile(n: Any, a: Any, b: Any, q: Any) -> np.ndarray:
     return np.where(sound & (q >= 0) & (q <= 1), k, np.nan)
 
 
+def negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
+    """P(X <= k), "lower", or P(X > k), "upper", of counts of dispersion r."""
+    r, mean = np.asarray(r, dtype=float), np.asarray(mean, dtype=float)
+    of_k, of_r = (sp.betaincc, sp.betainc) if side == "lower" else (sp.betainc, sp.betaincc)
+    near = of_k(k + 1.0, r, mean / (r + mean))
+    return np.where(mean < r, near, of_r(r, k + 1.0, r / (r + mean)))
+
+
+def smallest_above(cdf: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
+    """The smallest whole k >= 0 with cdf(k) >= q, elementwise."""
+    return _smallest(cdf, q, np.greater_equal)
+
+
 def smallest_below(survival: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
-    """The smallest whole k >= 0 with survival(k) <= q, elementwise: doubled, then halved."""
+    """The smallest whole k >= 0 with survival(k) <= q, elementwise."""
+    return _smallest(survival, q, np.less_equal)
+
+
+def _smallest(tail: Callable[[np.ndarray], Any], q: Any, reached: np.ufunc) -> np.ndarray:
+    """By a k that is doubled and an interval that is halved."""
     (q,) = _wide(q)
-    high = np.zeros(np.broadcast_shapes(q.shape, np.shape(survival(np.zeros(())))))
-    while np.any(short := (survival(high) > q) & (high < LARGEST_COUNT)):
+    high = np.zeros(np.broadcast_shapes(q.shape, np.shape(tail(np.zeros(())))))
+    known = ~np.isnan(tail(high) + q)
+    while np.any(short := known & ~reached(tail(high), q) & (high < LARGEST_COUNT)):
         high = np.where(short, 2.0 * high + 1.0, high)
-    low, fits = np.full(high.shape, -1.0), survival(high) <= q
+    low, fits = np.full(high.shape, -1.0), reached(tail(high), q)
     while np.any(high - low > 1.0):
         middle = np.maximum(np.floor(0.5 * (low + high)), 0.0)
-        inside = survival(middle) <= q
+        inside = reached(tail(middle), q)
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    high = np.where(fits, high, np.where(np.isnan(survival(high)), np.nan, np.inf))
+    high = np.where(fits, high, np.where(np.isnan(tail(high)), np.nan, np.inf))
     return np.where((q >= 0) & (q <= 1), high, np.nan)
 
 

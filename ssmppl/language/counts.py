@@ -134,19 +134,21 @@ class NegativeBinomial(_Counts):
 
     def cdf(self, value):
         k, r = self._count(value), self.dispersion
-        return self._below_zero(value, ew("betainc", r, k + 1.0, r / (r + self.mean_)))
+        # by the smaller share, of which 1 - share keeps its digits
+        shares, few = r + self.mean_, ew("lt", self.mean_, r)
+        by_mean = ew("betaincc", k + 1.0, r, self.mean_ / shares)
+        by_rest = ew("betainc", r, k + 1.0, r / shares)
+        return self._below_zero(value, _where(few, by_mean, by_rest))
 
     def survival(self, value):
         k, r = self._count(value), self.dispersion
         return self._one_below_zero(value, ew("betainc", k + 1.0, r, self.mean_ / (r + self.mean_)))
 
     def quantile(self, p):
-        r = self.dispersion
-        return array(ew("negbinomial_quantile", r, r / (r + self.mean_), p))
+        return array(ew("negbinomial_quantile", self.dispersion, self.mean_, p))
 
     def survival_quantile(self, p):
-        r = self.dispersion
-        return array(ew("negbinomial_survival_quantile", r, r / (r + self.mean_), p))
+        return array(ew("negbinomial_survival_quantile", self.dispersion, self.mean_, p))
 
     def sample_above(self, draws, lower):
         # As for Poisson, with the process run at a gamma distributed speed g for the time m / r:

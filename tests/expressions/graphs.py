@@ -43,6 +43,8 @@ HALF_SMOOTH = {
     "gammaincinv": (sp.gammaincinv, POSITIVE, UNIT),
     "gammainccinv": (sp.gammainccinv, POSITIVE, UNIT),
     "betainc": (sp.betainc, POSITIVE, POSITIVE, UNIT),
+    "betaincc": (sp.betaincc, POSITIVE, POSITIVE, UNIT),
+    "betainccinv": (sp.betainccinv, POSITIVE, POSITIVE, UNIT),
     "betaincinv": (sp.betaincinv, POSITIVE, POSITIVE, UNIT),
     "vonmises_cdf": (interpreted.vonmises_cdf, POSITIVE, (-2, 2)),
     "vonmises_quantile": (interpreted.vonmises_quantile, POSITIVE, UNIT),
