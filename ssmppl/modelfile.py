@@ -175,8 +175,15 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def _check_separator(path: Path, names: pd.Series) -> None:
-    """Refuse a table whose values are separated by semicolons or tabs, as spreadsheets write it."""
+    """Refuse a table whose values are separated by semicolons or tabs, as spreadsheets write it, or
+    that begins with a comment."""
     header = ",".join(names.fillna("").astype(str))  # the file itself may be compressed
+    if header.startswith("#"):
+        raise DataError(
+            f"{path} begins with a comment, {header.strip()!r}",
+            fix="let the first line be the names of the columns; in Python "
+            f"pd.read_csv({str(path)!r}, comment='#') reads it",
+        )
     for mark, name in ((";", "semicolons"), ("\t", "tabs")):
         if mark in header and "," not in header:
             raise DataError(

@@ -199,6 +199,19 @@ def a_variable_of_the_same_name():
     return declare(transition=transition)
 
 
+@bad("drift(), which @transition calls, reads the Python variable 'phi'", "arguments of drift")
+def a_variable_of_the_same_name_in_a_function_that_the_law_calls():
+    phi = 0.9
+
+    def drift(x):
+        return phi * x  # HERE
+
+    def transition(x, q):
+        return {"x": ssm.Normal(drift(x), variance=q)}
+
+    return declare(transition=transition)
+
+
 # -- what a law returns
 @bad("returned nothing", 'return a dictionary {"name": distribution}')
 def returns_nothing():

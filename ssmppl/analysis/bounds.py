@@ -66,7 +66,7 @@ def _reciprocal(a: Interval) -> Interval:
 def _pow(a: Interval, e: float) -> Interval:
     if e < 0:
         return _reciprocal(_pow(a, -e))
-    if e != int(e):  # defined for positive numbers only
+    if not e.is_integer():  # defined for positive numbers only
         a = (max(a[0], 0.0), max(a[1], 0.0))
         return _power(a[0], e), _power(a[1], e)
     ends = [_power(x, e) for x in a]

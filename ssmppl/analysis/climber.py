@@ -118,7 +118,7 @@ class Climber:
             out[self.where] = self.back([*z.tolist(), *rest])
         except DOMAIN:
             return theta
-        return out
+        return out if np.all(np.isfinite(out)) else theta
 
     def _at(self, z: np.ndarray, rest: list[float]) -> tuple[float, ...]:
         """(value, gradient..., Hessian...); -inf for the value outside of the domain."""

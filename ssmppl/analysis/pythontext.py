@@ -1,19 +1,22 @@
 """Expr -> plain Python function of a list of numbers, by way of its text.
 
 For what is evaluated once a draw, on scalars, outside the compiled kernels: correction factors,
-bounds that depend on other parameters, slice densities. The interpreter defines the meaning;
-`math` raises where NumPy gives nan, so callers catch `DOMAIN` and take the density as zero.
+bounds that depend on other parameters, slice densities. The interpreter defines the meaning:
+where `math` raises (1/0, exp(800), log(0), a root of -1: inf, or nan, in NumPy) the interpreter is
+asked, as there are conditions and quotients that make a number of it again: 1/(1 + inf) = 0. What
+raises an error of `DOMAIN` all the same is a function of the user's.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ssmppl.expressions.evaluate import MEANING
+from ssmppl.expressions.evaluate import MEANING, evaluate
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
 
 DOMAIN = (ValueError, ZeroDivisionError, OverflowError)
@@ -28,14 +31,17 @@ _TEXT = {
     "mul": "({0} * {1})", "div": "({0} / {1})", "pow": "math.pow({0}, {1})", "mod": "({0} % {1})",
     "lt": "({0} < {1})", "le": "({0} <= {1})", "eq": "({0} == {1})", "ne": "({0} != {1})",
     "and": "({0} and {1})", "or": "({0} or {1})", "where": "({1} if {0} else {2})",
-    "abs": "abs({0})", "maximum": "max({0}, {1})", "minimum": "min({0}, {1})",
+    "abs": "abs({0})", "logaddexp": "logaddexp({0}, {1})",
+    # max(1.0, nan) is 1.0 in Python, and nan in NumPy
+    "maximum": "({0} if {0} >= {1} or {0} != {0} else {1})",
+    "minimum": "({0} if {0} <= {1} or {0} != {0} else {1})",
     "gammaln": "math.lgamma({0})", "arcsin": "math.asin({0})", "arccos": "math.acos({0})",
     "arctan": "math.atan({0})", "arcsinh": "math.asinh({0})", "arccosh": "math.acosh({0})",
     "arctanh": "math.atanh({0})", "arctan2": "math.atan2({0}, {1})",
     **{n: f"math.{n}({{0}})" for n in _SAME_NAME},
 }  # fmt: skip
 _NEVER_RAISE = {"add", "sub", "mul", "neg", "not", "and", "or", "lt", "le", "eq", "ne", "where",
-                "abs", "maximum", "minimum"}  # fmt: skip
+                "abs", "maximum", "minimum", "logaddexp"}  # fmt: skip
 
 
 def python_function(expressions: Sequence[Expr], arguments: Sequence[Expr]) -> Function:
@@ -65,7 +71,7 @@ def _function(
     of `where(b > 0, sqrt(b), b)`. result : the text of the result, from those of the values.
     """
     done = {a: f"v[{i}]" for i, a in enumerate(arguments)}
-    lines = [f"def run({signature}):"]
+    lines = [f"def run({signature}):", "  try:"]
     always = _always(expressions)
     later: set[Expr] = set()
     for node in topological(expressions):
@@ -85,10 +91,21 @@ def _function(
             lines.append(f"    {name} = {text}")
             done[node] = name
     lines.append(f"    return {result([done[e] for e in expressions])}")
+    lines += ["  except DOMAIN:", "    w = meant(v)"]
+    lines.append(f"    return {result([f'w[{i}]' for i in range(len(expressions))])}")
     names = _names(expressions)
+    names["meant"] = partial(_meant, expressions, arguments)
     exec("\n".join(lines), names)
     run: Callable[..., Any] = names["run"]
     return run
+
+
+def _meant(
+    expressions: Sequence[Expr], arguments: Sequence[Expr], v: Sequence[float]
+) -> list[float]:
+    """The values by the interpreter."""
+    known = dict(zip(arguments, v, strict=True))
+    return [float(value) for value in evaluate(list(expressions), known)]
 
 
 def _always(expressions: Sequence[Expr]) -> set[Expr]:
@@ -134,6 +151,14 @@ def _spelled(node: Expr, parts: list[str]) -> str:
     return f"float(meaning[{node.op!r}]({', '.join(parts)}))"
 
 
+def _logaddexp(a: float, b: float) -> float:
+    """NumPy's, which warns of infinite numbers."""
+    if a == b:
+        return a + math.log(2.0)
+    low, high = (a, b) if a < b else (b, a)
+    return high + math.log1p(math.exp(low - high))
+
+
 def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], Any]:
     def run(n: int, entries: tuple[float, ...]) -> Any:
         try:
@@ -149,6 +174,8 @@ def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
     return {
         "math": math,
         "once": _once,
+        "logaddexp": _logaddexp,
+        "DOMAIN": DOMAIN,
         "meaning": MEANING,
         "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
         "matrix_cholesky": _matrix(np.linalg.cholesky),

@@ -304,14 +304,15 @@ def draw(
 
 
 def _guarded(function: Callable[..., float]) -> Callable[..., float]:
-    """The function with -inf where it is not defined."""
+    """The function with -inf where it is not defined, and where it is inf: a single point, or an
+    overflow, that a slice would never leave again."""
 
     def run(*args: Sequence[float]) -> float:
         try:
             value = function(*args)
         except DOMAIN:
             return -math.inf
-        return value if value == value else -math.inf
+        return value if value < math.inf else -math.inf
 
     return run
 

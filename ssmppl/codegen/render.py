@@ -29,6 +29,7 @@ CALLS = {
     "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "arcsinh": "arcsinh", "arccosh": "arccosh",
     "arctanh": "arctanh", "abs": "abs", "sign": "sign", "floor": "floor", "ceil": "ceil",
     "gammaln": "lgamma", "digamma": "digamma", "trigamma": "trigamma", "ndtr": "ndtr",
+    "gammaln_rise": "gammaln_rise", "digamma_rise": "digamma_rise", "betaln": "betaln",
     "log_ndtr": "log_ndtr", "ndtri": "ndtri", "erf": "erf", "erfc": "erfc",
     "i0e": "i0e", "i1e": "i1e", "vonmises_cdf": "vonmises_cdf",
     "vonmises_quantile": "vonmises_quantile", "betabinomial_cdf": "betabinomial_cdf",
@@ -36,6 +37,7 @@ CALLS = {
     "maximum": "maximum", "minimum": "minimum", "arctan2": "arctan2", "logaddexp": "logaddexp",
     "gammainc": "gammainc", "gammaincinv": "gammaincinv", "betainc": "betainc",
     "gammaincc": "gammaincc", "gammainccinv": "gammainccinv",
+    "betaincc": "betaincc", "betainccinv": "betainccinv",
     "betaincinv": "betaincinv", "poisson_quantile": "poisson_quantile",
     "binomial_quantile": "binomial_quantile", "negbinomial_quantile": "negbinomial_quantile",
     "poisson_survival_quantile": "poisson_survival_quantile",
@@ -182,7 +184,7 @@ class Writer:
 def is_small_power(node: Expr) -> bool:
     """Whether a power is written as a product."""
     e = node.args[1]
-    return e.op == "const" and e.data == int(e.data) and 1 <= abs(e.data) <= 4
+    return e.op == "const" and e.data.is_integer() and 1 <= abs(e.data) <= 4
 
 
 def _must_be_named(node: Expr) -> bool:

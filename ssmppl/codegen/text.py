@@ -17,9 +17,11 @@ from ssmppl.language.primitive import REGISTRY
 
 MODULES = {
     "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
-    "special": "lgamma digamma trigamma ndtr log_ndtr ndtri erf erfc i0e i1e",
+    "special": "lgamma digamma trigamma gammaln_rise digamma_rise betaln ndtr log_ndtr ndtri erf "
+    "erfc i0e i1e",
     "laws": "betabinomial_cdf betabinomial_quantile vonmises_cdf vonmises_quantile",
-    "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincinv",
+    "incomplete": "gammainc gammaincc gammaincinv gammainccinv betainc betaincc betaincinv "
+    "betainccinv",
     "random": "normal uniform gamma gamma_by poisson binomial vonmises",
     "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil "
     "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile "

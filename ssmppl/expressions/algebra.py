@@ -67,9 +67,9 @@ def polynomial(
 
 
 def _splits(expression: Expr, symbols: Sequence[Expr]) -> bool:
-    """Whether roots or logarithms of the symbols were split as for positive factors."""
+    """Whether roots (of matrices too) or logarithms were split as for positive factors."""
     return any(
-        n.op in ("sqrt", "log", "log1p")
+        n.op in ("sqrt", "cholesky", "log", "log1p")
         or (n.op == "pow" and not (n.args[1].op == "const" and float(n.args[1].data).is_integer()))
         for n in dependent([expression], symbols)
     )

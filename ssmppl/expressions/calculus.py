@@ -4,19 +4,35 @@
 it line by line. `None` marks a partial that has no closed form here: it is an error only where
 it is needed. Matrix nodes follow Giles (2008), "Collected matrix derivative results for forward
 and reverse mode algorithmic differentiation".
+
+A product of a partial and a slope is 0 times infinity, which is no number, where a function is
+steep of what does not move (the root of max(u - c, 0) for u below c) or flat of what moves without
+bound (1 / (1 + exp(a)) for a above 709.8). So a slope goes with the condition outside of which it
+is zero, whatever it is multiplied by, and exponentials are divided by each other in exponents.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import ExprArray, array
-from ssmppl.expressions.expr import BOOLEAN, Expr, apply, constant, dependent, topological
+from ssmppl.expressions.expr import (
+    BOOLEAN,
+    Expr,
+    apply,
+    as_expr,
+    constant,
+    dependent,
+    topological,
+    without_exponentials,
+)
 from ssmppl.expressions.linear import inverse
+from ssmppl.expressions.signs import never_negative
 
 Partial = Callable[..., Sequence[Expr | float | None]]
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
@@ -37,8 +53,7 @@ def _over(top: Expr, below: Expr, limit: float) -> Expr:
 
 
 def _beta_density(a: Expr, b: Expr, x: Expr) -> Expr:
-    norm = _f("gammaln", a) + _f("gammaln", b) - _f("gammaln", a + b)
-    return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - norm)
+    return _f("exp", (a - 1.0) * _f("log", x) + (b - 1.0) * _f("log1p", -x) - _f("betaln", a, b))
 
 
 def _vonmises_density(k: Expr, x: Expr) -> Expr:
@@ -67,6 +82,12 @@ PARTIALS: dict[str, Partial] = {
     "abs": lambda d, a: [_f("sign", a)],
     "gammaln": lambda d, a: [_f("digamma", a)],
     "digamma": lambda d, a: [_f("trigamma", a)],
+    "gammaln_rise": lambda d, a, b: [_f("digamma_rise", a, b), _f("digamma", a + b)],
+    "digamma_rise": lambda d, a, b: [
+        _f("trigamma", a + b) - _f("trigamma", a),
+        _f("trigamma", a + b),
+    ],
+    "betaln": lambda d, a, b: [-_f("digamma_rise", a, b), -_f("digamma_rise", b, a)],
     "ndtr": lambda d, a: [_f("exp", -0.5 * a**2) / _ROOT_2PI],
     "log_ndtr": lambda d, a: [_f("exp", -0.5 * a**2 - d) / _ROOT_2PI],
     "ndtri": lambda d, a: [_ROOT_2PI * _f("exp", 0.5 * d**2)],
@@ -81,8 +102,6 @@ PARTIALS: dict[str, Partial] = {
     "div": lambda d, a, b: [1.0 / b, -d / b],
     "pow": lambda d, a, b: [b * a ** (b - 1.0), d * _f("log", a)],
     "mod": lambda d, a, b: [1.0, -_f("floor", a / b)],
-    "maximum": lambda d, a, b: [_f("le", b, a) * 1.0, _f("lt", a, b) * 1.0],
-    "minimum": lambda d, a, b: [_f("le", a, b) * 1.0, _f("lt", b, a) * 1.0],
     "arctan2": lambda d, a, b: [b / (a**2 + b**2), -a / (a**2 + b**2)],
     "logaddexp": lambda d, a, b: [_f("exp", a - d), _f("exp", b - d)],
     "gammainc": lambda d, a, x: [None, _gamma_density(a, x)],
@@ -90,10 +109,19 @@ PARTIALS: dict[str, Partial] = {
     "gammaincinv": lambda d, a, p: [None, 1.0 / _gamma_density(a, d)],
     "gammainccinv": lambda d, a, p: [None, -1.0 / _gamma_density(a, d)],
     "betainc": lambda d, a, b, x: [None, None, _beta_density(a, b, x)],
+    "betaincc": lambda d, a, b, x: [None, None, -_beta_density(a, b, x)],
     "vonmises_cdf": lambda d, k, x: [None, _vonmises_density(k, x)],
     "vonmises_quantile": lambda d, k, p: [None, 1.0 / _vonmises_density(k, d)],
     "betaincinv": lambda d, a, b, p: [None, None, 1.0 / _beta_density(a, b, d)],
+    "betainccinv": lambda d, a, b, p: [None, None, -1.0 / _beta_density(a, b, d)],
 }
+# What is one of its two arguments: where it is the first.
+CHOICES: dict[str, Callable[[Expr, Expr], Expr]] = {
+    "maximum": lambda a, b: _f("le", b, a),
+    "minimum": lambda a, b: _f("le", a, b),
+}
+# Partials that fall to zero as fast as exponentials grow.
+_VANISHING = {"exp", "ndtr", "erf", "erfc"}
 # Piecewise constant: derivative zero wherever there is one.
 FLAT = BOOLEAN | {"sign", "floor", "ceil"}
 
@@ -111,7 +139,7 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
         an incomplete gamma or beta function, an opaque primitive, a random draw's parameters).
     """
     involved = dependent(expressions, [symbol])
-    tangent: dict[Expr, Expr] = {symbol: constant(1.0)}
+    tangent: dict[Expr, _Slope] = {symbol: _Slope(constant(1.0))}
     matrix_tangent: dict[Expr, ExprArray] = {}
     for node in topological(expressions, involved):
         if node is symbol:
@@ -119,40 +147,161 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
         if node.op in ("cholesky", "inverse"):
             matrix_tangent[node] = _matrix_tangent(node, tangent)
         elif node.op == "item":
-            tangent[node] = matrix_tangent[node.args[0]][node.data]
+            tangent[node] = _Slope(matrix_tangent[node.args[0]][node.data])
         else:
             tangent[node] = _chain(node, tangent)
-    zero = constant(0.0)
-    return [tangent.get(e, zero) for e in expressions]
+    return [tangent.get(e, _NONE).whole() for e in expressions]
 
 
-def _chain(node: Expr, tangent: dict[Expr, Expr]) -> Expr:
+class _Slope(NamedTuple):
+    """A slope, and the condition outside of which it is zero, whatever `value` is there."""
+
+    value: Expr
+    moves: Expr | None = None
+
+    def whole(self) -> Expr:
+        """The slope as one expression."""
+        return self.value if self.moves is None else apply("where", self.moves, self.value, 0.0)
+
+    def only(self, condition: Expr) -> _Slope:
+        """This slope where the condition holds, else zero."""
+        if self.moves is None or self.moves is condition:
+            return _Slope(self.value, condition)
+        return _Slope(self.value, apply("and", condition, self.moves))
+
+    def plus(self, other: _Slope) -> _Slope:
+        if _is_zero(self.value) or _is_zero(other.value):
+            return self if _is_zero(other.value) else other
+        if self.moves is other.moves:
+            return _Slope(self.value + other.value, self.moves)
+        total = self.whole() + other.whole()
+        if self.moves is None or other.moves is None:
+            return _Slope(total)
+        return _Slope(total, apply("or", self.moves, other.moves))
+
+
+_NONE = _Slope(constant(0.0))
+
+
+def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
     if node.op in FLAT:
-        return constant(0.0)
+        return _NONE
     if node.op == "where":
-        zero = constant(0.0)
-        return apply("where", node.args[0], *(tangent.get(a, zero) for a in node.args[1:]))
+        return _either(node.args[0], *(tangent.get(a, _NONE) for a in node.args[1:]))
+    if node.op in CHOICES:
+        return _either(CHOICES[node.op](*node.args), *(tangent.get(a, _NONE) for a in node.args))
     if node.op in ("logdet", "det"):
         slope = np.sum(_inverse_of(node).T * _entries(node, tangent))
-        return slope * node if node.op == "det" else slope
+        return _Slope(slope * node if node.op == "det" else slope)
     if node.op not in PARTIALS:
         raise NotDifferentiable(f"{node!r} has no derivative in closed form")
-    total = constant(0.0)
-    for argument, partial in zip(node.args, PARTIALS[node.op](node, *node.args), strict=True):
-        if argument in tangent and not _is_zero(tangent[argument]):
+    total = _NONE
+    partials = PARTIALS[node.op](node, *node.args)
+    for place, (argument, partial) in enumerate(zip(node.args, partials, strict=True)):
+        if argument in tangent and not _is_zero(tangent[argument].value):
             if partial is None:
                 raise NotDifferentiable(f"{node!r} has no derivative in {argument!r}")
-            total = total + partial * tangent[argument]
+            total = total.plus(_summand(node, place, partial, tangent))
     return total
+
+
+def _either(condition: Expr, first: _Slope, second: _Slope) -> _Slope:
+    """The slope of where(condition, a, b), from those of a and b."""
+    if _is_zero(second.value):
+        return first if _is_zero(first.value) else first.only(condition)
+    if _is_zero(first.value):
+        return second.only(apply("not", condition))
+    whole = apply("where", condition, first.whole(), second.whole())
+    if first.moves is None and second.moves is None:
+        return _Slope(whole)
+    ways = [
+        case if slope.moves is None else apply("and", case, slope.moves)
+        for case, slope in ((condition, first), (apply("not", condition), second))
+    ]
+    return _Slope(whole, apply("or", *ways))
+
+
+def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, _Slope]) -> _Slope:
+    """Partial times slope for one of the node's arguments."""
+    argument, op = node.args[place], node.op
+    value, moves = slope = tangent[argument]
+    if op in _VANISHING:
+        (down, falls), (up, grows) = map(without_exponentials, (as_expr(partial), value))
+        if falls is not None and grows is not None:
+            return _Slope(down * up * apply("exp", falls + grows), moves)
+    if (op, place) == ("div", 1) or ((op, place) == ("pow", 0) and never_negative(argument)):
+        relative = _relative(argument, tangent)
+        if relative is not None:
+            by = -1.0 if op == "div" else node.args[1]
+            return _Slope(by * node * relative, moves)
+    zeros = []  # where any of these is 0, so is the slope
+    if (op, place) == ("pow", 1):
+        zeros = [node.args[0]]  # 0 ** b is 0 for every b above 0
+    elif op == "sqrt" or (op == "pow" and not _at_least_one(node.args[1])):
+        zeros = _fixed_factors(argument, tangent)
+    elif op == "exp" and _divides(value):
+        # exp(-k / u) at u = 0 is 0 sooner than the slope of k / u is infinite
+        slope = slope.only(apply("ne", node, 0.0))
+    for zero in zeros:
+        if not _never_zero(zero):
+            slope = slope.only(apply("ne", zero, 0.0))
+    return _Slope(partial * value, slope.moves)
+
+
+def _relative(node: Expr, tangent: dict[Expr, _Slope]) -> Expr | None:
+    """The slope of a growing exponential relative to it, which is finite also where it is not."""
+    if node.op == "exp":
+        return tangent[node.args[0]].value
+    if node.op == "cosh":
+        return _f("tanh", node.args[0]) * tangent[node.args[0]].value
+    if node.op == "neg":
+        return _relative(node.args[0], tangent)
+    if node.op not in ("add", "sub", "mul", "div"):
+        return None
+    moving = [a for a in node.args if a in tangent]
+    if len(moving) != 1 or (node.op == "div" and moving[0] is node.args[1]):
+        return None
+    relative = _relative(moving[0], tangent)
+    if relative is None or node.op in ("mul", "div"):
+        return relative
+    fixed = node.args[0] if moving[0] is node.args[1] else node.args[1]
+    core, exponent = without_exponentials(moving[0])
+    share = fixed / core if exponent is None else fixed / core * apply("exp", -exponent)
+    return relative / (1.0 + share if node.op == "add" else 1.0 - share)
+
+
+def _fixed_factors(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
+    """Of a product those factors that do not move."""
+    if node not in tangent:
+        return [node]
+    if node.op == "mul":
+        return [f for a in node.args for f in _fixed_factors(a, tangent)]
+    return _fixed_factors(node.args[0], tangent) if node.op in ("neg", "div") else []
+
+
+def _divides(node: Expr) -> bool:
+    """Whether it has a denominator that is no number."""
+    return any(
+        (n.op == "div" and n.args[1].op != "const")
+        or (n.op == "pow" and n.args[1].op == "const" and n.args[1].data < 0.0)
+        for n in topological([node])
+    )
+
+
+def _never_zero(node: Expr) -> bool:
+    return node.op == "exp" or (node.op == "const" and node.data != 0.0)
+
+
+def _at_least_one(node: Expr) -> bool:
+    return bool(node.op == "const" and node.data >= 1.0)
 
 
 def _is_zero(node: Expr) -> bool:
     return node.op == "const" and node.data == 0.0
 
 
-def _entries(node: Expr, tangent: dict[Expr, Expr]) -> ExprArray:
-    zero = constant(0.0)
-    flat = array([tangent.get(a, zero) for a in node.args])
+def _entries(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
+    flat = array([tangent.get(a, _NONE).whole() for a in node.args])
     return array(flat.reshape(node.data, node.data))
 
 
@@ -160,7 +309,7 @@ def _inverse_of(node: Expr) -> ExprArray:
     return inverse(array(node.args).reshape(node.data, node.data))
 
 
-def _matrix_tangent(node: Expr, tangent: dict[Expr, Expr]) -> ExprArray:
+def _matrix_tangent(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
     n, d = node.data, _entries(node, tangent)
     item = np.array([[Expr("item", (node,), (i, j)) for j in range(n)] for i in range(n)])
     if node.op == "inverse":  # d(A^-1) = -A^-1 dA A^-1

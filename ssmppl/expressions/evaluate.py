@@ -20,8 +20,9 @@ Draw = Callable[[str, tuple[np.ndarray, ...]], np.ndarray]
 _NUMPY = """exp log log1p expm1 sqrt sin cos tan sinh cosh tanh arcsin arccos arctan arcsinh arccosh
     arctanh abs sign floor ceil maximum minimum arctan2 logaddexp"""
 _SCIPY = """gammaln digamma ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
-    betainc betaincinv i0e i1e"""
-_OWN = "betabinomial_cdf betabinomial_quantile vonmises_cdf vonmises_quantile"
+    betainc betaincc betaincinv betainccinv i0e i1e"""
+_OWN = """gammaln_rise digamma_rise betaln betabinomial_cdf betabinomial_quantile vonmises_cdf
+    vonmises_quantile"""
 MEANING: dict[str, Callable[..., Any]] = {
     **{n: getattr(np, n) for n in UNARY + BINARY if n in _NUMPY.split()},
     **{n: getattr(sp, n) for n in UNARY + BINARY + TERNARY if n in _SCIPY.split()},
@@ -34,15 +35,17 @@ MEANING: dict[str, Callable[..., Any]] = {
     "binomial_quantile": lambda n, p, q: _round_up(
         sp.bdtrik(q, n, p), lambda k: _binomial_cdf(k, n, p), q
     ),
-    "negbinomial_quantile": lambda r, p, q: _round_up(
-        sp.nbdtrik(q, r, p), lambda k: sp.betainc(r, k + 1.0, p), q
+    "negbinomial_quantile": lambda r, mean, q: np.where(
+        np.asarray(q) == 1.0,
+        np.inf,
+        special.smallest_above(lambda k: special.negbinomial_tail(k, r, mean, "lower"), q),
     ),
     # smallest k with P(X > k) <= q
     "poisson_survival_quantile": lambda rate, q: special.smallest_below(
         lambda k: sp.gammainc(k + 1.0, rate), q
     ),
-    "negbinomial_survival_quantile": lambda r, p, q: special.smallest_below(
-        lambda k: sp.betainc(k + 1.0, r, 1.0 - np.asarray(p)), q
+    "negbinomial_survival_quantile": lambda r, mean, q: special.smallest_below(
+        lambda k: special.negbinomial_tail(k, r, mean, "upper"), q
     ),
     "neg": np.negative,
     "not": np.logical_not,

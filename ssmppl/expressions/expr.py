@@ -37,7 +37,7 @@ from ssmppl.expressions.node import (
     symbol,
 )
 from ssmppl.expressions.provenance import attributed, recording, user_location
-from ssmppl.expressions.simplify import apply, split_constant
+from ssmppl.expressions.simplify import apply, split_constant, without_exponentials
 from ssmppl.expressions.text import symbol_text, to_text
 
 __all__ = [
@@ -71,4 +71,5 @@ __all__ = [
     "unpack",
     "unpack_one",
     "user_location",
+    "without_exponentials",
 ]

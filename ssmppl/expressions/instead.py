@@ -25,8 +25,7 @@ INSTEAD: dict[str, str] = {
     "gamma": "np.exp(scipy.special.gammaln(x))",
     "erfcx": "np.exp(x**2) * scipy.special.erfc(x)",
     "factorial": "np.exp(scipy.special.gammaln(x + 1))",
-    **dict.fromkeys(["beta", "betaln"], "scipy.special.gammaln(a) + gammaln(b) - gammaln(a + b), "
-                    "and np.exp of it for beta"),
+    "beta": "np.exp(scipy.special.betaln(a, b))",
     **dict.fromkeys(["comb", "binom"], "np.exp(gammaln(n + 1) - gammaln(k + 1) - "
                     "gammaln(n - k + 1)), with scipy.special.gammaln"),
     "poch": "np.exp(scipy.special.gammaln(x + m) - gammaln(x))",

@@ -26,10 +26,10 @@ _UNARY = """neg exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh c
     arccosh arctanh abs sign floor ceil gammaln digamma trigamma ndtr log_ndtr ndtri erf erfc i0e
     i1e not"""
 _BINARY = """add sub mul div pow mod maximum minimum arctan2 logaddexp lt le eq ne and or
-    gammainc gammaincc gammaincinv gammainccinv poisson_quantile poisson_survival_quantile
-    vonmises_cdf vonmises_quantile"""
+    gammaln_rise digamma_rise betaln gammainc gammaincc gammaincinv gammainccinv poisson_quantile
+    poisson_survival_quantile vonmises_cdf vonmises_quantile"""
 UNARY, BINARY = _UNARY.split(), _BINARY.split()
-_TERNARY = """where betainc betaincinv binomial_quantile negbinomial_quantile
+_TERNARY = """where betainc betaincc betaincinv betainccinv binomial_quantile negbinomial_quantile
     negbinomial_survival_quantile"""
 TERNARY = _TERNARY.split()
 QUATERNARY = ["betabinomial_cdf", "betabinomial_quantile"]
@@ -171,10 +171,10 @@ class Expr:
         return _binary("mod", other, self)
 
     def __floordiv__(self, other):
-        return _apply("floor", self / other)
+        return self.__array_ufunc__(np.floor_divide, "__call__", self, other)
 
     def __rfloordiv__(self, other):
-        return _apply("floor", other / self)
+        return self.__array_ufunc__(np.floor_divide, "__call__", other, self)
 
     def __neg__(self):
         return _apply("neg", self)
@@ -204,9 +204,13 @@ class Expr:
         return _binary("le", other, self)
 
     def __eq__(self, other):
+        if isinstance(other, list | tuple):  # else Python would compare what they are
+            return self == np.asarray(other)
         return _binary("eq", self, other)
 
     def __ne__(self, other):
+        if isinstance(other, list | tuple):
+            return self != np.asarray(other)
         return _binary("ne", self, other)
 
     def __and__(self, other):

@@ -46,8 +46,32 @@ _RENAMED = {
     "divide": "div", "true_divide": "div", "power": "pow", "float_power": "pow",
     "remainder": "mod", "less": "lt", "less_equal": "le", "equal": "eq", "not_equal": "ne",
     "logical_and": "and", "logical_or": "or", "logical_not": "not", "bitwise_and": "and",
-    "bitwise_or": "or", "invert": "not", "psi": "digamma", "fmax": "maximum", "fmin": "minimum",
+    "bitwise_or": "or", "invert": "not", "psi": "digamma",
 }  # fmt: skip
+
+
+def _floor_divide(a: Expr, b: Expr) -> Expr:
+    """NumPy's: 1.0 // 0.1 is 9, as 0.1 is more than a tenth, though 1.0 / 0.1 is rounded to 10."""
+    if b.op == "const" and b.data.is_integer() and b.data != 0.0:
+        return apply("floor", a / b)
+    whole = (a - a % b) / b  # but for rounding
+    below = apply("floor", whole)
+    return apply("where", apply("eq", b, 0.0), a / b, below + (whole - below > 0.5))
+
+
+def _unless_nan(op: str) -> Callable[[Expr, Expr], Expr]:
+    """`op` of two numbers; where one of them is nan, the other."""
+
+    def run(a: Expr, b: Expr) -> Expr:
+        return _if_nan(a, b, _if_nan(b, a, apply(op, a, b)))
+
+    return run
+
+
+def _if_nan(a: Expr, value: Any, otherwise: Any) -> Expr:
+    return apply("where", apply("ne", a, a), value, otherwise)
+
+
 _COMPOSED: dict[str, Callable[..., Any]] = {
     "greater": lambda a, b: apply("lt", b, a),
     "greater_equal": lambda a, b: apply("le", b, a),
@@ -62,19 +86,23 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "xlogy": lambda a, b: apply("where", apply("eq", a, 0.0), 0.0, a * apply("log", b)),
     "xlog1py": lambda a, b: apply("where", apply("eq", a, 0.0), 0.0, a * apply("log1p", b)),
     "hypot": lambda a, b: apply("sqrt", a**2 + b**2),
-    "floor_divide": lambda a, b: apply("floor", a / b),
+    "floor_divide": _floor_divide,
+    "fmax": _unless_nan("maximum"),
+    "fmin": _unless_nan("minimum"),
     "deg2rad": lambda a: a * (np.pi / 180.0),
     "radians": lambda a: a * (np.pi / 180.0),
     "rad2deg": lambda a: a * (180.0 / np.pi),
     "degrees": lambda a: a * (180.0 / np.pi),
-    "heaviside": lambda a, b: apply("where", apply("eq", a, 0.0), b, apply("lt", 0.0, a)),
+    "heaviside": lambda a, b: _if_nan(
+        a, a, apply("where", apply("eq", a, 0.0), b, apply("lt", 0.0, a))
+    ),
     "isnan": lambda a: apply("ne", a, a),
     "positive": lambda a: a,
     "conjugate": lambda a: a,
 }
 _DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "where")} | {
-    "add", "maximum", "minimum", "arctan2", "logaddexp", "gammainc", "gammaincc", "gammaincinv",
-    "gammainccinv",
+    "add", "maximum", "minimum", "arctan2", "logaddexp", "betaln", "gammainc", "gammaincc",
+    "gammaincinv", "gammainccinv",
 }  # fmt: skip
 
 # What a user can call, by a ufunc of NumPy's or of scipy.special's.

@@ -11,6 +11,7 @@ terms of a log density are on their support. Callers that build on a form check 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -202,6 +203,10 @@ class _Separator(MatrixRules):
 
     def _power(self, terms: Terms, e: float, node: Expr) -> Terms:
         terms = {m: [c] for m, c in gathered(terms).items()}
+        if not math.isfinite(e) or (e < 0 and not terms):  # 1/0
+            raise self._mixed(node)
+        if not terms:
+            return {}
         if len(terms) == 1:
             ((m, c),) = terms.items()
             return {frozenset((a, round(k * e, 12)) for a, k in m): [summed(c) ** e]}
@@ -240,6 +245,8 @@ class _Separator(MatrixRules):
 
     def _log(self, terms: Terms, node: Expr) -> Terms:
         terms = {m: [c] for m, c in gathered(terms).items()}
+        if not terms:  # of 0
+            raise self._mixed(node)
         if len(terms) == 1:
             ((monomial, c),) = terms.items()
             scale, atoms = summed(c), dict(monomial)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.expressions import special
 from ssmppl.expressions.node import BOOLEAN, UNARY, Expr, as_expr, behaviour, constant
 
 
@@ -52,6 +53,7 @@ FOLD: dict[str, Callable[..., Any]] = {
     "mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod,
     "maximum": np.maximum, "minimum": np.minimum, "arctan2": np.arctan2,
     "logaddexp": np.logaddexp, "gammaln": _gammaln, "where": np.where,
+    "gammaln_rise": special.gammaln_rise, "betaln": special.betaln,
     "lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne,
     "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
 }  # fmt: skip
@@ -74,16 +76,32 @@ def _begins_with_positive(a: Expr, op: str) -> bool:
     return _begins_with_number(a, op) and a.args[0].data > 0
 
 
-def _without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
+def without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
     """(b, e) with a = b exp(e), for products and quotients; no e where no factor is an exp."""
+    done: dict[Expr, tuple[Expr, Expr | None]] = {}
+    waiting = [a]
+    while waiting:  # a product may have thousands of factors, and share them
+        node = waiting[-1]
+        missing = [f for f in node.args if f not in done] if node.op in _FACTORS else []
+        waiting += missing
+        if not missing:
+            done[waiting.pop()] = _gathered(node, done)
+    return done[a]
+
+
+_FACTORS = {"neg", "mul", "div"}
+
+
+def _gathered(a: Expr, done: dict[Expr, tuple[Expr, Expr | None]]) -> tuple[Expr, Expr | None]:
+    """As `without_exponentials`, from what is known of the factors."""
     if a.op == "exp":
         return constant(1.0), a.args[0]
     if a.op == "neg":
-        rest, exponent = _without_exponentials(a.args[0])
+        rest, exponent = done[a.args[0]]
         return (-rest, exponent) if exponent is not None else (a, None)
-    if a.op not in ("mul", "div"):
+    if a.op not in _FACTORS:
         return a, None
-    (left, up), (right, down) = map(_without_exponentials, a.args)
+    (left, up), (right, down) = (done[f] for f in a.args)
     if up is None and down is None:
         return a, None
     if down is not None and a.op == "div":
@@ -93,7 +111,7 @@ def _without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
 
 
 def _log_without_exponentials(a: Expr) -> Expr:
-    rest, exponent = _without_exponentials(a)
+    rest, exponent = without_exponentials(a)
     assert exponent is not None
     return apply("log", rest) + exponent
 
@@ -142,7 +160,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
     "log": (
         ("log(exp x) = x", lambda a: a.op == "exp", lambda a: a.args[0]),
         ("log(b exp(x)) = log b + x, also where exp(x) under- or overflows",
-         lambda a: _without_exponentials(a)[1] is not None, _log_without_exponentials),
+         lambda a: without_exponentials(a)[1] is not None, _log_without_exponentials),
         ("log(c x) = log c + log x, c > 0",
          lambda a: _begins_with_positive(a, "mul"),
          lambda a: math.log(a.args[0].data) + apply("log", a.args[1])),

@@ -22,9 +22,53 @@ def _wide(*values: Any) -> list[np.ndarray]:
     return [np.array(v, dtype=float) for v in np.broadcast_arrays(*values)]
 
 
+def _stirling_error(x: np.ndarray) -> np.ndarray:
+    """log Gamma(x) - ((x - 1/2) log x - x + log(2 pi) / 2) for x >= 15."""
+    z = x**-2
+    q = 1.0 / 1680.0 - z * (1.0 / 1188.0 - z * (691.0 / 360360.0 - z / 156.0))
+    error: np.ndarray = (1.0 / 12.0 - z * (1.0 / 360.0 - z * (1.0 / 1260.0 - z * q))) / x
+    return error
+
+
+def _digamma_error(x: np.ndarray) -> np.ndarray:
+    """digamma(x) - log(x) for x >= 10."""
+    z = x**-2
+    q = 1.0 / 252.0 - z * (1.0 / 240.0 - z * (1.0 / 132.0 - z * (691.0 / 32760.0 - z / 12.0)))
+    error: np.ndarray = -0.5 / x - z * (1.0 / 12.0 - z * (1.0 / 120.0 - z * q))
+    return error
+
+
+def gammaln_rise(a: Any, b: Any) -> np.ndarray:
+    """log Gamma(a + b) - log Gamma(a) for a, a + b >= 0, by Stirling's formula where they are
+    large: the error is one of the result's size, not of the two functions'."""
+    a, b = _wide(a, b)
+    end = a + b
+    with np.errstate(all="ignore"):
+        leading = (a - 0.5) * np.log1p(b / a) + b * (np.log(end) - 1.0)
+        large = leading + (_stirling_error(end) - _stirling_error(a))
+        found = np.where(np.minimum(a, end) < 15.0, sp.gammaln(end) - sp.gammaln(a), large)
+    return np.where((a >= 0) & (end >= 0), found, np.nan)
+
+
+def digamma_rise(a: Any, b: Any) -> np.ndarray:
+    """digamma(a + b) - digamma(a), likewise."""
+    a, b = _wide(a, b)
+    end = a + b
+    with np.errstate(all="ignore"):
+        large = np.log1p(b / a) + (_digamma_error(end) - _digamma_error(a))
+        found = np.where(np.minimum(a, end) < 10.0, sp.digamma(end) - sp.digamma(a), large)
+    return np.where((a >= 0) & (end >= 0), found, np.nan)
+
+
+def betaln(a: Any, b: Any) -> np.ndarray:
+    """log of the beta function of a, b >= 0."""
+    small, large = np.minimum(a, b), np.maximum(a, b)
+    return np.where(small >= 0, sp.gammaln(small) - gammaln_rise(large, small), np.nan)
+
+
 def _log_mass(k: int, n: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     choose = sp.gammaln(n + 1.0) - sp.gammaln(k + 1.0) - sp.gammaln(n - k + 1.0)
-    mass: np.ndarray = choose + sp.betaln(k + a, n - k + b) - sp.betaln(a, b)
+    mass: np.ndarray = choose + gammaln_rise(a, k) + gammaln_rise(b, n - k) - gammaln_rise(a + b, n)
     return mass
 
 
@@ -57,18 +101,37 @@ def betabinomial_quantile(n: Any, a: Any, b: Any, q: Any) -> np.ndarray:
     return np.where(sound & (q >= 0) & (q <= 1), k, np.nan)
 
 
+def negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
+    """P(X <= k), "lower", or P(X > k), "upper", of counts of dispersion r."""
+    r, mean = np.asarray(r, dtype=float), np.asarray(mean, dtype=float)
+    of_k, of_r = (sp.betaincc, sp.betainc) if side == "lower" else (sp.betainc, sp.betaincc)
+    near = of_k(k + 1.0, r, mean / (r + mean))
+    return np.where(mean < r, near, of_r(r, k + 1.0, r / (r + mean)))
+
+
+def smallest_above(cdf: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
+    """The smallest whole k >= 0 with cdf(k) >= q, elementwise."""
+    return _smallest(cdf, q, np.greater_equal)
+
+
 def smallest_below(survival: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
-    """The smallest whole k >= 0 with survival(k) <= q, elementwise: doubled, then halved."""
+    """The smallest whole k >= 0 with survival(k) <= q, elementwise."""
+    return _smallest(survival, q, np.less_equal)
+
+
+def _smallest(tail: Callable[[np.ndarray], Any], q: Any, reached: np.ufunc) -> np.ndarray:
+    """By a k that is doubled and an interval that is halved."""
     (q,) = _wide(q)
-    high = np.zeros(np.broadcast_shapes(q.shape, np.shape(survival(np.zeros(())))))
-    while np.any(short := (survival(high) > q) & (high < LARGEST_COUNT)):
+    high = np.zeros(np.broadcast_shapes(q.shape, np.shape(tail(np.zeros(())))))
+    known = ~np.isnan(tail(high) + q)
+    while np.any(short := known & ~reached(tail(high), q) & (high < LARGEST_COUNT)):
         high = np.where(short, 2.0 * high + 1.0, high)
-    low, fits = np.full(high.shape, -1.0), survival(high) <= q
+    low, fits = np.full(high.shape, -1.0), reached(tail(high), q)
     while np.any(high - low > 1.0):
         middle = np.maximum(np.floor(0.5 * (low + high)), 0.0)
-        inside = survival(middle) <= q
+        inside = reached(tail(middle), q)
         low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    high = np.where(fits, high, np.where(np.isnan(survival(high)), np.nan, np.inf))
+    high = np.where(fits, high, np.where(np.isnan(tail(high)), np.nan, np.inf))
     return np.where((q >= 0) & (q <= 1), high, np.nan)
 
 

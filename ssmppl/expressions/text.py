@@ -69,7 +69,8 @@ def to_text(root: Expr, longest: int = LONGEST) -> str:
         elif node.op in _INFIX:
             sign, level = _INFIX[node.op]
             (a, la), (b, lb) = parts
-            left = f"({a})" if la < level or (node.op == "pow" and la == level) else a
+            chained = node.op == "pow" or level == 0  # in Python a < b == c is another thing
+            left = f"({a})" if la < level or (chained and la == level) else a
             tight = sign not in "+*" or node.args[1].op == "mod"
             right = f"({b})" if lb < level or (lb == level and tight) else b
             done[node] = (f"{left}{sign}{right}" if level > 1 else f"{left} {sign} {right}", level)
@@ -84,6 +85,9 @@ def to_text(root: Expr, longest: int = LONGEST) -> str:
             done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
         elif node.op == "gammaln":
             done[node] = (f"gammaln({done[_bare(node.args[0])][0]})", 9)
+        elif node.op in ("gammaln_rise", "digamma_rise"):
+            name, (a, b) = node.op.removesuffix("_rise"), (p[0] for p in parts)
+            done[node] = (f"{name}({a} + {b}) - {name}({a})", 1)
         else:
             name = node.data[0] if node.op == "random" else node.op
             done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)

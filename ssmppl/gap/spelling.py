@@ -20,8 +20,8 @@ WIDTH = 73  # of one expression, which may stand behind `concentration=` of a la
 
 _NUMPY = """exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
     arccosh arctanh abs sign floor ceil maximum minimum arctan2 logaddexp where"""
-_SPECIAL = """gammaln ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
-    betainc betaincinv i0e i1e"""
+_SPECIAL = """gammaln betaln ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv
+    gammainccinv betainc betaincc betaincinv betainccinv i0e i1e"""
 CALLS = {n: f"np.{n}" for n in _NUMPY.split()} | {n: f"special.{n}" for n in _SPECIAL.split()}
 CALLS |= {"digamma": "special.psi"}
 LINALG = {"cholesky": "np.linalg.cholesky({0})", "inverse": "np.linalg.inv({0})",

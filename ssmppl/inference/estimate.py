@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["Estimate", "by_name", "free_components", "make_estimate", "table"]
+__all__ = ["NO_METHOD", "Estimate", "by_name", "free_components", "make_estimate", "table"]
+
+NO_METHOD = "none"  # where every parameter is fixed
 
 
 @dataclass(frozen=True)
@@ -70,10 +72,10 @@ class Estimate:
 
     def _head(self) -> tuple[str, str]:
         """What was maximised and how, and the log-likelihood."""
-        title = (
-            f"{self.attrs.get('model', '')}: maximum {self.attrs.get('objective', '')} by "
-            f"{self.attrs.get('method', '')}"
-        )
+        name, method = self.attrs.get("model", ""), self.attrs.get("method", "")
+        title = f"{name}: maximum {self.attrs.get('objective', '')} by {method}"
+        if method == NO_METHOD:
+            title = f"{name}: likelihood of the given parameters"
         error = self.attrs.get("log_likelihood_error")
         spread = f" (Monte Carlo error {error:.2g})" if error else ""
         return title, f"log-likelihood {self.log_likelihood:.6f}{spread}"

@@ -173,7 +173,8 @@ def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
             return np.asarray(time[-1] + gaps[0] * count)
     elif np.issubdtype(time.dtype, np.number) and len(time):
         gaps = np.diff(time) if len(time) > 1 else np.ones(1, time.dtype)
-        if np.allclose(gaps, gaps[0], rtol=1e-6):
+        rounding = 4.0 * np.spacing(np.abs(np.asarray(time, dtype=float)).max())
+        if np.allclose(gaps, gaps[0], rtol=1e-6, atol=rounding):
             return np.asarray(time[-1] + gaps[0] * count)
     return len(time) + count
 

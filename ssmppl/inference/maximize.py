@@ -14,7 +14,7 @@ import numpy as np
 from ssmppl.analysis.structure import noisy_start
 from ssmppl.data import check_values
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
-from ssmppl.inference.estimate import Estimate, free_components, make_estimate
+from ssmppl.inference.estimate import NO_METHOD, Estimate, free_components, make_estimate
 from ssmppl.inference.exact.exact_score import ExactScore, exact_score
 from ssmppl.inference.exact.models import kind_of
 from ssmppl.inference.executors import check_executor
@@ -130,7 +130,7 @@ def maximize(
         ascent = CLIMBS[type(chosen)](setup, chosen)
     attrs: dict[str, Any] = {
         "model": problem.trace.name,
-        "method": type(chosen).__name__ if chosen is not None else "none",
+        "method": type(chosen).__name__ if chosen is not None else NO_METHOD,
         "method_chosen": reason,
         "objective": objective,
         "settings": asdict(chosen) if chosen is not None else {},

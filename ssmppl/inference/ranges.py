@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
+from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distributions import BetaBinomial, Binomial, Distribution, Mixture, Truncated
-from ssmppl.language.mixtures import SUM_ROUNDING
+from ssmppl.language.distributions import (
+    BetaBinomial,
+    Binomial,
+    Categorical,
+    Distribution,
+    Mixture,
+    Truncated,
+)
+from ssmppl.language.shares import SUM_ROUNDING
 
 __all__ = ["DOMAIN", "out_of_range"]
 
-_WEIGHTS = (
-    "write weights that are shares of 1 whatever the state, such as [1 - p, p] with "
+_SHARES = (
+    "that are shares of 1 whatever the state, such as [1 - p, p] with "
     "p = 1 / (1 + np.exp(-z)), or w / np.sum(w) of positive w"
 )
 DOMAIN = "some parameter, state or input leads outside the domain of an operation"
@@ -56,13 +65,7 @@ def _of_one(
             needed = symbols_of(e)
             if not needed:
                 continue
-            fix = _fix(
-                called,
-                e,
-                low,
-                high,
-                count=isinstance(law, (Binomial, BetaBinomial)) and called == "n",
-            )
+            fix = _fix(law, called, e, low, high)
             if needed <= set(values):
                 value = float(evaluate(e, values))
                 if np.isnan(value):
@@ -75,30 +78,37 @@ def _of_one(
             else:
                 demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
                 might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
-    return _sums(law, values) if isinstance(law, Mixture) else None
+    return _sums(law, values) if isinstance(law, (Categorical, Mixture)) else None
 
 
-def _sums(law: Mixture, values: Mapping[Expr, float]) -> tuple[str, str] | None:
-    """Weights that do not sum to 1, where their symbols have values."""
+def _sums(law: Categorical | Mixture, values: Mapping[Expr, float]) -> tuple[str, str] | None:
+    """Shares that do not sum to 1, where their symbols have values."""
+    called, own = _shares(law)
     for index in np.ndindex(law.shape):
-        weights = [w[index] for w in law.weights]
-        if symbols_of(weights) and symbols_of(weights) <= set(values):
-            total = float(np.sum(evaluate(weights, values)))
+        shares = [array(share)[index] for share in own]
+        if symbols_of(shares) and symbols_of(shares) <= set(values):
+            total = float(np.sum(evaluate(shares, values)))
             if not abs(total - 1.0) <= SUM_ROUNDING:
-                text = ", ".join(map(repr, weights))
-                return f"the weights of Mixture, [{text}], sum to {total:.6g} there", _WEIGHTS
+                text = ", ".join(map(repr, shares))
+                found = f"the {called} of {type(law).__name__}, [{text}], sum to {total:.6g} there"
+                return found, f"write {called} {_SHARES}"
     return None
 
 
-def _fix(called: str, e: Expr, low: float, high: float, count: bool = False) -> str:
+def _shares(law: Categorical | Mixture) -> tuple[str, Iterable[Any]]:
+    """What the shares of a law are called, and these."""
+    return ("weights", law.weights) if isinstance(law, Mixture) else ("probabilities", law.p)
+
+
+def _fix(law: Distribution, called: str, e: Expr, low: float, high: float) -> str:
     """A function that maps all numbers into the range."""
-    if count:
+    if isinstance(law, (Binomial, BetaBinomial)) and called == "n":
         return (
             f"write a {called} that is never below 0, np.maximum({e!r}, 0); where several flows "
             "empty one compartment, draw each out of what the others have left"
         )
-    if called.startswith("weights["):
-        return _WEIGHTS
+    if isinstance(law, (Categorical, Mixture)):
+        return f"write {_shares(law)[0]} {_SHARES}"
     if (low, high) == (0.0, 1.0):
         logistic = f"1 / (1 + np.exp(-({e!r})))"
         return f"write a {called} between 0 and 1 whatever the state, such as {logistic}"

@@ -140,22 +140,35 @@ def return_location(function: Law) -> Location:
 
 # -- names from outside of the law
 def check_outer_names(function: Law, role: str, known: Known) -> None:
-    """Refuse a law that reads a variable of Python's named as a quantity of the model.
+    """Refuse a law that reads a variable of Python's named as a quantity of the model, itself or
+    in a function of the user's that it calls.
 
     With `phi = 0.9` at the top of the file, a law that forgets `phi` among its arguments would
     quietly use 0.9.
     """
-    for name, value in outer_values(function).items():
-        if name not in known or callable(value) or inspect.ismodule(value):
-            continue
-        where = _line_of_name(plain_function(function).__code__, name, location_of(function))
-        raise ModelError(
-            f"@{role} {function.__name__} reads the Python variable {name!r}, while {name!r} is "
-            f"{known[name]} of the model",
-            fix=f"add {name!r} to the arguments of {function.__name__}; if the variable is meant, "
-            "rename it",
-            where=where,
-        )
+    who = f"@{role} {function.__name__} reads"
+    to_read: list[tuple[Callable[..., Any], str]] = [(function, who)]
+    met = {id(function)}
+    while to_read:
+        reader, who = to_read.pop()
+        for name, value in outer_values(reader).items():
+            if inspect.isfunction(value) and id(value) not in met and _of_the_users(value):
+                met.add(id(value))
+                to_read.append((value, f"{value.__name__}(), which @{role} calls, reads"))
+            if name not in known or callable(value) or inspect.ismodule(value):
+                continue
+            code = plain_function(reader).__code__
+            raise ModelError(
+                f"{who} the Python variable {name!r}, while {name!r} is {known[name]} of the model",
+                fix=f"add {name!r} to the arguments of {reader.__name__}; if the variable is "
+                "meant, rename it",
+                where=_line_of_name(code, name, location_of(reader)),
+            )
+
+
+def _of_the_users(function: Callable[..., Any]) -> bool:
+    file = plain_function(function).__code__.co_filename
+    return not file.startswith((*INSTALLED, _OWN))
 
 
 def _line_of_name(code: CodeType, name: str, where: Location) -> Location:

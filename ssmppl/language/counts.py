@@ -13,7 +13,7 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.language.continuous import _each, _where
 from ssmppl.language.distribution import INFINITY, Distribution, Support
-from ssmppl.language.positive import Beta, log_gamma
+from ssmppl.language.positive import Beta
 
 
 def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
@@ -116,7 +116,7 @@ class NegativeBinomial(_Counts):
 
     def log_densities(self, value):
         v, m, r = array(value), self.mean_, self.dispersion
-        choose = ew("gammaln", v + r) - log_gamma(r) - ew("gammaln", v + 1.0)
+        choose = array(ew("gammaln_rise", r, v)) - ew("gammaln", v + 1.0)
         return choose - r * ew("log1p", m / r) + _times_log(v, m / (r + m))
 
     def sample(self, draws):
@@ -134,19 +134,21 @@ class NegativeBinomial(_Counts):
 
     def cdf(self, value):
         k, r = self._count(value), self.dispersion
-        return self._below_zero(value, ew("betainc", r, k + 1.0, r / (r + self.mean_)))
+        # by the smaller share, of which 1 - share keeps its digits
+        shares, few = r + self.mean_, ew("lt", self.mean_, r)
+        by_mean = ew("betaincc", k + 1.0, r, self.mean_ / shares)
+        by_rest = ew("betainc", r, k + 1.0, r / shares)
+        return self._below_zero(value, _where(few, by_mean, by_rest))
 
     def survival(self, value):
         k, r = self._count(value), self.dispersion
         return self._one_below_zero(value, ew("betainc", k + 1.0, r, self.mean_ / (r + self.mean_)))
 
     def quantile(self, p):
-        r = self.dispersion
-        return array(ew("negbinomial_quantile", r, r / (r + self.mean_), p))
+        return array(ew("negbinomial_quantile", self.dispersion, self.mean_, p))
 
     def survival_quantile(self, p):
-        r = self.dispersion
-        return array(ew("negbinomial_survival_quantile", r, r / (r + self.mean_), p))
+        return array(ew("negbinomial_survival_quantile", self.dispersion, self.mean_, p))
 
     def sample_above(self, draws, lower):
         # As for Poisson, with the process run at a gamma distributed speed g for the time m / r:
@@ -274,9 +276,8 @@ class BetaBinomial(_OutOf):
 
     def log_densities(self, value):
         v, n, a, b = array(value), self.n, self.a, self.b
-        above = ew("gammaln", v + a) + array(ew("gammaln", n - v + b)) - ew("gammaln", n + a + b)
-        below = log_gamma(a) + log_gamma(b) - ew("gammaln", a + b)
-        return self._log_choose(v) + above - below
+        successes, failures = array(ew("gammaln_rise", a, v)), ew("gammaln_rise", b, n - v)
+        return self._log_choose(v) + successes + failures - ew("gammaln_rise", a + b, n)
 
     def sample(self, draws):
         p = Beta(self.a, self.b).sample(draws)

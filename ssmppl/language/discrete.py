@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ModelError
-from ssmppl.expressions.arrays import array
+from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import constant
 from ssmppl.language.continuous import _each, _where
 from ssmppl.language.counts import Binomial, _Counts
 from ssmppl.language.distribution import INFINITY, Distribution, Support
+from ssmppl.language.nested import holding
+from ssmppl.language.shares import sum_holds, wrong_sum
 
 
 class Bernoulli(_Counts):
@@ -80,14 +82,16 @@ class Categorical(_Counts):
                 where=self.location,
             )
         self._require("p", 0.0, 1.0, strict=False)
-        if all(e.op == "const" for e in self.p):
-            total = sum(e.data for e in self.p)
-            if abs(total - 1.0) > 1e-8:
-                raise ModelError(
-                    f"Categorical: p sums to {total:.9g}",
-                    fix="divide p by its sum",
-                    where=self.location,
-                )
+        total = wrong_sum(self.p)
+        if total is not None:
+            raise ModelError(
+                f"Categorical: p sums to {total:.9g}",
+                fix="divide p by its sum",
+                where=self.location,
+            )
+
+    def in_range(self) -> ExprArray | None:
+        return holding([super().in_range(), sum_holds(self.p)])
 
     def support(self):
         return Support("integers", self._full(0.0), self._full(len(self.p) - 1.0))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import Location
-from ssmppl.language.reading import PLAIN, names_in, outer_values
+from ssmppl.language.reading import PLAIN, attribute, names_in, outer_values
 
 CALLED = ("__init__", "__call__")  # the methods of a class that act without being named
 PACKAGE = "ssmppl"
@@ -52,7 +52,8 @@ class _Content:
             return self._code(value)
         if isinstance(value, Location):
             return "place"
-        if hasattr(value, "__qualname__") and self._foreign(getattr(value, "__module__", None)):
+        named = attribute(value, "__qualname__") is not None
+        if named and self._foreign(attribute(value, "__module__")):
             return f"{value.__module__}.{value.__qualname__}"
         if not isinstance(value, tuple | frozenset | np.ndarray | np.generic):
             if id(value) in self.met:
@@ -76,10 +77,10 @@ class _Content:
         if isinstance(value, set | frozenset):
             return sorted(repr(self.of(v, names)) for v in value)
         for wrapped in ("py_func", "__wrapped__", "__func__", "fget", "func"):
-            inner = getattr(value, wrapped, None)
+            inner = attribute(value, wrapped)
             if callable(inner):  # Numba's, a cache, a method, a property, a partial
                 own = ("__self__", "args", "keywords", "targetoptions")  # fastmath changes digits
-                rest = [getattr(value, n, None) for n in own]
+                rest = [attribute(value, n) for n in own]
                 return self.of(inner, names), self.of(rest, names)
         return self._object(value, names)
 
@@ -122,9 +123,9 @@ class _Content:
                 return hashlib.sha256(pickle.dumps(value, 5)).hexdigest()
             except Exception:  # whatever a class may raise that cannot be pickled
                 return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
-        own = getattr(value, "__dict__", None)
+        own = attribute(value, "__dict__")
         if own is None:
-            own = {n: getattr(value, n, None) for n in getattr(kind, "__slots__", ())}
+            own = {n: attribute(value, n) for n in getattr(kind, "__slots__", ())}
         return self.of(kind, names), [(n, self.of(own[n], names)) for n in sorted(own)]
 
 

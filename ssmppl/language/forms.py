@@ -33,8 +33,9 @@ def form(
     ------
     ModelError : it gives no expression of its arguments; names its line.
     """
-    given: dict[str, Any] = {
-        n: place(n) if v is None else v for n, v in zip(parameters, pattern, strict=True)
+    given: dict[str, Any] = {  # NumPy's numbers, which may be divided by 0
+        n: place(n) if v is None else np.float64(v)
+        for n, v in zip(parameters, pattern, strict=True)
     }
     first = next(iter(inspect.signature(function).parameters), "")
     found: list[Expr] = []

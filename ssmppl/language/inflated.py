@@ -14,10 +14,10 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import user_location
-from ssmppl.expressions.signs import never_negative
-from ssmppl.language.continuous import _NAN, _each, _where
+from ssmppl.language.continuous import _each, _where
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.nested import cut, exists, holding
+from ssmppl.language.shares import log_sum, none_below_zero
 
 
 class ZeroInflated(Distribution):
@@ -66,19 +66,16 @@ class ZeroInflated(Distribution):
     def in_range(self) -> ExprArray | None:
         return holding([super().in_range(), exists(self.base)])
 
-    def _share(self) -> ExprArray:
-        """p; NaN below 0, where log(1 - p) is a number."""
-        p = self.p
-        return p if all(map(never_negative, p.ravel())) else _where(ew("le", 0.0, p), p, _NAN)
-
     def log_densities(self, value):
-        v, p = array(value), self._share()
-        at_zero, rest = array(ew("log", p)), array(ew("log1p", -p))
-        if all(e.data > 0.0 for e in self.base.support().lower.ravel()):  # a hurdle
-            return _where(ew("eq", v, 0.0), at_zero, rest + cut(self.base, v))
-        law_zero = array(self.base.log_densities(array(np.zeros(v.shape))))
-        at_zero = array(ew("logaddexp", at_zero, rest + law_zero))
-        return _where(ew("eq", v, 0.0), at_zero, rest + self.base.log_densities(v))
+        v, p = array(value), self.p
+        parts = [self._full(0.0), self._of_base(array(np.zeros(v.shape)))]
+        rest = array(ew("log1p", -none_below_zero(p)))
+        return _where(ew("eq", v, 0.0), log_sum([p, 1.0 - p], parts), rest + self._of_base(v))
+
+    def _of_base(self, value: ExprArray) -> ExprArray:
+        """The law's own log density from 0 on; -inf at zeros that it does not have."""
+        from_zero = all(e.data == 0.0 for e in self.base.support().lower.ravel())
+        return array(self.base.log_densities(value) if from_zero else cut(self.base, value))
 
     def sample(self, draws):
         u = _each(self, lambda i: draws.uniform())

@@ -1,7 +1,6 @@
 """Mixture: one of several laws by a hidden choice, which is summed out.
 
-McLachlan and Peel (2000), "Finite mixture models". The logarithm of the sum is taken from its
-larger term (`logaddexp`), so that no component is lost to underflow.
+McLachlan and Peel (2000), "Finite mixture models".
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import INFINITY, Distribution, Support
 from ssmppl.language.draws import Draws
 from ssmppl.language.nested import cut, exists, holding
-
-SUM_ROUNDING = 1e-6  # by which weights that are expressions may miss the sum 1
+from ssmppl.language.shares import log_sum, sum_holds, wrong_sum
 
 
 class Mixture(Distribution):
@@ -67,7 +65,13 @@ class Mixture(Distribution):
         self.drawable = all(law.drawable for law in self.components)
         for k in range(len(self.components)):
             self._require(f"weight_{k}", 0.0, 1.0, strict=False)
-        self._refuse_sum()
+        total = wrong_sum(self.weights)
+        if total is not None:
+            raise ModelError(
+                f"Mixture: weights sum to {total:.9g}",
+                fix="divide the weights by their sum",
+                where=self.location,
+            )
 
     @property
     def weights(self) -> list[ExprArray]:
@@ -85,21 +89,6 @@ class Mixture(Distribution):
         ]
         weights = [values[f"weight_{k}"] for k in range(len(laws))]
         return self._at_place(Mixture(weights, laws))
-
-    def _sums(self) -> ExprArray:
-        total = self.weights[0]
-        for w in self.weights[1:]:
-            total = total + w
-        return array(total)
-
-    def _refuse_sum(self) -> None:
-        for total in self._sums().ravel():
-            if total.op == "const" and abs(total.data - 1.0) > 1e-8:
-                raise ModelError(
-                    f"Mixture: weights sum to {total.data:.9g}",
-                    fix="divide the weights by their sum",
-                    where=self.location,
-                )
 
     def __repr__(self) -> str:
         weights = ", ".join(repr(w.ravel()[0]) if w.size else "" for w in self.weights)
@@ -128,11 +117,7 @@ class Mixture(Distribution):
 
     def in_range(self) -> ExprArray | None:
         """As of any law, for all components at once: what is never chosen has to exist too."""
-        gap = array(self._sums() - 1.0)
-        sums = None
-        if any(e.op != "const" for e in gap.ravel()):
-            sums = array(ew("le", ew("abs", gap), SUM_ROUNDING))
-        return holding([super().in_range(), sums, *map(exists, self.components)])
+        return holding([super().in_range(), sum_holds(self.weights), *map(exists, self.components)])
 
     def _parts(self, value: ExprArray) -> list[ExprArray]:
         """Log density of each component, -inf where the mixture has a value and it has none."""
@@ -147,11 +132,7 @@ class Mixture(Distribution):
         return out
 
     def log_densities(self, value):
-        total = None
-        for weight, part in zip(self.weights, self._parts(array(value)), strict=True):
-            term = array(ew("log", weight)) + part
-            total = term if total is None else array(ew("logaddexp", total, term))
-        return total
+        return log_sum(self.weights, self._parts(array(value)))
 
     def guarded_log_densities(self, value):
         density = super().guarded_log_densities(value)

@@ -62,6 +62,14 @@ class _Joint(Distribution):
                 )
         return m
 
+    def _where_definite(self, m: ExprArray, density: ExprArray) -> ExprArray:
+        """A density in which the matrix m stands, and -inf where m is not positive definite: its
+        determinant may be positive all the same."""
+        if _surely_positive(m):
+            return density
+        last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
+        return array(ew("where", ew("lt", 0.0, last), density[()], -math.inf))
+
 
 class MvNormal(_Joint):
     """MvNormal(mean, covariance= | precision= | cholesky=): a vector (d,).
@@ -126,10 +134,7 @@ class MvNormal(_Joint):
 
     def guarded_log_densities(self, value):
         density, m = self.log_densities(value), self.parameters[self.spread]
-        if self.spread == "cholesky" or _surely_positive(m):
-            return density
-        last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
-        return array(ew("where", ew("lt", 0.0, last), density[()], -math.inf))
+        return density if self.spread == "cholesky" else self._where_definite(m, density)
 
     def factor(self) -> ExprArray:
         """A matrix L, (d, d), with L L' = covariance."""
@@ -200,7 +205,8 @@ class Dirichlet(_Joint):
     def log_densities(self, value):
         total, rows = constant(0.0), array(value).reshape(-1, self.shape[-1]).view(np.ndarray)
         for a, v in zip(self._rows(), rows, strict=True):
-            norm = np.sum(log_gamma(a)) - ew("gammaln", np.sum(a))
+            # the beta functions of sticks that are broken off one by one
+            norm = np.sum([ew("betaln", a[k], np.sum(a[k + 1 :])) for k in range(len(a) - 1)])
             total = total + np.sum((a - 1.0) * ew("log", array(v))) - norm
         return array(total)
 
@@ -257,6 +263,9 @@ class _WishartFamily(_Joint):
 
     def support(self):
         return Support("positive definite", self._full(-math.inf), self._full(math.inf))
+
+    def guarded_log_densities(self, value):
+        return self._where_definite(self.scale, super().guarded_log_densities(value))
 
     def _bartlett(self, draws: Draws) -> ExprArray:
         """A with A A' ~ Wishart(df, identity)."""

@@ -307,8 +307,7 @@ class Beta(Distribution):
 
     def log_densities(self, value):
         a, b, v = self.a, self.b, array(value)
-        norm = log_gamma(a) + log_gamma(b) - ew("gammaln", a + b)
-        return (a - 1.0) * ew("log", v) + (b - 1.0) * ew("log1p", -v) - norm
+        return (a - 1.0) * ew("log", v) + (b - 1.0) * ew("log1p", -v) - ew("betaln", a, b)
 
     def sample(self, draws):
         def draw(i):
@@ -333,17 +332,14 @@ class Beta(Distribution):
         return array(ew("betainc", self.a, self.b, clipped))
 
     def survival(self, value):
-        clipped = array(ew("minimum", 1.0, ew("maximum", 0.0, value)))
-        near_one = ew("betainc", self.b, self.a, 1.0 - clipped)
-        return _where(ew("lt", clipped, 0.5), 1.0 - self.cdf(clipped), near_one)
+        clipped = ew("minimum", 1.0, ew("maximum", 0.0, value))
+        return array(ew("betaincc", self.a, self.b, clipped))
 
     def quantile(self, p):
         return array(ew("betaincinv", self.a, self.b, p))
 
     def survival_quantile(self, p):
-        p = array(p)
-        near_one = 1.0 - array(ew("betaincinv", self.b, self.a, p))
-        return _where(ew("lt", p, 0.5), near_one, ew("betaincinv", self.a, self.b, 1.0 - p))
+        return array(ew("betainccinv", self.a, self.b, p))
 
     def weighted(self, power):
         moment = math.prod(

@@ -3,7 +3,8 @@
 A primitive is compiled by Numba and called once per particle. It has no symbolic form, so nothing
 is derived through it: no gradients, no conjugate updates of what enters it, and no proposal that
 looks at an observation through it. In the mean of a Gaussian transition guided and auxiliary
-proposals are still derived, as they need its value only.
+proposals are still derived, as they need its value only. What it reads from outside is part of what
+is compiled: a primitive that finds something else there is refused.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.language.fingerprints import fingerprint
 from ssmppl.language.model import location_of
 from ssmppl.language.packing import holder_of
+from ssmppl.language.reading import outer_values
 
 REGISTRY: dict[str, Callable[..., Any]] = {}  # unique name -> compiled function
 
@@ -36,7 +38,9 @@ class Primitive:
         self.arguments = _arguments(function)
         self.compiled = _compile(function, len(self.arguments))
         word = re.sub(r"\W+", "_", function.__name__).strip("_")  # <lambda> is no identifier
-        self.name = f"{word}_{fingerprint(function)[:8]}"
+        self._compiled_of = fingerprint(function)
+        self.name = f"{word}_{self._compiled_of[:8]}"
+        self.__wrapped__ = function  # so that a law that calls it reads what the function reads
         self.__name__, self.__doc__ = function.__name__, function.__doc__
         REGISTRY[self.name] = self.compiled
 
@@ -50,11 +54,24 @@ class Primitive:
             )
         if not any(_symbolic(v) for v in values):
             return self.function(*values)
+        self._check_as_compiled()
         arrays: Any = np.broadcast_arrays(*(array(v).view(np.ndarray) for v in values))
         out = np.empty(arrays[0].shape, dtype=object)
         for i in np.ndindex(out.shape):
             out[i] = Expr("call", tuple(a[i] for a in arrays), self)
         return scalar_or_array(out)
+
+    def _check_as_compiled(self) -> None:
+        """Numba has frozen what the function reads from outside."""
+        if fingerprint(self.function) != self._compiled_of:
+            read = sorted(outer_values(self.function))
+            raise ModelError(
+                f"the primitive {self.__name__} was compiled with other values of what it reads "
+                f"from outside ({', '.join(read)}), and its compiled form does not see the change",
+                fix=f"give what changes as an argument, or make it anew: {self.__name__} = "
+                f"ssm.primitive({self.__name__}.function)",
+                where=self.location,
+            )
 
     def __reduce__(self):  # by name where a module holds it, else by the function
         if holder_of(self.function) is self:
@@ -95,7 +112,8 @@ def primitive(function: Callable[..., float]) -> Primitive:
 
     Raises
     ------
-    ModelError : Numba cannot compile it; names the function, its line and Numba's reason.
+    ModelError : Numba cannot compile it; names the function, its line and Numba's reason. Also in
+        a law, where a variable that the function reads has changed since.
 
     Examples
     --------

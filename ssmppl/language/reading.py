@@ -1,9 +1,12 @@
 """What laws read from outside while they are traced, as one digest within this process.
 
 A trace keeps the numbers that its laws read, and is made anew where the digest differs. Of a module
-or an object those attributes count that the code names, of a function what it reads in its turn;
-what has no other form goes by which object it is, and libraries by their names. It is taken at
-every call of a verb: `fingerprints`, which are the same in every process, spell out more.
+or an object those attributes count that the code names, anywhere in the functions that are reached,
+and what the special methods of its class read; all of them where the code has one of the words
+that read all (`WHOLE`). Of a function counts what it reads in its turn; of an object of a library,
+such as a Series of pandas, its pickle. What has no other form goes by which object it is, and
+libraries by their names. It is taken at every call of a verb: `fingerprints`, which are the same in
+every process, spell out more.
 """
 
 from __future__ import annotations
@@ -12,9 +15,10 @@ import dis
 import functools
 import hashlib
 import inspect
+import pickle
 import sys
 import sysconfig
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from types import (
     BuiltinFunctionType,
@@ -32,6 +36,7 @@ __all__ = [
     "INSTALLED",
     "PLAIN",
     "Declared",
+    "attribute",
     "digest_of_code",
     "names_in",
     "outer_values",
@@ -40,6 +45,19 @@ __all__ = [
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented), range)
 _CORE = ("numpy", "numba", "ssmppl", "scipy")
+# Words of code that reads attributes without naming them.
+WHOLE = frozenset((
+    "vars", "getattr", "attrgetter", "asdict", "astuple", "fields", "replace", "deepcopy",
+    "__dict__", "__slots__",
+))  # fmt: skip
+# Special methods that do not run where an object is read.
+_NOT_READ = frozenset((
+    "__init__", "__new__", "__init_subclass__", "__set_name__", "__class_getitem__", "__repr__",
+    "__str__", "__del__", "__setattr__", "__delattr__", "__setitem__", "__delitem__",
+    "__getstate__", "__setstate__", "__reduce__", "__reduce_ex__", "__eq__", "__hash__",
+))  # fmt: skip
+# Library modules of mappings that are read as dictionaries are.
+_MAPPINGS = ("builtins", "collections", "os")
 _STDLIB = sysconfig.get_path("stdlib")
 INSTALLED = tuple(
     path for key in ("stdlib", "platstdlib", "purelib", "platlib")
@@ -77,11 +95,20 @@ def outer_values(function: Callable[..., Any]) -> dict[str, Any]:
     return found
 
 
+def attribute(thing: Any, name: str, otherwise: Any = None) -> Any:
+    """An object's attribute; `otherwise` where it has none, whatever its `__getattr__` raises."""
+    try:
+        return getattr(thing, name, otherwise)
+    except Exception:
+        return otherwise
+
+
 def digest_of_code(functions: Iterable[Callable[..., Any]]) -> str:
     """Changes, within this process, with functions and with what they take from outside."""
     reading = _Reading()
     for function in functions:
-        reading.value(function, frozenset())
+        reading.value(function)
+    reading.named()
     return reading.text.hexdigest()
 
 
@@ -91,7 +118,9 @@ class _Reading:
     def __init__(self) -> None:
         self.text = hashlib.sha256()
         self.met: dict[int, tuple[int, Any]] = {}  # the thing itself: its id stays in use
-        self.read: dict[int, set[str]] = {}  # of modules and objects, names that were looked up
+        self.names: set[str] = set()  # that the code looks up
+        self.having: dict[int, tuple[Any, dict[str, Any]]] = {}  # attributes, with their class's
+        self.read: dict[int, set[str]] = {}  # of these, the names that were looked up
 
     def put(self, *words: Any) -> None:
         for word in words:
@@ -105,136 +134,166 @@ class _Reading:
         self.put("again" if known else "first", number)
         return known
 
-    def value(self, v: Any, names: frozenset[str]) -> None:
-        """names : that the code around it looks up."""
+    def value(self, v: Any) -> None:
         if type(v) in PLAIN:
             self.put(type(v).__name__, repr(v))
         elif isinstance(v, CodeType):
             self.code(v)
         elif isinstance(v, (np.ndarray, np.generic)):
-            self.array(v, names)
+            self.array(v)
         elif isinstance(v, np.dtype):
             self.put("dtype", v.str, v.descr)
         elif isinstance(v, Enum):
             self.put("member", type(v).__module__, type(v).__qualname__, v.name)
-            self.value(v.value, names)
+            self.value(v.value)
         elif isinstance(v, (list, tuple, dict)):
-            self.container(v, names)
+            self.container(v)
         elif isinstance(v, (set, frozenset)):
             self.put(type(v).__name__, *sorted(map(repr, v)))
         elif isinstance(v, ModuleType):
-            self.module(v, names)
+            self.module(v)
         elif (home := self.library_name(v)) is not None:
             self.put("library", *home)
         elif isinstance(v, FunctionType):
             self.function(v)
         else:
-            self.thing(v, names)
+            self.thing(v)
 
-    def array(self, v: Any, names: frozenset[str]) -> None:
+    def array(self, v: Any) -> None:
         self.put(type(v).__name__, v.dtype.str, v.dtype.descr, v.shape)
         if v.dtype.hasobject:
             for entry in np.asarray(v).ravel().tolist():
-                self.value(entry, names)
+                self.value(entry)
         else:
             self.put(np.ascontiguousarray(v).tobytes())
         if isinstance(v, np.ma.MaskedArray):
             self.put(np.ma.getmaskarray(v).tobytes())
 
-    def container(self, v: Any, names: frozenset[str]) -> None:
-        self.put(type(v).__name__, getattr(v, "_fields", ()), len(v))
+    def container(self, v: Any) -> None:
+        self.put(type(v).__name__, getattr(type(v), "_fields", ()), len(v))
         if not self.again(v):
-            for entry in v.items() if isinstance(v, dict) else v:
-                self.value(entry, names)
+            for entry in dict.items(v) if isinstance(v, dict) else v:
+                self.value(entry)
+            if type(v) not in (list, tuple, dict):
+                self.having[id(v)] = v, self.shared(v)
 
     def code(self, code: CodeType) -> None:
         self.put("code", code.co_code, code.co_exceptiontable, code.co_flags, code.co_names)
         self.put(code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
         self.put(code.co_freevars, code.co_cellvars, len(code.co_consts))
         for constant in code.co_consts:
-            self.value(constant, frozenset())
+            self.value(constant)
 
     def function(self, f: FunctionType) -> None:
         self.put(id(f))
         if self.again(f):
             return
         self.code(f.__code__)
-        names = names_in(f.__code__)
-        self.value(f.__defaults__, names)
-        self.value(f.__kwdefaults__, names)
+        self.names |= names_in(f.__code__)
+        self.value(f.__defaults__)
+        self.value(f.__kwdefaults__)
         for name, outer in sorted(outer_values(f).items()):
             self.put(name)
-            self.value(outer, names)
+            self.value(outer)
+        if f.__dict__:
+            self.having[id(f)] = f, {}
 
-    def module(self, module: ModuleType, names: frozenset[str]) -> None:
+    def module(self, module: ModuleType) -> None:
         self.put("module", module.__name__)
         if self.is_library(module.__name__):
             return
-        self.attributes(module, names, {})
+        self.having.setdefault(id(module), (module, {}))
 
-    def attributes(self, thing: Any, names: Iterable[str], shared: dict[str, Any]) -> None:
-        """What a module or an object has under these names. shared : what its class has."""
+    def named(self) -> None:
+        """What modules and objects have under the names that the code looks up, or under any."""
+        while True:
+            before = len(self.names), len(self.having)
+            whole = not self.names.isdisjoint(WHOLE)
+            for number, (thing, shared) in enumerate([*self.having.values()]):
+                self.attributes(number, thing, shared, whole)
+            if (len(self.names), len(self.having)) == before:
+                return
+
+    def attributes(self, number: int, thing: Any, shared: dict[str, Any], whole: bool) -> None:
+        """shared : what the object has from its class. whole : all that it has of its own."""
         read = self.read.setdefault(id(thing), set())
-        for name in sorted(set(names) - read):
+        own = attribute(thing, "__dict__", {})
+        unread = frozenset() if isinstance(thing, type) else _NOT_READ  # a class may be called
+        wanted = self.names | {n for n in shared if n.startswith("__") and n not in unread}
+        if whole and not isinstance(thing, (ModuleType, type)):
+            slots = {n for n, v in shared.items() if isinstance(v, MemberDescriptorType)}
+            wanted |= own.keys() | slots
+        for name in sorted((wanted & (own.keys() | shared.keys())) - read):
             read.add(name)
-            own = getattr(thing, "__dict__", {})
-            found = own.get(name, shared.get(name, own))
-            if found is own:  # there is none
+            found = own[name] if name in own else shared[name]
+            if name in shared and isinstance(found, MemberDescriptorType):
+                found = attribute(thing, name)
+            elif name.startswith("__") and not callable(found):
                 continue
-            self.put(name)
-            if isinstance(found, MemberDescriptorType):  # of __slots__
-                found = getattr(thing, name, None)
-            found = getattr(found, "fget", None) or getattr(found, "__func__", found)
-            self.value(found, frozenset(names))
-            if name in shared and isinstance(found, FunctionType):  # reads the object in its turn
-                self.attributes(thing, names_in(found.__code__), shared)
+            self.put(number, name)
+            found = attribute(found, "fget") or attribute(found, "__func__", found)
+            self.value(found)
 
-    def thing(self, v: Any, names: frozenset[str]) -> None:
+    def thing(self, v: Any) -> None:
         """An object: what is behind it if it is a function's wrapper, else what is read of it."""
         kind = type(v).__name__
         self.put(kind)
         if type(v).__module__.startswith("numba."):
-            compiled = getattr(v, "py_func", getattr(v, "__wrapped__", None))
+            compiled = attribute(v, "py_func", attribute(v, "__wrapped__"))
             if inspect.isfunction(compiled):  # by njit, vectorize, cfunc
                 options = getattr(v, "targetoptions", {})
                 self.put(sorted(map(repr, options.items())), getattr(v, "_sig", ""))
-                self.value(compiled, names)
+                self.value(compiled)
                 return
             if ".types" in type(v).__module__:
                 self.put(str(v))
                 return
         if isinstance(v, MethodType):
-            self.value(v.__func__, names)
-            code = getattr(v.__func__, "__code__", None)
-            self.value(v.__self__, names | (names_in(code) if code else frozenset()))
+            self.value(v.__func__)
+            self.value(v.__self__)
             return
         if isinstance(v, functools.partial):
             for part in (v.func, v.args, v.keywords):
-                self.value(part, names)
+                self.value(part)
             return
         if isinstance(v, BuiltinFunctionType):
             self.put(v.__name__)
-            self.value(v.__self__, names)
+            self.value(v.__self__)
             return
         if isinstance(v, type) and issubclass(v, Enum):
             self.put(v.__module__, v.__qualname__)
             for member in v:
-                self.value(member, names)
+                self.value(member)
             return
         if isinstance(v, type) and issubclass(v, BaseException):
             self.put(v.__module__, v.__qualname__)
             return
         self.put(id(v))
         if self.again(v):
-            pass  # under other names there may be more to read
-        elif isinstance(v, Declared):
-            self.container(v.functions, names)
+            return
+        if isinstance(v, Declared):
+            self.container(v.functions)
         else:
             for name in ("__wrapped__", "pyfunc"):  # functools.wraps, np.vectorize
-                if inspect.isfunction(wrapped := getattr(v, name, None)):
+                if inspect.isfunction(wrapped := attribute(v, name)):
                     self.function(wrapped)
-        if not isinstance(v, Declared):
-            self.attributes(v, names | {"__call__"}, self.shared(v))
+            self.having[id(v)] = v, self.shared(v)
+            if not isinstance(v, type) and self.is_library(type(v).__module__):
+                self.content(v)
+
+    def content(self, v: Any) -> None:
+        """What is in an object of a library's class."""
+        if type(v).__module__.partition(".")[0] == "ssmppl":
+            return
+        try:
+            if isinstance(v, memoryview):
+                self.put(v.tobytes())
+            elif isinstance(v, Mapping) and type(v).__module__ in _MAPPINGS:
+                self.value(dict(v))
+            else:
+                self.put(pickle.dumps(v, pickle.HIGHEST_PROTOCOL))
+        except Exception:  # whatever a class may raise that cannot be pickled
+            return
 
     def shared(self, v: Any) -> dict[str, Any]:
         """What an object has from its class, where a user wrote that."""
@@ -245,10 +304,10 @@ class _Reading:
     # -- libraries
     def library_name(self, v: Any) -> tuple[str, ...] | None:
         """Module and name of what a library has."""
-        name = getattr(v, "__qualname__", None) or getattr(v, "__name__", None)
+        name = attribute(v, "__qualname__") or attribute(v, "__name__")
         if not isinstance(name, str):
             return None
-        module = getattr(v, "__module__", None)
+        module = attribute(v, "__module__")
         homes = ["numpy", "scipy.special"] if isinstance(v, np.ufunc) else [module]
         for home in homes:
             if not isinstance(home, str) or not self.is_library(home):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import math
+import unicodedata
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,12 +40,24 @@ def check_name(name: Any, role: str, where: Location) -> None:
             fix="use letters, digits and underscores, starting with a letter, and no keyword",
             where=where,
         )
+    if (read := unicodedata.normalize("NFKC", name)) != name:
+        raise ModelError(
+            f"{a(role)} is named {name!r} with the characters {_characters(name, read)}, which "
+            f"Python reads as {read!r} in an argument",
+            fix=f"write {read!a} for the name, or choose one of plain letters",
+            where=where,
+        )
     if name in RESERVED:
         raise ModelError(
             f"{a(role)} is named {name!r}, which means {RESERVED[name]}",
             fix=f"choose another name, for example {name + '_'!r}",
             where=where,
         )
+
+
+def _characters(name: str, read: str) -> str:
+    """Those of a name that are not in what Python reads for it, by their Unicode names."""
+    return ", ".join(unicodedata.name(c, repr(c)) for c in dict.fromkeys(name) if c not in read)
 
 
 def check_dims(

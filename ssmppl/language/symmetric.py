@@ -60,7 +60,7 @@ class StudentT(_Symmetric):
 
     def log_densities(self, value):
         z, nu = (array(value) - self.loc) / self.scale, self.df
-        norm = ew("gammaln", 0.5 * (nu + 1.0)) - ew("gammaln", 0.5 * nu)
+        norm = ew("gammaln_rise", 0.5 * nu, 0.5)
         spread = 0.5 * ew("log", nu * math.pi) + ew("log", self.scale)
         return norm - spread - 0.5 * (nu + 1.0) * ew("log1p", z**2 / nu)
 
@@ -83,22 +83,21 @@ class StudentT(_Symmetric):
         return array(ew("lt", float(power), self.df))
 
     def _standard_cdf(self, z):
-        # The tail beyond |z| is I_{nu/(nu+z^2)}(nu/2, 1/2) / 2; in the middle, where that argument
-        # is close to 1, its complement I_{z^2/(nu+z^2)}(1/2, nu/2).
-        half, middle = 0.5 * self.df, array(ew("lt", z**2, self.df))
-        a, b = _where(middle, 0.5, half), _where(middle, half, 0.5)
-        x = _where(middle, z**2, self.df) / (self.df + z**2)
-        part = 0.5 * array(ew("betainc", a, b, x))
-        tail = _where(middle, 0.5 - part, part)
+        # Both tails beyond |z| are I_{nu/(nu+z^2)}(nu/2, 1/2), and 1 - I_{z^2/(nu+z^2)}(1/2, nu/2):
+        # by the argument that is not close to 1.
+        half, total = 0.5 * self.df, self.df + z**2
+        near = ew("betaincc", 0.5, half, z**2 / total)
+        far = ew("betainc", half, 0.5, self.df / total)
+        tail = 0.5 * _where(ew("lt", z**2, self.df), near, far)
         return _where(ew("lt", z, 0.0), tail, 1.0 - tail)
 
     def _standard_quantile(self, p):
-        half, tail = 0.5 * self.df, array(ew("minimum", p, 1.0 - p))
-        middle = array(ew("lt", 0.25, tail))
-        a, b = _where(middle, 0.5, half), _where(middle, half, 0.5)
-        x = array(ew("betaincinv", a, b, _where(middle, 1.0 - 2.0 * tail, 2.0 * tail)))
-        ratio = _where(middle, x, 1.0 - x) / _where(middle, 1.0 - x, x)
-        z = array(ew("sqrt", self.df * ratio))
+        # likewise by z^2/(nu+z^2) where z^2 < nu, else by nu/(nu+z^2)
+        half, tails = 0.5 * self.df, 2.0 * array(ew("minimum", p, 1.0 - p))
+        near = ew("lt", ew("betainc", half, 0.5, 0.5), tails)
+        x = array(ew("betainccinv", 0.5, half, _where(near, tails, 1.0)))
+        y = array(ew("betaincinv", half, 0.5, _where(near, 1.0, tails)))
+        z = array(ew("sqrt", self.df * _where(near, x / (1.0 - x), (1.0 - y) / y)))
         return _where(ew("lt", p, 0.5), -z, z)
 
 

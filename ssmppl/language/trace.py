@@ -167,6 +167,7 @@ class _Tracer:
         self.known: dict[str, tuple[str, tuple[int, ...]]] = {}  # name -> (role, shape)
         self.owner: dict[str, Location] = {}
         self.symmetric: set[str] = set()  # parameters that are symmetric matrices
+        self.defaults: list[tuple[str, str, Location]] = []  # taken: argument, role, function
 
     def run(self) -> Trace:
         model = self.model
@@ -189,6 +190,7 @@ class _Tracer:
         check_states(initial, transition, proposal)
         check_dims(self.known, self.owner)
         self._check_outer_names()
+        self._check_defaults()
         return Trace(
             name=model.name,
             parameters=parameters,
@@ -255,6 +257,7 @@ class _Tracer:
             value = self._argument(name, role)
             if value is None:
                 if parameter.default is not parameter.empty:
+                    self.defaults.append((name, role, where))
                     continue  # a plain Python constant of the user's
                 raise self._unknown(name, role, where)
             arguments[name] = value
@@ -269,6 +272,18 @@ class _Tracer:
             for function in functions:
                 known = self._roles() | ({} if role == "prior" else {"t": "the row number"})
                 check_outer_names(function, role, known)
+
+    def _check_defaults(self) -> None:
+        """Refuse a default that was taken where the name is a quantity, which it would hide."""
+        for name, role, where in self.defaults:
+            if name in self.known or name == "t":
+                told = self._unknown(name, role, where)
+                raise ModelError(
+                    f"@{role} {where.function} takes the default of {name!r}, which hides the "
+                    f"model's {name!r}: {told.found}",
+                    fix=f"rename the argument if its default is meant; else {told.fix}",
+                    where=where,
+                )
 
     def _allowed(self, role: str) -> dict[str, str]:
         """Role of a known name -> kind of symbol, for arguments of this kind of function."""

@@ -109,7 +109,8 @@ class Truncated(Distribution):
         base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
         bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
         kept = {n: b for n, b in bounds.items() if not is_infinite(b)}
-        return self._at_place(Truncated(base, **kept))
+        # one law of several may have infinite bounds alone, which it is given as they are
+        return self._at_place(Truncated(base, **(kept or bounds)))
 
     def _refuse_empty(self) -> None:
         """Numbers that leave (nearly) nothing of the base."""
@@ -244,6 +245,8 @@ class Truncated(Distribution):
     def _moments(self) -> tuple[ExprArray, ExprArray]:
         """Mean and variance: in closed form, else by quadrature; infinite where they diverge."""
         lower, upper = self._bounds()
+        if all(self.base.open_sides(lower, upper)):
+            return self.base.mean(), self.base.variance()
         if isinstance(self.base, Normal):
             return normal_moments(self.base, lower, upper)
         if isinstance(self.base, HalfNormal):
@@ -303,9 +306,26 @@ class Truncated(Distribution):
             for p, q, weight in _double_exponential():
                 low = start + width * p
                 high = (1.0 - start - width) + width * q if len(parts) > 1 else q
-                d = self._quantile(self._full(0.0) + low, self._full(0.0) + high) - centre
+                d = self._node(self._full(0.0) + low, self._full(0.0) + high) - centre
                 first, second = first + weight * width * d, second + weight * width * d**2
         return centre + first, second - first**2
+
+    def _node(self, p: ExprArray, q: ExprArray) -> ExprArray:
+        """The quantile at p, q = 1 - p, by the tail of the base that it lies in.
+
+        Unlike draws, nodes go on to where only one of p and q has digits, and to bounds that are
+        far in the tails.
+        """
+        base, (lower, upper) = self.base, self._bounds()
+        if type(base).quantile_between is not Distribution.quantile_between:
+            return self._quantile(p, q)  # by logarithms of its tails
+        open_below, open_above = base.open_sides(lower, upper)
+        left = q * (0.0 if open_below else base.cdf(lower))
+        left = left + p * (1.0 if open_above else base.cdf(upper))
+        right = q * (1.0 if open_below else base.survival(lower))
+        right = right + p * (0.0 if open_above else base.survival(upper))
+        value = _where(ew("lt", left, 0.5), base.quantile(left), base.survival_quantile(right))
+        return self._clip(value)
 
 
 def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[float, float, float]]:

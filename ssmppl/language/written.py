@@ -242,6 +242,17 @@ class Written(Distribution):
             out = out + ew("lt", below, p) * 1.0
         return array(out)
 
+    def survival_quantile(self, p):
+        """By `quantile` of what is below 1, where it may be infinite."""
+        return self.quantile(ew("minimum", 1.0 - array(p), 1.0 - 2.0**-53))
+
+    def has_moment(self, power):
+        """By its mean and variance where they are declared; else they are taken to exist."""
+        if not self._has("mean" if power == 1 else "variance"):
+            return self._full(1.0)
+        moment = self.mean() if power == 1 else self.variance()
+        return array(ew("lt", ew("abs", moment), INFINITY))
+
     def inverts(self) -> bool:
         """Whether it has a distribution function and that function's inverse."""
         return self.has_cdf and (self._has("quantile") or self.bounds.values is not None)

@@ -285,7 +285,7 @@ def deterministic(m):
     laws(m, normal_prior, transition, initial)
 
 
-@refused("a", "Gamma", "Beta(a, 2)", "prior law of p", "gammaln")
+@refused("a", "Gamma", "Beta(a, 2)", "prior law of p", "betaln")
 def child_of_a_hierarchy(m):
     """Corrected by a Metropolis step: one term, however long the series."""
 

@@ -1,11 +1,13 @@
 """Functions of plain Python numbers against the interpreter."""
 
+import math
+
 import numpy as np
 import pytest
 
 from ssmppl.analysis.pythontext import python_function, python_sum
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import apply, symbol
+from ssmppl.expressions.expr import Expr, apply, symbol
 
 A, B = symbol("parameter", "a"), symbol("parameter", "b")
 GUARDED = {
@@ -35,10 +37,38 @@ def test_what_a_condition_guards_is_not_computed(name):
         assert summed(point, [2.0, 3.0]) == pytest.approx(2.0 * exact[0] + 3.0 * exact[1])
 
 
-def test_what_no_condition_guards_raises():
-    both = np.where(B > 0, np.sqrt(B), B) + np.sqrt(B)
+# Numbers made of what Python's `math` raises for, and NumPy has inf or nan for.
+BEYOND = {
+    "a quotient": 1.0 / (1.0 + 1.0 / np.maximum(A, 0.0)),
+    "an exponential": 1.0 / (1.0 + np.exp(-A / 1e-3)),
+    "a power": (1.0 + np.exp(A) ** (-1000.0)) ** (-2.0),
+    "an exponential of one": np.exp(-np.exp(-800.0 * A)),
+    "a hyperbolic cosine": 1.0 / np.cosh(800.0 * B),
+    "a logarithm": np.exp(np.log(np.maximum(A, 0.0))),
+    "a remainder": np.where(A % np.maximum(B, 0.0) > -1.0, B, A),
+    "log sums": np.logaddexp(1.0 / np.maximum(A, 0.0), -1.0 / np.maximum(B, 0.0)),
+    "a root": np.where(B > 0, np.sqrt(B), B) + np.sqrt(B),
+    "nan in second place": np.maximum(A, np.sqrt(B)) + np.minimum(A, np.sqrt(B)),
+}
+
+
+@pytest.mark.parametrize("name", BEYOND)
+@pytest.mark.filterwarnings("error")
+def test_beyond_the_range_of_python_the_numbers_are_numpys(name):
+    """A density was zero where it was not, and parts of a posterior were never seen."""
+    function = python_function([BEYOND[name], A - B], [A, B])
+    summed = python_sum([BEYOND[name], A - B], [A, B])
+    for point in POINTS:
+        exact = evaluate([BEYOND[name], A - B], dict(zip((A, B), point, strict=True)))
+        close = {"rel": 1e-14, "nan_ok": True}
+        assert function(point) == pytest.approx([float(e) for e in exact], **close)
+        assert summed(point, [2.0, 3.0]) == pytest.approx(2.0 * exact[0] + 3.0 * exact[1], **close)
+
+
+def test_a_users_function_raises_its_own_errors():
+    own = Expr("call", (A,), math.log)
     with pytest.raises(ValueError, match="domain"):
-        python_function([both], [B])([-1.0])
+        python_function([own], [A])([-1.0])
 
 
 def test_what_is_shared_is_written_once():

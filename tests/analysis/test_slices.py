@@ -6,7 +6,10 @@ import itertools
 
 import numpy as np
 
+from ssmppl.analysis.pythontext import python_sum
+from ssmppl.analysis.sampler import _guarded
 from ssmppl.analysis.slices import slice_step
+from ssmppl.expressions.expr import apply, symbol
 from tests.statistics.checks import seed_of
 
 ENOUGH = 10_000  # calls of a density in one step
@@ -31,3 +34,11 @@ def test_the_width_may_be_less_than_the_spacing():
     """Then there may be no way to go, which is an answer too."""
     rng = np.random.default_rng(seed_of("slices", "narrow"))
     assert np.isfinite([slice_step(lambda v: 0.0, 2e16, rng) for _ in range(50)]).all()
+
+
+def test_an_infinite_density_is_no_place_to_stay():
+    """That of a Gamma of shape 1/2 from 1 on, at 1 itself: no slice would ever leave it."""
+    a = symbol("parameter", "a")
+    density = _guarded(python_sum([apply("log", a - 1.0), a], [a]))
+    assert density([1.0], [-0.5, -1.0]) == -np.inf
+    assert density([2.0], [-0.5, -1.0]) == -2.0

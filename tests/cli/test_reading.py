@@ -180,6 +180,13 @@ def test_a_name_that_stands_twice_is_told(dated, names):
     assert list(read_table(dated("time,y,y.1\n1,9,1.5\n"))["y"]) == [9]
 
 
+@pytest.mark.parametrize("rest", ["time,y\n1,9\n2,8\n", "y\n1\n2\n"])
+def test_a_comment_before_the_names_is_told(dated, rest):
+    with pytest.raises(DataError, match="begins with a comment, '# of 1998'") as caught:
+        read_table(dated(f"# of 1998\n{rest}"))
+    assert "comment='#'" in caught.value.fix
+
+
 def test_one_column_is_a_table(dated):
     assert list(read_table(dated("y\n1\n2\n"))["y"]) == [1, 2]
 

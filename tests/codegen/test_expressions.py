@@ -14,7 +14,7 @@ import ssmppl.language.distributions as D
 from ssmppl.codegen.kernels import elementary, incomplete, laws, scalars, special
 from ssmppl.codegen.kernels.flags import exact, kernel
 from ssmppl.codegen.module import Layout, Section, Target
-from ssmppl.codegen.render import CALLS, INFIX, MATRIX_CALLS
+from ssmppl.codegen.render import CALLS, INFIX, MATRIX_CALLS, is_small_power
 from ssmppl.codegen.sums import scalar_function
 from ssmppl.expressions import evaluate as interpreter
 from ssmppl.expressions.evaluate import evaluate
@@ -71,6 +71,12 @@ def test_every_operation_has_a_spelling():
     spelled = {*INFIX, *CALLS, *MATRIX_CALLS, "neg", "not", "where"}
     assert set(UNARY + BINARY + TERNARY + QUATERNARY) | set(MATRIX_OPS) == spelled
     assert {*CALLS.values(), *MATRIX_CALLS.values()} <= set(NAMESPACE)
+
+
+def test_a_power_without_end_is_no_product():
+    x = TRACE.state_symbols[0]
+    assert not is_small_power(x**np.inf)
+    assert is_small_power(x**3)
 
 
 _EXP, _TRIG = ["exp", "log", "log1p", "expm1", "sqrt"], ["sin", "cos", "tanh", "arctan"]

@@ -32,7 +32,9 @@ SMOOTH = {
     "mul": (np.multiply, REAL, REAL), "div": (np.divide, REAL, POSITIVE),
     "pow": (np.power, POSITIVE, (-2, 2)), "arctan2": (np.arctan2, REAL, POSITIVE),
     "logaddexp": (np.logaddexp, REAL, REAL), "i0e": (sp.i0e, POSITIVE),
-    "i1e": (sp.i1e, POSITIVE),
+    "i1e": (sp.i1e, POSITIVE), "betaln": (interpreted.betaln, POSITIVE, POSITIVE),
+    "gammaln_rise": (lambda a, b: sp.gammaln(a + b) - sp.gammaln(a), POSITIVE, POSITIVE),
+    "digamma_rise": (lambda a, b: sp.digamma(a + b) - sp.digamma(a), POSITIVE, POSITIVE),
 }  # fmt: skip
 # Derivatives in the last argument only.
 HALF_SMOOTH = {
@@ -41,6 +43,8 @@ HALF_SMOOTH = {
     "gammaincinv": (sp.gammaincinv, POSITIVE, UNIT),
     "gammainccinv": (sp.gammainccinv, POSITIVE, UNIT),
     "betainc": (sp.betainc, POSITIVE, POSITIVE, UNIT),
+    "betaincc": (sp.betaincc, POSITIVE, POSITIVE, UNIT),
+    "betainccinv": (sp.betainccinv, POSITIVE, POSITIVE, UNIT),
     "betaincinv": (sp.betaincinv, POSITIVE, POSITIVE, UNIT),
     "vonmises_cdf": (interpreted.vonmises_cdf, POSITIVE, (-2, 2)),
     "vonmises_quantile": (interpreted.vonmises_quantile, POSITIVE, UNIT),

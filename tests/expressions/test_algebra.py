@@ -244,3 +244,35 @@ def test_long_sums_separate():
     assert b[0] is constant(0.0)
     k = np.arange(1, 2001)
     assert evaluate(a[0, 0], {X: 0.3}) == pytest.approx(np.sin(0.3 * k).sum(), abs=1e-9)
+
+
+def test_a_matrix_root_of_a_square_is_no_polynomial():
+    """The Cholesky factor of x**2 C is |x| times that of C, and was taken to be x times it."""
+    c = np.array([[2.0, 0.5], [0.5, 1.0]])
+    form = polynomial(np.linalg.cholesky(X**2 * c)[1, 0], [X], 1)
+    assert isinstance(form, NotApplicable)
+    assert "whatever the sign of x" in form.reason
+    right, _ = affine([np.linalg.cholesky(V**2 * c)[1, 0] * X], [X])
+    assert evaluate(right[0, 0], {V: -2.0}) == pytest.approx(2.0 * np.linalg.cholesky(c)[1, 0])
+
+
+ZERO = X * V - V * X  # found to be 0 when it is multiplied out, not before
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [1.0 / ZERO, np.log(ZERO), V / (PHI * ZERO), V * X / constant(0.0), np.log1p(ZERO - 1.0),
+     (V * X) ** np.inf, (V * X) ** -np.inf, (V + X) ** np.nan],
+)  # fmt: skip
+def test_what_is_no_number_does_not_separate(expression):
+    """One over nothing, the logarithm of nothing, powers without end: an IndexError was raised."""
+    form = separate(expression, [X])
+    assert isinstance(form, NotApplicable)
+    assert "does not separate in x" in form.reason
+    alone = separate(expression, symbols_of(expression))  # one function, as it stands
+    assert list(alone.terms.values()) == [constant(1.0)]
+
+
+def test_roots_of_nothing_are_nothing():
+    for root in (np.sqrt(ZERO), ZERO**3, ZERO**1.5):
+        assert separate(root + X, [X]).terms == separate(X, [X]).terms

@@ -203,6 +203,29 @@ def test_numpy_code_means_the_same_on_symbols(name):
         np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
 
 
+SPECIAL = [-np.inf, -7.3, -1.0, -0.0, 0.0, 0.3, 1.0, 3.0, 6.0, 2.0**52 + 1.0, np.nan]
+AT_SPECIAL = {
+    "whole divisors": lambda x: x // 2 + x // -3,
+    "other divisors": lambda x: x // 0.1 + x // -0.3,
+    "a divisor of symbols": lambda x: x // (x * 0.1) + 1.0 // x,
+    "an array": lambda x: x // np.array([0.1, 0.2]),
+    "of numbers": lambda x: np.array([0.6, 0.7]) // (x * x + 0.1),
+    "fmax": lambda x: np.fmax(np.sqrt(x), 0.5) + np.fmax(0.5, np.sqrt(-x)),
+    "fmin": lambda x: np.fmin(np.sqrt(x), 0.5) + np.fmin(np.nan, x),
+    "steps": lambda x: np.heaviside(x, 0.5),
+}
+
+
+@pytest.mark.parametrize("name", AT_SPECIAL)
+@pytest.mark.parametrize("value", SPECIAL)
+def test_special_values_are_numpys(name, value):
+    function, x = AT_SPECIAL[name], symbol("state", "x")
+    with np.errstate(all="ignore"):
+        expected = function(np.float64(value))
+    found = evaluate(array(function(x)), {x: value})
+    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=0.0)
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     some.lists(some.integers(1, 3), min_size=0, max_size=3),

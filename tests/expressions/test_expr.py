@@ -173,7 +173,7 @@ def test_substitution_simplifies():
         (X / (Y / 3), "x/(y/3)"), ((-X) ** 2, "(-x)**2"), (-(X**2), "-x**2"),
         ((X**2) ** Y, "(x**2)**y"), (np.exp(-X), "exp(-x)"), (X % 2, "x%2"),
         (symbol("state_prev", "x", (1,)), "x_prev[1]"), (-(X + Y), "-(x + y)"),
-        ((X + 1) ** -2.0, "(x + 1)**(-2)"),
+        ((X + 1) ** -2.0, "(x + 1)**(-2)"), ((X > 0) == (Y > 0), "(0 < x) == (0 < y)"),
     ],
 )  # fmt: skip
 def test_text(expression, text):
@@ -341,6 +341,14 @@ def test_refusals_name_the_users_line_and_the_fix(function):
 def test_operands_without_meaning(op, other):
     with pytest.raises(TypeError):
         op(X, other)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_a_number_is_compared_with_each_of_a_list(kind):
+    numbers = kind([0, 1, 2])
+    # a list has no comparison of its own with a symbol: this is the symbol's
+    assert [repr(e) for e in numbers == X] == ["0 == x", "1 == x", "2 == x"]
+    assert [repr(e) for e in numbers != X] == ["0 != x", "1 != x", "2 != x"]
 
 
 def test_errors_survive_pickling():

@@ -60,3 +60,14 @@ def test_logarithms_of_products_neither_underflow_nor_overflow(x):
         (Y / np.exp(X), np.log(3) - x), (np.exp(X) * Y * np.exp(-X), np.log(3)),
     ]:  # fmt: skip
         assert evaluate(np.log(product), at)[0] == pytest.approx(expected, rel=1e-14)
+
+
+def test_logarithms_of_products_of_many_factors():
+    parts = [symbol("state", "z", (i,)) for i in range(3000)]
+    at = {s: 0.001 * i for i, s in enumerate(parts)}
+    found = np.log(np.prod([np.exp(s) for s in parts]))
+    assert evaluate(found, at) == pytest.approx(sum(at.values()))
+    square = np.exp(X)
+    for _ in range(60):  # 2^60 factors, of which each half is the other
+        square = square * square
+    assert evaluate(np.log(square), {X: 2.0}) == pytest.approx(2.0**61)

@@ -161,6 +161,8 @@ def test_time_goes_on():
     assert after(np.array([1.0, 2.0, 5.0]), 2).tolist() == [4, 5]
     assert after(np.array(["a", "b"]), 2).tolist() == [3, 4]
     assert after(np.array([7]), 1).tolist() == [8]
+    assert after(1e-9 * np.array([1.0, 2.0, 4.0]), 1).tolist() == [4]
+    np.testing.assert_allclose(after(1.6e9 + 0.01 * np.arange(5), 1), [1.6e9 + 0.05], rtol=1e-15)
     hours = pd.timedelta_range("1h", periods=5, freq="90min").to_numpy()
     np.testing.assert_array_equal(after(hours[:3], 2), hours[3:])
     assert after(hours[[0, 1, 3]], 2).tolist() == [4, 5]

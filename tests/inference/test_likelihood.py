@@ -351,14 +351,36 @@ def test_simulate_names_the_argument_out_of_range_with_its_value_and_a_fix(name)
     assert fix in str(simulated.value)
 
 
-def test_simulate_names_weights_that_do_not_sum_to_one():
-    law = negative(
-        lambda x: ssm.Mixture([0.3, 0.5 / (1 + x**2)], [ssm.Normal(0, sd=1), ssm.Normal(x, sd=2)])
-    )
+SUMS = {
+    "weights of Mixture": lambda share, x: ssm.Mixture(
+        [0.3, share], [ssm.Normal(0, sd=1), ssm.Normal(x, sd=2)]
+    ),
+    "probabilities of Categorical": lambda share, x: ssm.Categorical([0.3, share]),
+}
+
+
+@pytest.mark.parametrize("name", SUMS)
+def test_simulate_names_shares_that_do_not_sum_to_one(name):
+    model = negative(lambda x: SUMS[name](0.5 / (1 + x**2), x))
     with pytest.raises(ssm.SamplingError) as simulated:
-        ssm.simulate(law, steps=20, seed=1)
-    assert re.search(r"the weights of Mixture, \[.*\], sum to 0\.\d+ there", str(simulated.value))
-    assert "w / np.sum(w)" in str(simulated.value)
+        ssm.simulate(model, steps=20, seed=1)
+    found = str(simulated.value)
+    assert re.search(rf"the {name}, \[.*\], sum to 0\.\d+ there", found)
+    assert f"write {name.split()[0]} that" in found
+    assert "w / np.sum(w)" in found
+
+
+@pytest.mark.parametrize("proposal", [None, "bootstrap"])
+def test_no_likelihood_of_a_chain_whose_rows_do_not_sum_to_one(proposal):
+    model = ssm.Model("chain")
+    model.prior(lambda: {"a": ssm.Uniform(0, 1)})
+    model.initial(lambda a: {"z": ssm.Categorical([a, 0.5])})
+    model.transition(lambda z: {"z": ssm.Categorical(np.where(z == 0, [0.9, 0.1], [0.3, 0.7]))})
+    model.observation(lambda z: {"y": ssm.Normal(z, sd=1)})
+    options = {"seed": 1} if proposal is None else {"proposal": proposal, "seed": 1}
+    data = {"y": np.array([0.3, 1.2, -0.4])}
+    assert np.isfinite(ssm.log_likelihood(model, data, {"a": 0.5}, **options))
+    assert ssm.log_likelihood(model, data, {"a": 0.2}, **options) == -np.inf
 
 
 @pytest.mark.parametrize("name", LAWS_OF_A_STATE)

@@ -220,6 +220,8 @@ def test_nothing_free_gives_the_likelihood_alone(exact_values):
     assert estimate.standard_errors == {}
     assert estimate.log_likelihood == pytest.approx(exact_values[name]["log_likelihood"]["1.0"])
     assert "every parameter is fixed" in estimate.attrs["method_chosen"]
+    assert "likelihood of the given parameters" in str(estimate)
+    assert "maximum" not in str(estimate)
 
 
 def test_a_likelihood_without_a_maximum_is_not_called_converged():

@@ -315,3 +315,23 @@ def test_components_without_data_weigh_nothing_wherever_a_particle_is():
     )  # fmt: skip
     ratio = np.exp(estimates - total)
     assert abs(ratio.mean() - 1.0) < 4.0 * ratio.std(ddof=1) / np.sqrt(len(ratio))
+
+
+@pytest.mark.parametrize("proposal", ["bootstrap", "guided", "auxiliary"])
+def test_a_particle_far_behind_comes_back_where_nothing_is_resampled(proposal):
+    """Two classes, of which the rows at first speak against the right one by more than a number can
+    hold. Without resampling a particle is a sample of the class, and its weight the likelihood."""
+    model = ssm.Model("class")
+    model.initial(lambda: {"s": ssm.Bernoulli(0.5), "x": ssm.Normal(0, sd=1)})
+    model.transition(lambda s, x: {"s": ssm.Dirac(s), "x": ssm.Normal(0.5 * x, sd=1)})
+    model.observation(lambda s, x: {"y": ssm.Normal(s, sd=0.5), "z": ssm.Normal(x**2, sd=2)})
+    y = np.concatenate([np.full(600, -0.2), np.full(900, 1.2)])
+    n = 60
+    found = ssm.log_likelihood(
+        model, {"y": y, "z": np.full(len(y), np.nan)}, {}, proposal=proposal, ess_threshold=0.0,
+        particles=n, repeats=2, seed=seed_of("behind", proposal),
+    )  # fmt: skip
+    right = stats.norm.logpdf(y, 1.0, 0.5).sum()
+    # by how many of the particles are of the class, at least one in 2^-n
+    assert np.all(found <= right + 1e-6)
+    assert np.all(found > right - np.log(n) - 1e-6)

@@ -16,7 +16,7 @@ import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import chart, coordinates
 from ssmppl.inference.chains.curvature import fitted_covariance
 from ssmppl.inference.chains.smc2 import _factor
-from ssmppl.inference.particles.pilot import find_mode, space_of
+from ssmppl.inference.particles.pilot import find_mode, scale_of, space_of
 from ssmppl.inference.problem import pose
 from tests.statistics.checks import some
 
@@ -273,6 +273,11 @@ def test_the_pilot_finds_the_same_mode_and_scale_in_any_unit(c):
     (here, scale), (expected, known) = pilot(c), pilot(1.0)
     assert np.all(np.abs(here - expected) < 0.5 * known * [1.0, expected[1]])
     np.testing.assert_allclose(scale, known, rtol=0.4)
+
+
+def test_scales_at_an_edge_are_those_of_the_side_that_there_is():
+    found = scale_of(np.zeros(1), lambda z: -3.0 * z[0] if z[0] >= 0.0 else -np.inf)
+    assert 0.5 < found[0] < 1.0  # log p falls by 8 over 8 / 3
 
 
 def test_the_factor_of_particles_has_their_unit():

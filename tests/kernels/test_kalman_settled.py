@@ -84,12 +84,36 @@ def test_covariances_settle_and_start_anew(d, k):
         assert not any(kept[rows])
 
 
-def test_distance_of_roots():
-    """In units of the rows, whatever the signs of the columns."""
+def test_roots_at_rest():
+    """But for rounding, whatever the signs of the columns."""
     root = np.array([[2.0, 0.0], [3.0, 4.0]])
     last = root.copy()
-    assert kalman.moved(root * np.array([-1.0, 1.0]), last) == 0.0
+    assert kalman.rests(root * np.array([-1.0, 1.0]), last)
     np.testing.assert_array_equal(last, root)
-    root[1, 0] += 0.5
-    assert kalman.moved(root, last) == pytest.approx(0.5 / np.hypot(3.5, 4.0))
-    assert kalman.moved(root, last) == 0.0
+    root[1, 0] += 4e-14
+    assert not kalman.rests(root, last)
+    assert kalman.rests(root, last)
+    root[1, 0] += 4e-15
+    assert kalman.rests(root, last)
+
+
+def test_what_is_learned_beside_what_no_data_tell():
+    """Of two constants only the difference is measured, and each alone may be anything. In units of
+    the rows of the root nothing moved from the first rows on, and the mean of the second half came
+    in at the gain of then."""
+    wide, steps = 1e9, 4000
+    rng = np.random.default_rng(7)
+    y = rng.normal(size=(steps, 1)) + 0.5 * (np.arange(steps) >= steps // 2)[:, None]
+    shapes = ((), (2,), (2, 2), (2,), (2, 2), (1,), (1, 1))
+    out = [np.empty((steps, *s)) for s in shapes]
+    given = (
+        np.zeros(2), wide**2 * np.eye(2), np.eye(2)[None], np.zeros((1, 2)), np.zeros((1, 2, 2)),
+        np.array([[[1.0, -1.0]]]), np.zeros((1, 1)), np.ones((1, 1, 1)), y, np.ones((steps, 1)),
+    )  # fmt: skip
+    assert kalman_filter(*given, *out) == (OK, steps)
+    n, ratio = np.arange(steps), 1.0 / (2.0 * wide**2)
+    before = np.concatenate([[0.0], np.cumsum(y[:-1, 0])]) / (n + ratio)
+    spread = 1.0 + 1.0 / (n + ratio)
+    wanted = -0.5 * (np.log(2 * np.pi * spread) + (y[:, 0] - before) ** 2 / spread)
+    np.testing.assert_allclose(out[0], wanted, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(out[5][:, 0], before, atol=1e-5)

@@ -46,8 +46,30 @@ CASES = [
     (incomplete.gammainc, lower_gamma, (SHAPE, GAMMA_X), 2e-12, 0.0),
     (incomplete.gammaincc, upper_gamma, (SHAPE, GAMMA_X), 2e-12, 0.0),
     (incomplete.betainc, beta, (ALPHA, BETA, BETA_X), 2e-12, 0.0),
+    (incomplete.betaincc, lambda a, b, x: beta(b, a, 1 - x), (ALPHA, BETA, BETA_X), 2e-12, 0.0),
     (scalars.logaddexp, lambda a, b: mp.log(mp.exp(a) + mp.exp(b)), (REAL, -REAL), 1e-14, 1e-15),
 ]
+
+
+START = np.concatenate([10 ** RNG.uniform(-3, 17, 2 * N), RNG.uniform(8, 30, N)])
+RISE = 10 ** RNG.uniform(-3, 8, START.size)
+DIFFERENCES = {
+    "gammaln_rise": lambda a, b: mp.loggamma(a + b) - mp.loggamma(a),
+    "digamma_rise": lambda a, b: mp.psi(0, a + b) - mp.psi(0, a),
+    "betaln": lambda a, b: mp.log(mp.beta(a, b)),
+}
+
+
+@pytest.mark.parametrize("home", [special, interpreted])
+@pytest.mark.parametrize("name", sorted(DIFFERENCES))
+def test_differences_of_gamma_functions(name, home):
+    """Errors are of the differences' size, also where both functions are 1e18."""
+    with mp.workdps(60):
+        for a, b in zip(START.tolist(), RISE.tolist(), strict=True):
+            expected = float(DIFFERENCES[name](mp.mpf(a), mp.mpf(b)))
+            small = 2e-14 if a < 30 else 1e-13 * abs(expected)
+            found = float(getattr(home, name)(a, b))
+            assert found == pytest.approx(expected, rel=2e-14, abs=small), (a, b)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: c[0].__name__)
@@ -58,6 +80,40 @@ def test_accuracy(case):
             expected = float(reference(*(mp.mpf(x) for x in point)))
             value = function(*point)
             assert value == pytest.approx(expected, rel=rtol, abs=max(atol, 1e-300)), point
+
+
+@pytest.mark.parametrize("small", [0.5, 4.0, 70.0])
+@pytest.mark.parametrize("large", [1e6, 1e10, 1e14, 1e16])
+def test_beta_integrals_with_one_large_shape(small, large):
+    """Those of a gamma law, in both tails; the interpreter's are SciPy's."""
+    for u in small * np.array([0.05, 0.5, 1.0, 1.5, 5.0]):
+        x, tail = u / (u + large), scipy_special.gammaincc(small, u)
+        for home in (incomplete, scipy_special):
+            found = home.betaincc(small, large, x)
+            assert found == pytest.approx(tail, rel=3e-12 + 300 * u**2 / large, abs=0)
+        if tail < 0.999:
+            found = incomplete.betainccinv(small, large, incomplete.betaincc(small, large, x))
+            assert found == pytest.approx(x, rel=1e-9, abs=0)
+
+
+@pytest.mark.parametrize("a", [1.01e8, 1e9, 1e11, 1e13, 1e15])
+def test_gamma_integrals_of_large_shapes(a):
+    """SciPy's, of which the far tails are wrong; there the continued fraction's."""
+    for z in (6.0, 30.0):
+        x = a + z * np.sqrt(a)
+        tail = special.poisson_density(a, x) * a * incomplete._gamma_fraction(a, x)
+        assert incomplete.gammaincc(a, x) == pytest.approx(tail, rel=1e-11, abs=0.0)
+    near = scipy_special.ndtr(-30.0) * np.exp(-9000.0 / np.sqrt(a))
+    assert incomplete.gammainc(a, a - 30 * np.sqrt(a)) == pytest.approx(near, rel=0.15, abs=0.0)
+    for z in (-1.0, 0.0, 1.0):
+        x = a + z * np.sqrt(a)
+        for name in ("gammainc", "gammaincc"):
+            found, expected = (getattr(m, name)(a, x) for m in (incomplete, scipy_special))
+            assert found == pytest.approx(expected, rel=2e-11, abs=0.0), (name, z)
+    assert incomplete.gammainc(a, a) == pytest.approx(0.5 + 1 / np.sqrt(18 * np.pi * a), rel=1e-14)
+    assert incomplete.gammaincinv(a, 0.25) == pytest.approx(
+        scipy_special.gammaincinv(a, 0.25), rel=2e-13
+    )
 
 
 def test_gamma_quantile():
@@ -133,6 +189,10 @@ def test_limits():
     assert laws.vonmises_cdf(2.0, np.pi) == 1.0
     assert laws.vonmises_quantile(2.0, 1.0) == pytest.approx(np.pi)
     assert special.lgamma(0.0) == np.inf
+    for home in (special, interpreted):
+        assert home.gammaln_rise(3.0, 0.0) == home.digamma_rise(30.0, 0.0) == 0.0
+        assert home.gammaln_rise(0.0, 2.0) == -np.inf
+        assert home.betaln(0.0, 2.0) == home.betaln(2.0, 0.0) == np.inf
     assert special.lgamma(-3.0) == np.inf
     assert special.ndtri(0.0) == -np.inf
     assert special.ndtri(1.0) == np.inf
@@ -152,6 +212,9 @@ def test_outside_the_domain_is_nan():
         special.lgamma(np.nan),
         special.digamma(-1.0),
         special.trigamma(0.0),
+        *(f(-0.5, 2.0) for f in (special.gammaln_rise, special.digamma_rise, special.betaln)),
+        *(f(0.5, -2.0) for f in (special.gammaln_rise, special.digamma_rise, special.betaln)),
+        *(f(-0.5, 2.0) for f in (interpreted.gammaln_rise, interpreted.betaln)),
         special.ndtri(-0.1),
         special.ndtri(np.nan),
         incomplete.gammainc(-1.0, 1.0),
@@ -166,5 +229,7 @@ def test_outside_the_domain_is_nan():
         special.i0e(np.nan),
         incomplete.betainc(1.0, 0.0, 0.5),
         incomplete.betaincinv(1.0, 1.0, 1.5),
+        incomplete.betainccinv(1.0, 1.0, -0.5),
+        incomplete.betaincc(1.0, 0.0, 0.5),
     ]
     assert np.isnan(values).all()

@@ -366,3 +366,23 @@ def test_no_density_where_a_matrix_is_not_positive_definite(spread):
     found = evaluate(density, {a: np.array([2.0, -2.0])})  # -2: determinant positive all the same
     assert np.isfinite(found[0])
     assert found[1] == -np.inf
+
+
+@pytest.mark.parametrize("name", ["Wishart", "InverseWishart"])
+def test_no_density_of_a_matrix_whose_law_has_no_covariance_for_its_scale(name):
+    law = getattr(D, name)(6, scale=np.array([[1.0, X], [X, 1.0]], dtype=object))
+    value = np.array([[1.0, 0.2], [0.2, 1.0]])
+    found = evaluate(law.log_density(value), {X: np.array([0.5, 0.99, -2.0, 1.5, 4.0])})
+    reference = {"Wishart": st.wishart, "InverseWishart": st.invwishart}[name]
+    expected = [reference(6, [[1.0, r], [r, 1.0]]).logpdf(value) for r in (0.5, 0.99)]
+    assert found[:2] == pytest.approx(expected, rel=1e-10)
+    assert np.all(found[2:] == -np.inf)
+
+
+def test_no_labels_of_probabilities_that_do_not_sum_to_one():
+    law = D.Categorical([X, X, 0.2])
+    at = {X: np.array([0.4, 0.9, 0.1])}
+    found = evaluate(law.log_density(1.0), at)
+    assert found[0] == pytest.approx(math.log(0.4))
+    assert np.all(np.isnan(found[1:]))
+    assert evaluate(law.in_range()[()], at).tolist() == [1.0, 0.0, 0.0]

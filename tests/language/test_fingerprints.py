@@ -189,3 +189,27 @@ def test_every_field_of_an_effect_counts():
     found = [declared(**o) for o in others]
     assert found == [declared(**o) for o in others]
     assert len(set(found)) == len(found)
+
+
+class Attributes(dict):
+    """A dictionary read by attributes, which raises KeyError for those that it lacks."""
+
+    __getattr__ = dict.__getitem__
+
+
+class Lookup:
+    def __init__(self, c):
+        self.values = {"V0": c}
+
+    def __getattr__(self, name):
+        return self.__dict__["values"][name]
+
+
+@pytest.mark.parametrize("kind", [lambda c: Attributes(V0=c), Lookup])
+def test_objects_that_look_their_attributes_up_in_a_dictionary(kind):
+    def of(c):
+        settings = kind(c)
+        return fingerprint(lambda v: np.tanh(v / settings.V0))
+
+    assert of(1.0) == of(1.0)
+    assert of(1.0) != of(2.0)

@@ -14,6 +14,7 @@ from ssmppl.expressions.calculus import differentiate, hessian
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.draws import Draws
+from ssmppl.language.shares import log_sum
 
 X, P, A, B = (symbol("state", n) for n in "xpab")
 LEVEL = 1e-6  # of each distribution test
@@ -239,6 +240,18 @@ def test_a_hurdle_is_inflation_of_a_law_without_zeros():
     assert at(later.log_density(X), [1.0]) == -math.inf
 
 
+def test_zeros_are_added_to_a_vector_of_laws_with_and_without():
+    lower, k = [0, 1, 2], np.arange(0.0, 5.0)
+    law = D.ZeroInflated(D.Truncated(D.Poisson(2.0), lower=lower), P)
+    for i, least in enumerate(lower):
+        mass = 0.7 * st.poisson.pmf(k, 2.0) / st.poisson.sf(least - 1, 2.0) * (k >= least)
+        mass[0] += 0.3
+        for own in (law, law.element((i,))):
+            found = own.log_densities(array([X] * 3 if own is law else X)).ravel()
+            density = evaluate(found[i if own is law else 0], {X: k, P: 0.3})
+            np.testing.assert_allclose(np.exp(density), mass, rtol=1e-10)
+
+
 def test_truncated_zero_inflated():
     law = D.Truncated(D.ZeroInflated(D.Poisson(3.0), 0.3), lower=0, upper=4)
     mass = 0.7 * st.poisson.pmf(np.arange(5), 3.0)
@@ -287,6 +300,48 @@ def test_first_and_second_derivatives(name, value):
                 lambda v, f=f, s=s: float(evaluate(f, {**point, s: v})), point[s]
             )
             assert abs(float(evaluate(found, point)) - expected) < bound + 1e-9 * abs(expected)
+
+
+EDGES = {
+    "mixture": (D.Mixture([P, 1 - P], [D.Normal(A, sd=0.5), D.StudentT(4, A, scale=B)]),
+                lambda x, a, b: (st.norm(a, 0.5).pdf(x), st.t(4, a, b).pdf(x))),
+    "far apart": (D.Mixture([1 - P, P], [D.Normal(A + 30, sd=0.5), D.Normal(A, sd=B)]),
+                  lambda x, a, b: (st.norm(a, b).pdf(x), st.norm(a + 30, 0.5).pdf(x))),
+    "inflated": (D.ZeroInflated(D.Poisson(A + B), P),
+                 lambda x, a, b: (float(x == 0), st.poisson(a + b).pmf(x))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0])
+@pytest.mark.parametrize("name", EDGES)
+def test_slopes_where_a_share_is_zero(name, value):
+    """Of p f + (1 - p) g: (f - g) / (rest) in p; in others those of log g, at 1 of log f."""
+    law, densities = EDGES[name]
+    density, h = law.log_density(value), 1e-5
+    slopes = [differentiate([density], s)[0] for s in (P, A, B)]
+    for p in (0.0, 1.0):
+        f, g = densities(value, 0.8, 1.7)
+        kept = (g, f)[int(p)]
+        if kept == 0.0:
+            continue
+        point = {P: p, A: 0.8, B: 1.7}
+        assert evaluate(density, point) == pytest.approx(math.log(kept), rel=1e-10)
+        found = [float(evaluate(s, point)) for s in slopes]
+        assert found[0] == pytest.approx((f - g) / kept, rel=1e-9)
+        for k, (a, b) in enumerate([(h, 0.0), (0.0, h)]):
+            up, down = (densities(value, 0.8 + s * a, 1.7 + s * b)[1 - int(p)] for s in (1, -1))
+            assert found[1 + k] == pytest.approx(math.log(up / down) / (2 * h), rel=1e-6, abs=1e-8)
+
+
+def test_a_component_that_is_never_chosen_hides_no_other_one():
+    """However much likelier the value would be by it."""
+    law = D.Mixture([P, 1 - P], [D.Normal(0.0, sd=1.0), D.Normal(60.0, sd=1.0)])
+    density = law.log_density(0.0)
+    assert evaluate(density, {P: 0.0}) == pytest.approx(st.norm.logpdf(60.0))
+    assert evaluate(density, {P: 1e-30}) == pytest.approx(st.norm.logpdf(0.0) + math.log(1e-30))
+    ends = [array([0.0, math.inf, -math.inf]), array([0.0, 0.0, -math.inf])]
+    found = evaluate(log_sum([array([P] * 3), array([1 - P] * 3)], ends), {P: 0.5})
+    assert found.tolist() == [0.0, math.inf, -math.inf]
 
 
 OUT = {

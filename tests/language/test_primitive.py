@@ -141,3 +141,27 @@ def test_a_name_follows_called_functions_and_not_their_addresses():
         return friction
 
     assert fingerprint(make(3)) == fingerprint(make(3)) != fingerprint(make(2))
+
+
+def test_what_it_reads_may_not_change_unseen():
+    """The compiled form went on with the old number, in new models too."""
+    gain = 1.0
+
+    def amplified(v):
+        return gain * v
+
+    law = ssm.primitive(amplified)
+
+    def likelihood(model):
+        y = {"y": np.ones(3)}
+        return ssm.log_likelihood(model, y, {"k": 0.3, "q": 30.0}, particles=50, seed=1)
+
+    model = build(lambda v, k: law(v))
+    before = likelihood(model)
+    assert likelihood(model) == before
+    gain = 3.0
+    for changed in (model, build(lambda v, k: law(v))):
+        with pytest.raises(ssm.ModelError, match=r"amplified was .* with other .*gain"):
+            likelihood(changed)
+    law = ssm.primitive(law.function)
+    assert likelihood(model) != before

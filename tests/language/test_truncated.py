@@ -206,6 +206,36 @@ def test_one_law_between_bounds_for_each_element():
     assert evaluate(array(d.mean())) == pytest.approx([value(one.mean()) for one in each])
 
 
+UNBOUNDED = {
+    "Normal": D.Normal([0.5, 0.5], sd=X), "StudentT": D.StudentT(4, [0.5, 0.5], scale=X),
+    "Laplace": D.Laplace([0.5, 0.5], scale=X), "Gamma": D.Gamma([2.0, 2.0], rate=X),
+    "InverseGamma": D.InverseGamma([3.0, 3.0], scale=X), "Poisson": D.Poisson([X, X]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNBOUNDED)
+def test_a_law_between_infinite_bounds_beside_one_with_a_bound(name):
+    """An element of a vector of laws, as mixtures and missing components take it."""
+    both = D.Truncated(UNBOUNDED[name], lower=[-math.inf, 1.0])
+    free, bounded = both.element((0,)), both.element((1,))
+    law = UNBOUNDED[name].element((0,))
+    for p in (0.2, 0.5, 0.9):
+        x = value(law.quantile(array(p)), x=1.3)
+        assert value(free.quantile(array(p)), x=1.3) == pytest.approx(x, rel=1e-12)
+        for part in ("cdf", "survival", "log_density"):
+            found = value(getattr(free, part)(array(x)), x=1.3)
+            assert found == pytest.approx(value(getattr(law, part)(array(x)), x=1.3), rel=1e-12)
+    for part in ("mean", "variance"):
+        expected = value(getattr(law, part)(), x=1.3)
+        assert value(getattr(free, part)(), x=1.3) == pytest.approx(expected, rel=1e-12)
+    one = D.Truncated(law, lower=1.0)
+    assert value(bounded.log_density(2.0), x=1.3) == value(one.log_density(2.0), x=1.3)
+    mixed = D.Mixture([0.5, 0.5], [both, UNBOUNDED[name]])
+    rng = np.random.default_rng(1)
+    drawn = evaluate(mixed.sample(Draws("m")), {X: 1.3}, numpy_draws(rng, (2000,)))
+    assert np.all(np.isfinite(drawn.astype(float)))
+
+
 @pytest.mark.parametrize("bounds", [{"upper": 2.0}, {"lower": 0.5}, {"lower": 0.5, "upper": 2.0}])
 def test_slopes_of_a_truncated_weibull_by_its_shape(bounds):
     """Also where a bound is the end of the support, of which a power has none."""

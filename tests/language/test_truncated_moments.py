@@ -192,3 +192,53 @@ def test_predictions_of_a_particle_filter():
         assert found[f"{k}_predicted"].values[0] - low == pytest.approx(own[:, 0], abs=1e-9)
         sd = found[f"{k}_predicted_sd"].values[0]
         np.testing.assert_allclose(sd, np.sqrt(own[:, 1]), rtol=1e-5, atol=1e-9)
+
+
+FAR = [1e4, 1e7, 1e9, 1e12]
+
+
+@pytest.mark.parametrize("bound", FAR)
+@pytest.mark.parametrize("sides", ["lower", "upper", "both"])
+def test_bounds_far_in_heavy_tails_leave_the_moments(bound, sides):
+    bounds = {"lower": {"lower": -bound}, "upper": {"upper": bound}}
+    given = bounds.get(sides, {"lower": -bound, "upper": bound})
+    for law, variance, left in [
+        (D.StudentT(5.0, 0.0, scale=1.0), 5.0 / 3.0, 100.0 / bound**3),
+    ]:
+        found = one_sided(law, **given)
+        assert abs(found[0]) < 1e-9 + left
+        assert found[1] == pytest.approx(variance, rel=1e-8 + left)
+    if sides == "upper":
+        found = one_sided(D.InverseGamma(30.0, scale=30.0), **given)
+        assert found[1] == pytest.approx(st.invgamma(30, scale=30).var(), rel=1e-8)
+
+
+@pytest.mark.parametrize(("lower", "rel"), [(1.0, 1e-4), (100.0, 0.02)])
+def test_a_law_of_the_users_own_has_the_moments_that_exist(lower, rel):
+    """Its upper tail is one less its distribution function, to 1e-16 of the law."""
+    found = one_sided(Pareto(3.0), lower=lower)
+    assert found[0] == pytest.approx(lower + 0.5 * (lower + 1.0), rel=rel)
+    assert found[1] == pytest.approx(0.75 * (lower + 1.0) ** 2, rel=10 * rel)
+    assert one_sided(Pareto(3.0), upper=1e9)[1] == pytest.approx(0.75, rel=1e-4)
+    heavy = one_sided(Pareto(0.5), lower=lower)
+    assert heavy[0] == np.inf
+
+
+@ssm.distribution(lower=0, positive=("shape",))
+def Pareto(y, shape):
+    return np.log(shape) - (shape + 1) * np.log1p(y)
+
+
+@Pareto.cdf
+def below(y, shape):
+    return -np.expm1(-shape * np.log1p(y))
+
+
+@Pareto.quantile
+def value(p, shape):
+    return np.expm1(-np.log1p(-p) / shape)
+
+
+@Pareto.mean
+def mean_of_pareto(shape):
+    return np.where(shape > 1, 1 / (shape - 1.0), np.inf)

@@ -190,6 +190,14 @@ def test_functions_run_twice_for_each_pattern_of_numbers():
     assert repr(calls) == "count(6)"
 
 
+def test_functions_divide_by_numbers_that_are_zero():
+    """As NumPy does, on all that np.where leaves out too."""
+    found = [float(evaluate(array(Lomax(shape, 2.0).mean()))) for shape in (0.5, 1.0, 3.0)]
+    assert found == [math.inf, math.inf, 1.0]
+    by_symbol = Lomax(Y, 2.0).mean()
+    assert evaluate(array(by_symbol)[()], {Y: np.array([1.0, 3.0])}).tolist() == [math.inf, 1.0]
+
+
 def test_one_draw_that_is_used_twice_is_one_draw():
     @ssm.distribution(lower=0, upper=1)
     def Arcsine(y):

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from ssmppl.codegen.kernels.elementary import exp, expm1, log, log1p
+from ssmppl.codegen.kernels.elementary import exp, expm1, log
 from ssmppl.codegen.kernels.flags import exact
 from ssmppl.codegen.kernels.special import (
     deviance_part,
@@ -25,7 +25,7 @@ from ssmppl.codegen.kernels.special import (
 _INF = np.inf
 _EPS = 2.220446049250313e-16
 _TINY = 1e-300
-_STEPS = 1_000_000  # of a series or fraction; about sqrt(max(a, b)) of them are needed
+_STEPS = 1_000_000  # of a series or fraction; some 8 sqrt(max(a, b)) of them are needed
 
 
 @exact
@@ -90,6 +90,24 @@ def _gamma_small(a, x):
 
 
 @exact
+def _gamma_uniform(a, x):
+    """`gamma_tails` for large a: N. M. Temme's uniform expansion, *SIAM J. Math. Anal.* 10 (1979),
+    whose second term is below rounding from a = 1e8 on.
+
+    With a eta^2 / 2 = x - a - a log(x/a): Q = erfc(eta sqrt(a/2)) / 2 + R.
+    """
+    deviance = deviance_part(a, x)
+    eta = math.copysign(math.sqrt(2.0 * deviance / a), x - a)
+    if abs(eta) < 1e-3:
+        first = -1.0 / 3.0 + eta * (1.0 / 12.0 - eta * (2.0 / 135.0 - eta / 864.0))
+    else:
+        first = a / (x - a) - 1.0 / eta
+    rest = first * exp(-deviance) / math.sqrt(2.0 * np.pi * a)
+    root = math.copysign(math.sqrt(deviance), eta)
+    return 0.5 * math.erfc(-root) - rest, 0.5 * math.erfc(root) + rest
+
+
+@exact
 def gamma_tails(a, x):
     """(P, Q): lower and upper regularised incomplete gamma function, each to full accuracy."""
     if not (a > 0.0 and x >= 0.0) or (a == _INF and x == _INF):
@@ -103,6 +121,8 @@ def gamma_tails(a, x):
         # e^t (1 + s) directly, in case it is the small one.
         lower = exp(a * log(x) - x - lgamma(a + 1.0)) * _gamma_series(a, x)
         return lower, upper
+    if a > 1e8:
+        return _gamma_uniform(a, x)
     factor = poisson_density(a, x)
     if x < a + 1.0:
         lower = factor * _gamma_series(a, x)
@@ -188,29 +208,28 @@ def _beta_factor(a, b, x, y):
 
 
 @exact
-def _beta_fraction(a, b, x):
-    """The continued fraction A&S 26.5.8 of I_x(a, b), by Lentz's method."""
-    c = 1.0
-    d = 1.0 - (a + b) * x / (a + 1.0)
-    d = 1.0 / (d if abs(d) > _TINY else _TINY)
-    h = d
+def _beta_fraction(a, b, x, y):
+    """I_x(a, b) over x^a y^b / B(a, b): every other convergent of the continued fraction A&S
+    26.5.8, as DiDonato and Morris, *ACM TOMS* 18 (1992), equation 9, have it, by Lentz's method.
+
+    Nothing cancels in it where y is small and known to its last digit.
+    """
+    away = a * y - b * x
+    c = h = a / (a + 1.0) * (1.0 + away)
+    d = 0.0
     for m in range(1, _STEPS):
-        even = m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m))
-        d = 1.0 + even * d
+        step = (a + m - 1.0) * x / (a + 2 * m - 1.0)
+        above = step * ((a + b + m - 1.0) * x / (a + 2 * m - 1.0)) * (m * (b - m))
+        below = m * (b - m) * x / (a + 2 * m - 1.0) + m
+        below += (a + m) / (a + 2 * m + 1.0) * (1.0 + away + m * (1.0 + y))
+        d = below + above * d
         d = 1.0 / (d if abs(d) > _TINY else _TINY)
-        c = 1.0 + even / c
+        c = below + above / c
         c = c if abs(c) > _TINY else _TINY
         h *= d * c
-        odd = -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0))
-        d = 1.0 + odd * d
-        d = 1.0 / (d if abs(d) > _TINY else _TINY)
-        c = 1.0 + odd / c
-        c = c if abs(c) > _TINY else _TINY
-        step = d * c
-        h *= step
-        if abs(step - 1.0) < _EPS:
+        if abs(d * c - 1.0) < _EPS:
             break
-    return h
+    return 1.0 / h
 
 
 @exact
@@ -220,9 +239,9 @@ def beta_tails(a, b, x, y):
         return (0.0, 1.0) if x <= 0.0 else (1.0, 0.0)
     factor = _beta_factor(a, b, x, y)
     if x * (a + b + 2.0) < a + 1.0:
-        lower = min(factor * _beta_fraction(a, b, x) / a, 1.0)
+        lower = min(factor * _beta_fraction(a, b, x, y), 1.0)
         return lower, 1.0 - lower
-    upper = min(factor * _beta_fraction(b, a, y) / b, 1.0)
+    upper = min(factor * _beta_fraction(b, a, y, x), 1.0)
     return 1.0 - upper, upper
 
 
@@ -235,23 +254,43 @@ def betainc(a, b, x):
 
 
 @exact
-def betaincinv(a, b, p):
-    """x with I_x(a, b) = p: bracketed Newton in the log-odds of x."""
-    if not (a > 0.0 and b > 0.0 and 0.0 <= p <= 1.0) or a + b == _INF:
+def betaincc(a, b, x):
+    """1 - I_x(a, b)."""
+    if not (a > 0.0 and b > 0.0 and 0.0 <= x <= 1.0) or a + b == _INF:
         return np.nan
-    if p == 0.0 or p == 1.0:
-        return p
+    return beta_tails(a, b, x, 1.0 - x)[1]
+
+
+@exact
+def betaincinv(a, b, p):
+    """x with I_x(a, b) = p."""
+    return _beta_quantile(a, b, p, 1.0 - p)
+
+
+@exact
+def betainccinv(a, b, q):
+    """x with 1 - I_x(a, b) = q."""
+    return _beta_quantile(a, b, 1.0 - q, q)
+
+
+@exact
+def _beta_quantile(a, b, p, q):
+    """x with I_x(a, b) = p = 1 - q: bracketed Newton in the log-odds of x."""
+    if not (a > 0.0 and b > 0.0 and p >= 0.0 and q >= 0.0) or a + b == _INF:
+        return np.nan
+    if p == 0.0 or q == 0.0:
+        return 0.0 if p == 0.0 else 1.0
     low = -745.0
     high = 745.0
     use_lower = p <= 0.5
-    target = log(p) if use_lower else log1p(-p)
+    target = log(p) if use_lower else log(q)
     t = log(a / b)
     for _ in range(300):
         # x and y = 1 - x, both exact to rounding, from the log-odds t.
         x = 1.0 / (1.0 + exp(-t))
         y = 1.0 / (1.0 + exp(t))
         lower, upper = beta_tails(a, b, x, y)
-        too_large = lower > p if use_lower else upper < 1.0 - p
+        too_large = lower > p if use_lower else upper < q
         if too_large:
             high = t
         else:

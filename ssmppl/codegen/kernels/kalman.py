@@ -34,8 +34,9 @@ LOG_2PI = math.log(2.0 * math.pi)
 # Of a covariance's entries: pivots below this share are zero, and what they leave may be as large
 # as that one.
 PIVOT, REST = 1e-14, 1e-10
-# A root that moved by no more, as a share of its rows, has settled: rounding alone moves it so.
-SETTLED = 16 * 2.0**-52
+# A root that moved by no more, as a share of its rows and of its columns, rests: rounding alone
+# moves it so, and what falls as 1 / t moves its columns by more in any series.
+SETTLED, LEARNT = 16 * 2.0**-52, 1e-11
 
 
 @exact
@@ -224,22 +225,33 @@ def learn(array, k, residual, seen, mean, z):
 
 
 @exact
-def moved(root, last):
-    """How far a triangular root is from the last one, in units of its rows; last <- root.
+def rests(root, last):
+    """Whether a triangular root is the last one but for rounding; last <- root.
 
-    The signs of columns do not matter: last holds the root with a diagonal that is not negative.
+    What rounding moves is small in units of the rows. That alone does not tell: beside a part that
+    no data tell of, what is being learned may be as small, and shrink as slowly as 1 / t. It is
+    in columns of its own, which have to rest in their own units, unless they are rounding as a
+    whole. The signs of columns do not matter: last holds the root with a diagonal that is not
+    negative.
     """
-    most = 0.0
-    for i in range(root.shape[0]):
+    n, still = root.shape[0], True
+    for i in range(n):
         squares, change = 0.0, 0.0
         for j in range(i + 1):
             entry = root[i, j] if root[j, j] >= 0.0 else -root[i, j]
             squares += entry * entry
             change = max(change, abs(entry - last[i, j]))
+        still = still and change <= SETTLED * math.sqrt(squares)
+    for j in range(n):
+        size, change, noise = 0.0, 0.0, 0.0
+        for i in range(j, n):
+            entry = root[i, j] if root[j, j] >= 0.0 else -root[i, j]
+            size, change = max(size, abs(entry)), max(change, abs(entry - last[i, j]))
+            for k in range(i + 1 if still else 0):
+                noise = max(noise, SETTLED * abs(root[i, k]))
             last[i, j] = entry
-        if change > 0.0:
-            most = max(most, change / math.sqrt(squares))
-    return most
+        still = still and (change <= LEARNT * size or size <= noise)
+    return still
 
 
 @exact
@@ -324,5 +336,5 @@ def kalman_filter(
         if moments:
             square(root, covariance[t])
         if constant:
-            settled = moved(root, last) <= SETTLED and alike
+            settled = rests(root, last) and alike
     return OK, n_steps

@@ -14,7 +14,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.elementary import exp, log
 from ssmppl.codegen.kernels.flags import exact
-from ssmppl.codegen.kernels.special import i0e, lgamma
+from ssmppl.codegen.kernels.special import gammaln_rise, i0e, lgamma
 
 FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
 STEP, NODES = 0.0625, 52  # of the rule, on each side of its middle
@@ -29,8 +29,7 @@ def _betabinomial_sound(n, a, b):
 @exact
 def _betabinomial_log_mass(k, n, a, b):
     choose = lgamma(n + 1.0) - lgamma(k + 1.0) - lgamma(n - k + 1.0)
-    above = lgamma(k + a) + lgamma(n - k + b) - lgamma(n + a + b)
-    return choose + above - (lgamma(a) + lgamma(b) - lgamma(a + b))
+    return choose + gammaln_rise(a, k) + gammaln_rise(b, n - k) - gammaln_rise(a + b, n)
 
 
 @exact

@@ -91,6 +91,13 @@ def take_log(w, log_base):
         log_base[i] = log(w[i])
 
 
+@kernel
+def below(log_v, log_sum, log_w):
+    """log_w = log_v - log_sum."""
+    for i in range(log_v.size):
+        log_w[i] = log_v[i] - log_sum
+
+
 @exact
 def any_finite(log_v):
     """Whether some log weight is an ordinary number."""
@@ -153,6 +160,7 @@ def particle_filter(
     fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     log_v, log_base, w, p = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    log_w = np.empty(n)
     ancestors = np.empty(n + PADDING, dtype=np.int32)
     log_n = math.log(n)
     log_increment[:] = -np.inf
@@ -192,9 +200,7 @@ def particle_filter(
                 x, x_prev = x_prev, x
                 if ahead != NO_LOOK_AHEAD:
                     fits, fits_prev = fits_prev, fits
-                    take_log(w, log_base)
-                else:
-                    take_log(p, log_base)
+                copy(log_w, log_base)
                 uniform_base = False
             if ahead == NO_LOOK_AHEAD and sizes[5] > 0:
                 fit(theta, c, s, x_prev, fits)
@@ -214,6 +220,9 @@ def particle_filter(
             status = ALL_ZERO
         if status != OK:
             return status, t
+        if ess_threshold < 1.0:
+            # not from w, where one that is far behind is zero: later rows may bring it back
+            below(log_v, log_sum, log_w)
         log_increment[t] = log_sum - log_n if uniform_base else log_sum
         if kept is not None:
             for k in range(sizes[2]):

@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.elementary import exp, log1p
 from ssmppl.codegen.kernels.flags import exact, precise
-from ssmppl.codegen.kernels.incomplete import betainc, gammainc, gammaincc
+from ssmppl.codegen.kernels.incomplete import beta_tails, betainc, gammainc, gammaincc
 
 LARGEST_COUNT = 2.0**53
 
@@ -104,8 +104,17 @@ def _binomial_cdf(k, n, p, c):
 
 
 @exact
-def _negbinomial_cdf(k, r, p, c):
-    return betainc(r, k + 1.0, p)
+def _negbinomial_tails(k, r, mean):
+    """P(X <= k) and P(X > k)."""
+    if not (r > 0.0 and mean >= 0.0) or r + mean == math.inf:
+        return math.nan, math.nan
+    above, below = beta_tails(k + 1.0, r, mean / (r + mean), r / (r + mean))
+    return below, above
+
+
+@exact
+def _negbinomial_cdf(k, r, mean, c):
+    return _negbinomial_tails(k, r, mean)[0]
 
 
 @exact
@@ -135,8 +144,8 @@ def _poisson_survival(k, a, b, c):
 
 
 @exact
-def _negbinomial_survival(k, r, p, c):
-    return betainc(k + 1.0, r, 1.0 - p)
+def _negbinomial_survival(k, r, mean, c):
+    return _negbinomial_tails(k, r, mean)[1]
 
 
 @exact
@@ -166,8 +175,8 @@ def poisson_survival_quantile(rate, q):
 
 
 @exact
-def negbinomial_survival_quantile(r, p, q):
-    return _smallest_below(_negbinomial_survival, q, r, p)
+def negbinomial_survival_quantile(r, mean, q):
+    return _smallest_below(_negbinomial_survival, q, r, mean)
 
 
 @exact
@@ -181,8 +190,8 @@ def binomial_quantile(n, p, q):
 
 
 @exact
-def negbinomial_quantile(r, p, q):
-    return _smallest(_negbinomial_cdf, q, r, p, 0.0)
+def negbinomial_quantile(r, mean, q):
+    return _smallest(_negbinomial_cdf, q, r, mean, 0.0)
 
 
 @exact

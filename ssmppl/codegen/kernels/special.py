@@ -54,9 +54,15 @@ def digamma(x):
     while x < 10.0:
         value -= 1.0 / x
         x += 1.0
+    return value + log(x) + _digamma_error(x)
+
+
+@exact
+def _digamma_error(x):
+    """digamma(x) - log(x) for x >= 10."""
     z = 1.0 / (x * x)
     q = 1.0 / 252.0 - z * (1.0 / 240.0 - z * (1.0 / 132.0 - z * (691.0 / 32760.0 - z / 12.0)))
-    return value + log(x) - 0.5 / x - z * (1.0 / 12.0 - z * (1.0 / 120.0 - z * q))
+    return -0.5 / x - z * (1.0 / 12.0 - z * (1.0 / 120.0 - z * q))
 
 
 @exact
@@ -201,6 +207,37 @@ def stirling_error(x):
     z = 1.0 / (x * x)
     q = 1.0 / 1680.0 - z * (1.0 / 1188.0 - z * (691.0 / 360360.0 - z / 156.0))
     return (1.0 / 12.0 - z * (1.0 / 360.0 - z * (1.0 / 1260.0 - z * q))) / x
+
+
+@exact
+def gammaln_rise(a, b):
+    """log Gamma(a + b) - log Gamma(a) for a, a + b >= 0, by Stirling's formula where they are
+    large: the error is one of the result's size, not of the two functions'."""
+    end = a + b
+    if not (a >= 0.0 and end >= 0.0):
+        return np.nan
+    if min(a, end) < 15.0:
+        return lgamma(end) - lgamma(a)
+    leading = (a - 0.5) * log1p(b / a) + b * (log(end) - 1.0)
+    return leading + (stirling_error(end) - stirling_error(a))
+
+
+@exact
+def digamma_rise(a, b):
+    """digamma(a + b) - digamma(a), likewise."""
+    end = a + b
+    if not (a >= 0.0 and end >= 0.0):
+        return np.nan
+    if min(a, end) < 10.0:
+        return digamma(end) - digamma(a)
+    return log1p(b / a) + (_digamma_error(end) - _digamma_error(a))
+
+
+@exact
+def betaln(a, b):
+    """log of the beta function of a, b >= 0."""
+    small = min(a, b)
+    return lgamma(small) - gammaln_rise(max(a, b), small) if small >= 0.0 else np.nan
 
 
 @exact

@@ -15,12 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.analysis.density import terms
+from ssmppl.data import spelled
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.language.transforms import unconstrained
 
+# What to do where a function has no slope to climb.
+ELSEWHERE = "give start={name: value} where it has one, or use ssm.IF2(), which needs no slopes"
 STEP = 1e-5  # of the central differences where a prior has no derivative in closed form
 
 
@@ -101,6 +104,15 @@ class Chart:
             log_jacobian = float(evaluate(self.log_jacobian, values))
         log_prior = total - log_jacobian if total > -np.inf else -np.inf
         return Point(theta.copy(), log_prior, log_jacobian, jacobian, d_log_prior, slope)
+
+    def without_slope(self, value: float, theta: np.ndarray, gradient: np.ndarray) -> str:
+        """Says in what a function of theta (P,) that has a value there has no slope (P,); else
+        empty."""
+        names = [repr(s) for s, g in zip(self.symbols, gradient, strict=True) if not np.isfinite(g)]
+        if not names or not np.isfinite(value) or not np.all(np.isfinite(theta)):
+            return ""
+        here = spelled(self.space.problem.trace, theta)
+        return f"it has a value and no finite slope in {' and '.join(names)} at {here}"
 
     def curvature(self, z: np.ndarray, weights: np.ndarray) -> Curvature:
         """Second derivatives at z (F,); weights (P,) of the components of theta."""

@@ -23,6 +23,7 @@ from ssmppl.inference.exact.models import ExactModel, filter_name
 from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.maximum import smooth_likelihood
 from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.chart import ELSEWHERE
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.progress import announced
@@ -69,6 +70,7 @@ class ExactClimb:
         free = free_components(setup.problem.trace, setup.held)
         self.exact = exact_score(model, self.experiments, free, setup.space.theta)
         self.best, self.best_value = np.empty(0), -np.inf
+        self.without_slope = ""  # at the last point of that kind
         self.iterates: list[np.ndarray] = []
         self.values: list[float] = []
         self.evaluations = 0
@@ -99,6 +101,10 @@ class ExactClimb:
         except _WithoutMaximum as reason:
             unbounded = stopped = str(reason)
         if not np.isfinite(self.best_value):
+            if self.without_slope:
+                raise ArgumentError(
+                    f"the likelihood cannot be climbed: {self.without_slope}", fix=ELSEWHERE
+                )
             raise ArgumentError(
                 "the likelihood is zero at every point that was tried",
                 fix="give start={name: value} near plausible values",
@@ -136,6 +142,9 @@ class ExactClimb:
         if self.setup.with_prior:
             value, slope = value + point.log_prior, slope + point.d_log_prior
         if not np.isfinite(value) or not np.all(np.isfinite(slope)):
+            self.without_slope = (
+                self.setup.chart.without_slope(value, point.theta, gradient) or self.without_slope
+            )
             return nothing
         self.known[z.tobytes()] = value
         if value > self.best_value:

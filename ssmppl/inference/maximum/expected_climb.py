@@ -7,7 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
+from ssmppl.errors import SamplingError
 from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.chart import ELSEWHERE
 
 
 def climbed(
@@ -15,7 +17,12 @@ def climbed(
     with_slope: bool,
 ) -> np.ndarray:  # fmt: skip
     """Where theta' -> (Q, its derivatives (P,)) has its top near theta, by BFGS on the
-    unconstrained scale; Nelder and Mead's simplex where the derivatives are not there."""
+    unconstrained scale; Nelder and Mead's simplex where the derivatives are not there.
+
+    Raises
+    ------
+    SamplingError : Q has a value and no slope at theta itself.
+    """
     chart = setup.chart
 
     def at(z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -29,6 +36,9 @@ def climbed(
         return -total, -point.pull(gradient)
 
     z = setup.space_at(theta)
+    value, gradient = expected(theta)
+    if with_slope and (reason := chart.without_slope(value, theta, gradient)):
+        raise SamplingError(f"the expected log density cannot be climbed: {reason}", fix=ELSEWHERE)
     before = at(z)[0]
     found = scipy.optimize.minimize(
         at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,

@@ -15,7 +15,8 @@ import numpy as np
 import scipy
 
 from ssmppl.analysis.climber import LONGEST_STEP, uphill
-from ssmppl.inference.maximum.chart import Chart, Point
+from ssmppl.errors import SamplingError
+from ssmppl.inference.maximum.chart import ELSEWHERE, Chart, Point
 from ssmppl.inference.particles.complete_score import CompleteScores
 
 STEPS, HALVINGS, BFGS_STEPS = 30, 20, 50
@@ -68,6 +69,24 @@ class _Mean:
         finite = np.isfinite(value) and np.all(np.isfinite(slope))
         return _Height(point, value, slope, gradient) if finite else None
 
+    def first(self, z: np.ndarray) -> _Height | None:
+        """`at` where a climb begins.
+
+        Raises
+        ------
+        SamplingError : there is a value, and no slope.
+        """
+        here = self.at(z)
+        if here is None:
+            point = self.chart.at(z)
+            values, gradients = self.scores.value_and_gradient(point.theta, self.paths)
+            value, gradient = float(self.weights @ values), self.weights @ gradients
+            if reason := self.chart.without_slope(value, point.theta, gradient):
+                raise SamplingError(
+                    f"the log density of the states cannot be climbed: {reason}", fix=ELSEWHERE
+                )
+        return here
+
     def curvature(self, z: np.ndarray, height: _Height) -> np.ndarray:
         """Second derivatives in z, (F, F)."""
         j = height.point.jacobian
@@ -80,7 +99,7 @@ class _Mean:
 
     def newton(self, z: np.ndarray) -> np.ndarray:
         """The top by Newton's steps, halved until the mean rises; see `analysis/climber.py`."""
-        here = self.at(z)
+        here = self.first(z)
         if here is None:
             return z
         for _ in range(STEPS):
@@ -117,6 +136,7 @@ class _Mean:
                 return np.inf, np.zeros(len(z))
             return -height.value, -height.slope
 
+        self.first(z)
         found = scipy.optimize.minimize(
             negative, z, jac=True, method="BFGS", options={"maxiter": BFGS_STEPS}
         )

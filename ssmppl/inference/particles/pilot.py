@@ -243,7 +243,8 @@ def scale_of(
 ) -> np.ndarray:
     """Per coordinate the standard deviation of a Gaussian that falls as log p does.
 
-    Measured where log p has fallen by several units, as the estimates are noisy.
+    Measured where log p has fallen by several units, as the estimates are noisy, or where neither
+    side has any.
 
     on_the_line : (d,) which coordinates may be of any size; the others, logarithms and the like,
         are at most 5.
@@ -253,7 +254,9 @@ def scale_of(
     for i, unit in enumerate(np.eye(len(z))):
 
         def drop_at(step: float, unit: np.ndarray = unit) -> float:
-            return top - 0.5 * (log_density(z + step * unit) + log_density(z - step * unit))
+            ends = np.array([log_density(z + step * unit), log_density(z - step * unit)])
+            within = ends > -np.inf  # at an edge of the support the one side has to tell
+            return top - float(ends[within].mean()) if within.any() else np.inf
 
         step, drop = _small_step(drop_at, abs(z[i]))
         while drop < FALL and step < (MOST_STEP if anywhere[i] else 30.0):
