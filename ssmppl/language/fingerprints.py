@@ -125,7 +125,8 @@ class _Content:
                 return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
         own = attribute(value, "__dict__")
         if own is None:
-            own = {n: attribute(value, n) for n in getattr(kind, "__slots__", ())}
+            slots = [n for c in kind.__mro__ for n in vars(c).get("__slots__", ())]
+            own = {n: attribute(value, n) for n in slots}
         return self.of(kind, names), [(n, self.of(own[n], names)) for n in sorted(own)]
 
 

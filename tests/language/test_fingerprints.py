@@ -213,3 +213,17 @@ def test_objects_that_look_their_attributes_up_in_a_dictionary(kind):
 
     assert of(1.0) == of(1.0)
     assert of(1.0) != of(2.0)
+
+
+def test_slots_of_the_classes_above():
+    class Gain:
+        __slots__ = ("gain",)
+
+    class Shifted(Gain):
+        __slots__ = ("shift",)
+
+    settings = Shifted()
+    seen = set()
+    for settings.gain, settings.shift in ((1, 0), (2, 0), (2, 1)):
+        seen.add(fingerprint(lambda x: settings.gain * x + settings.shift))
+    assert len(seen) == 3
