@@ -122,7 +122,9 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
                     raise KeyError(f"no random draws given for {node!r}")
                 done[node] = draw(node.data[0], tuple(args))
             elif node.op == "call":
-                done[node] = np.vectorize(node.data, otypes=[float])(*args)
+                # compiled it has no errors of Python's: log(-1) is NaN, as in the kernels
+                function = getattr(node.data, "compiled", node.data)
+                done[node] = np.vectorize(function, otypes=[float])(*args)
             else:
                 done[node] = MEANING[node.op](*args)
     return [done[r] for r in roots]

@@ -165,3 +165,20 @@ def test_what_it_reads_may_not_change_unseen():
             likelihood(changed)
     law = ssm.primitive(law.function)
     assert likelihood(model) != before
+
+
+def test_outside_of_its_domain_a_primitive_is_no_number():
+    """As in the kernels, and not an error of Python's `math`, where a prior's draw leads there."""
+
+    @ssm.primitive
+    def lg(a):
+        return math.log(a)
+
+    @ssm.primitive
+    def one_over(a):
+        return 1.0 / a
+
+    x = symbol("parameter", "a", ())
+    at = {x: np.array([-1.0, 0.0, 1.0])}
+    np.testing.assert_array_equal(evaluate(lg(x), at), [np.nan, -np.inf, 0.0])
+    np.testing.assert_array_equal(evaluate(one_over(x), at), [-1.0, np.inf, 1.0])
