@@ -146,7 +146,7 @@ def read_csv(path: Path) -> pd.DataFrame:
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(path, skipinitialspace=True, index_col=False)
     except pd.errors.ParserWarning as error:  # pandas would leave out what has no name
-        _check_separator(path, names)
+        _check_first_line(path, names)
         raise DataError(
             f"the rows of {path} have more values than its first line has names, {len(names)}",
             fix="give each column a name, and write decimal numbers with points",
@@ -164,7 +164,7 @@ def read_csv(path: Path) -> pd.DataFrame:
             "separated by commas",
         ) from error
     if len(table.columns) == 1:
-        _check_separator(path, names)
+        _check_first_line(path, names)
     given = names.dropna().str.strip()
     if given.duplicated().any():
         raise DataError(
@@ -174,7 +174,7 @@ def read_csv(path: Path) -> pd.DataFrame:
     return labelled(table)
 
 
-def _check_separator(path: Path, names: pd.Series) -> None:
+def _check_first_line(path: Path, names: pd.Series) -> None:
     """Refuse a table whose values are separated by semicolons or tabs, as spreadsheets write it, or
     that begins with a comment."""
     header = ",".join(names.fillna("").astype(str))  # the file itself may be compressed

@@ -17,7 +17,7 @@ from ssmppl.language.continuous import _each, _where
 from ssmppl.language.counts import Binomial, _Counts
 from ssmppl.language.distribution import INFINITY, Distribution, Support
 from ssmppl.language.nested import holding
-from ssmppl.language.shares import sum_holds, wrong_sum
+from ssmppl.language.shares import check_sum, sum_holds
 
 
 class Bernoulli(_Counts):
@@ -82,13 +82,7 @@ class Categorical(_Counts):
                 where=self.location,
             )
         self._require("p", 0.0, 1.0, strict=False)
-        total = wrong_sum(self.p)
-        if total is not None:
-            raise ModelError(
-                f"Categorical: p sums to {total:.9g}",
-                fix="divide p by its sum",
-                where=self.location,
-            )
+        check_sum(self.p, "Categorical", "p sums", "divide p by its sum", self.location)
 
     def in_range(self) -> ExprArray | None:
         return holding([super().in_range(), sum_holds(self.p)])

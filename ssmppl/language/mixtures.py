@@ -19,7 +19,7 @@ from ssmppl.language.discrete import Dirac
 from ssmppl.language.distribution import INFINITY, Distribution, Support
 from ssmppl.language.draws import Draws
 from ssmppl.language.nested import cut, exists, holding
-from ssmppl.language.shares import log_sum, sum_holds, wrong_sum
+from ssmppl.language.shares import check_sum, log_sum, sum_holds
 
 
 class Mixture(Distribution):
@@ -65,13 +65,8 @@ class Mixture(Distribution):
         self.drawable = all(law.drawable for law in self.components)
         for k in range(len(self.components)):
             self._require(f"weight_{k}", 0.0, 1.0, strict=False)
-        total = wrong_sum(self.weights)
-        if total is not None:
-            raise ModelError(
-                f"Mixture: weights sum to {total:.9g}",
-                fix="divide the weights by their sum",
-                where=self.location,
-            )
+        fix = "divide the weights by their sum"
+        check_sum(self.weights, "Mixture", "weights sum", fix, self.location)
 
     @property
     def weights(self) -> list[ExprArray]:

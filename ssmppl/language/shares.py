@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.signs import never_negative
@@ -26,10 +27,15 @@ def _sums(shares: Iterable[Any]) -> ExprArray:
     return array(first)
 
 
-def wrong_sum(shares: Iterable[Any]) -> float | None:
-    """A sum of numbers that is not 1; None where there is none."""
+def check_sum(shares: Iterable[Any], kind: str, sums: str, fix: str, where: Location) -> None:
+    """Refuse numbers that do not sum to 1: the shares of a law of this kind.
+
+    sums : the subject and its verb, as in "weights sum".
+    """
     known = [total.data for total in _sums(shares).ravel() if total.op == "const"]
-    return next((total for total in known if abs(total - 1.0) > NUMBERS_ROUNDING), None)
+    for total in known:
+        if abs(total - 1.0) > NUMBERS_ROUNDING:
+            raise ModelError(f"{kind}: {sums} to {total:.9g}", fix=fix, where=where)
 
 
 def sum_holds(shares: Iterable[Any]) -> ExprArray | None:

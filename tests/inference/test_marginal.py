@@ -1,6 +1,7 @@
 """Rao-Blackwellised particle filters and smoothers against exact answers."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.particles.marginal import draw_given
-from ssmppl.inference.particles.marginal_backward import backward_pass, marginal_paths
+from ssmppl.inference.particles.marginal_backward import _Step, backward_pass, marginal_paths
 from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
 from tests.inference.conditional_models import THETA, enumerated, four_states, regimes
@@ -309,6 +310,25 @@ def test_paths_back_from_values_that_a_particle_tells_exactly():
         for i in range(24)
     ]  # fmt: skip
     _agree(np.array(runs), expected, np.sqrt(expected * (1 - expected) / (24 * 300)))
+
+
+def test_point_masses_that_fit_are_alike_and_outdo_densities():
+    """Of five particles for one component two tell it exactly, by covariances of another size in
+    the component before, one tells another value, and two know it with a spread, one far off."""
+    n, spread = 5, np.zeros((2, 2, 5))
+    spread[0, 0] = [1.0, 1.0, 1.0, 1.0, 1.0]
+    spread[1, 1] = [4.0, 9.0, 4.0, 5.0, 5.0]  # of which the first component tells 4, 9, 4, 4, 4
+    spread[0, 1] = spread[1, 0] = [2.0, 3.0, 2.0, 2.0, 2.0]
+    predicted = np.zeros((2, n))
+    predicted[1] = [1.0, 0.0, 1.5, 1.0, 9.0]
+    law = SimpleNamespace(free=[], columns=SimpleNamespace(coupled=[]))
+    step = _Step(law, {}, np.zeros(n), *(np.zeros(1),) * 3, predicted, spread)
+    # the first component is 1: the second is then 1 + 2, 0 + 3, 1.5 + 2, and 1 + 2 and 9 + 2 +- 1
+    log_w = step.log_weights(np.zeros((0, 1)), np.array([[1.0], [3.0]]))[:, 0]
+    assert log_w[0] == pytest.approx(log_w[1])
+    assert log_w[3] - log_w[4] == pytest.approx(0.5 * 8.0**2)
+    assert log_w[2] < log_w[4] - 1e6
+    assert log_w[3] < log_w[0] - 10.0
 
 
 def _behind(n):

@@ -19,17 +19,32 @@ import numpy as np
 from ssmppl.codegen.kernels.flags import exact
 
 UNSURE = -2  # stopped where ordinary numbers do not tell
+FAINT, DIM = 1e-180, 1e-160  # shares; see `forward`
+LEFT_FAINT = math.log(FAINT / DIM)  # log densities of a row, less log p(y_t), that leave dim faint
+
+
+@exact
+def chosen_of(w, level):
+    """The index of the weight within which a level between 0 and their sum lies."""
+    chosen = -1
+    for i in range(w.size):
+        if w[i] > 0.0:
+            chosen = i
+            level -= w[i]
+            if level < 0.0:
+                break
+    return chosen
 
 
 @exact
 def forward(move, log_start, log_move, log_g, increments, predicted, filtered, stopped):
     """Fill increments (S, T), log p(y_t | y_{1:t-1}), the laws (S, T, K) of x_t given y_{1:t-1} and
     given y_{1:t}, and stopped (S,), the row (from 0) at which no value is possible, -1 if none
-    is, -2 where these laws may lack a value that matters.
+    is, UNSURE where these laws may lack a value that matters.
 
-    A share below 1e-180 is faint. It does not matter in the next row where the others come to
-    1e-160; where they do not, the value there is dim, of a share below about 1e-160, and it has to
-    be shown that the row of data leaves it faint. In the end what is faint does not matter.
+    A share below FAINT is faint. It does not matter in the next row where the others come to DIM;
+    where they do not, the value there is dim, of a share below about DIM, and it has to be shown
+    that the row of data leaves it faint. In the end what is faint does not matter.
     """
     n_sequences, n_steps, n = log_g.shape
     faint, dim = np.empty(n, dtype=np.bool_), np.empty(n, dtype=np.bool_)
@@ -42,14 +57,14 @@ def forward(move, log_start, log_move, log_g, increments, predicted, filtered, s
             for j in range(n):
                 if t == 0:
                     total = math.exp(log_start[first, j])
-                    dim[j] = total < 1e-160 and log_start[first, j] > -np.inf
+                    dim[j] = total < DIM and log_start[first, j] > -np.inf
                 else:
                     total = 0.0
                     for i in range(n):
                         if filtered[s, t - 1, i] > 0.0:
                             total += filtered[s, t - 1, i] * move[b, a, i, j]
                     dim[j] = False
-                    if total < 1e-160:
+                    if total < DIM:
                         for i in range(n):
                             if faint[i] or filtered[s, t - 1, i] > 0.0:
                                 dim[j] = dim[j] or log_move[b, a, i, j] > -np.inf
@@ -64,7 +79,7 @@ def forward(move, log_start, log_move, log_g, increments, predicted, filtered, s
                 stopped[s] = t
                 break
             if not top > -np.inf:
-                stopped[s] = -2 if hidden > -np.inf else t
+                stopped[s] = UNSURE if hidden > -np.inf else t
                 break
             total = 0.0
             for j in range(n):
@@ -74,16 +89,16 @@ def forward(move, log_start, log_move, log_g, increments, predicted, filtered, s
                 total += filtered[s, t, j]
             if not 0.0 < total < np.inf:
                 # the likeliest by the data may be too unlikely before them
-                stopped[s] = -2 if total == 0.0 else t
+                stopped[s] = UNSURE if total == 0.0 else t
                 break
             increments[s, t] = math.log(total) + top
-            if hidden - increments[s, t] > -46.0:  # log(1e-180 / 1e-160)
-                stopped[s] = -2
+            if hidden - increments[s, t] > LEFT_FAINT:
+                stopped[s] = UNSURE
                 break
             for j in range(n):
                 filtered[s, t, j] /= total
                 possible = dim[j] or predicted[s, t, j] > 0.0
-                faint[j] = possible and filtered[s, t, j] < 1e-180 and log_g[s, t, j] > -np.inf
+                faint[j] = possible and filtered[s, t, j] < FAINT and log_g[s, t, j] > -np.inf
 
 
 @exact
@@ -134,11 +149,4 @@ def sample_backward(move, filtered, which, uniforms, paths):
                     a = t + 1 if move.shape[1] > 1 else 0
                     w[i] *= move[b, a, i, paths[m, t + 1]]
                 total += w[i]
-            level, chosen = uniforms[m, t] * total, -1
-            for i in range(n):
-                if w[i] > 0.0:
-                    chosen = i
-                    level -= w[i]
-                    if level < 0.0:
-                        break
-            paths[m, t] = chosen
+            paths[m, t] = chosen_of(w, uniforms[m, t] * total)

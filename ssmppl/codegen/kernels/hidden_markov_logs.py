@@ -11,11 +11,12 @@ import math
 import numpy as np
 
 from ssmppl.codegen.kernels.flags import exact
+from ssmppl.codegen.kernels.hidden_markov import chosen_of
 
 
 @exact
 def forward_logs(log_start, log_move, log_g, increments, predicted, filtered, stopped):
-    """As `forward`; stopped is never -2."""
+    """As `forward`; stopped is never UNSURE."""
     n_sequences, n_steps, n = log_g.shape
     for s in range(n_sequences):
         first = s if log_start.shape[0] > 1 else 0
@@ -114,11 +115,4 @@ def sample_backward_logs(move, filtered, which, uniforms, paths):
             for i in range(n):
                 w[i] = math.exp(w[i] - most)
                 total += w[i]
-            level, chosen = uniforms[m, t] * total, -1
-            for i in range(n):
-                if w[i] > 0.0:
-                    chosen = i
-                    level -= w[i]
-                    if level < 0.0:
-                        break
-            paths[m, t] = chosen
+            paths[m, t] = chosen_of(w, uniforms[m, t] * total)
