@@ -19,6 +19,7 @@ from ssmppl.counts import check_count
 from ssmppl.data.channels import channel, holds
 from ssmppl.data.parameters import pack
 from ssmppl.data.sources import Source, sources
+from ssmppl.data.undefined import check_defined
 from ssmppl.data.values import name_of, number, outside
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
@@ -125,7 +126,10 @@ def bind_inputs(
     values = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
-    return _input_array(trace, values, rows), rows, source.time
+    u = _input_array(trace, values, rows)
+    drawn = np.ones((rows, len(trace.observation_symbols)), dtype=bool)
+    check_defined(trace, source, u, None, drawn)
+    return u, rows, source.time
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,7 @@ def _bind(trace: Trace, source: Source, need: bool, steps: int | None, once: _On
     missing = np.isnan(packed)
     if need:
         _check_needed(trace, source, missing, once.needed)
+    check_defined(trace, source, u, packed, ~missing)
     return Experiment(
         y=np.ascontiguousarray(np.where(missing, 0.0, packed)),
         seen=np.ascontiguousarray(np.where(missing, 0.0, 1.0)),

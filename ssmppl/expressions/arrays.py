@@ -12,6 +12,7 @@ from numpy.lib.array_utils import normalize_axis_tuple
 from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.expr import Expr, apply, as_expr, constant, pack, unpack, user_location
 from ssmppl.expressions.node import behaviour
+from ssmppl.expressions.provenance import CHOICES
 
 
 def _any_operator(self: Any, other: Any) -> Any: ...
@@ -130,12 +131,17 @@ def refuse(what: str, fix: str) -> NoReturn:
 
 # -- NumPy's functions of these names
 def choose(index: Any, choices: Sequence[Any] | np.ndarray) -> Any:
-    """choices[index], element by element; the last of them where the index is out of range."""
+    """choices[index], element by element; the last of them where the index is out of range, which
+    `choosing` lets a caller refuse where it can tell."""
     if len(choices) == 0:
         refuse("a choice from no elements", "give at least one element")
     chosen = scalar_or_array(choices[-1])
     for k in range(len(choices) - 2, -1, -1):
         chosen = elementwise("where", elementwise("eq", index, k), choices[k], chosen)
+    kept = CHOICES.get()
+    if kept is not None and len(choices) > 1:
+        for node, own in np.broadcast(plain(chosen), plain(index)):
+            kept[node] = (as_expr(own), len(choices))
     return chosen
 
 

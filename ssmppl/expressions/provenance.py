@@ -1,4 +1,4 @@
-"""Where the user wrote each node."""
+"""Where the user wrote each node, and which are elements of an array that a symbol chose."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 # Of the block that records; None where none does. And the place that its nodes are given.
 PLACES: ContextVar[dict[Expr, Location] | None] = ContextVar("places", default=None)
+CHOICES: ContextVar[dict[Expr, tuple[Expr, int]] | None] = ContextVar("choices", default=None)
 _given: ContextVar[Location | None] = ContextVar("given", default=None)
 # Frames of these folders are never the place "where the user wrote it".
 _OWN = tuple(
@@ -39,6 +40,18 @@ def recording() -> Iterator[dict[Expr, Location]]:
         yield places
     finally:
         PLACES.reset(token)
+
+
+@contextmanager
+def choosing() -> Iterator[dict[Expr, tuple[Expr, int]]]:
+    """Within the block, each element that a symbol chose is kept in the result, with the index and
+    the number of elements. Its node alone does not tell: out of range it is the last element."""
+    choices: dict[Expr, tuple[Expr, int]] = {}
+    token = CHOICES.set(choices)
+    try:
+        yield choices
+    finally:
+        CHOICES.reset(token)
 
 
 @contextmanager

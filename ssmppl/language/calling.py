@@ -8,7 +8,7 @@ import itertools
 import os
 import re
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import CodeType, TracebackType
 from typing import Any
 
@@ -19,6 +19,7 @@ from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
 from ssmppl.expressions.instead import INSTEAD
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
 from ssmppl.language.elsewhere import advice
+from ssmppl.language.lookups import check_lookups, instructions
 from ssmppl.language.model import location_of
 from ssmppl.language.reading import INSTALLED, outer_values, plain_function
 
@@ -81,6 +82,7 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
     It is called twice: a law that is not the same again draws random numbers or changes something,
     and what was drawn would be frozen into the model.
     """
+    check_lookups(function, role, arguments)
     first = once(function, role, arguments, known)
     again = once(function, role, arguments, known)
     if not _same(first, again):
@@ -172,18 +174,10 @@ def _of_the_users(function: Callable[..., Any]) -> bool:
 
 
 def _line_of_name(code: CodeType, name: str, where: Location) -> Location:
-    for instruction, line in _instructions(code):
+    for instruction, line in instructions(code):
         if instruction.opname.startswith("LOAD_") and instruction.argval == name and line:
             return Location(where.file, line, where.function)
     return where
-
-
-def _instructions(code: CodeType) -> Iterator[tuple[dis.Instruction, int | None]]:
-    for instruction in dis.get_instructions(code):
-        yield instruction, instruction.positions.lineno if instruction.positions else None
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            yield from _instructions(inner)
 
 
 # -- errors inside of the law

@@ -22,6 +22,7 @@ from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distribution import Distribution, Support
 from ssmppl.language.draws import Draws
+from ssmppl.language.matrices import checked_matrix
 from ssmppl.language.positive import LEAST_SHARE, log_gamma, log_gamma_draw, needs_log_gamma
 
 
@@ -30,37 +31,7 @@ class _Joint(Distribution):
 
     def _matrix(self, name: str) -> ExprArray:
         """A parameter that must be a square, symmetric, positive definite matrix."""
-        m = self.parameters[name]
-        if m.ndim != 2 or m.shape[0] != m.shape[1]:
-            raise ModelError(
-                f"{type(self).__name__}: {name} has shape {m.shape}",
-                fix="give a square matrix",
-                where=self.location,
-            )
-        above = [m[i, j] for i in range(len(m)) for j in range(i + 1, len(m))]
-        if name == "cholesky" and any(e is not constant(0.0) for e in above):
-            raise ModelError(
-                f"{type(self).__name__}: cholesky is not lower triangular",
-                fix="give the lower factor L with L L' = covariance, as np.linalg.cholesky does",
-                where=self.location,
-            )
-        if all(e.op == "const" for e in m.ravel()):
-            numbers = np.array([e.data for e in m.ravel()]).reshape(m.shape)
-            lower = name == "cholesky"
-            symmetric = lower or np.allclose(numbers, numbers.T, rtol=1e-10, atol=0)
-            positive = (
-                bool(np.all(np.diagonal(numbers) > 0))
-                if lower
-                else symmetric and bool(np.all(np.linalg.eigvalsh(numbers) > 0))
-            )
-            if not symmetric or not positive:
-                what = "positive definite" if symmetric else "symmetric"
-                raise ModelError(
-                    f"{type(self).__name__}: {name} is not {what}: {numbers.tolist()}",
-                    fix="check its entries; a noise that is exactly zero is ssm.Dirac",
-                    where=self.location,
-                )
-        return m
+        return checked_matrix(self, name)
 
     def _where_definite(self, m: ExprArray, density: ExprArray) -> ExprArray:
         """A density in which the matrix m stands, and -inf where m is not positive definite: its

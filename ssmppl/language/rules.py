@@ -5,11 +5,11 @@ from __future__ import annotations
 import keyword
 import math
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from ssmppl.errors import Location, ModelError, listing
-from ssmppl.expressions.expr import topological
+from ssmppl.expressions.expr import symbols_of, to_text, topological
 from ssmppl.language.distributions import (
     Dirac,
     Distribution,
@@ -153,6 +153,19 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
                 fix="look for the constant that is NaN (0/0, np.log of a negative number, a "
                 "missing entry of an array)",
                 where=where,
+            )
+
+
+def check_read(name: str, distribution: Distribution, role: str, kinds: Collection[str]) -> None:
+    """Refuse symbols of other kinds than the arguments of the function: another law kept them."""
+    for s in symbols_of(distribution.expressions()):
+        if s.data[0] not in kinds:
+            raise ModelError(
+                f"the law of {name!r} reads {to_text(s)}, a symbol of another law than this "
+                f"@{role}",
+                fix="name what a law needs among its arguments; what one law keeps in a variable "
+                "or a dictionary means nothing in another",
+                where=distribution.location,
             )
 
 

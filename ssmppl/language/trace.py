@@ -27,9 +27,11 @@ import numpy as np
 from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, recording, symbol
+from ssmppl.expressions.provenance import choosing
 from ssmppl.language.calling import call, check_outer_names, return_location
 from ssmppl.language.covariances import find_root, independent
 from ssmppl.language.distributions import Distribution
+from ssmppl.language.indexes import check_indexes
 from ssmppl.language.model import Model, location_of
 from ssmppl.language.packing import Known, digest_of, packed, unpacked
 from ssmppl.language.rules import (
@@ -38,6 +40,7 @@ from ssmppl.language.rules import (
     check_dims,
     check_law,
     check_name,
+    check_read,
     check_returned,
     check_states,
     is_symmetric,
@@ -81,6 +84,7 @@ class Trace:
     inputs: dict[str, tuple[int, ...]]
     locations: dict[Expr, Location]
     functions: dict[str, list[Location]] = field(default_factory=dict)
+    choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Packed once, and one object in each process that gets it: what was generated for it is
@@ -140,6 +144,11 @@ def symbols(kind: str, name: str, shape: tuple[int, ...], symmetric: bool = Fals
     return array(out)
 
 
+def _time(role: str) -> str:
+    """The kind of `t` in this kind of function."""
+    return "time_prev" if role in ("transition", "proposal") else "time"
+
+
 _traces: weakref.WeakKeyDictionary[Model, tuple[tuple, Trace]] = weakref.WeakKeyDictionary()
 
 
@@ -181,7 +190,7 @@ class _Tracer:
         for name in model.inputs:
             check_name(name, "input", model.location)
             self._claim(name, "input", model.inputs[name], model.location)
-        with recording() as locations:
+        with recording() as locations, choosing() as choices:
             parameters = self._sites("prior", "parameter")
             initial = self._sites("initial", "state")
             observations = self._sites("observation", "observation")
@@ -191,7 +200,7 @@ class _Tracer:
         check_dims(self.known, self.owner)
         self._check_outer_names()
         self._check_defaults()
-        return Trace(
+        traced = Trace(
             name=model.name,
             parameters=parameters,
             initial=initial,
@@ -201,7 +210,10 @@ class _Tracer:
             inputs=dict(model.inputs),
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
+            choices=choices,
         )
+        check_indexes(traced)
+        return traced
 
     def _sites(self, function_role: str, role: str) -> dict[str, Site]:
         sites: dict[str, Site] = {}
@@ -213,6 +225,7 @@ class _Tracer:
             for name, distribution in laws.items():
                 check_name(name, role, line)
                 check_law(name, distribution, function_role)
+                check_read(name, distribution, function_role, self._kinds(function_role))
                 if function_role != "prior":
                     distribution = independent(distribution)
                 if function_role in ("initial", "transition"):
@@ -305,9 +318,12 @@ class _Tracer:
             },
         }[role]
 
+    def _kinds(self, role: str) -> set[str]:
+        return {*self._allowed(role).values(), _time(role)}
+
     def _argument(self, name: str, role: str) -> Expr | ExprArray | None:
         if name == "t" and role != "prior":
-            return symbol("time_prev" if role in ("transition", "proposal") else "time", "t")
+            return symbol(_time(role), "t")
         if name not in self.known or self.known[name][0] not in self._allowed(role):
             return None
         known_as, shape = self.known[name]

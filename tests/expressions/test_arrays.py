@@ -268,7 +268,7 @@ def test_an_out_of_range_symbol_takes_the_last():
     v = symbols()["v"]
     at = {symbol("state", "v", (i,)): float(i) for i in range(3)}
     picked = v[symbol("state", "k")]
-    assert evaluate(picked, {**at, symbol("state", "k"): 7.0}) == 2.0
+    assert evaluate(picked, {**at, symbol("state", "k"): 7.0}) == 2.0  # laws refuse it
 
 
 @pytest.mark.parametrize(

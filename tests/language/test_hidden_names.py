@@ -1,5 +1,6 @@
 """Names of quantities that a law would not read: hidden by a default, or spelled otherwise."""
 
+import pandas as pd
 import pytest
 
 import ssmppl as ssm
@@ -43,3 +44,74 @@ def test_a_name_that_python_reads_otherwise_is_told():
         trace(model)
     assert "write '\\u03bc'" in caught.value.fix
     trace(walk(priors=[lambda: {"\u03bc": ssm.Normal(0, sd=1)}]))
+
+
+SUMMER, RATES, INDEX = {6.0, 7.0, 8.0}, {1.0: 0.5}, pd.Index([1.0, 2.0])
+
+
+def literal(x, u):
+    return {"y": ssm.Normal(x + (1.0 if u in {6.0, 7.0} else 0.0), sd=1)}
+
+
+def computed(x, u):
+    return {"y": ssm.Normal(x + (1.0 if u % 12 in SUMMER else 0.0), sd=1)}
+
+
+def absent(x, u):
+    if u not in RATES:
+        x = 2 * x
+    return {"y": ssm.Normal(x, sd=1)}
+
+
+def got(x, u):
+    return {"y": ssm.Normal(x + RATES.get(u, 0.0), sd=1)}
+
+
+def got_of_a_sum(x, u):
+    return {"y": ssm.Normal(x + RATES.get(u + 1.0, 0.0), sd=1)}
+
+
+def of_pandas(x, u):
+    return {"y": ssm.Normal(x + (1.0 if u in INDEX else 0.0), sd=1)}
+
+
+@pytest.mark.parametrize("law", [literal, computed, absent, got, got_of_a_sum, of_pandas])
+def test_a_symbol_is_not_looked_for_in_a_set(law):
+    model = ssm.Model("months", inputs=("u",))
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(law)
+    with pytest.raises(ssm.ModelError, match="looks 'u', a symbol, up in a") as caught:
+        trace(model)
+    assert caught.value.where.line == law.__code__.co_firstlineno + 1
+    assert "np.where((u == 1) | (u == 2)" in caught.value.fix
+
+
+def test_numbers_are_looked_for_in_sets_as_ever():
+    def law(x, u, k=6.0):
+        parts = [n for n in (1.0, 6.0) if n in SUMMER]
+        if u.ndim in {0, 1} and "a" not in RATES and k in SUMMER and len([u]) in {1}:
+            x = len(parts) * 3 * x + RATES.get(k, 0.0) + RATES.get(u.ndim, 0.0)
+        return {"y": ssm.Normal(x + u, sd=1)}
+
+    model = ssm.Model("months", inputs=("u",))
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
+    model.observation(law)
+    assert "3*x" in repr(trace(model).observations["y"].distribution)
+
+
+def test_what_one_law_keeps_is_not_read_by_another():
+    store = {}
+
+    def transition(x):
+        store["gain"] = 0.5 * x
+        return {"x": ssm.Normal(x, sd=1)}
+
+    def observation(x):
+        return {"y": ssm.Normal(x + store.get("gain", 0.0), sd=1)}
+
+    model = walk(transition=transition, observation=observation)
+    trace(model)  # the transition comes after
+    with pytest.raises(ssm.ModelError, match="'y' reads x_prev, a symbol of another law"):
+        trace(model)

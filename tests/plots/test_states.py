@@ -247,6 +247,14 @@ def test_forecasts_that_are_infinite_in_part_are_drawn(ahead):
     assert quantiles_of(last.values[:, -1:], LEVELS)[0, 0] == -np.inf
 
 
+def test_quantiles_of_the_largest_numbers_do_not_overflow():
+    draws = np.array([-1.7e308, 1.7e308, 1.0])[:, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = quantiles_of(draws, [0.0, 0.25, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(found[:, 0], [-1.7e308, -8.5e307, 1.0, 8.5e307, 1.7e308], rtol=1e-12)
+
+
 def test_a_forecast_of_one_experiment_is_put_after_that_one():
     second = ssm.forecast(level, sampled(True), inputs={"push": [0.0, 0.0]}, experiment=2, seed=1)
     ax = ssm.plot_forecast(second, sampled(True), var_names="z")
