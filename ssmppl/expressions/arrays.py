@@ -79,6 +79,18 @@ class ExprArray(np.ndarray):
     def cumsum(self, *args, **kwargs):  # type: ignore[override]
         return _by_function(np.cumsum, self, args, kwargs)
 
+    def any(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.any, self, args, kwargs)
+
+    def all(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.all, self, args, kwargs)
+
+    def cumprod(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.cumprod, self, args, kwargs)
+
+    def round(self, *args, **kwargs):  # type: ignore[override]
+        return _by_function(np.round, self, args, kwargs)
+
 
 def _by_function(function: Any, a: ExprArray, args: tuple, kwargs: dict) -> Any:
     return behaviour["function"](function, (a, *args), kwargs)

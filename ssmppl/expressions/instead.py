@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 SHOWN = 3
-_ROUNDED = "np.floor(x + 0.5)"
+_ROUNDED = "np.floor(x + 0.5), which takes halves up, where NumPy takes them to even numbers"
 _SORTED = "np.minimum and np.maximum of the elements"
 _TABLE = "np.where(...) by pieces, or wrap the table by @ssm.primitive"
 # by the names that NumPy, SciPy and their ufuncs have
@@ -18,12 +18,12 @@ INSTEAD: dict[str, str] = {
     **dict.fromkeys(["any", "logical_xor"], "conditions joined by |"),
     "all": "conditions joined by &",
     **dict.fromkeys(["sort", "median", "partition"], _SORTED),
-    **dict.fromkeys(["argmax", "argmin"], "np.where(x[0] > x[1], 0, 1), and so on"),
+    **dict.fromkeys(["argmax", "argmin"], "np.where(x[0] >= x[1], 0, 1), and so on"),
     "cumprod": "np.exp(np.cumsum(np.log(x))) of positive numbers, or the products one by one",
     "nan_to_num": "np.where(np.isnan(x), 0.0, x)",
     "sinc": "np.where(x == 0, 1.0, np.sin(np.pi * x) / (np.pi * x))",
-    "gamma": "np.exp(scipy.special.gammaln(x))",
-    "erfcx": "np.exp(x**2) * scipy.special.erfc(x)",
+    "gamma": "np.exp(scipy.special.gammaln(x)) of positive numbers",
+    "erfcx": "2 * np.exp(x**2 + scipy.special.log_ndtr(-np.sqrt(2) * x))",
     "factorial": "np.exp(scipy.special.gammaln(x + 1))",
     "beta": "np.exp(scipy.special.betaln(a, b))",
     **dict.fromkeys(["comb", "binom"], "np.exp(gammaln(n + 1) - gammaln(k + 1) - "
@@ -52,6 +52,8 @@ def fix_for(name: str, known: Iterable[str]) -> str:
     nearly so."""
     if name in INSTEAD:
         return f"write {INSTEAD[name]}"
+    if name in known:  # a namesake in another module, as in np.linalg
+        return f"write np.{name}"
     near = ", ".join(difflib.get_close_matches(name, sorted(known), SHOWN))
     return (f"there are {near}; else " if near else "") + (
         "write the computation by functions that symbols have, or wrap it by @ssm.primitive"

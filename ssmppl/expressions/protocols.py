@@ -323,7 +323,8 @@ def apply_function(func: Callable[..., Any], args: tuple, kwargs: dict) -> Any:
             return type(result)(array(r) for r in result)
         return scalar_or_array(result)
     known = {f.__name__ for f in [*FUNCTIONS, *STRUCTURAL]}
-    refuse(f"np.{name}", fix_for(name, known))
+    module = str(func.__module__).replace("numpy", "np", 1)
+    refuse(f"{module}.{name}", fix_for(name, known))
 
 
 @cache

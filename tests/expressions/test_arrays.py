@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy
 import scipy.special as sp
 from hypothesis import given, settings
 from hypothesis import strategies as some
@@ -12,6 +13,7 @@ from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.expressions.instead import INSTEAD
 
 NAMES = {"x": (), "y": (), "k": (), "v": (3,), "w": (3,), "A": (3, 3), "S": (3, 3), "B": (2, 3)}
 C = np.array([[1.0, 0.5, -1.0], [0.25, 2.0, 0.0], [0.0, 1.0, 3.0]])
@@ -287,3 +289,28 @@ def test_conditions_may_be_true_and_false_themselves():
     assert ((k > 2) & True) is ((k > 2) & np.bool_(True))
     assert evaluate(np.where(~(k > 2) | np.where(k > 5, True, False), 1.0, 0.0), {k: 7.0}) == 1.0
     assert evaluate(np.where(np.logical_and(k, 1), 1.0, 0.0), {k: 2.0}) == 1.0
+
+
+ADVICE = [
+    (lambda v, m: v.any(), "np.any", "conditions joined by |"),
+    (lambda v, m: v.all(), "np.all", "conditions joined by &"),
+    (lambda v, m: v.cumprod(), "np.cumprod", "np.cumsum(np.log(x))"),
+    (lambda v, m: v.round(1), "np.round", "np.floor(x + 0.5), which takes halves up"),
+    (lambda v, m: np.linalg.outer(v, v), "np.linalg.outer", "write np.outer"),
+    (lambda v, m: np.linalg.matrix_power(m, 2), "np.linalg.matrix_power", "@ssm.primitive"),
+]
+
+
+@pytest.mark.parametrize(("call", "name", "fix"), ADVICE)
+def test_what_symbols_do_not_have_is_named_as_it_was_written(call, name, fix):
+    v = symbols()["v"]
+    with pytest.raises(UnsupportedOperation) as caught:
+        call(v, np.stack([v, v]))
+    assert caught.value.found.startswith(f"{name} has no meaning")
+    assert fix in caught.value.fix
+
+
+@pytest.mark.parametrize("x", [-3.0, 0.5, 27.0, 200.0])
+def test_the_advice_for_erfcx_is_erfcx(x):
+    found = eval(INSTEAD["erfcx"], {"np": np, "scipy": scipy, "x": x})
+    np.testing.assert_allclose(found, sp.erfcx(x), rtol=1e-9)
