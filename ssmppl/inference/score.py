@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -190,6 +191,13 @@ def _score(
         whole = np.full((len(free), len(free)), np.nan) if matrix is None else matrix
         return table(labels, whole[np.ix_(free, free)])
 
+    slopes = zip(labels, found.gradient[free], strict=True)
+    if none := [f"{n} is {g:g}" for n, g in slopes if not np.isfinite(g)]:
+        warnings.warn(
+            f"the log-likelihood has no finite slope at these parameters, as at the root or the "
+            f"logarithm of 0: the score in {', '.join(none)}",
+            stacklevel=3,
+        )
     return Score(
         named(found.gradient), labelled(found.information), found.log_likelihood,
         named(np.sqrt(np.diagonal(found.gradient_covariance))),

@@ -201,3 +201,16 @@ def test_what_is_refused(arguments, found):
     given = {"parameters": {"phi": 0.9, "tau": 20.0}, "proposal": "bootstrap"} | arguments
     with pytest.raises(ArgumentError, match=found):
         ssm.score(models.varves, {"y": datasets.ice_varves()[:20]}, **given)
+
+
+def test_where_there_is_no_finite_slope_score_says_so():
+    model = ssm.Model("root")
+    model.prior(lambda: {"b": ssm.HalfNormal(sd=1.0), "c": ssm.Normal(0.0, sd=1.0)})
+    model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
+    model.transition(lambda x: {"x": ssm.Normal(0.9 * x, sd=1.0)})
+    model.observation(lambda x, b, c: {"y": ssm.Normal(x + np.sqrt(b) + c, sd=1.0)})
+    data = {"y": np.ones(5)}
+    with pytest.warns(UserWarning, match=r"no finite slope.*the score in b is inf$"):
+        found = ssm.score(model, data, {"b": 0.0, "c": 0.0})
+    near = ssm.score(model, data, {"b": 1e-12, "c": 0.0})
+    assert found.gradient["c"] == pytest.approx(near.gradient["c"], rel=1e-5)
