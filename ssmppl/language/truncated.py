@@ -297,15 +297,16 @@ class Truncated(Distribution):
         The double exponential rule of Takahasi and Mori (1974), *Publ. RIMS* 9, which takes the
         singularities at the ends; in two parts where the density has a kink.
         """
-        centre, parts = self.quantile(self._full(0.5)), [(0.0, 1.0)]
+        parts = [(0.0, 1.0, 0.0)]  # where it begins, its width, and what is left above it
+        centre = self.quantile(self._full(0.5))
         if isinstance(self.base, Laplace):
             at_kink = self.cdf(self.base.loc)
-            parts = [(0.0, at_kink), (at_kink, 1.0 - at_kink)]
+            parts = [(0.0, at_kink, 1.0 - at_kink), (at_kink, 1.0 - at_kink, 0.0)]
         first = second = self._full(0.0)
-        for start, width in parts:
+        for start, width, rest in parts:
             for p, q, weight in _double_exponential():
                 low = start + width * p
-                high = (1.0 - start - width) + width * q if len(parts) > 1 else q
+                high = rest + width * q
                 d = self._node(self._full(0.0) + low, self._full(0.0) + high) - centre
                 first, second = first + weight * width * d, second + weight * width * d**2
         return centre + first, second - first**2
@@ -317,7 +318,8 @@ class Truncated(Distribution):
         far in the tails.
         """
         base, (lower, upper) = self.base, self._bounds()
-        if type(base).quantile_between is not Distribution.quantile_between:
+        own = type(base).quantile_between is not Distribution.quantile_between
+        if own and not isinstance(base, Laplace):
             return self._quantile(p, q)  # by logarithms of its tails
         open_below, open_above = base.open_sides(lower, upper)
         left = q * (0.0 if open_below else base.cdf(lower))
@@ -325,6 +327,9 @@ class Truncated(Distribution):
         right = q * (1.0 if open_below else base.survival(lower))
         right = right + p * (0.0 if open_above else base.survival(upper))
         value = _where(ew("lt", left, 0.5), base.quantile(left), base.survival_quantile(right))
+        if isinstance(base, Laplace):  # by logarithms on one side of the kink only
+            beside = ew("or", ew("le", base.loc, lower), ew("le", upper, base.loc))
+            value = _where(beside, self._quantile(p, q), value)
         return self._clip(value)
 
 

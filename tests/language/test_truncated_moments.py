@@ -204,6 +204,7 @@ def test_bounds_far_in_heavy_tails_leave_the_moments(bound, sides):
     given = bounds.get(sides, {"lower": -bound, "upper": bound})
     for law, variance, left in [
         (D.StudentT(5.0, 0.0, scale=1.0), 5.0 / 3.0, 100.0 / bound**3),
+        (D.Laplace(0.0, scale=1.0), 2.0, 0.0),
     ]:
         found = one_sided(law, **given)
         assert abs(found[0]) < 1e-9 + left
@@ -211,6 +212,19 @@ def test_bounds_far_in_heavy_tails_leave_the_moments(bound, sides):
     if sides == "upper":
         found = one_sided(D.InverseGamma(30.0, scale=30.0), **given)
         assert found[1] == pytest.approx(st.invgamma(30, scale=30).var(), rel=1e-8)
+
+
+@pytest.mark.parametrize("upper", [-0.5, 0.0, 0.1, 2.0, 30.0])
+def test_laplace_cut_on_either_side_of_its_kink(upper):
+    """From below it is upper - Exponential on the far side; X and its reflection beyond."""
+    found = one_sided(D.Laplace(0.0, scale=1.0), lower=-1e9, upper=upper)
+    rest = np.exp(-max(upper, 0.0))  # the density is exp(-|x|) / 2
+    mass = 2.0 - rest if upper > 0.0 else np.exp(upper)
+    first = -(upper + 1.0) * rest if upper > 0.0 else (upper - 1.0) * mass
+    second = (4.0 - (upper**2 + 2 * upper + 2.0) * rest if upper > 0.0
+              else (upper**2 - 2 * upper + 2.0) * mass)  # fmt: skip
+    assert found[0] == pytest.approx(first / mass, rel=1e-9, abs=1e-12)
+    assert found[1] == pytest.approx(second / mass - (first / mass) ** 2, rel=1e-8)
 
 
 @pytest.mark.parametrize(("lower", "rel"), [(1.0, 1e-4), (100.0, 0.02)])
