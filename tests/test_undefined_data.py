@@ -135,6 +135,11 @@ def test_entries_of_a_vector_ask_where_they_are_measured():
         ssm.log_likelihood(model, {"y": y, "u": [1, 1, 1, -1, 1, 1]}, {})
 
 
+def test_what_has_a_value_all_the_same_is_taken():
+    power = model_of(lambda x, mu, u, t: x + np.log(u) ** (0.0 * u))  # NaN**0 is 1
+    assert evidence(power, -np.ones(6)) == evidence(model_of(lambda x, mu, u, t: x + 1.0), [1] * 6)
+
+
 def test_simulations_and_forecasts_ask_too():
     model = model_of(by_group)
     with pytest.raises(DataError, match="'u', row 2"):

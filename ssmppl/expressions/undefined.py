@@ -97,12 +97,12 @@ def _state(
         else:
             chosen = np.minimum(state[first], state[second])
         return np.maximum(state[condition], chosen)
-    if node.op in BOOLEAN or node.op == "call":  # these may have a value where a part is NaN
-        out = np.where(out == _NAN, _FINE, out)
     if node in values:
         value = np.asarray(values[node], dtype=float)  # matrices in the last two axes
         wrong = np.isnan(value) if value.ndim < 2 else np.isnan(value).any(axis=(-2, -1))
-        out = np.maximum(out, np.where(wrong, _NAN, _FINE))
+        return np.where(out == _OUTSIDE, _OUTSIDE, np.where(wrong, _NAN, _FINE))
+    if node.op in BOOLEAN or node.op == "call":  # these may have a value where a part is NaN
+        return np.where(out == _NAN, _FINE, out)
     return out
 
 

@@ -59,7 +59,8 @@ def check_indexes(trace: Trace) -> None:
     if not trace.choices:
         return
     ranges = _ranges(trace)
-    for sites in (trace.parameters, trace.initial, trace.transition, trace.observations):
+    laws = (trace.parameters, trace.initial, trace.transition, trace.observations, trace.proposal)
+    for sites in laws:
         for site in sites.values():
             for form in site.distribution.expressions():
                 _check(trace, site, form, ranges)

@@ -38,7 +38,7 @@ def check_lookups(function: Law, role: str, arguments: Mapping[str, Any]) -> Non
         elif instruction.argval == "get" and k + 1 < len(found):
             whole = _value(found[k - 1], outer)
             after = [i for i in found[k + 1 : k + 4] if i.opname not in ("PUSH_NULL", "CACHE")]
-            named = _loaded(after[0])[:1]
+            named = _loaded(after[0])[:1] if after else []
             if len(after) > 1 and _may_be_number(after[1]):
                 named = []
         else:

@@ -73,7 +73,10 @@ class Site:
 
 @dataclass(frozen=True)
 class Trace:
-    """The traced model; see the module's docstring for its symbols."""
+    """The traced model; see the module's docstring for its symbols.
+
+    choices : element of an array that a symbol chose -> (the index, the number of elements).
+    """
 
     name: str
     parameters: dict[str, Site]
