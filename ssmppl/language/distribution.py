@@ -174,6 +174,11 @@ class Distribution:
         own = [e for p in self.parameters.values() for e in p.ravel()]
         return [*own, *(e for law in self.inside() for e in law.expressions())]
 
+    def arguments(self) -> list[Expr]:
+        """What the user gave for the parameters of the law and of those inside of it."""
+        own = [e for p in self.parameters.values() for e in p.ravel()]
+        return [*own, *(e for law in self.inside() for e in law.arguments())]
+
     def rebuilt(self, parameters: Mapping[str, Any]) -> Distribution:
         """The law of this family with these for its own `parameters`, at its place in the file."""
         values = {**self.parameters, **parameters}

@@ -62,7 +62,7 @@ def check_indexes(trace: Trace) -> None:
     laws = (trace.parameters, trace.initial, trace.transition, trace.observations, trace.proposal)
     for sites in laws:
         for site in sites.values():
-            for form in site.distribution.expressions():
+            for form in site.distribution.arguments():
                 _check(trace, site, form, ranges)
 
 

@@ -158,7 +158,7 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
 
 def check_read(name: str, distribution: Distribution, role: str, kinds: Collection[str]) -> None:
     """Refuse symbols of other kinds than the arguments of the function: another law kept them."""
-    for s in symbols_of(distribution.expressions()):
+    for s in symbols_of(distribution.arguments()):
         if s.data[0] not in kinds:
             raise ModelError(
                 f"the law of {name!r} reads {to_text(s)}, a symbol of another law than this "
