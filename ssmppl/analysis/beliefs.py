@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.expressions.expr import Expr, apply, constant
-from ssmppl.language.trace import seen
+from ssmppl.language.traced import seen
 
 ZERO = constant(0.0)
 

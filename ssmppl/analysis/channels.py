@@ -21,7 +21,7 @@ from ssmppl.language.distributions import (
     ZeroInflated,
 )
 from ssmppl.language.sequential import SequentialNormal
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 from ssmppl.language.written import Written
 
 

@@ -23,8 +23,8 @@ from ssmppl.analysis.update import Update
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import Separation, separate
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Site, previous, seen, symbol, symbols
+from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.language.traced import Site, previous, seen, symbols
 
 POINTS = 24
 NEEDED = 5

@@ -32,7 +32,7 @@ from ssmppl.analysis.sufficient import (
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, to_text
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 __all__ = ["Update", "conjugate_update", "derive_updates", "draw"]
 

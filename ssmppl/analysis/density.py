@@ -16,7 +16,7 @@ from ssmppl.expressions.expr import Expr, apply, attributed, constant
 from ssmppl.expressions.linear import inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import MvNormal
-from ssmppl.language.trace import Site, Trace, seen
+from ssmppl.language.traced import Site, Trace, seen
 
 
 @dataclass(frozen=True)

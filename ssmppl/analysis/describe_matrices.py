@@ -18,7 +18,7 @@ from ssmppl.expressions.algebra import affine, split_constant
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbols_of, to_text
 from ssmppl.language import distributions as laws
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 FEW = 3  # numbers whose functions are told one by one
 LENGTH = 80

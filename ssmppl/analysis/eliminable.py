@@ -21,7 +21,7 @@ from ssmppl.analysis.sufficient import BlockForm, CompleteData, complete_data, s
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 FAMILIES = (Gamma, Normal, NormalGamma, Beta, Dirichlet)
 

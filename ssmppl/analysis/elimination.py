@@ -40,7 +40,7 @@ from ssmppl.expressions.algebra import ONE, Separation, separate
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol, symbols_of
 from ssmppl.language.distributions import Dirac, Draws
-from ssmppl.language.trace import Site, Trace, previous
+from ssmppl.language.traced import Site, Trace, previous
 
 COLUMNS = ("before", "moved", "now", "whole")  # of the base: see `Elimination.columns`
 INFINITY = float("inf")

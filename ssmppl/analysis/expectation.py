@@ -34,7 +34,7 @@ from ssmppl.analysis.sufficient import (
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import Expr, constant, depends_on, symbol, symbols_of, to_text
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 IN_TIME = ("initial", "transition", "observation")
 

@@ -22,7 +22,7 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, apply, attributed, constant, depends_on
 from ssmppl.language import distributions as laws
 from ssmppl.language.distribution import Distribution
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 Estimate = Callable[[Any, ExprArray], Any]
 

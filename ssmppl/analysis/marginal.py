@@ -40,7 +40,7 @@ from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_
 from ssmppl.language.distribution import Distribution
 from ssmppl.language.distributions import Dirac, MvNormal, Normal
 from ssmppl.language.sequential import SequentialNormal
-from ssmppl.language.trace import Site, Trace, previous
+from ssmppl.language.traced import Site, Trace, previous
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ssmppl.analysis.structure import GaussianBlock, gaussian_block
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, attributed, depends_on, substitute, topological
 from ssmppl.language.distributions import Draws
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ from ssmppl.analysis.sufficient import (
 from ssmppl.analysis.update import Update
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbol, symbols_of
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 SWEEPS = 50  # of conditional maximisations in one M-step
 SETTLED = 1e-13  # relative change at which they stop

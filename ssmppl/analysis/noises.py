@@ -38,7 +38,7 @@ from ssmppl.language.distributions import (
     Uniform,
     Weibull,
 )
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 GAUSSIAN = (Normal, MvNormal, LogNormal)
 

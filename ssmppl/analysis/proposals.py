@@ -34,7 +34,7 @@ from ssmppl.expressions.expr import (
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import Draws
-from ssmppl.language.trace import Trace, seen
+from ssmppl.language.traced import Trace, seen
 
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
 LARGEST_EXPONENT = 600.0  # of q / f where exp is taken

@@ -31,7 +31,7 @@ from ssmppl.analysis.sufficient import (
 )
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
-from ssmppl.language.trace import Site
+from ssmppl.language.traced import Site
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import BOOLEAN, dependent, topological
 from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 from ssmppl.language.written import Written
 
 JUMPING = BOOLEAN | {"floor", "ceil", "sign", "mod"}

@@ -32,7 +32,7 @@ from ssmppl.expressions.algebra import (
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 ROLES = ("prior", "initial", "transition", "observation")
 BOUNDED_ROLES = ("prior", "initial")  # as many terms, however long the series

@@ -15,7 +15,7 @@ from ssmppl.analysis.structure import deterministic, flat_start, without_density
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, depends_on
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 MOVABLE = ("real", "interval")  # supports that a random walk can move about in
 

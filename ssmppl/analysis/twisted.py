@@ -38,7 +38,7 @@ from ssmppl.expressions.calculus import (
 )
 from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, symbol
 from ssmppl.language.distributions import Dirac, Draws, LogNormal, MvNormal, Normal
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 DEFENSIVE = 0.02  # share of the transition in the proposal's mixture
 # Noises up to which the matrices are written out, in which LLVM finds what they have in common;

@@ -33,7 +33,7 @@ from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.text import MODULES, ModuleText
 from ssmppl.errors import ArgumentError
 from ssmppl.language.primitive import REGISTRY
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 TILE = 256
 """Threads of a block: particles that are weighed together."""

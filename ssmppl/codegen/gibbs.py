@@ -12,7 +12,7 @@ from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 def statistics_name(update: Update) -> str:

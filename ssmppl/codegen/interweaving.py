@@ -14,7 +14,7 @@ from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import linear_passes
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 STEERED = ("linear_initial", "linear")
 

@@ -17,7 +17,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.language.distributions import Categorical
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 from ssmppl.language.transforms import transforms
 
 DRAW_INITIAL = "theta, c, s, states, normals, uniforms, rng"

@@ -25,7 +25,7 @@ from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
 from ssmppl.errors import NotApplicable
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 # Names of the filters -> the proposal of the sampled states.
 NAMES = {"marginal": "bootstrap", "marginal_guided": "guided", "marginal_auxiliary": "auxiliary"}

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from ssmppl.codegen.render import Names, Writer, comment, depends, symbol_name, topological_until
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 CONSTANT, THETA, STEP, PARTICLE = 0, 1, 2, 3
 LEVELS = {

@@ -54,7 +54,7 @@ from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import TwistedFilter, compile_twisted
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 @dataclass

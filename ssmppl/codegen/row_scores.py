@@ -14,7 +14,7 @@ from ssmppl.codegen.module import Layout, Section, Target
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 TOGETHER = 48  # derivatives in one loop
 

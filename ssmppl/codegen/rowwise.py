@@ -12,7 +12,7 @@ from ssmppl.codegen.loading import load
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 def compile_filter_rows(trace: Trace, proposal: Proposal) -> Callable[..., Any]:

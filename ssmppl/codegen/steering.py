@@ -10,7 +10,7 @@ from ssmppl.codegen.module import PARTICLE, Layout, Section, Target, level_of, l
 from ssmppl.codegen.render import depends
 from ssmppl.codegen.text import ModuleText
 from ssmppl.expressions.expr import constant, symbol
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 def steered_section(trace: Trace, layout: Layout, found: Guided, plain: Proposal) -> Section:

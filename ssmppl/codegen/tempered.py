@@ -28,7 +28,7 @@ from ssmppl.codegen.module import Layout, Section
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 MOVES, MOST_MOVES = 2, 8  # Metropolis steps at each temperature: so many and one for each component
 LEVELS = 30  # temperatures of a row at most

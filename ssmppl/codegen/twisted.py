@@ -34,7 +34,7 @@ from ssmppl.codegen.steering import steered_moves, steered_section
 from ssmppl.codegen.text import ModuleText
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 MOST_STEPS = 12  # forward passes that improve the reference
 CLOSE = 0.05  # nats of improvement with which they end

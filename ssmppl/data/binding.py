@@ -25,7 +25,7 @@ from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
 from ssmppl.language.distribution import Support
 from ssmppl.language.distributions import MvNormal
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 
 @dataclass(frozen=True)

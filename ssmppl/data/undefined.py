@@ -15,7 +15,7 @@ from ssmppl.errors import DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of, to_text
 from ssmppl.expressions.undefined import Undefined, first_undefined, may_be_undefined
 from ssmppl.language.distribution import Distribution
-from ssmppl.language.trace import Site, Trace, once_per_trace, previous
+from ssmppl.language.traced import Site, Trace, once_per_trace, previous
 
 
 class _Suspect(NamedTuple):

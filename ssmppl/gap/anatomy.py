@@ -14,7 +14,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, symbol, symbols_of
 from ssmppl.gap.laws import Index, noise_free, scale_of_mean
 from ssmppl.language.distributions import Dirac, Distribution
-from ssmppl.language.trace import Trace, previous, symbols
+from ssmppl.language.traced import Trace, previous, symbols
 
 _POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
 

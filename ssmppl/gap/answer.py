@@ -26,7 +26,7 @@ from ssmppl.gap.share import HowFar
 from ssmppl.gap.words import CURVES
 from ssmppl.gap.writing import model_text, to_model
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 CLEARLY = 2.0  # standard errors
 MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"

@@ -31,7 +31,7 @@ from ssmppl.gap.laws import (
     substituted,
 )
 from ssmppl.language.distributions import Distribution, Flat, HalfFlat, Uniform
-from ssmppl.language.trace import Site, Trace, symbols
+from ssmppl.language.traced import Site, Trace, symbols
 
 Sum = dict[tuple[str, tuple[int, ...]], Expr]  # (name, index) -> what is added
 _LAWS = {"transition": shifted, "observation": shifted, "initial": shifted, "noise": scaled,

@@ -25,7 +25,7 @@ from ssmppl.gap.effect import Auxiliary, Effect, numbers
 from ssmppl.gap.flows import Reaction, carried
 from ssmppl.gap.laws import has_scale, scale_of_mean
 from ssmppl.language.distributions import Dirac, Distribution
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
 CURVES = bases((0.0, 1.0), MEAN + 1)[1:]  # of a standardised variable, without the constant

@@ -28,7 +28,7 @@ from ssmppl.gap.declared import PROFILES
 from ssmppl.gap.effect import Auxiliary, Effect
 from ssmppl.language.calling import call
 from ssmppl.language.distributions import Distribution
-from ssmppl.language.trace import previous, symbols
+from ssmppl.language.traced import previous, symbols
 
 _POINTS = 200  # at which an effect of strength 0 is held against the model
 _WITHOUT_STATES = ("parameter", "input", "time")  # what an initial law may depend on

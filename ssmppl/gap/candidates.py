@@ -22,7 +22,7 @@ from ssmppl.gap.laws import has_scale, has_tail, scale_of_mean
 from ssmppl.gap.profiles import ONE_OFF
 from ssmppl.gap.scales import Scale, Scales, value_of
 from ssmppl.language.rules import RESERVED
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 __all__ = ["Candidate", "Refused", "Scale", "Scales", "offers"]
 

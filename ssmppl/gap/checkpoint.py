@@ -32,7 +32,7 @@ from ssmppl.inference.checkpoints.origin import (
 )
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.fingerprints import fingerprint
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 SECONDS = 5.0  # between two writings, at least
 SHARE = 0.05  # of the time that may go into writing

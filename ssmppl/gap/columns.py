@@ -22,7 +22,7 @@ from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol
 from ssmppl.gap.laws import substituted
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.trace import Site, Trace, previous
+from ssmppl.language.traced import Site, Trace, previous
 
 
 @dataclass(frozen=True)

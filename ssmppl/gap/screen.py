@@ -33,7 +33,7 @@ from ssmppl.gap.smoothing import Pass, Settings, Smoother, probability_transform
 from ssmppl.gap.when import bin_edges, binned
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.language.distributions import Distribution, Flat
-from ssmppl.language.trace import Site, Trace, symbols
+from ssmppl.language.traced import Site, Trace, symbols
 
 OWN_RUNS = 6  # passes over the data themselves, which tell the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through

@@ -21,7 +21,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.simulation import feeds_back
 from ssmppl.language.distributions import Dirac, Flat
-from ssmppl.language.trace import Site, Trace, symbols
+from ssmppl.language.traced import Site, Trace, symbols
 
 
 class Simulator:

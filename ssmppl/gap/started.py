@@ -21,7 +21,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.gap.smoothing import LAG, Smoother
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.language.distributions import Normal
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 WIDE = 5.0  # times how far the states go, root mean square, or the starts lie apart in all
 KEPT = 64  # means of x_1 at a time

@@ -20,7 +20,7 @@ from ssmppl.gap.smoothing import Settings
 from ssmppl.gap.started import Start, needs_start
 from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import LogNormal, Uniform
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 class Workshop:

@@ -25,7 +25,7 @@ from ssmppl.gap.spelling import Lines
 from ssmppl.gap.terms import parts_of, terms_with
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Site, Trace, symbols
+from ssmppl.language.traced import Site, Trace, symbols
 from ssmppl.language.written import Written
 
 LINE = 96

@@ -12,7 +12,7 @@ from ssmppl import markup
 from ssmppl.data import unpack_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:

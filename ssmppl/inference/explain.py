@@ -38,7 +38,8 @@ from ssmppl.inference.method_choice import (
 )
 from ssmppl.inference.problem import missing_of
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Site, Trace, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Site, Trace
 from ssmppl.language.transforms import transforms
 
 PAGE = 100  # columns

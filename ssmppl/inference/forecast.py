@@ -30,7 +30,8 @@ from ssmppl.inference.posterior_draws import (
 from ssmppl.inference.simulation import check_finite, check_samplers, feeds_back
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Trace, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Trace
 from ssmppl.results import time_axes, to_dataset
 
 if TYPE_CHECKING:

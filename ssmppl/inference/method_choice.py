@@ -21,7 +21,7 @@ from ssmppl.inference.methods import (
 )
 from ssmppl.inference.smoothing_methods import FFBSi, ForwardBackward, KalmanSmoother
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
 FEW = 6  # numbers that a random walk moves at once without trouble

@@ -12,7 +12,7 @@ import numpy as np
 from ssmppl.data import check_values
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 def group(idata: Any, name: str) -> Any:

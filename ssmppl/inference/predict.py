@@ -29,7 +29,8 @@ from ssmppl.inference.simulation import (
     feeds_back,
 )
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Trace, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Trace
 from ssmppl.results import time_axes, to_inference_data
 
 # Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.

@@ -10,7 +10,7 @@ from ssmppl.analysis.moves import drawn
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 def draw_prior(

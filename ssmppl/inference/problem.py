@@ -16,7 +16,8 @@ from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Trace, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Trace
 
 # What filters without particles are called where a proposal is asked for.
 EXACT = ("kalman", "forward", "deterministic")

@@ -24,7 +24,8 @@ from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.prior import draw_prior
 from ssmppl.inference.ranges import out_of_range
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Trace, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ssmppl.analysis.structure import linear_gaussian, without_density
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 WITHOUT = {  # what to use instead: of a linear Gaussian model, and of others
     "sample": ("ssm.MetropolisHastings()", "ssm.PMMH()"),

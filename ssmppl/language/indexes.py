@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +15,7 @@ from ssmppl.expressions.arrays import plain
 from ssmppl.expressions.expr import Expr, symbol, symbols_of, to_text, topological
 from ssmppl.expressions.undefined import Undefined, first_undefined
 from ssmppl.language.distribution import Distribution
-
-if TYPE_CHECKING:
-    from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 MOST = 4096  # combinations of values that are tried
 

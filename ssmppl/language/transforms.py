@@ -18,7 +18,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
 from ssmppl.language.positive import LEAST_SHARE
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 ZERO = constant(0.0)
 

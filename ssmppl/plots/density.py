@@ -12,7 +12,8 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.prior import draw_prior
 from ssmppl.language.model import Model
-from ssmppl.language.trace import Site, Trace, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Site, Trace
 from ssmppl.plots.reading import components
 from ssmppl.results import time_axes
 

@@ -16,7 +16,8 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.model import Model
-from ssmppl.language.trace import previous, seen, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import previous, seen
 
 DRAWS = 200_000
 

@@ -26,7 +26,7 @@ from ssmppl.analysis.twisted import (
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import topological
-from ssmppl.language.trace import previous, seen
+from ssmppl.language.traced import previous, seen
 from tests.analysis.test_proposals import model_of, total, values
 
 COMPLETE = Missing(none=True)

@@ -10,7 +10,8 @@ from bench.gap.truth import SYSTEMS
 from bench.gap.truth.forms import SLOTS, delayed, driven, lagged, play
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.gap.catalogue import effects
-from ssmppl.language.trace import previous, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import previous
 from ssmppl.modelfile import load_model
 
 

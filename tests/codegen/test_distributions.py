@@ -24,7 +24,8 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.draws import Draws
 from ssmppl.language.rules import is_symmetric
-from ssmppl.language.trace import Site, Trace, symbols, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Site, Trace, symbols
 from tests.codegen.models import declare
 from tests.language.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
 from tests.language.test_truncated import COUNTS, check_counts

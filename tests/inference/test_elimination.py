@@ -24,7 +24,7 @@ from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.problem import pose
 from ssmppl.language.distributions import Draws
-from ssmppl.language.trace import previous, seen
+from ssmppl.language.traced import previous, seen
 from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some
 from tests.statistics.checks import deviations as deviations_of
 

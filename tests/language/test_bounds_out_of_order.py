@@ -10,7 +10,8 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.prior import draw_prior
-from ssmppl.language.trace import Site, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import Site
 
 A = symbol("parameter", "a")
 LAWS = {

@@ -9,7 +9,8 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, symbols_of
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model import Model, location_of
-from ssmppl.language.trace import previous, seen, trace
+from ssmppl.language.trace import trace
+from ssmppl.language.traced import previous, seen
 
 
 def names(symbols):

@@ -17,7 +17,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.inference.problem import Problem
-from ssmppl.language.trace import Site
+from ssmppl.language.traced import Site
 from ssmppl.language.transforms import transforms
 
 SCALES = ("unconstrained", "natural", "log", "reciprocal")

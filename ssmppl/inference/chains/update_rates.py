@@ -17,7 +17,7 @@ import numpy as np
 from ssmppl.inference.draws import ChainDraws
 from ssmppl.inference.problem import Problem
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.trace import Site
+from ssmppl.language.traced import Site
 
 LOW = 0.02  # share of draws at which a row changes, below which there is a warning
 APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart

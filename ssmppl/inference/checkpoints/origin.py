@@ -19,7 +19,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.primitive import Primitive
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 from ssmppl.language.written import Written
 
 # What the digits of draws depend on besides this package: compilers, random number generators,

@@ -30,7 +30,7 @@ from ssmppl.inference.particles.complete_score import CompleteScores, complete_s
 from ssmppl.inference.particles.filtering import FilterSettings, failure, random_state, run_filter
 from ssmppl.inference.problem import Problem, missing_of
 from ssmppl.inference.totals import total_of
-from ssmppl.language.trace import Trace, once_per_trace
+from ssmppl.language.traced import Trace, once_per_trace
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.inference.exact.histories import Histories, histories
 from ssmppl.inference.exact.scored import Scored
-from ssmppl.language.trace import previous
+from ssmppl.language.traced import previous
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
 

@@ -24,7 +24,7 @@ from ssmppl.inference.exact.finite_passes import Filtered, forward
 from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.mixtures import inverted
-from ssmppl.language.trace import Trace, once_per_trace
+from ssmppl.language.traced import Trace, once_per_trace
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from ssmppl.inference.exact.kalman_moments import (
 from ssmppl.inference.exact.kalman_score import Slopes, check_free, score, slopes
 from ssmppl.inference.exact.scored import Scored
 from ssmppl.inference.totals import total_of
-from ssmppl.language.trace import Trace, once_per_trace
+from ssmppl.language.traced import Trace, once_per_trace
 
 __all__ = [
     "Disturbances",

@@ -20,7 +20,7 @@ from ssmppl.data import Experiment
 from ssmppl.errors import SamplingError
 from ssmppl.inference.exact.kalman_moments import Stopped
 from ssmppl.inference.totals import total_of
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 AGREEMENT = 1e-6  # of log p(y) by two roads; what is worse was lost to rounding
 

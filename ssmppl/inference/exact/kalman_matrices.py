@@ -11,7 +11,7 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.language.trace import Trace, previous
+from ssmppl.language.traced import Trace, previous
 
 CAUSE = {
     kernel.NOT_COVARIANCE: (

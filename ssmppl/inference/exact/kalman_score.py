@@ -25,7 +25,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.kalman_matrices import values_of
 from ssmppl.inference.exact.kalman_moments import Stopped
 from ssmppl.inference.totals import total_of
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",
         "C": "observation", "d": "observation", "R": "observation"}  # fmt: skip

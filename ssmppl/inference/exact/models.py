@@ -12,7 +12,7 @@ from ssmppl.inference.exact.deterministic import Deterministic, deterministic_mo
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.problem import EXACT
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 ExactModel = KalmanModel | HiddenMarkov | Deterministic
 

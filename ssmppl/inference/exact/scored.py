@@ -11,7 +11,7 @@ import numpy as np
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.inference.exact.differences import observed_information
-from ssmppl.language.trace import Trace
+from ssmppl.language.traced import Trace
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from ssmppl.inference.maximum.expected_climb import climbed
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods import EM
 from ssmppl.inference.singular import need_density
-from ssmppl.language.trace import Trace, previous, seen
+from ssmppl.language.traced import Trace, previous, seen
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
 ROUNDING = 1e-13  # of the log-likelihood, relative

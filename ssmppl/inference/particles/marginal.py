@@ -25,7 +25,7 @@ from ssmppl.inference.exact import kalman_matrices
 from ssmppl.inference.exact.kalman_moments import Stopped, drawn
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, failure, run_filter
 from ssmppl.inference.problem import Problem
-from ssmppl.language.trace import previous, seen
+from ssmppl.language.traced import previous, seen
 
 MOST_VALUES = 100_000  # particles times steps whose moments are computed at a time
 

@@ -39,7 +39,7 @@ from ssmppl.inference.particles.marginal import (
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.smoothing_methods import FFBSi
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.trace import previous
+from ssmppl.language.traced import previous
 
 MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time
 WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}

@@ -14,7 +14,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distribution import Distribution
-from ssmppl.language.trace import Site, Trace
+from ssmppl.language.traced import Site, Trace
 
 __all__ = ["ordinary_values"]
 
