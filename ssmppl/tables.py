@@ -83,10 +83,10 @@ def quantiles_of(draws: np.ndarray, levels: Sequence[float]) -> np.ndarray:
     """Quantiles along the first axis, (levels, ...): between draws where all are finite, else a
     draw itself, as nothing lies between infinities."""
     between: Any = "linear" if np.isfinite(draws).all() else "inverted_cdf"
-    huge = np.abs(draws).max(initial=0.0) > np.finfo(float).max / 4.0
-    unit = 0.25 if huge and between == "linear" else 1.0  # so that differences are finite
-    found: np.ndarray = np.quantile(unit * draws, levels, axis=0, method=between)
-    return found / unit
+    if between == "linear" and np.abs(draws).max(initial=0.0) > np.finfo(float).max / 4.0:
+        return 4.0 * quantiles_of(0.25 * draws, levels)  # whose differences are finite
+    found: np.ndarray = np.quantile(draws, levels, axis=0, method=between)
+    return found
 
 
 def component_label(name: str, index: Sequence[int], others: Container[Any]) -> str:

@@ -350,15 +350,15 @@ def test_steps_must_agree_with_the_rows():
 
 
 def test_inputs_of_a_simulation():
-    u, steps, time = bind_inputs(mixed(), {"u": MIXED["u"], "w": MIXED["w"]}, None)
+    u, steps, source = bind_inputs(mixed(), {"u": MIXED["u"], "w": MIXED["w"]}, None)
     assert_array_equal(u, [[0, 1, 2], [1, 3, 4], [2, 5, 6]])
-    assert (steps, time) == (3, None)
-    u, steps, time = bind_inputs(mixed(), frame(index=[1.0, 2.0, 4.0]), 3)
-    assert_array_equal(time, [1.0, 2.0, 4.0])
+    assert (steps, source.time) == (3, None)
+    u, steps, source = bind_inputs(mixed(), frame(index=[1.0, 2.0, 4.0]), 3)
+    assert_array_equal(source.time, [1.0, 2.0, 4.0])
     for nothing in (None, {}):
-        u, steps, time = bind_inputs(scalar(), nothing, 7)
-        assert (u.shape, steps, time) == ((7, 0), 7, None)
-    u, steps, time = bind_inputs(scalar(), {"time": [0.5, 1.0]}, None)
+        u, steps, source = bind_inputs(scalar(), nothing, 7)
+        assert (u.shape, steps, source.time) == ((7, 0), 7, None)
+    u, steps, source = bind_inputs(scalar(), {"time": [0.5, 1.0]}, None)
     assert (u.shape, steps) == ((2, 0), 2)
 
 

@@ -5,6 +5,7 @@ arrays over the trace's symbols, or an error that names data set, variable, row 
 """
 
 from ssmppl.data.binding import Experiment, bind, bind_inputs, unread
+from ssmppl.data.defined import check_defined
 from ssmppl.data.parameters import (
     check_parameters,
     check_values,
@@ -18,6 +19,7 @@ __all__ = [
     "Experiment",
     "bind",
     "bind_inputs",
+    "check_defined",
     "check_parameters",
     "check_values",
     "spelled",

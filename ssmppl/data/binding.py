@@ -17,9 +17,9 @@ import numpy as np
 
 from ssmppl.counts import check_count
 from ssmppl.data.channels import channel, holds
+from ssmppl.data.defined import check_defined
 from ssmppl.data.parameters import pack
 from ssmppl.data.sources import Source, sources
-from ssmppl.data.undefined import check_defined
 from ssmppl.data.values import name_of, number, outside
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
@@ -88,10 +88,8 @@ def unread(trace: Trace, data: Any) -> list[str]:
     return [c for c in columns if c not in (*named, "time") and not c.startswith(parts)]
 
 
-def bind_inputs(
-    trace: Trace, inputs: Any, steps: int | None
-) -> tuple[np.ndarray, int, np.ndarray | None]:
-    """Inputs of a simulation: u (T, U), T, and the labels of the rows.
+def bind_inputs(trace: Trace, inputs: Any, steps: int | None) -> tuple[np.ndarray, int, Source]:
+    """Inputs of a simulation: u (T, U), T, and where they are from, with the labels of the rows.
 
     `inputs` is None or {} for a model without inputs, which needs `steps`; otherwise a data set,
     whose number of rows is `steps` unless both are given, and then they must agree.
@@ -126,10 +124,7 @@ def bind_inputs(
     values = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
-    u = _input_array(trace, values, rows)
-    drawn = np.ones((rows, len(trace.observation_symbols)), dtype=bool)
-    check_defined(trace, source, u, None, drawn)
-    return u, rows, source.time
+    return _input_array(trace, values, rows), rows, source
 
 
 @dataclass(frozen=True)
@@ -162,7 +157,7 @@ def _bind(trace: Trace, source: Source, need: bool, steps: int | None, once: _On
     missing = np.isnan(packed)
     if need:
         _check_needed(trace, source, missing, once.needed)
-    check_defined(trace, source, u, packed, ~missing)
+    check_defined(trace, source, u, packed, ~missing if need else None)
     return Experiment(
         y=np.ascontiguousarray(np.where(missing, 0.0, packed)),
         seen=np.ascontiguousarray(np.where(missing, 0.0, 1.0)),

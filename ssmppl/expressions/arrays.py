@@ -153,7 +153,9 @@ def choose(index: Any, choices: Sequence[Any] | np.ndarray) -> Any:
     kept = CHOICES.get()
     if kept is not None and len(choices) > 1:
         for node, own in np.broadcast(plain(chosen), plain(index)):
-            kept[node] = (as_expr(own), len(choices))
+            if node.op == "where":  # elements that are all alike are no choice
+                _, before = kept.get(node, (own, 0))
+                kept[node] = (as_expr(own), max(len(choices), before))
     return chosen
 
 

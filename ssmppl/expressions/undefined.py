@@ -3,8 +3,10 @@ the root of a negative input."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,8 @@ from ssmppl.expressions.node import BOOLEAN, Expr
 Choices = Mapping[Expr, tuple[Expr, int]]  # as `provenance.choosing` keeps them
 
 # How a part has no value, the larger before the less: comparisons with NaN have one.
-_FINE, _NAN, _OUTSIDE = 0, 1, 2
+_FINE, _NAN, _OUTSIDE = np.int8(0), np.int8(1), np.int8(2)
+_NOTHING_WRONG = np.zeros((), dtype=np.int8)
 
 # Of finite numbers they are numbers, or infinite.
 _ALWAYS = BOOLEAN | {"add", "sub", "mul", "neg", "abs", "sign", "floor", "ceil", "minimum",
@@ -56,40 +59,52 @@ def may_be_undefined(root: Expr, choices: Choices, known: set[str]) -> bool:
 
 
 def first_undefined(
-    root: Expr, choices: Choices, known: Mapping[Expr, np.ndarray], rows: int
-) -> Undefined | None:
-    """The first row where `root` has no value, whatever the symbols outside `known` are.
+    roots: Sequence[Expr],
+    choices: Choices,
+    known: Mapping[Expr, np.ndarray],
+    rows: int,
+    asked: Sequence[np.ndarray] | None = None,
+) -> tuple[int, Undefined] | None:
+    """Which of `roots` has no value in some row, whatever the symbols outside `known` are, and the
+    first row where.
 
-    known : symbol -> (rows,) finite numbers.
+    known : symbol -> (rows,) finite numbers, or NaN in rows that are not asked for.
+    asked : for each root, (rows,) where it matters; None: everywhere.
     """
-    nodes = list(topological([root]))
-    found: set[Expr] = set()
+    nodes = list(topological(list(roots)))
+    computed: set[Expr] = set()
     for node in nodes:  # made of numbers and the known symbols alone
         if node in known or (
-            node.op not in ("symbol", "random") and all(a in found for a in node.args)
+            node.op not in ("symbol", "random") and all(a in computed for a in node.args)
         ):
-            found.add(node)
-    ordered = [n for n in nodes if n in found]
+            computed.add(node)
+    ordered = [n for n in nodes if n in computed]
     values = dict(zip(ordered, evaluate(ordered, known), strict=True))
     state: dict[Expr, np.ndarray] = {}
     for node in nodes:
-        state[node] = _state(node, state, values, rows)
+        state[node] = _state(node, state, values)
         if node in choices and choices[node][0] in values:
             index, elements = choices[node]
             k = values[index]
             inside = (k >= 0.0) & (k < elements) & (k == np.floor(k))
             state[node] = np.where(inside, state[node], _OUTSIDE)
-    if not state[root].any():
-        return None
-    return _innermost(root, int(np.argmax(state[root] > _FINE)), state, values, choices)
+    for place, root in enumerate(roots):
+        bad = np.broadcast_to(state[root] > _FINE, rows)
+        if asked is not None:
+            bad = bad & asked[place]
+        if bad.any():
+            return place, _innermost(root, int(np.argmax(bad)), state, values, choices)
+    return None
 
 
 def _state(
-    node: Expr, state: Mapping[Expr, np.ndarray], values: Mapping[Expr, np.ndarray], rows: int
+    node: Expr, state: Mapping[Expr, np.ndarray], values: Mapping[Expr, np.ndarray]
 ) -> np.ndarray:
-    """(rows,) of a node, by those of its parts and, where it has them, its values."""
+    """() or (rows,) of a node, by those of its parts and, where it has them, its values."""
     parts = [state[a] for a in node.args]
-    out = np.max(parts, axis=0) if parts else np.full(rows, _FINE)
+    if node.op in ("mul", "and"):  # a mask: what is times 0 is not asked for
+        parts = [_unless(node.args[1 - k], parts[k], values) for k in (0, 1)]
+    out = functools.reduce(np.maximum, parts) if parts else _NOTHING_WRONG
     if node.op == "where":
         condition, first, second = node.args
         if condition in values:
@@ -100,10 +115,19 @@ def _state(
     if node in values:
         value = np.asarray(values[node], dtype=float)  # matrices in the last two axes
         wrong = np.isnan(value) if value.ndim < 2 else np.isnan(value).any(axis=(-2, -1))
+        if not wrong.any() and not out.any():
+            return _NOTHING_WRONG
         return np.where(out == _OUTSIDE, _OUTSIDE, np.where(wrong, _NAN, _FINE))
     if node.op in BOOLEAN or node.op == "call":  # these may have a value where a part is NaN
         return np.where(out == _NAN, _FINE, out)
     return out
+
+
+def _unless(mask: Expr, state: np.ndarray, values: Mapping[Expr, np.ndarray]) -> np.ndarray:
+    """The state of a factor: fine where the other one is 0, unless it is NaN."""
+    if mask not in values or not (state == _OUTSIDE).any():
+        return state
+    return np.where((values[mask] == 0) & (state == _OUTSIDE), _FINE, state)
 
 
 def _innermost(
@@ -114,17 +138,16 @@ def _innermost(
     while True:
         parts = node.args
         if node.op == "where" and node.args[0] in values:
-            condition = values[node.args[0]]
-            chosen = condition if np.ndim(condition) == 0 else condition[row]
-            parts = (node.args[0], node.args[1 if chosen else 2])
-        bad = [a for a in parts if state[a][row]]
+            parts = (node.args[0], node.args[1 if _at(values[node.args[0]], row) else 2])
+        bad = [a for a in parts if _at(state[a], row)]
         if bad:
             node = bad[0]
             continue
         if node not in choices or choices[node][0] not in values:
             return Undefined(row, node)
         index, elements = choices[node]
-        value = values[index]
-        return Undefined(
-            row, node, index, elements, float(value if np.ndim(value) == 0 else value[row])
-        )
+        return Undefined(row, node, index, elements, float(_at(values[index], row)))
+
+
+def _at(values: np.ndarray, row: int) -> Any:
+    return values if np.ndim(values) == 0 else values[row]

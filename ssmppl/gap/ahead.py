@@ -29,7 +29,7 @@ def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
 
     mean |x_i - y| - sum_{i<j} |x_i - x_j| / (M (M - 1)): fair, i.e. unbiased for the score of the
     law that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018, equation 6).
-    NaN where nothing was observed.
+    NaN where nothing was observed, or a sample is infinite.
     """
     x, y = np.sort(np.asarray(samples, float), axis=-1), np.asarray(observed, float)
     m = x.shape[-1]
@@ -38,8 +38,10 @@ def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
             f"predictive samples of shape {x.shape} for observations of shape {y.shape}",
             fix="give (T, M) samples, M at least 2, and (T,) observations",
         )
-    apart = x @ (2.0 * np.arange(1, m + 1) - m - 1.0)  # sum over pairs, by the order statistics
-    return np.mean(np.abs(x - y[..., None]), axis=-1) - apart / (m * (m - 1.0))
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = x @ (2.0 * np.arange(1, m + 1) - m - 1.0)  # sum over pairs, by the order statistics
+        score = np.mean(np.abs(x - y[..., None]), axis=-1) - apart / (m * (m - 1.0))
+    return np.where(np.isfinite(x).all(axis=-1), score, np.nan)
 
 
 def crps_ahead(

@@ -11,7 +11,13 @@ import numpy as np
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.counts import check_room
-from ssmppl.data import bind_inputs, unpack_observations, unpack_parameters, unpack_states
+from ssmppl.data import (
+    bind_inputs,
+    check_defined,
+    unpack_observations,
+    unpack_parameters,
+    unpack_states,
+)
 from ssmppl.data.parameters import pack
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError
@@ -83,7 +89,8 @@ def forecast(
     """
     traced, posterior = trace(model), posterior_of(idata, KNOWN)
     check_samplers(traced)
-    future, steps, labels = bind_inputs(traced, inputs, steps)
+    future, steps, source = bind_inputs(traced, inputs, steps)
+    labels = source.time
     mark, axis = _which(traced, posterior, experiment)
     theta = parameters_of(traced, posterior)
     paths = states_of(traced, posterior, mark, axis)
@@ -101,6 +108,7 @@ def forecast(
     given = _past(idata, "constant_data", traced.inputs, mark, rows)
     columns = [given[n].reshape(rows, -1) for n in traced.inputs]
     u = np.concatenate([np.concatenate([np.zeros((rows, 0)), *columns], axis=1), future])
+    check_defined(traced, source, u, after=rows)
     y = np.zeros((rows + steps, len(traced.observation_symbols)))
     feedback = feeds_back(traced)
     if feedback:

@@ -13,6 +13,7 @@ from ssmppl.codegen.program import compile_trace
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import (
     bind_inputs,
+    check_defined,
     check_parameters,
     unpack_observations,
     unpack_parameters,
@@ -64,7 +65,8 @@ def simulate(
     """
     traced = trace(model)
     check_drawable(traced)
-    u, steps, time = bind_inputs(traced, inputs, steps)
+    u, steps, source = bind_inputs(traced, inputs, steps)
+    check_defined(traced, source, u)
     check_count("draws", draws, 1)
     d, k = len(traced.state_symbols), len(traced.observation_symbols)
     check_room(f"{draws} draws of {steps} rows", draws * steps * (d + k), "give fewer of them")
@@ -95,7 +97,7 @@ def simulate(
     return to_dataset(
         variables,
         over_time=over_time,
-        time=time,
+        time=source.time,
         attrs={"model": traced.name, "seed": str(root.entropy)},
     )
 

@@ -7,42 +7,37 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import plain
-from ssmppl.expressions.expr import Expr, symbol, symbols_of, to_text, topological
+from ssmppl.expressions.expr import Expr, symbols_of, to_text, topological
 from ssmppl.expressions.undefined import Undefined, first_undefined
-from ssmppl.language.distribution import Distribution
-from ssmppl.language.traced import Site, Trace
+from ssmppl.language.traced import Site, Trace, previous
 
 MOST = 4096  # combinations of values that are tried
 
 
-class _Range:
-    """The values that the laws of one quantity give it."""
+class _Values:
+    """What the laws of one quantity give it."""
 
     def __init__(self) -> None:
-        self.lower, self.upper = math.inf, -math.inf
-        self.continuum = False
-        self.known = True
+        self.found: set[float] = set()
+        self.continuum = self.unbounded = False
+        self.told = True  # whether `found` are all
 
     def add(self, kind: str, lower: Expr, upper: Expr) -> None:
-        if kind != "integers":
-            self.continuum |= kind != "point"
-            self.known = False
-        elif lower.op != "const" or upper.op != "const":
-            self.known = False
-        else:
-            self.lower, self.upper = min(self.lower, lower.data), max(self.upper, upper.data)
-
-    @property
-    def values(self) -> np.ndarray | None:
-        """Whole numbers; None where they are too many, or not told by numbers."""
-        if not self.known or not self.upper - self.lower < MOST:
-            return None
-        return np.arange(self.lower, self.upper + 0.5)
+        """Those of a law with this support; of points, `_follow` adds them."""
+        if kind == "integers" and lower.op == upper.op == "const":
+            self.unbounded |= not upper.data - lower.data < MOST
+            self.told &= not self.unbounded
+            if self.told:
+                self.found.update(np.arange(lower.data, upper.data + 0.5).tolist())
+        elif kind != "point":
+            self.continuum |= kind != "integers"
+            self.told = False
 
 
 def check_indexes(trace: Trace) -> None:
@@ -55,52 +50,75 @@ def check_indexes(trace: Trace) -> None:
     """
     if not trace.choices:
         return
-    ranges = _ranges(trace)
+    values = _values(trace)
     laws = (trace.parameters, trace.initial, trace.transition, trace.observations, trace.proposal)
     for sites in laws:
         for site in sites.values():
             for form in site.distribution.arguments():
-                _check(trace, site, form, ranges)
+                _check(trace, site, form, values)
 
 
-def _ranges(trace: Trace) -> dict[Expr, _Range]:
-    ranges: dict[Expr, _Range] = {}
+def _values(trace: Trace) -> dict[Expr, _Values]:
+    """Of each state, before too, and each parameter."""
+    values: dict[Expr, _Values] = {}
+    points: list[tuple[Expr, Expr]] = []
     for sites in (trace.parameters, trace.initial, trace.transition):
         for site in sites.values():
-            for s, lower, upper in _bounds(site.distribution, site.value):
-                ranges.setdefault(s, _Range()).add(site.distribution.support().kind, lower, upper)
-    before = {symbol(f"{s.data[0]}_prev", *s.data[1:]): r for s, r in ranges.items()}
-    return ranges | before
+            support = site.distribution.support()
+            ends = [
+                np.broadcast_to(plain(a), site.shape).ravel()
+                for a in (support.lower, support.upper)
+            ]
+            for s, lower, upper in zip(plain(site.value).ravel(), *ends, strict=True):
+                values.setdefault(s, _Values()).add(support.kind, lower, upper)
+                if support.kind == "point":
+                    points.append((s, lower))
+    values |= {previous(s): own for s, own in values.items()}
+    for _ in points:  # a lag of a lag takes as many rounds
+        _follow(points, values)
+    return values
 
 
-def _bounds(law: Distribution, value: np.ndarray) -> list[tuple[Expr, Expr, Expr]]:
-    support = law.support()
-    ends = [np.broadcast_to(plain(a), value.shape).ravel() for a in (support.lower, support.upper)]
-    return list(zip(plain(value).ravel(), *ends, strict=True))
+def _follow(points: list[tuple[Expr, Expr]], values: dict[Expr, _Values]) -> None:
+    """Give deterministic states the values of what they are set to: a number, or another state."""
+    for s, e in points:
+        if e.op == "const":
+            values[s].found.add(e.data)
+        elif e in values and values[e].told:
+            values[s].found.update(values[e].found)
+        else:
+            values[s].told = False
 
 
-def _check(trace: Trace, site: Site, form: Expr, ranges: dict[Expr, _Range]) -> None:
+def _check(trace: Trace, site: Site, form: Expr, values: dict[Expr, _Values]) -> None:
     chosen = [n for n in topological([form]) if n in trace.choices]
     indexes = [trace.choices[n][0] for n in chosen]
     for node, index in zip(chosen, indexes, strict=True):
-        if index.op == "symbol" and index in ranges:
+        if index.op == "symbol" and index in values:
             where = trace.locations.get(node, site.distribution.location)
-            _check_alone(index, trace.choices[node][1], ranges[index], where)
-    for read in (symbols_of([form]), symbols_of(indexes)):  # conditions too, if they are few
-        values = {s: ranges[s].values for s in read if s in ranges}
-        told = {s: v for s, v in values.items() if v is not None}
-        size = math.prod(len(v) for v in told.values())
-        if told and size <= MOST:
-            columns = np.array(list(itertools.product(*told.values())), dtype=float).T
-            known = dict(zip(told, columns, strict=True))
-            found = first_undefined(form, trace.choices, known, size)
-            if found is not None and found.index is not None:
-                where = trace.locations.get(found.node, site.distribution.location)
-                raise _beyond(found, known, where)
-            return
+            _check_alone(index, trace.choices[node][1], values[index], where)
+    known = _combined(symbols_of([form]), values)  # with those in conditions, if they are few
+    known = known or _combined(symbols_of(indexes), values)
+    if not known:
+        return
+    size = len(next(iter(known.values())))
+    found = first_undefined([form], trace.choices, known, size)
+    if found is not None and found[1].index is not None:
+        undefined = found[1]
+        where = trace.locations.get(undefined.node, site.distribution.location)
+        raise _beyond(undefined, known, where)
 
 
-def _check_alone(index: Expr, elements: int, own: _Range, where: Location) -> None:
+def _combined(read: Iterable[Expr], values: dict[Expr, _Values]) -> dict[Expr, np.ndarray]:
+    """All combinations of the values of those symbols whose values are told; none if too many."""
+    told = {s: sorted(values[s].found) for s in read if s in values and values[s].told}
+    if not told or math.prod(len(v) for v in told.values()) > MOST:
+        return {}
+    columns = np.array(list(itertools.product(*told.values())), dtype=float).T
+    return dict(zip(told, columns, strict=True))
+
+
+def _check_alone(index: Expr, elements: int, own: _Values, where: Location) -> None:
     """Of a quantity as it is: values that cannot be listed cannot all be elements."""
     last = elements - 1
     if own.continuum:
@@ -111,7 +129,7 @@ def _check_alone(index: Expr, elements: int, own: _Range, where: Location) -> No
             "can have a law of whole numbers, such as Categorical",
             where=where,
         )
-    if own.known and own.values is None:
+    if own.unbounded:
         raise ModelError(
             f"the index {to_text(index)} has no bound, and there are {elements} elements, 0 to "
             f"{last}",
@@ -123,13 +141,17 @@ def _check_alone(index: Expr, elements: int, own: _Range, where: Location) -> No
 
 def _beyond(found: Undefined, known: dict[Expr, np.ndarray], where: Location) -> ModelError:
     assert found.index is not None
-    last = found.elements - 1
     at = ", ".join(f"{to_text(s)} = {known[s][found.row]:.10g}" for s in symbols_of([found.index]))
     own = "" if found.index.op == "symbol" else f" where {at}"
     return ModelError(
-        f"the index {to_text(found.index)} can be {found.value:.10g}{own}, and there are "
-        f"{found.elements} elements, 0 to {last}",
+        f"the index {to_text(found.index)} can be {_spelled(found.value)}{own}, and there are "
+        f"{found.elements} elements, 0 to {found.elements - 1}",
         fix="count from 0, as Python does (negative indices do not count from the end), and give "
-        "the array an element for each value; or bound the index by np.clip",
+        "the array an element for each value; or bound the index by np.clip, or rule it out by "
+        "np.where",
         where=where,
     )
+
+
+def _spelled(value: float) -> str:
+    return f"{value:.0f}" if value == math.floor(value) else repr(value)

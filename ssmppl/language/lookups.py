@@ -1,7 +1,8 @@
 """Symbols that a law looks up in a set or a dictionary, which does not have them and says nothing.
 
 `u in {1, 2}` and `TABLE.get(u, 0.0)` ask for the symbol itself, by its hash: there is no operation
-of it that could tell. They are found in the law's instructions.
+of it that could tell. They are found in the law's own instructions, where an argument goes there
+by its name: not in functions that the law calls, nor under another name.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def instructions(code: CodeType) -> Iterator[tuple[dis.Instruction, int | None]]
 def check_lookups(function: Law, role: str, arguments: Mapping[str, Any]) -> None:
     """Refuse them; an argument that went through a call before may be a number, and is let pass."""
     found = [i for i, _ in instructions(plain_function(function).__code__)]
-    outer = outer_values(function)
+    outer, rebound = outer_values(function), _rebound(plain_function(function).__code__, found)
     for k, instruction in enumerate(found):
         if instruction.opname == "CONTAINS_OP":
             whole = _value(found[k - 1], outer)
@@ -43,7 +44,7 @@ def check_lookups(function: Law, role: str, arguments: Mapping[str, Any]) -> Non
                 named = []
         else:
             continue
-        named = [n for n in named if n in arguments]
+        named = [n for n in named if n in arguments and n not in rebound]
         if named and _by_hash(whole):
             where = location_of(function)
             line = instruction.positions.lineno if instruction.positions else None
@@ -54,6 +55,17 @@ def check_lookups(function: Law, role: str, arguments: Mapping[str, Any]) -> Non
                 "table, np.choose(k, values) is values[k] for a symbol k from 0",
                 where=Location(where.file, line or where.line, function.__name__),
             )
+
+
+def _rebound(code: CodeType, found: list[dis.Instruction]) -> set[str]:
+    """Names that may stand for other things than the law's arguments: assigned anew, or local to a
+    function inside."""
+    names = {n for i in found if i.opname.startswith("STORE_") for n in _names(i)}
+    inner = [c for c in code.co_consts if isinstance(c, CodeType)]
+    for c in inner:
+        names.update(c.co_varnames)
+        inner += [d for d in c.co_consts if isinstance(d, CodeType)]
+    return names
 
 
 def _by_hash(whole: Any) -> bool:
@@ -89,8 +101,11 @@ def _may_be_number(instruction: dis.Instruction) -> bool:
 
 
 def _loaded(instruction: dis.Instruction) -> list[str]:
-    if not instruction.opname.startswith("LOAD_FAST"):
-        return []
+    return _names(instruction) if instruction.opname.startswith("LOAD_FAST") else []
+
+
+def _names(instruction: dis.Instruction) -> list[str]:
+    """One, or two where Python 3.13 does two things at once."""
     names = instruction.argval
     return list(names) if isinstance(names, tuple) else [names]
 

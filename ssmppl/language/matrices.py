@@ -7,11 +7,12 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import constant
+from ssmppl.expressions.expr import constant, topological
 from ssmppl.language.distribution import Distribution
 from ssmppl.language.places import moderate, with_cases
 
-UNEQUAL = 1e-6  # by which share two entries that are meant to be one may differ by rounding
+# By which share two entries that are meant to be one may differ: of themselves, and of variances.
+UNEQUAL, ROUNDING = 1e-6, 1e-10
 
 
 def checked_matrix(law: Distribution, name: str) -> ExprArray:
@@ -62,15 +63,19 @@ def _check_numbers(law: Distribution, name: str, m: ExprArray) -> None:
 def _check_symmetry(law: Distribution, name: str, m: ExprArray) -> None:
     """Of symbols: for what reads one half only, and for what reads both, it would be two laws."""
     pairs = [(i, j) for i in range(len(m)) for j in range(i) if m[i, j] is not m[j, i]]
-    entries = [m[i, j] for i, j in pairs] + [m[j, i] for i, j in pairs]
-    if not entries:
+    if not pairs:
         return
+    entries = [m[i, j] for i, j in pairs] + [m[j, i] for i, j in pairs] + list(np.diagonal(m))
+    if any(n.op == "call" for n in topological(entries)):
+        return  # a primitive may have no value at numbers that no model gives it
     forms = with_cases(entries)
     with np.errstate(all="ignore"):
         found = [np.asarray(v, float) for v in evaluate(forms, moderate(forms))]
+    diagonal = found[2 * len(pairs) :]
     for (i, j), a, b in zip(pairs, found, found[len(pairs) :], strict=False):
         # at every point: where it is no number nothing is known, and rounding may part some
-        if np.all(np.abs(a - b) > UNEQUAL * (np.abs(a) + np.abs(b))):
+        rounding = ROUNDING * np.sqrt(np.abs(diagonal[i] * diagonal[j]))
+        if np.all(np.abs(a - b) > UNEQUAL * (np.abs(a) + np.abs(b)) + rounding):
             raise ModelError(
                 f"{type(law).__name__}: {name} is not symmetric: its entry [{i}, {j}] is "
                 f"{m[i, j]}, and [{j}, {i}] is {m[j, i]}",

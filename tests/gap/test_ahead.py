@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -155,3 +156,12 @@ def test_means_by_channel_and_horizon():
     assert found["a"]["CRPS 10 rows ahead"] == pytest.approx(together[:, 1, 0].mean())
     assert found["a"]["CRPS 100 rows ahead"] == 0.0
     assert mean_scores([], ["a"])["a"]["CRPS 1 row ahead"] == 0.0
+
+
+def test_samples_that_are_infinite_have_no_score():
+    samples = np.array([[0.0, 1.0, np.inf], [-np.inf, 0.0, np.inf], [0.0, 1.0, 2.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = crps(samples, np.zeros(3))
+    assert np.isnan(found[:2]).all()
+    assert found[2] == pytest.approx(1.0 - 4.0 / 6.0)

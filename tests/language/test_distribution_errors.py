@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
+import ssmppl as ssm
 import ssmppl.language.distributions as D
 from ssmppl.errors import ModelError, UnsupportedOperation
 from ssmppl.expressions.arrays import array
@@ -170,3 +171,20 @@ def test_symbols_are_not_judged():
 def test_errors_of_the_arguments_come_through():
     with pytest.raises(UnsupportedOperation, match="math"):
         D.Normal(float(X), sd=1)
+
+
+def test_covariances_that_are_symmetric_up_to_rounding_are_taken():
+    a = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.7], [0.1, 0.7, 3.0]])
+    D.MvNormal(np.zeros(3), covariance=np.linalg.inv(a) @ (X * a))
+    D.MvNormal(np.zeros(2), covariance=[[1.0, 0.1 * (3.0 * X)], [0.3 * X, 1.0]])
+
+
+def test_primitives_are_not_run_to_see_whether_a_covariance_is_symmetric():
+    @ssm.primitive
+    def table(s: float) -> float:
+        if s != 1.0:
+            raise ValueError("not a class")
+        return 0.5
+
+    r = table(X)
+    D.MvNormal(np.zeros(2), covariance=[[1.0, r * (X * 0.5)], [(r * X) * 0.5, 1.0]])

@@ -87,13 +87,26 @@ def test_a_symbol_is_not_looked_for_in_a_set(law):
     assert "np.where((u == 1) | (u == 2)" in caught.value.fix
 
 
-def test_numbers_are_looked_for_in_sets_as_ever():
-    def law(x, u, k=6.0):
-        parts = [n for n in (1.0, 6.0) if n in SUMMER]
-        if u.ndim in {0, 1} and "a" not in RATES and k in SUMMER and len([u]) in {1}:
-            x = len(parts) * 3 * x + RATES.get(k, 0.0) + RATES.get(u.ndim, 0.0)
-        return {"y": ssm.Normal(x + u, sd=1)}
+def of_numbers(x, u, k=6.0):
+    parts = [n for n in (1.0, 6.0) if n in SUMMER]
+    if u.ndim in {0, 1} and "a" not in RATES and k in SUMMER and len([u]) in {1}:
+        x = len(parts) * 3 * x + RATES.get(k, 0.0) + RATES.get(u.ndim, 0.0)
+    return {"y": ssm.Normal(x + u, sd=1)}
 
+
+def of_namesakes(x, u):
+    inner = sum(1.0 for u in (1.0, 6.0) if u in SUMMER) + (lambda u: RATES.get(u, 0.0))(2.0)
+    return {"y": ssm.Normal(3 * x + u + inner, sd=1)}
+
+
+def of_a_name_anew(x, u):
+    for u in (1.0, 2.0):
+        x = 3 * x if u in RATES else x + RATES.get(u, 0.0)
+    return {"y": ssm.Normal(x + (1.0 if u in SUMMER else 0.0), sd=1)}
+
+
+@pytest.mark.parametrize("law", [of_numbers, of_namesakes, of_a_name_anew])
+def test_numbers_are_looked_for_in_sets_as_ever(law):
     model = ssm.Model("months", inputs=("u",))
     model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
     model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})

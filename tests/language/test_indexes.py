@@ -1,12 +1,11 @@
 """Elements that states and parameters choose: refused where the law can choose one beyond."""
 
-import pickle
-
 import numpy as np
 import pytest
 
 import ssmppl as ssm
 from ssmppl.errors import ModelError
+from ssmppl.language.packing import packed, unpacked
 from ssmppl.language.trace import trace
 
 
@@ -51,6 +50,7 @@ REFUSED = [
     (ssm.Poisson(1.0), lambda s, g, mu, k: mu[s], "(?s)s has no bound.*np.minimum(s, 2)"),
     (ssm.Normal(0.0, sd=1.0), lambda s, g, mu, k: mu[s], "(?s)continuum.*np.floor(s)"),
     (classes(2), lambda s, g, mu, k: mu[k], "index k takes a continuum"),
+    (classes(3), lambda s, g, mu, k: mu[np.sqrt(s)], "can be 1.4142135623730951 where s = 2"),
 ]
 
 
@@ -71,6 +71,9 @@ ACCEPTED = [
     (classes(4), lambda s, g, mu, k: np.where(s == 3, 0.0, mu[s])),
     (classes(4), lambda s, g, mu, k: mu[np.minimum(s, 2)]),
     (classes(2), lambda s, g, mu, k: mu[s + g]),
+    (classes(4), lambda s, g, mu, k: (s > 0) * mu[s - 1]),
+    (classes(4), lambda s, g, mu, k: np.where((s > 0) & (mu[s - 1] > 0), 1.0, 0.0)),
+    (classes(4), lambda s, g, mu, k: np.where(s > 2, 0.0, np.choose(s, [0.0, 1.0, 1.0]))),
     (ssm.Poisson(1.0), lambda s, g, mu, k: mu[np.minimum(s, 2)]),
     (ssm.Truncated(ssm.Poisson(1.0), upper=2), lambda s, g, mu, k: mu[s]),
     (ssm.Normal(0.0, sd=1.0), lambda s, g, mu, k: mu[np.clip(np.floor(s), 0, 2)]),
@@ -115,8 +118,60 @@ def test_rows_of_a_matrix_in_a_transition():
         trace(chain(3))
 
 
+def test_columns_that_are_all_alike_are_no_choice():
+    """Their node is a number, which may stand elsewhere too."""
+    table, first = [[0.9, 0.1, 0.0], [0.1, 0.9, 0.0]], [0.0, 0.0, 1.0]
+    model = ssm.Model("columns")
+
+    @model.initial
+    def initial():
+        return {"s": classes(3)}
+
+    @model.transition
+    def transition(s):
+        return {"s": ssm.Categorical(np.where(s > 0, np.choose(s - 1, table), first))}
+
+    @model.observation
+    def observation(s):
+        return {"y": ssm.Normal(s, sd=1.0)}
+
+    trace(model)
+
+
+def lagged(n, begin=0.0):
+    model = ssm.Model("lagged")
+    model.prior(lambda: {"mu": ssm.Normal(np.zeros(2), sd=1.0)})
+    model.initial(lambda: {"s": classes(n), "a": ssm.Dirac(begin), "b": ssm.Dirac(0.0)})
+    model.transition(lambda s, a: {"s": classes(n), "a": ssm.Dirac(s), "b": ssm.Dirac(a)})
+    model.observation(lambda b, mu: {"y": ssm.Normal(mu[b], sd=1.0)})
+    return model
+
+
+def test_lags_have_the_values_of_what_they_keep():
+    trace(lagged(2))
+    with pytest.raises(ModelError, match="index b can be 2"):
+        trace(lagged(3))
+    with pytest.raises(ModelError, match="index b can be 5"):
+        trace(lagged(2, begin=5.0))
+
+
+def test_bounds_are_asked_for_once_for_each_law(monkeypatch):
+    asked = []
+    support = ssm.Dirichlet.support
+    monkeypatch.setattr(ssm.Dirichlet, "support", lambda law: asked.append(law) or support(law))
+    model = ssm.Model("large")
+    model.prior(lambda: {"P": ssm.Dirichlet(np.ones((30, 30)))})
+    model.initial(lambda: {"s": classes(30)})
+    model.transition(lambda s, P: {"s": ssm.Categorical(P[s])})
+    model.observation(lambda s: {"y": ssm.Normal(s, sd=1.0)})
+    trace(model)
+    assert len(asked) < 30
+
+
 def test_choices_travel_with_the_trace():
-    traced = trace(model_of(classes(3), lambda s, g, mu, k: mu[s]))
-    assert {repr(k): v[1] for k, v in pickle.loads(pickle.dumps(traced)).choices.items()} == {
-        repr(k): v[1] for k, v in traced.choices.items()
+    choices = trace(model_of(classes(3), lambda s, g, mu, k: mu[s])).choices
+    (again,) = unpacked(packed((choices,)))
+    assert {repr(k): (repr(i), n) for k, (i, n) in again.items()} == {
+        repr(k): (repr(i), n) for k, (i, n) in choices.items()
     }
+    assert set(map(repr, choices)) == {"where(s == 0, mu[0], where(s == 1, mu[1], mu[2]))"}

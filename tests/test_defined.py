@@ -5,7 +5,8 @@ import pandas as pd
 import pytest
 
 import ssmppl as ssm
-from ssmppl.errors import DataError, SSMError
+from ssmppl.data import defined
+from ssmppl.errors import DataError
 
 Y = np.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.2])
 
@@ -51,7 +52,7 @@ def test_an_index_of_the_data_beyond_the_elements():
     assert "'u', row 3" in text
     assert "the index u is 3, and there are 3 elements, 0 to 2, in the mean of Normal" in text
     assert "the law of 'y'" in text
-    assert "test_undefined_data.py" in text
+    assert "test_defined.py" in text
     assert "index - 1" in text
 
 
@@ -140,14 +141,94 @@ def test_what_has_a_value_all_the_same_is_taken():
     assert evidence(power, -np.ones(6)) == evidence(model_of(lambda x, mu, u, t: x + 1.0), [1] * 6)
 
 
-def test_simulations_and_forecasts_ask_too():
+def test_masks_rule_out_too():
+    masked = model_of(lambda x, mu, u, t: x + (u >= 0) * mu[u])
+    guarded = model_of(lambda x, mu, u, t: x + np.where(u >= 0, mu[u], 0.0))
+    assert evidence(masked, [0, -1, 2, -1, 1, 0]) == evidence(guarded, [0, -1, 2, -1, 1, 0])
+    with pytest.raises(DataError, match="'u', row 4"):
+        evidence(masked, [0, -1, 2, 3, 1, 0])
+
+
+def test_an_index_that_is_not_whole_is_told_in_full():
+    model = model_of(lambda x, mu, u, t: x + np.choose(100 * u, np.arange(60.0)))
+    with pytest.raises(DataError, match=r"(?s)28\.999999999999996, which is not whole.*floor"):
+        evidence(model, [0.0, 0.01, 0.29, 0.5, 0.5, 0.5])
+
+
+def test_entries_of_mvnormal_ask_where_they_are_measured():
+    model = ssm.Model("pair", inputs=("u",))
+    model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
+    model.transition(lambda x: {"x": ssm.Normal(x, sd=1.0)})
+
+    @model.observation
+    def observation(x, u):
+        mean = np.stack([x, x + np.choose(u, [0.0, 1.0])])
+        return {"y": ssm.MvNormal(mean, covariance=[[1.0, 0.2], [0.2, 1.0]])}
+
+    y = np.column_stack([Y, np.where(np.arange(6) == 2, np.nan, Y)])
+    found = ssm.log_likelihood(model, {"y": y, "u": [0, 1, 9, 1, 0, 0]}, {}, seed=1)
+    assert found == ssm.log_likelihood(model, {"y": y, "u": [0, 1, 0, 1, 0, 0]}, {}, seed=1)
+    with pytest.raises(DataError, match="'u', row 4"):
+        ssm.log_likelihood(model, {"y": y, "u": [0, 1, 0, 9, 0, 0]}, {})
+
+
+def fed_back(centre):
+    model = ssm.Model("fed back")
+    model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
+    model.transition(lambda x, y: {"x": ssm.Normal(0.5 * x + centre(y), sd=1.0)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=1.0)})
+    return model
+
+
+def test_earlier_observations_are_asked_where_there_are_some():
+    root = fed_back(lambda y: np.sqrt(y))
+    with pytest.raises(DataError, match=r"(?s)'y', row 2.*sqrt\(y_prev\) at y_prev = -0.2"):
+        ssm.log_likelihood(root, {"y": Y}, {})
+    taken = fed_back(lambda y: np.log(1.0 + y**2))
+    ssm.predict(taken, None, steps=5, draws=10, seed=1)  # y is drawn there
+    gap = np.where(np.arange(6) == 2, np.nan, Y)
+    ssm.predict(taken, None, {"y": gap}, draws=10, seed=1)
+
+
+def test_what_is_drawn_asks_in_every_row():
     model = model_of(by_group)
     with pytest.raises(DataError, match="'u', row 2"):
         ssm.simulate(model, {"mu": [0.0, 1.0, 2.0]}, inputs={"u": [0, 3, 0]}, seed=1)
-    data = {"y": Y, "u": [0, 1, 2, 0, 1, 2]}
+    with pytest.raises(DataError, match="'u', row 3"):
+        ssm.predict(model, None, {"u": [0, 1, 9]}, draws=10, seed=1)
+
+
+def forecast_of(model, u, ahead):
+    data = {"y": Y, "u": np.asarray(u, float)}
     drawn = ssm.sample(model, data, draws=20, warmup=20, chains=1, seed=1, progress=False)
-    with pytest.raises(SSMError, match="the index u is 3"):
-        ssm.forecast(model, drawn, inputs={"u": [0.0, 3.0]}, seed=1)
+    return ssm.forecast(model, drawn, inputs={"u": np.asarray(ahead, float)}, seed=1)
+
+
+@pytest.mark.filterwarnings("ignore:the chains")
+def test_forecasts_ask_in_the_rows_that_they_draw():
+    with pytest.raises(DataError, match=r"(?s)In inputs, 'u', row 2.*the index u is 3"):
+        forecast_of(model_of(by_group), [0, 1, 2, 0, 1, 2], [0, 3])
+    moved = model_of(move=lambda x, u: x + np.choose(u, [0.5, 1.0]))
+    with pytest.raises(
+        DataError, match=r"(?s)the last row of the data, 'u'.*the index u_prev is 7"
+    ):
+        forecast_of(moved, [0, 0, 0, 0, 0, 7], [0, 0])
+    forecast_of(moved, np.zeros(6), [0, 7])  # nothing follows the last row
+    begun = model_of(start=lambda u: np.choose(u, [0.5, 1.0]))
+    forecast_of(begun, [1, 6, 6, 6, 6, 6], [6, 6])
+    table = model_of(lambda x, mu, u, t: x + np.choose(t - 1, np.arange(8.0)))
+    forecast_of(table, np.zeros(6), np.zeros(2))
+    with pytest.raises(DataError, match=r"(?s)In inputs, row 3.*the index t - 1 is 8"):
+        forecast_of(table, np.zeros(6), np.zeros(4))
+
+
+def test_rows_are_looked_at_in_parts(monkeypatch):
+    monkeypatch.setattr(defined, "CHUNK", 4)
+    with pytest.raises(DataError, match="'u', row 6"):
+        evidence(model_of(by_group), [0, 1, 2, 0, 1, 3])
+    moved = model_of(move=lambda x, u: x + np.choose(u, [0.5, 1.0]))
+    with pytest.raises(DataError, match="'u', row 5"):
+        evidence(moved, [0, 0, 0, 0, 2, 0])
 
 
 def test_each_data_set_is_named():
