@@ -144,7 +144,10 @@ def _compare_matrix_normal(conditional, draws):
 
 
 # Tens of thousands of draws each; one case of a matrix with its coefficients stays.
-LONG = ("conjugate_columns", "flat_coefficients", "conjugate_precision", "noise_through_a_matrix")
+LONG = (
+    "conjugate_columns", "flat_coefficients", "conjugate_precision", "negative_binomial",
+    "noise_through_a_matrix",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from tests.fuzz.block import cases, recipe_of
 from tests.fuzz.calls import Wrong, judged
 from tests.fuzz.models import FAULTS, random_model
 
-ROOT, DEFAULT, SLOW, ALL = 7, 4, 8, 30  # the root is none of those that the long runs took
+ROOT, DEFAULT, SLOW, ALL = 7, 2, 8, 30  # the root is none of those that the long runs took
 
 
 def marks_of(number):

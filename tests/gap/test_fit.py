@@ -85,6 +85,7 @@ def test_a_quick_fit_is_the_same_without_information():
     assert np.all(np.linalg.eigvalsh(fit.information) > 0.0)
 
 
+@pytest.mark.slow
 def test_a_flat_start_is_fitted_as_a_vague_one():
     """Two data sets apart by a constant give the same fit, as a shift of x_1 is nothing."""
     found = []

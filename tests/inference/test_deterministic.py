@@ -208,6 +208,7 @@ def test_the_maximum_is_that_of_the_recursion(tank, garch):
     assert found.log_likelihood >= -best.fun - 1e-6
 
 
+@pytest.mark.slow
 def test_the_posterior_and_the_evidence_are_those_of_a_grid(tank):
     rows = tank_rows(40, 6)
     held = {"r": 0.09}
@@ -256,6 +257,7 @@ def test_smoothing_gives_the_one_trajectory_without_a_warning(tank, recwarn):
     assert not recwarn.list
 
 
+@pytest.mark.slow
 def test_leave_future_out_is_that_of_a_grid(garch):
     y, held = returns(60, 9), {"w": 0.1, "a": 0.05, "g": 0.1}
     found = ssm.leave_future_out(

@@ -56,6 +56,7 @@ def same_numbers(cases):
         )
 
 
+@pytest.mark.slow
 def test_the_simulator_finds_the_numbers_of_numpy():
     same_numbers(FEW)
 

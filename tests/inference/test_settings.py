@@ -80,9 +80,21 @@ FINE = {
     ("FFBSi", "rescue"): [0],
     ("FixedLag", "lag"): [0],
 }
+
+
+def goes_on(method, name, value):
+    return any(value == fine for fine in FINE.get((type(method).__name__, name), []))
+
+
 SAMPLERS = ("MetropolisHastings", "Gibbs", "PMMH", "PGAS", "SMC2")
 CALLS = [
-    pytest.param(method, field.name, value, id=f"{type(method).__name__} {field.name}={value!r}")
+    pytest.param(
+        method,
+        field.name,
+        value,
+        id=f"{type(method).__name__} {field.name}={value!r}",
+        marks=[pytest.mark.slow] * goes_on(method, field.name, value),
+    )
     for method in SMALL
     for field in fields(method)
     for value in ODD
@@ -103,7 +115,7 @@ def run(method):
 @pytest.mark.parametrize(("method", "name", "value"), CALLS)
 def test_odd_settings_are_refused_by_their_names(method, name, value):
     given = replace(method, **{name: value})
-    if any(value == f for f in FINE.get((type(method).__name__, name), [])):
+    if goes_on(method, name, value):
         run(given)
         return
     with pytest.raises(ssm.ArgumentError) as error:

@@ -61,7 +61,7 @@ def vehicle_exact(y, h):
 
 
 @pytest.mark.parametrize(("particles", "repeats"), [
-    *some([(2, 1000), (10, 1000)], 0), (100, 200),
+    *some([(2, 1000), (10, 1000), (100, 200)], 0),
 ])  # fmt: skip
 def test_position_and_velocity(particles, repeats):
     """Every scheme and threshold. The guide is exact here, so that even two particles do.
