@@ -111,29 +111,48 @@ def test_roots_and_logarithms_of_the_data():
     assert np.isfinite(evidence(guarded, [1, -1, 0, 1, 1, 1]))
 
 
-def test_laws_inside_of_laws():
-    model = ssm.Model("mixed", inputs=("u",))
+def observed_by(law):
+    """A random walk x, and y under `law(x, u)`."""
+    model = ssm.Model("observed", inputs=("u",))
     model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
     model.transition(lambda x: {"x": ssm.Normal(x, sd=1.0)})
+    model.observation(lambda x, u: {"y": law(x, u)})
+    return model
 
-    @model.observation
-    def observation(x, u):
+
+def test_laws_inside_of_laws():
+    def law(x, u):
         inner = [ssm.Normal(x + np.choose(u, [0.0, 1.0]), sd=1.0), ssm.Normal(x, sd=9.0)]
-        return {"y": ssm.Mixture([0.9, 0.1], inner)}
+        return ssm.Mixture([0.9, 0.1], inner)
 
     with pytest.raises(DataError, match=r"(?s)'u', row 4.*the mean of Normal, the law of 'y'"):
-        ssm.log_likelihood(model, {"y": Y, "u": [0, 1, 1, 2, 0, 0]}, {})
+        ssm.log_likelihood(observed_by(law), {"y": Y, "u": [0, 1, 1, 2, 0, 0]}, {})
 
 
-def test_entries_of_a_vector_ask_where_they_are_measured():
-    model = ssm.Model("two", inputs=("u",))
-    model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
-    model.transition(lambda x: {"x": ssm.Normal(x, sd=1.0)})
-    model.observation(lambda x, u: {"y": ssm.Normal(np.stack([x, x + np.sqrt(u)]), sd=1.0)})
-    y = np.column_stack([Y, np.where(np.arange(6) == 2, np.nan, Y)])
-    assert np.isfinite(ssm.log_likelihood(model, {"y": y, "u": [1, 1, -1, 1, 1, 1]}, {}))
+PAIRS = np.column_stack([Y, np.where(np.arange(6) == 2, np.nan, Y)])  # one missing in row 3
+ROOM = [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        lambda x, u: ssm.Normal(np.stack([x, x + np.choose(u, ROOM)]), sd=1.0),
+        lambda x, u: ssm.MvNormal(
+            np.stack([x, x + np.choose(u, ROOM)]), covariance=[[1.0, 0.2], [0.2, 1.0]]
+        ),
+        lambda x, u: ssm.MvNormal(
+            np.stack([x, x]),
+            covariance=np.block([[1.0, 0.1 * np.choose(u, ROOM)], [0.1 * np.choose(u, ROOM), 1.0]]),
+        ),
+    ],
+    ids=["independent", "mean", "covariance"],
+)
+def test_entries_of_a_vector_ask_where_they_are_measured(law):
+    model = observed_by(law)
+    found = ssm.log_likelihood(model, {"y": PAIRS, "u": [0, 1, 9, 1, 0, 0]}, {}, seed=1)
+    assert found == ssm.log_likelihood(model, {"y": PAIRS, "u": [0, 1, 0, 1, 0, 0]}, {}, seed=1)
     with pytest.raises(DataError, match="'u', row 4"):
-        ssm.log_likelihood(model, {"y": y, "u": [1, 1, 1, -1, 1, 1]}, {})
+        ssm.log_likelihood(model, {"y": PAIRS, "u": [0, 1, 0, 9, 0, 0]}, {})
 
 
 def test_what_has_a_value_all_the_same_is_taken():
@@ -153,23 +172,6 @@ def test_an_index_that_is_not_whole_is_told_in_full():
     model = model_of(lambda x, mu, u, t: x + np.choose(100 * u, np.arange(60.0)))
     with pytest.raises(DataError, match=r"(?s)28\.999999999999996, which is not whole.*floor"):
         evidence(model, [0.0, 0.01, 0.29, 0.5, 0.5, 0.5])
-
-
-def test_entries_of_mvnormal_ask_where_they_are_measured():
-    model = ssm.Model("pair", inputs=("u",))
-    model.initial(lambda: {"x": ssm.Normal(0.0, sd=1.0)})
-    model.transition(lambda x: {"x": ssm.Normal(x, sd=1.0)})
-
-    @model.observation
-    def observation(x, u):
-        mean = np.stack([x, x + np.choose(u, [0.0, 1.0])])
-        return {"y": ssm.MvNormal(mean, covariance=[[1.0, 0.2], [0.2, 1.0]])}
-
-    y = np.column_stack([Y, np.where(np.arange(6) == 2, np.nan, Y)])
-    found = ssm.log_likelihood(model, {"y": y, "u": [0, 1, 9, 1, 0, 0]}, {}, seed=1)
-    assert found == ssm.log_likelihood(model, {"y": y, "u": [0, 1, 0, 1, 0, 0]}, {}, seed=1)
-    with pytest.raises(DataError, match="'u', row 4"):
-        ssm.log_likelihood(model, {"y": y, "u": [0, 1, 0, 9, 0, 0]}, {})
 
 
 def fed_back(centre):

@@ -85,6 +85,15 @@ def test_what_lies_within_is_taken(law, chosen):
     assert trace(model_of(law, chosen)).choices
 
 
+def test_tables_that_are_one_expression_have_the_elements_of_the_longer():
+    """np.choose(s, [0, 1, 1]) and np.choose(s, [0, 1]), which is kept later, are one node."""
+
+    def chosen(s, g, mu, k):
+        return np.choose(s, [0.0, 1.0, 1.0]) + np.where(s < 2, np.choose(s, [0.0, 1.0]), 0.0)
+
+    trace(model_of(classes(3), chosen))
+
+
 def test_the_initial_law_counts():
     trace(model_of(classes(3), lambda s, g, mu, k: mu[s], first=classes(2)))
     with pytest.raises(ModelError, match="index s can be 3"):
