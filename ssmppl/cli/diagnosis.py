@@ -11,7 +11,7 @@ import ssmppl as ssm
 from ssmppl.cli.group import command
 from ssmppl.cli.options import FIXED, MODEL, NEEDED_DATA, PROGRESS, option, output
 from ssmppl.cli.reading import read_data
-from ssmppl.cli.rendering import answer, records, say, stop_interrupted, wrote
+from ssmppl.cli.rendering import answer, records, say, stop_in_part, stop_interrupted, wrote
 from ssmppl.errors import ArgumentError
 from ssmppl.modelfile import load_model, parse_assignments
 
@@ -70,12 +70,16 @@ def _made(folder: Path) -> Path:
     "--checkpoint", type=click.Path(path_type=Path), metavar="PATH", section="Run",
     help="Keeps the stages that are done [default: stages/ in the folder of the report].",
 )  # fmt: skip
+@option(
+    "--debug", is_flag=True, section="Run", show_default=False,
+    help="Stop at the first fault with its traceback, where else its part is left out.",
+)  # fmt: skip
 @PROGRESS
 @output("the name of the data file, with _report", "Folder for the report.", file=False)
 def diagnose(
     model: str, data: tuple[Path, ...], output: Path | None, mode: str, fast: bool,
     fixed: tuple[str, ...], effects: str | None, particles: int | None, alpha: float,
-    seed: int, checkpoint: Path | None, progress: bool,
+    seed: int, checkpoint: Path | None, debug: bool, progress: bool,
 ) -> None:  # fmt: skip
     """Where MODEL.py differs from DATA, which effect is missing, how far the gap closes.
 
@@ -83,7 +87,8 @@ def diagnose(
     (CSV), plots (PNG) and the model with what was found added. The page is one file that any
     browser shows, on a phone too. Inputs are columns of the data; several DATA are several
     experiments of one system. Ctrl-C ends early: the stages that are done are kept, and the same
-    command goes on from there.
+    command goes on from there. Where a part fails, the answer is without it and says so, and the
+    exit code is 3.
 
     \b
         ssmppl diagnose model.py data.csv -o report/
@@ -97,7 +102,7 @@ def diagnose(
     try:
         report: GapReport = ssm.diagnose(
             loaded, read, names, mode="fast" if fast else mode, alpha=alpha, fixed=held or None,
-            particles=particles, checkpoint=kept, progress=progress, seed=seed,
+            particles=particles, checkpoint=kept, progress=progress, seed=seed, debug=debug,
         )  # fmt: skip
     except KeyboardInterrupt:
         stop_interrupted(f"before there was anything to report. {kept} holds the stages that are "
@@ -109,6 +114,10 @@ def diagnose(
     if report.interrupted:
         stop_interrupted(f"this is what the stages done so far tell. {kept} holds them: the same "
                          "command goes on from there.")  # fmt: skip
+    if len(report.left_out):
+        failed = "; ".join(report.left_out["part"])
+        stop_in_part(f"{failed} failed. {kept} holds what is done: the same command tries the "
+                     "rest again, and --debug shows where it fails.")  # fmt: skip
 
 
 def _told(report: GapReport) -> dict[str, Any]:
@@ -116,7 +125,8 @@ def _told(report: GapReport) -> dict[str, Any]:
     tables = {name: records(table) for name, table in report.tables().items()}
     return {
         "verdict": report.verdict, "chosen": report.chosen, "estimates": report.estimates,
-        **tables, "missing": tables.get("missing"), "parts": report.parts, "notes": report.notes,
+        **tables, "missing": tables.get("missing"), "complete": not len(report.left_out),
+        "parts": report.parts, "notes": report.notes,
         "settings": report.settings, "mode": report.mode, "seconds": report.seconds,
         "interrupted": report.interrupted,
     }  # fmt: skip

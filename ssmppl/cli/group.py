@@ -6,6 +6,7 @@ code  when
 0     all is done
 1     a fault of the model, of the data or of a value; or of this package, with a traceback
 2     the command line is not one: an unknown option, a file that is not there
+3     answered in part: what failed is named in the answer and on standard error
 130   interrupted by Ctrl-C; what was kept is said on standard error
 ====  ==============================================================================
 """
@@ -23,9 +24,18 @@ import click
 from ssmppl.cli.wording import in_words_of
 from ssmppl.errors import SSMError
 
-__all__ = ["AS_JSON", "INTERRUPTED", "Argument", "Commands", "Option", "command", "plain_option"]
+__all__ = [
+    "AS_JSON",
+    "INTERRUPTED",
+    "IN_PART",
+    "Argument",
+    "Commands",
+    "Option",
+    "command",
+    "plain_option",
+]
 
-INTERRUPTED = 130
+IN_PART, INTERRUPTED = 3, 130
 AS_JSON = "ssmppl.json"  # whether the answer is wanted as JSON, in the context's `meta`
 
 # Options that take all the name=value which follow.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 import numpy as np
 
-from ssmppl.cli.group import AS_JSON, INTERRUPTED
+from ssmppl.cli.group import AS_JSON, IN_PART, INTERRUPTED
 from ssmppl.cli.reading import PARQUET, TABLES, pyarrow
 from ssmppl.errors import ArgumentError
 from ssmppl.results import save
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "answer", "columns_of", "fitting_rows", "heading", "labelled_matrix", "note", "plain",
-    "records", "say", "spread", "spread_table", "stop_interrupted", "summary_lines", "table_text",
-    "write", "wrote",
+    "records", "say", "spread", "spread_table", "stop_in_part", "stop_interrupted", "summary_lines",
+    "table_text", "write", "wrote",
 ]  # fmt: skip
 
 SHOWN_ROWS = 10
@@ -76,6 +76,12 @@ def stop_interrupted(kept: str) -> NoReturn:
     """The end of a command that Ctrl-C stopped, once what it has is written."""
     note(f"{click.style('Interrupted:', fg='yellow')} {kept}")
     raise click.exceptions.Exit(INTERRUPTED)
+
+
+def stop_in_part(failed: str) -> NoReturn:
+    """The end of a command whose answer lacks parts, once what it has is written."""
+    note(f"{click.style('Answered in part:', fg='yellow')} {failed}")
+    raise click.exceptions.Exit(IN_PART)
 
 
 # -- JSON

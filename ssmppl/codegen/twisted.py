@@ -83,7 +83,7 @@ class TwistedFilter:
         out[0, u.shape[1] + np.array(ones, dtype=int)] = 1.0
         reference, covariance = self._empty(steps)
         where = reference.x, covariance, *reference.derivatives
-        if not self.module.follow_filter(*given, *where):
+        if not self.module.follow_filter(*given, *where) > -np.inf:
             return out
         reference = self._climbed(given, reference)
         back = _Back.empty(steps, d, max(size))
@@ -106,7 +106,8 @@ class TwistedFilter:
         """About the likeliest trajectory (T, D) given theta; None where it comes to no number."""
         given = (theta, y, seen, u)
         found, covariance = self._empty(len(y))
-        if not self.module.follow_filter(*given, found.x, covariance, *found.derivatives):
+        where = found.x, covariance, *found.derivatives
+        if not self.module.follow_filter(*given, *where) > -np.inf:
             return None
         x = self._climbed(given, found).x
         return x if np.all(np.isfinite(x)) else None
@@ -123,8 +124,20 @@ class TwistedFilter:
         comes to no number."""
         found, covariance = self._empty(len(y))
         where = found.x, covariance, *found.derivatives
-        fine = self.module.follow_filter(theta, y, seen, u, *where)
-        return (found.x, covariance) if fine else None
+        value = self.module.follow_filter(theta, y, seen, u, *where)
+        return (found.x, covariance) if value > -np.inf else None
+
+    def extended_log_likelihood(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> float:
+        """log p(y | theta) by the extended Kalman filter, whose update is the mode of each row: an
+        approximation, exact where the model is linear and Gaussian; -inf where it comes to no
+        number."""
+        found, covariance = self._empty(len(y))
+        value = self.module.follow_filter(
+            theta, y, seen, u, found.x, covariance, *found.derivatives
+        )
+        return float(value)
 
     def _climbed(self, given: tuple[np.ndarray, ...], first: _Reference) -> _Reference:
         """The mode of the noise, from a first trajectory that need not follow the model."""

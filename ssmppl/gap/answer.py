@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,9 +14,11 @@ from ssmppl.gap import tables
 from ssmppl.gap.apart import heads, told
 from ssmppl.gap.attribute import Attribution
 from ssmppl.gap.augment import augment
+from ssmppl.gap.bounds import note
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.classes import Classes
 from ssmppl.gap.detect import Statistics, detection
+from ssmppl.gap.failures import Failures
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import Parts
 from ssmppl.gap.refit import Refit, standard_errors
@@ -31,7 +33,7 @@ from ssmppl.language.traced import Trace
 CLEARLY = 2.0  # standard errors
 MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
 LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows bear it out
-UNLIKE = "none of these"
+UNLIKE, NOTHING = "none of these", "no measurable gap"
 
 
 @dataclass
@@ -52,6 +54,7 @@ class Results:
     screen: Screen
     settings: dict[str, Any]
     notes: list[str]
+    failures: Failures = field(default_factory=Failures)
     attribution: Attribution | None = None
     far: HowFar | None = None
     blocks: int = 0
@@ -99,14 +102,22 @@ class Results:
 
 
 def answer(r: Results, seconds: float) -> GapReport:
-    """The report of what is done."""
+    """The report of what is done; a table that an error ends is empty, and said to be left out."""
     screen, notes = r.screen, list(r.notes)
-    where, _ = tables.where_table(screen, r.alpha)
-    order, found = r.classes()
+
+    def table(name: str, make: Callable[[], Any], nothing: Any = None) -> Any:
+        with r.failures.part(f"the table {name!r}"):
+            return make()
+        return tabulate(name) if nothing is None else nothing
+
+    where = table("where", lambda: tables.where_table(screen, r.alpha)[0])
+    checks = table("detection", lambda: _detection(screen))
+    order, found = table("classes", r.classes, ([], None))
     verdict, missing = _verdict(r, where)
     share, runs = tabulate("closed"), None
     if r.attribution:
         notes += r.attribution.notes
+        notes += filter(None, [_bound(r)])
     if r.far is not None:
         notes += r.far.notes
         runs = (r.far.before, r.far.after)
@@ -117,40 +128,59 @@ def answer(r: Results, seconds: float) -> GapReport:
             open_, gained = not np.isfinite(share["F"].iloc[0]), share["nats_per_sample"].iloc[0]
             if not r.blocks and open_:
                 if gained <= 0.0 or (verdict == UNLIKE and r.chosen is None):
-                    verdict, missing = "no measurable gap", None
+                    verdict, missing = NOTHING, None
                 elif verdict == UNLIKE:
                     verdict, missing = _effect(r, where)
+    if verdict == NOTHING and _stands_out(r.alpha, where, checks):
+        verdict, missing = UNLIKE, _curve_of(r, where)
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}
     if r.chosen is not None and verdict == "effect":
         values = _estimates(r.chosen.fitter, r.chosen.fit)
         own = augment(r.trace, list(r.chosen.candidates)).parameter_symbols
         estimates["after"] = {repr(s): values[repr(s)] for s in own}
-        augmented, text = _written(r.trace, r.chosen, r.names, notes)
+        augmented, text = _written(r, r.chosen, notes)
     free = tabulate("free_run")
     if runs is not None:
         channels = [repr(s) for s in r.trace.observation_symbols]
-        free = tables.run_table(r.experiments, channels, *runs)
-    causes = tables.causes_table(screen, r.refits, found, order, r.tested, r.screened)
+        free = table("free_run", lambda: tables.run_table(r.experiments, channels, *runs))
+    causes, classes = tabulate("causes"), tabulate("classes")
+    leading: list[dict[str, Any]] = []
+    if found is not None:
+        causes = table("causes", lambda: tables.causes_table(
+            screen, r.refits, found, order, r.tested, r.screened))  # fmt: skip
+        classes = table("classes", lambda: tables.classes_table(
+            screen, found, order, r.separating))  # fmt: skip
+        if len(causes) and (text or r.unfitted is not None):
+            leading = table("leading", lambda: _leading(r, order), leading)
     started = next((x.fitter.start for x in [*r.refits, r.chosen] if x and x.fitter.start), None)
     if started:
         notes.append(f"only linear Gaussian models can start flat: others start with {started}")
     return GapReport(
-        verdict=verdict, where=where,
-        causes=causes,
-        classes=tables.classes_table(screen, found, order, r.separating),
-        closed=share, detection=_detection(screen), residual_map=tables.map_table(screen),
+        verdict=verdict, where=where, causes=causes, classes=classes, closed=share,
+        detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
         free_run=free, not_applicable=_not_applicable(screen), missing=missing,
-        model=augmented, model_text=text,
-        chosen=r.names if text else [], estimates=estimates,
-        leading=_leading(r, order, found) if text or r.unfitted is not None else [],
-        parts=_parts(r), notes=notes,
+        model=augmented, model_text=text, chosen=r.names if text else [], estimates=estimates,
+        leading=leading, parts=_parts(r), notes=notes,
         settings={**r.settings, "candidates": len(set(screen.groups.tolist())),
                   "shapes": len(screen.question.candidates),
                   "samples": sum(e.steps for e in r.experiments), "simulated sets": screen.sets,
                   "experiment": _longest(r.experiments) + 1 if len(r.experiments) > 1 else ""},
-        seconds=seconds, mode=r.mode, interrupted=r.interrupted,
+        seconds=seconds, mode=r.mode, interrupted=r.interrupted, failures=r.failures,
     )  # fmt: skip
+
+
+def _stands_out(alpha: float, *found: Any) -> bool:
+    """Whether a place or a check of the predictions is more than chance: then there is a gap."""
+    return any(len(t) > 0 and float(np.nanmin(t["p"], initial=1.0)) <= alpha for t in found)
+
+
+def _bound(r: Results) -> str:
+    """Of the parameters of the chosen model that ran to a bound of their support."""
+    if r.chosen is None:
+        return ""
+    names = " and ".join(r.names)
+    return note(r.chosen.fit.bounds, r.chosen.fit.values(), f"the fit with {names}")
 
 
 def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> list[str]:
@@ -162,7 +192,7 @@ def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> lis
             else f"{c.effect.name} on {c.equation}" for c in candidates]  # fmt: skip
 
 
-def _leading(r: Results, order: Sequence[int], found: Classes) -> list[dict[str, Any]]:
+def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
     """The chosen effects: their rows in `causes`, and what the model with all of them says; or the
     one that stands out and could not be refitted."""
     chosen, offered = r.chosen, r.screen.question.candidates
@@ -171,12 +201,11 @@ def _leading(r: Results, order: Sequence[int], found: Classes) -> list[dict[str,
         return [{"row": groups.index(offered[r.unfitted].group), "unfitted": True}]
     if chosen is None:
         return []
-    rows = [groups.index(c.group) for c in chosen.candidates]
-    each = [Refit((order[i],), (c,), chosen.fitter, chosen.fit, chosen.gain)
-            for i, c in zip(rows, chosen.candidates, strict=True)]  # fmt: skip
-    told = tables.causes_table(r.screen, each, found, order, r.tested, r.screened)
-    own = told[["form", "sign", "estimate", "se"]].to_dict("records")
-    return [{"row": i, **own[i]} for i in rows]
+    return [
+        {"row": groups.index(c.group), **tables.estimated(r.screen, chosen, c)}
+        for c in chosen.candidates
+        if c.group in groups
+    ]
 
 
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
@@ -188,23 +217,28 @@ def _verdict(r: Results, where: Any) -> tuple[str, Any]:
         tried = list(best.candidates) if best else []
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= r.alpha and key is not None:
-            return UNLIKE, _curve(r.screen, key, tried)
+            return UNLIKE, _curve(r, key, tried)
     if r.chosen is not None or (least <= r.alpha and not asked):
         return _effect(r, where)
     if not asked:  # nothing is held out: what all of the catalogue leaves
         tried = tables.catalogue(r.screen)
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= LEFT * r.alpha and key is not None:
-            return UNLIKE, _curve(r.screen, key, tried)
-    return "no measurable gap", None
+            return UNLIKE, _curve(r, key, tried)
+    return NOTHING, None
 
 
 def _effect(r: Results, where: Any) -> tuple[str, Any]:
     """That verdict, with the curve of the equation where most is missing."""
+    return "effect", _curve_of(r, where)
+
+
+def _curve_of(r: Results, where: Any) -> Any:
+    """The curve of the equation where most is missing, if that is in its mean."""
     head = where.iloc[0] if len(where) else None
     if head is not None and head["moment"] == "mean":
-        return "effect", _curve(r.screen, (head["equation"], "mean"), ())
-    return "effect", None
+        return _curve(r, (head["equation"], "mean"), ())
+    return None
 
 
 def _curves_beat(far: HowFar, chosen: bool) -> bool:
@@ -216,35 +250,41 @@ def _curves_beat(far: HowFar, chosen: bool) -> bool:
     return not share > 1.0 - MATTERS
 
 
-def _curve(screen: Screen, key: tuple[str, str], others: Sequence[Candidate]) -> Any:
-    return tables.missing_table(screen, key, others) if key[1] == "mean" else None
+def _curve(r: Results, key: tuple[str, str], others: Sequence[Candidate]) -> Any:
+    """The estimated curve of a mean; None of other moments, and where an error ended it."""
+    with r.failures.part("the table 'missing'"):
+        return tables.missing_table(r.screen, key, others) if key[1] == "mean" else None
+    return None
 
 
 def _detection(screen: Screen) -> Any:
     names = screen.question.detection_names(screen.experiments)
-    return detection(
+    found = detection(
         Statistics(names.names, screen.observed.detection, names.quadratic),
         screen.stacked("detection"), screen.observed.nuisance, screen.stacked("nuisance"),
     )  # fmt: skip
+    found["p"] = tables.shared(found["p"])
+    return found
 
 
-def _written(
-    trace: Trace, chosen: Refit, names: Sequence[str], notes: list[str]
-) -> tuple[Model | None, str]:
+def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None, str]:
+    names = " and ".join(r.names)
     try:
-        added = augment(trace, list(chosen.candidates))
+        added = augment(r.trace, list(chosen.candidates))
         if chosen.fitter.start:
             added = chosen.fitter.start.given(added)
         values = {n: v for n, v in chosen.fit.values().items() if n.split("[")[0] in
                   added.parameters}  # fmt: skip
         text = model_text(
-            added, title=f"{trace.name} with {' and '.join(names)}",
+            added, title=f"{r.trace.name} with {names}",
             notes=["Fitted values:", *(f"{n} = {v:.6g}" for n, v in values.items())],
         )  # fmt: skip
         return to_model(added), text
     except SSMError as error:
         notes.append(f"the augmented model is not written: {error.found}")
-        return None, ""
+    except Exception as error:
+        r.failures.met("the augmented model", error)
+    return None, ""
 
 
 def _estimates(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:

@@ -99,7 +99,8 @@ def separating(
     results = kept.each("trying inputs", SETS * len(names), one)
     covariances = {}
     for which, name in enumerate(names):
-        done = [r for r in results[which :: len(names)] if r]
+        own = results[which :: len(names)]
+        done = [r for r in own if not kept.failures.of_task(f"a set under {name}", r) and r]
         if not done:
             continue
         law = Null.of(

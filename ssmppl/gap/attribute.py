@@ -81,49 +81,58 @@ def attribute(
         stages["refitting other delays"] = lambda: delays(screen, refits)
         stages[AFRESH] = lambda: asleep(screen)
     for stage, which in stages.items():
-        heads = which()
-        more, failed = refit_all(
-            workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept, stage,
-            afresh=stage == AFRESH,
-        )  # fmt: skip
-        refits = best_of_groups(screen, refits + more)
-        out.notes += [f"not refitted: {reason}" for reason in failed]
+        with kept.failures.part(stage):
+            heads = which()
+            more, failed = refit_all(
+                workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept,
+                stage, afresh=stage == AFRESH,
+            )  # fmt: skip
+            refits = best_of_groups(screen, refits + more)
+            out.notes += [f"not refitted: {reason}" for reason in failed]
     out.refits = refits
     significant = False
     if not always:
         own = alpha / 2  # of two tests, each has half
-        _rebase(out, workshop, train, _seed(seed, 6), kept, needed_gain(screen, alpha))
+        with kept.failures.part("the model fitted from the best refit"):
+            _rebase(out, workshop, train, _seed(seed, 6), kept, needed_gain(screen, alpha))
         if out.rebased:  # the screen was asked at the wrong place
             out.p |= {r.index[0]: gain_p(screen, r) for r in out.refits}
         else:
             significant = bool(np.min(screen.family.p, initial=1.0) <= own)
             out.unfitted = _unfitted(screen, refits, own)
-        significant |= _by_refit(out, workshop, screen, train, _seed(seed, 4), own, kept)
+        with kept.failures.part("the test of what a refit gains"):
+            significant |= _by_refit(out, workshop, screen, train, _seed(seed, 4), own, kept)
     if not out.refits or not (significant or always) or out.unfitted is not None:
         return
     scales = screen.question.scales
     if not quick:
-        out.refits = shaped_all(
-            workshop, out.base, scales, out.refits, train, _seed(seed, 7), kept,
-            "estimating shapes",
-        )  # fmt: skip
+        with kept.failures.part("estimating shapes"):
+            out.refits = shaped_all(
+                workshop, out.base, scales, out.refits, train, _seed(seed, 7), kept,
+                "estimating shapes",
+            )  # fmt: skip
     out.chosen = out.refits[0]
     single, pair = out.chosen, None
     if steps > 1:
-        rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept)
-        if significant or always:  # a step from the best one, against the best pair
+        rival = None
+        with kept.failures.part("pairs of effects"):
+            rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept)
+        # a step from the best one, against the best pair
+        with kept.failures.part("whether a second effect is missing"):
             _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, 2)
         if rival is not None and rival.merit > out.chosen.merit:
             out.chosen = rival
-        if (significant or always) and len(out.chosen.candidates) == 2:
+        if len(out.chosen.candidates) == 2:
             pair = out.chosen
-            _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
+            with kept.failures.part("whether a third effect is missing"):
+                _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
     out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen]
     if not quick and len(out.chosen.candidates) > 1:
-        (out.chosen,) = shaped_all(
-            workshop, out.base, scales, [out.chosen], train, _seed(seed, 8), kept,
-            "estimating the shapes of all that was chosen",
-        )  # fmt: skip
+        with kept.failures.part("the shapes of all that was chosen"):
+            (out.chosen,) = shaped_all(
+                workshop, out.base, scales, [out.chosen], train, _seed(seed, 8), kept,
+                "estimating the shapes of all that was chosen",
+            )  # fmt: skip
     if not quick:
         measure(out, _seed(seed, 5), kept)
 
@@ -160,13 +169,14 @@ def measure(out: Attribution, seed: np.random.SeedSequence, kept: Checkpoint) ->
     old = out.chosen
     assert old is not None
     number = len(old.candidates)
-    numbers = kept.of(
-        "standard errors" if number == 1 else f"standard errors of {number} effects",
-        lambda: {"information": old.fitter.measured(old.fit, seed).information},
-    )
-    new = replace(old, fit=replace(old.fit, information=np.array(numbers["information"])))
-    out.chosen = new
-    out.refits = [new if r is old else r for r in out.refits]
+    what = "standard errors" if number == 1 else f"standard errors of {number} effects"
+    with kept.failures.part(what):
+        numbers = kept.of(
+            what, lambda: {"information": old.fitter.measured(old.fit, seed).information}
+        )
+        new = replace(old, fit=replace(old.fit, information=np.array(numbers["information"])))
+        out.chosen = new
+        out.refits = [new if r is old else r for r in out.refits]
 
 
 def _rebase(
@@ -257,9 +267,9 @@ def _forward(
         if not more or more[0].merit < needed_gain(again, alpha):
             return
         best = more[0]
-        strengths = {c.key: k for k, c in enumerate(screen.question.candidates)}
+        places = {c.key: k for k, c in enumerate(screen.question.candidates)}
         asked = again.question.candidates[best.index[0]]
-        index = (*chosen.index, strengths[asked.key])
+        index = (*chosen.index, places[asked.key])
         chosen = Refit(
             index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain,
             chosen.cost + best.cost,
@@ -283,8 +293,10 @@ def _screen_again(
 ) -> Screen:  # fmt: skip
     fitter, number = chosen.fitter, len(chosen.candidates)
     question = Question(
-        fitter.problem.trace, screen.question.scales, workshop.missing, tuple(fitter.fixed),
+        fitter.problem.trace, screen.question.scales, workshop.missing,
+        (*fitter.fixed, *chosen.fit.bounds),
         fitter.settings, candidates=rest, simulator=fitter.simulator if fitter.start else None,
+        failures=kept.failures,
     )  # fmt: skip
     stage = f"screening for effect {number + 1}"
     sets = min(screen.sets, AGAIN)

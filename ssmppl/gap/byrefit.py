@@ -5,7 +5,8 @@ refit gains, as the refit lets the noise shrink again (a break in the level of a
 the gain itself is tested: by the law of the scores, which is the same to first order (likelihood
 ratio and score tests); in short records, where a fit is quick and first order a poor guide, by its
 own: data sets simulated at theta-hat are fitted, screened and refitted as the data were. That test
-stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991).
+stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991), and as
+soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from ssmppl.inference.particles.filtering import random_state
 LAX = 4.0  # times alpha, up to which a closer look is worth it
 TRIED = 2  # candidates refitted in each set, the best by the score
 SETS, CHUNK = 99, 10
+ENOUGH, CLEAR = 30, 0.1  # sets from which their tail is believed, where p is such a share of alpha
 MOST_WORK = 1.5e5  # rows times particles, beyond which the fits would take too long
 MOST_ROWS = 300  # from which on the law of the scores is taken
 
@@ -53,7 +55,8 @@ def refit_p(
     workshop: Workshop, base: Fit, screen: Screen, refits: Sequence[Refit], alpha: float,
     seed: np.random.SeedSequence, kept: Checkpoint,
 ) -> float:  # fmt: skip
-    """p of the largest gain among the `TRIED` best; 1 / (sets + 1) at least.
+    """p of the largest gain among the `TRIED` best; by their count 1 / (sets + 1) at least, smaller
+    by their tail.
 
     base : the model's fit to the screen's experiments.
     """
@@ -61,11 +64,18 @@ def refit_p(
     one = partial(_one, workshop, base, screen, seed)
     for last in range(CHUNK, SETS + CHUNK, CHUNK):
         found = kept.each("refitting simulated data", min(last, SETS), one)
-        gains = np.array([float(f["gain"]) for f in found])
+        for f in found:
+            kept.failures.of_task("a refit of simulated data", f)
+        gains = np.array([float(f.get("gain", np.nan)) for f in found])
         done = int(np.sum(np.isfinite(gains)))
         beyond = int(np.sum(gains >= gain))
         if (beyond + 1.0) / (SETS + 1.0) > alpha:
             break
+        if beyond == 0 and done >= ENOUGH:
+            heights = np.sqrt(2.0 * np.maximum(gains[np.isfinite(gains)], 0.0))
+            p = tail_p(float(np.sqrt(2.0 * max(gain, 0.0))), heights)
+            if p <= CLEAR * alpha:
+                return p
     return (beyond + 1.0) / (done + 1.0)
 
 

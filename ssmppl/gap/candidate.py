@@ -83,6 +83,11 @@ class Candidate:
         """What it does to its equation, as a kind other than "state"."""
         return OF_ROLE[self.role] if self.kind == "state" else self.kind
 
+    @property
+    def sided(self) -> int:
+        """The sign that its strength must have, 0 for both."""
+        return int(self.effect.lower >= 0.0) - int(self.effect.upper <= 0.0)
+
     def variable(self, argument: str) -> str:
         """The label of what an argument stands for; "" is the first."""
         own = {"": self.equation, self.effect.arguments[0]: self.equation}

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.gap.anatomy import Anatomy, Part
@@ -17,6 +17,7 @@ from ssmppl.gap.candidate import OF_ROLE, Candidate
 from ssmppl.gap.catalogue import effects as catalogue
 from ssmppl.gap.declared import ON
 from ssmppl.gap.effect import Effect
+from ssmppl.gap.failures import Failures
 from ssmppl.gap.flows import Flows
 from ssmppl.gap.laws import has_scale, has_tail, scale_of_mean
 from ssmppl.gap.profiles import ONE_OFF
@@ -52,7 +53,7 @@ Chosen = Iterable["Effect | str"] | Mapping[str, "Effect | str"] | None
 
 
 def offers(
-    trace: Trace, scales: Scales, effects: Chosen = None
+    trace: Trace, scales: Scales, effects: Chosen = None, failures: Failures | None = None
 ) -> tuple[list[Candidate], list[Refused]]:
     """The candidates that apply to a model, and what does not with the reason.
 
@@ -61,6 +62,7 @@ def offers(
     effects : names restrict the catalogue to them; own effects alone are added to it, in place of
         what has the same name there; both together are just these. A mapping renames and
         restricts: ``{"my name": "coulomb friction"}``.
+    failures : takes the effects that a fault of this package ends; None: faults are raised.
 
     Raises
     ------
@@ -71,8 +73,15 @@ def offers(
     shared = Flows.of(anatomy)
     out: list[Candidate] = []
     refused: list[Refused] = []
+    failures = failures or Failures(raised=True)
     for effect in chosen(effects):
-        found, not_for = _of_effect(effect, anatomy, scales, shared)
+        try:
+            found, not_for = _of_effect(effect, anatomy, scales, shared)
+        except SSMError:  # of the user's own effect, or of their model
+            raise
+        except Exception as error:
+            failures.met(f"the effect {effect.name!r}", error)
+            continue
         out += found
         refused += not_for
     return _named(out, anatomy), refused

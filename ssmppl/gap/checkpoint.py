@@ -20,6 +20,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.gap.effect import Effect
+from ssmppl.gap.failures import FAULT, Failures, Tolerant
 from ssmppl.inference.checkpoints.archive import no_checkpoint, read, unwritable, write
 from ssmppl.inference.checkpoints.origin import (
     Origin,
@@ -48,7 +49,8 @@ class Checkpoint:
 
     path : a file, or a folder that has one file for each mode; neither needs to exist.
     made_from : digests by what they are of: "model", "data", ...
-    executor, progress : where tasks run, and whether they are shown, on stderr.
+    executor, progress : where tasks run, and whether they are shown, on stderr. failures : takes
+    what fails in between.
 
     Raises
     ------
@@ -58,8 +60,10 @@ class Checkpoint:
     def __init__(
         self, path: str | os.PathLike[str] | None, made_from: Mapping[str, str],
         executor: Executor | None = None, progress: bool = False,
+        failures: Failures | None = None,
     ):  # fmt: skip
         self.made_from = Origin(dict(made_from))
+        self.failures = failures or Failures()
         self.executor, self.progress = executor, progress
         self.prefix = ""
         self.file = None if path is None else _file(Path(path), made_from.get("mode", "stages"))
@@ -112,23 +116,30 @@ class Checkpoint:
     ) -> list[Numbers]:
         """The numbers of task(0), ..., task(count - 1), those left out that are there.
 
-        A task may run in another process: a function of a module, or a `partial` of one. At Ctrl-C
-        the tasks that are done are kept, and KeyboardInterrupt goes on.
+        A task may run in another process: a function of a module, or a `partial` of one. One that
+        a fault of this package ends has that for its numbers (`Tolerant`), and is not kept: the
+        next call tries again. At Ctrl-C the tasks that are done are kept, and KeyboardInterrupt
+        goes on.
         """
         todo = [k for k in range(count) if f"{stage}/{k}" not in self]
+        lost: dict[int, Numbers] = {}
 
         def take(i: int, numbers: Mapping[str, Any]) -> None:
-            self.put(f"{stage}/{todo[i]}", numbers)
+            if FAULT in numbers:
+                lost[todo[i]] = dict(numbers)
+            else:
+                self.put(f"{stage}/{todo[i]}", numbers)
 
         try:
             if todo:
                 run_tasks(
-                    task, todo, executor=self.executor, progress=self.progress,
-                    title=self.prefix + stage, take=take,
+                    task if self.failures.raised else Tolerant(task), todo,
+                    executor=self.executor, progress=self.progress, title=self.prefix + stage,
+                    take=take,
                 )  # fmt: skip
         finally:
             self.flush()
-        return [self.get(f"{stage}/{k}") for k in range(count)]
+        return [lost[k] if k in lost else self.get(f"{stage}/{k}") for k in range(count)]
 
     # -- the file
     def _write(self) -> None:
@@ -167,6 +178,7 @@ class _Part(Checkpoint):
         self._whole, self.prefix = whole, f"{whole.prefix}{stage}: "
         self._own = f"{stage}: "
         self.executor, self.progress = whole.executor, whole.progress
+        self.failures = whole.failures
 
     def __contains__(self, name: str) -> bool:
         return self._own + name in self._whole

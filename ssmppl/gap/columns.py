@@ -51,7 +51,8 @@ def score_columns(
     base: Trace, superset: Trace, strengths: Collection[str], held: Collection[str],
     missing: Missing,
 ) -> Columns:  # fmt: skip
-    """The columns of a model with candidates; `held` parameters have none.
+    """The columns of a model with candidates; `held` parameters, or components of them by their
+    text, have none.
 
     superset : the base model with candidates, as of `augment`; the base itself for none.
     strengths : names of the superset's parameters that are strengths; other further parameters
@@ -62,7 +63,7 @@ def score_columns(
     # Auxiliary states come in multiplied by a strength, which is zero.
     inert = frozenset(superset.state_symbols) - frozenset(base.state_symbols)
     superset = _linear_in(superset, strengths, inert)
-    free = [s for s in superset.parameter_symbols if s.data[1] not in held]
+    free = [s for s in superset.parameter_symbols if not {s.data[1], repr(s)} & set(held)]
     free = [s for s in free if s in own or s.data[1] in strengths]
     derived = CompleteScore(superset, free, missing, inert)
     for s in free:

@@ -23,7 +23,7 @@ from ssmppl.errors import ArgumentError, SSMError
 from ssmppl.gap.attribute import Attribution, attribute
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
-from ssmppl.gap.closed import closed
+from ssmppl.gap.closed import FEWEST_BLOCKS, closed
 from ssmppl.gap.confirm import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import FOLDS, Fold, folds
@@ -31,7 +31,7 @@ from ssmppl.gap.profiles import one_off
 from ssmppl.gap.reference import fit_reference
 from ssmppl.gap.refit import Refit
 from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.share import NOT_GIVEN, HowFar, notes_of
+from ssmppl.gap.share import NOT_GIVEN, HowFar, interval_of, notes_of
 from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.simulation import feeds_back
 
@@ -64,10 +64,19 @@ class CrossFit:
         try:
             for k, fold in enumerate(parts):
                 own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 20, k))
-                where = kept.within(f"block {k + 1} of {len(parts)}")
-                each.append(where.of("held out", partial(self._one, fold, own, where)))
+                name = f"block {k + 1} of {len(parts)}"
+                where = kept.within(name)
+                try:
+                    each.append(where.of("held out", partial(self._one, fold, own, where)))
+                except SSMError:  # a block that a model cannot predict is no block to leave out
+                    raise
+                except Exception as error:
+                    kept.failures.met(name, error)
         except SSMError as error:
             out.notes.append(NOT_GIVEN.format(error.found))
+            return out
+        if len(each) < FEWEST_BLOCKS:
+            out.notes.append(NOT_GIVEN.format(f"{len(each)} of {len(parts)} blocks are done"))
             return out
         table = {n: np.stack([v[n] for v in each], axis=-1) for n in each[0]}
         share = closed(table["base"], table["effect"], table["reference"], block=1)
@@ -75,8 +84,9 @@ class CrossFit:
         out.beyond = closed(rival, best, best, block=1).gain
         size = table["rows"] / table["rows"].sum()
         mean = float(table["gain_mean"].sum())
+        low, high = interval_of(share)
         out.rows.append({
-            "effect": label, "F": share.F, "F_low": share.low, "F_high": share.high,
+            "effect": label, "F": share.F, "F_low": low, "F_high": high,
             "nats_per_sample": share.gain.nats / float(table["rows"].sum()), "gain_mean": mean,
             "gain_noise": share.gain.nats - mean,
             "rmse_before": float(np.sqrt(np.sum(size * table["before"] ** 2))),

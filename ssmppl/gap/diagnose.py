@@ -20,6 +20,7 @@ from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.gap.answer import Results, answer
 from ssmppl.gap.apart import separating
 from ssmppl.gap.attribute import MOST_WORK, Attribution, attribute, measure
+from ssmppl.gap.bounds import note
 from ssmppl.gap.candidates import Chosen
 from ssmppl.gap.candidates import chosen as chosen_effects
 from ssmppl.gap.checkpoint import Checkpoint, Numbers, digests
@@ -27,6 +28,7 @@ from ssmppl.gap.confirm import Predictions, predict
 from ssmppl.gap.crossfit import CrossFit
 from ssmppl.gap.expected import Timed, in_words, timed
 from ssmppl.gap.expected import seconds as expected
+from ssmppl.gap.failures import Failures, reason_of
 from ssmppl.gap.fit import Fit, Fitter
 from ssmppl.gap.parts import FOLDS, Parts, long_enough, three_parts
 from ssmppl.gap.profiles import passing
@@ -63,6 +65,7 @@ def diagnose(
     checkpoint: str | os.PathLike[str] | None = None,
     progress: bool = True,
     seed: int | None = 1,
+    debug: bool = False,
 ) -> GapReport:
     """Find where a model differs from reality, and which effect that it lacks causes this.
 
@@ -86,6 +89,8 @@ def diagnose(
         there and gives the same report. None: nothing is kept.
     progress : whether to show the stages and the time that they will take, on stderr.
     seed : the same seed gives the same report.
+    debug : the first fault of this package is raised, where else the part that it ended (a
+        candidate, a refit, a block, a table) is left out: see `GapReport.left_out`.
 
     Returns
     -------
@@ -95,6 +100,7 @@ def diagnose(
     Raises
     ------
     ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
+    SSMError : the fit or the screen, without which there is no answer, ended in a fault.
     """
     if mode not in MODES:
         raise ArgumentError(f"mode={mode!r}", fix=f"use one of: {listing(str(mode), MODES)}")
@@ -103,7 +109,18 @@ def diagnose(
         check_count("particles", particles, 10)
     check_executor(executor)
     return _Diagnosis(
-        model, data, effects, mode, alpha, fixed, particles, executor, checkpoint, progress, seed
+        model,
+        data,
+        effects,
+        mode,
+        alpha,
+        fixed,
+        particles,
+        executor,
+        checkpoint,
+        progress,
+        seed,
+        Failures(debug),
     ).run()
 
 
@@ -114,7 +131,9 @@ class _Diagnosis:
         self, model: Model, data: Any, effects: Chosen, mode: str, alpha: float,
         fixed: Mapping[str, Any] | None, particles: int | None, executor: Executor | None,
         checkpoint: str | os.PathLike[str] | None, progress: bool, seed: int | None,
+        failures: Failures,
     ):  # fmt: skip
+        self.failures = failures
         self.began = time.perf_counter()
         self.problem = pose(model, data)
         self.trace = self.problem.trace
@@ -144,7 +163,7 @@ class _Diagnosis:
             "sets": SETS[mode],
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
-        self.kept = Checkpoint(checkpoint, made_from, executor, progress)
+        self.kept = Checkpoint(checkpoint, made_from, executor, progress, failures)
 
     def run(self) -> GapReport:
         """All stages, and the report; after an interrupt, of those that are done."""
@@ -156,9 +175,18 @@ class _Diagnosis:
                 except KeyboardInterrupt:
                     results.interrupted = True
                     self.kept.say("interrupted: the report is of the stages that are done")
+            return answer(results, time.perf_counter() - self.began)
+        except SSMError:
+            raise
+        except Exception as error:
+            if self.failures.raised:
+                raise
+            raise SSMError(
+                f"the diagnosis of {self.trace.name!r} could not be finished: {reason_of(error)}",
+                fix="please report it with the model and the data; debug=True shows where it is",
+            ) from error
         finally:
             self.kept.flush()
-        return answer(results, time.perf_counter() - self.began)
 
     # -- stages
     def _screened(self) -> Results:
@@ -170,7 +198,7 @@ class _Diagnosis:
         self.workshop.start = start_of(self.trace, [x[0].mean(axis=0) for x in states], states)
         question = Question(
             self.trace, self._scales(states, training), self.workshop.missing,
-            tuple(self.fixed), self.settings, self.effects,
+            (*self.fixed, *fit.bounds), self.settings, self.effects, failures=self.failures,
         )  # fmt: skip
         if not question.candidates:
             raise ArgumentError(
@@ -178,7 +206,8 @@ class _Diagnosis:
                 + "; ".join(map(str, question.refused[:3])),
                 fix="name others in effects=; ssm.effects.names() lists them",
             )
-        self._tell_time(base, fit, question, training)
+        with self.failures.part("the time that is expected"):
+            self._tell_time(base, fit, question, training)
         screen = ask(question, training, fit.theta, SETS[self.mode], self._seed(2), self.kept)
         settings = {
             "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
@@ -186,22 +215,26 @@ class _Diagnosis:
         }  # fmt: skip
         return Results(
             self.trace, self.experiments, self.parts, self.mode, self.alpha, base, fit, screen,
-            settings, self.notes,
+            settings, self.notes, self.failures,
         )  # fmt: skip
 
     def _explained(self, r: Results) -> None:
         """Refit and choose, tell apart, and measure how far the gap closes; into `r`."""
         found = Attribution(r.fit)
-        attribute(
-            found, self.workshop, r.screen, r.screen.experiments, self._seed(4), self.alpha,
-            self.kept,
-        )  # fmt: skip
+        with self.failures.part("the choice of an effect"):
+            attribute(
+                found, self.workshop, r.screen, r.screen.experiments, self._seed(4), self.alpha,
+                self.kept,
+            )  # fmt: skip
         r.attribution, r.fit = found, found.base
         if found.unfitted is not None:  # nothing to measure, then
             return
-        self._borne_out(r)
-        self._separated(r)
-        r.far = self._how_far(r)
+        with self.failures.part("whether several effects predict better than fewer"):
+            self._borne_out(r)
+        with self.failures.part("the input that would separate the class best"):
+            self._separated(r)
+        with self.failures.part("how far the gap closes"):
+            r.far = self._how_far(r)
 
     def _borne_out(self, r: Results) -> None:
         """Of several effects chosen together, fewer again while all of them predict the held-out
@@ -253,8 +286,8 @@ class _Diagnosis:
             missing = replace(self.workshop.missing, none=False)
             workshop = Workshop(self.trace, missing, self.fixed, self.settings, self.workshop.start)
             question = Question(
-                self.trace, question.scales, missing, tuple(self.fixed), self.settings,
-                self.effects,
+                self.trace, question.scales, missing, (*self.fixed, *r.fit.bounds),
+                self.settings, self.effects, failures=self.failures,
             )  # fmt: skip
             fitter = workshop.fitter(())
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
@@ -288,6 +321,8 @@ class _Diagnosis:
         if not fit.converged:
             left = f": about {fit.distance:.1f} nats may be left" if fit.distance > 0.0 else ""
             self.notes.append(f"the fit of the model did not settle ({stage}){left}")
+        if fit.bounds:
+            self.notes.append(note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}"))
         return fit
 
     def _tell_time(

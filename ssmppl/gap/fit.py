@@ -1,21 +1,26 @@
-"""Fits of a model and of its augmentations: the mode of the posterior, by scoring.
+"""Fits of a model and of its augmentations: the mode of the posterior.
 
-Linear Gaussian models are climbed with their exact score, others with the particle smoother's: see
-`noisy_climb`. How far the top still is is told in nats: g' H^-1 g / 2 is what a quadratic would
-still gain.
+Linear Gaussian models are climbed with their exact score. Others are climbed by the extended Kalman
+filter's log-likelihood where there is one, which is smooth and takes a millisecond, from several
+starts, and from there by the particle smoother's score (`noisy_climb`). How far the top still is is
+told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from ssmppl.codegen.twisted import TwistedFilter
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import SamplingError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import symbols_of
+from ssmppl.gap.bounds import bounded, names_of
 from ssmppl.gap.columns import Columns, score_columns
 from ssmppl.gap.noisy_climb import NEAR, noisy_climb
 from ssmppl.gap.simulator import Simulator
@@ -23,7 +28,10 @@ from ssmppl.gap.smoothing import Settings, Smoother
 from ssmppl.gap.started import FirstStates, Start
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.maximum.direct_optimization import climb, observed_information
+from ssmppl.inference.maximum.by_differences import climb
+from ssmppl.inference.maximum.chart import Chart
+from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
+from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods import DirectOptimization
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings, random_state
@@ -37,8 +45,11 @@ INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
 PILOT_PARTICLES = 300
 PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
 NUMBERS = (
-    "theta", "z", "log_likelihood", "error", "information", "distance", "converged",
+    "theta", "z", "log_likelihood", "error", "information", "distance", "converged", "at_bound",
 )  # fmt: skip
+QUIETER = (1.0, 0.3, 0.1)  # times the noise of the transition, from which climbs start
+ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
+SPREAD = 0.1  # least information of a logarithm that steps are made with
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,8 @@ class Fit:
     theta : (P,). z : (F,). log_likelihood : at theta; error : its Monte Carlo standard deviation,
     0 where exact. information : (F, F), minus the second derivatives of log p(y) in z, about.
     distance : nats from the top by the last score. converged : whether that is a small number.
+    at_bound : (F,) bool, which numbers ran to a bound of their support, where they are held: they
+    are left out of the information (`bounds`).
     """
 
     space: Space
@@ -58,6 +71,12 @@ class Fit:
     information: np.ndarray
     distance: float
     converged: bool
+    at_bound: np.ndarray
+
+    @property
+    def bounds(self) -> list[str]:
+        """Components that ran to a bound of their support, by their text."""
+        return names_of(self.space, self.at_bound)
 
     @property
     def problem(self) -> Problem:
@@ -135,8 +154,8 @@ class Fitter:
             float(numbers[n]) for n in ("log_likelihood", "error", "distance")
         )
         return Fit(space, theta, np.array(numbers["z"]), value, error,
-                   np.array(numbers["information"]), distance,
-                   bool(numbers["converged"]))  # fmt: skip
+                   np.array(numbers["information"]), distance, bool(numbers["converged"]),
+                   np.array(numbers["at_bound"], dtype=bool))  # fmt: skip
 
     def fit(
         self, experiments: Sequence[Experiment], seed: np.random.SeedSequence,
@@ -160,14 +179,89 @@ class Fitter:
             return self._exactly(self.kalman, space, dict(start), seed, quick, climbs)
         if information is not None:
             information = self._unconstrained(space, space.theta, information, seed)
+        smooth = self._extended(problem)
         if not searched:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
+                if smooth is not None:
+                    return smooth(theta)
                 return self._estimate(problem, theta, self.few, random_state(seed))
 
             z, _ = climb_to_mode(space, seed, estimate)
             space = at(space, space.parameters(z)[0].copy())
-        return self._climb(space, seed, information)
+        if smooth is not None:
+            space, curvature = self._by_extended(space, smooth, seed)
+            information = curvature if curvature is not None else information
+        return self._climb(space, seed, information, smooth)
+
+    # -- by the extended Kalman filter
+    def _extended(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
+        """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no
+        number; None where the model has no such filter."""
+        twisted = problem.program.twisted if self.settings.proposal == "twisted" else None
+        if not isinstance(twisted, TwistedFilter):
+            return None
+
+        def value(theta: np.ndarray) -> float:
+            total = 0.0
+            for e in problem.experiments:
+                total += twisted.extended_log_likelihood(theta, e.y, e.seen, e.u) + self.height
+            return total if np.isfinite(total) else -np.inf
+
+        return value
+
+    def _by_extended(
+        self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence
+    ) -> tuple[Space, np.ndarray | None]:
+        """The top of that, and minus the second derivatives there (F, F), from where the space
+        stands; as it is, and None, where the particle filter knows better."""
+        function = density_of(space, smooth)
+        tops = []
+        for share in QUIETER:
+            begin = self._quieter(space, share)
+            top = climb(function, begin.z[begin.where])
+            if top is not None:
+                tops.append(top)
+        if not tops:
+            return space, None
+        best = max(tops, key=lambda top: top.value)
+        there = at(space, space.parameters(best.z)[0].copy())
+        was, now = (
+            self._estimate(s.problem, s.theta, self.settings.particles, random_state(seed, 8))
+            for s in (space, there)
+        )
+        if not now >= was - ASTRAY:
+            return space, None
+        return there, steady(best.information, ~space.on_the_line)
+
+    def _quieter(self, space: Space, share: float) -> Space:
+        """The space with the scales of the transition's noise at a share of what they are."""
+        names = [n for n in self._noises if n not in self.fixed]
+        if share == 1.0 or not names:
+            return space
+        trace = space.problem.trace
+        theta = np.array([
+            v * share if s.data[1] in names else v
+            for s, v in zip(trace.parameter_symbols, space.theta, strict=True)
+        ])  # fmt: skip
+        return at(space, theta)
+
+    @cached_property
+    def _noises(self) -> set[str]:
+        """Positive parameters that the noise of the transition is made of."""
+        twisted, trace = self.problem.program.twisted, self.problem.trace
+        if not isinstance(twisted, TwistedFilter):
+            return set()
+        inside = {s.data[1] for s in symbols_of(list(twisted.found.transition.spread().ravel()))
+                  if s.data[0] == "parameter"}  # fmt: skip
+        out = set()
+        for name in inside:
+            support = trace.parameters[name].distribution.support()
+            ends = [e for end in (support.lower, support.upper) for e in array(end).ravel()]
+            if support.kind == "interval" and all(e.op == "const" for e in ends):
+                if {e.data for e in ends} == {0.0, np.inf}:
+                    out.add(name)
+        return out
 
     def _exactly(
         self, kalman: KalmanModel, space: Space, start: dict[str, np.ndarray],
@@ -175,16 +269,23 @@ class Fitter:
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Setup(problem, space, "posterior", self.fixed, start, seed)
-        if len(space.where):
-            ascent = climb(setup, DirectOptimization(restarts=climbs))
+        function = density_of(space, lambda t: kalman.log_likelihood(problem.experiments, t))
+        top = None
+        if quick and not climbs:  # from near the top, and to within what a decision needs
+            top = climb(function, space.z[space.where])
+        if top is not None and top.distance < NEAR:
+            theta, converged = space.parameters(top.z)[0].copy(), True
+        elif len(space.where):
+            ascent = climb_exactly(setup, DirectOptimization(restarts=climbs))
             theta, converged = ascent.theta, bool(ascent.report["converged"])
         else:
             theta, converged = space.theta, True
-        z = setup.space_at(theta)
+        z, mask = bounded(function, setup.space_at(theta), ~space.on_the_line)
+        theta = space.parameters(z)[0].copy() if mask.any() else theta
         value = kalman.log_likelihood(problem.experiments, theta)
         size = len(space.where)
         information = np.full((size, size), np.nan)
-        fit = Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged)
+        fit = Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged, mask)
         return fit if quick else self.measured(fit, seed)
 
     def states(
@@ -200,11 +301,10 @@ class Fitter:
         return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
 
     def gradient(
-        self, space: Space, z: np.ndarray, stream: np.ndarray
+        self, space: Space, z: np.ndarray, stream: np.ndarray, chart: Chart | None = None
     ) -> tuple[float, np.ndarray] | None:
         """(log p(y) + log prior, its derivatives (F,) in z), estimated; None where none is."""
-        setup = Setup(space.problem, space, "posterior", self.fixed, {}, np.random.SeedSequence(0))
-        point = setup.chart.at(z)
+        point = (chart or Chart(space)).at(z)
         if point.log_prior == -np.inf:
             return None
         try:
@@ -222,13 +322,15 @@ class Fitter:
         return value + point.log_prior, slope
 
     def _climb(
-        self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
-    ) -> Fit:
+        self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None,
+        smooth: Callable[[np.ndarray], float] | None,
+    ) -> Fit:  # fmt: skip
         stream = random_state(seed, 1)
         z = space.z[space.where]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
-        found = self.gradient(space, z, stream)
+        chart = Chart(space)
+        found = self.gradient(space, z, stream, chart)
         if found is None:
             raise SamplingError(
                 f"the model {space.problem.trace.name!r} cannot have produced the data where its "
@@ -237,11 +339,15 @@ class Fitter:
                 "values",
             )
         z, h, distance = noisy_climb(
-            lambda z: self.gradient(space, z, stream), z, found, information
+            lambda z: self.gradient(space, z, stream, chart), z, found, information
         )
+        mask = np.zeros(len(z), dtype=bool)
+        if smooth is not None:
+            z, mask = bounded(density_of(space, smooth), z, ~space.on_the_line)
         theta = space.parameters(z)[0].copy()
         value, error = self.log_likelihood(space.problem.experiments, theta, seed)
-        return Fit(at(space, theta), theta, z, value, error, h, distance, distance < 3.0 * NEAR)
+        converged = distance < 3.0 * NEAR
+        return Fit(at(space, theta), theta, z, value, error, h, distance, converged, mask)
 
     def log_likelihood(
         self, experiments: Sequence[Experiment], theta: np.ndarray, seed: np.random.SeedSequence,
@@ -350,3 +456,29 @@ class Fitter:
             )
         square = np.mean([np.outer(s, s) for s in scores], axis=0)
         return self._unconstrained(space, theta, square, seed)
+
+
+def density_of(
+    space: Space, log_likelihood: Callable[[np.ndarray], float]
+) -> Callable[[np.ndarray], float]:
+    """z (F,) -> log likelihood + log prior density of theta, -inf off the support."""
+    log_prior = space.problem.program.entry("log_prior") if len(space.theta) else None
+
+    def value(z: np.ndarray) -> float:
+        theta, inside = space.parameters(z)
+        if inside == -np.inf or log_prior is None:
+            return -np.inf if inside == -np.inf else log_likelihood(theta)
+        found = log_likelihood(theta) + float(log_prior(theta))
+        return found if np.isfinite(found) else -np.inf
+
+    return value
+
+
+def steady(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
+    """(F, F) positive definite and near to `information`, for the steps of a climb; `logarithms`
+    (F,) are known to have moderate units, and steps of them are kept moderate."""
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), np.where(logarithms, SPREAD, 0.0)))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    lifted = (vectors * np.maximum(np.abs(values), 0.05)) @ vectors.T
+    return lifted * np.outer(scale, scale)

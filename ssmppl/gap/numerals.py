@@ -77,9 +77,10 @@ def p_text(p: Any) -> str:
 
 
 def interval(low: Any, high: Any) -> str:
-    """The ends of a 95% interval of a share, also where the data bound it on one side or none."""
+    """The ends of a 95% interval of a share, also where the data bound it on one side or none; NaN
+    where the share is of the reference itself."""
     if not (is_number(low) and is_number(high)):
-        return "no interval could be computed"
+        return "no comparison: the reference is this model itself"
     below, above = math.isinf(float(low)), math.isinf(float(high))
     if below and above:
         return "95% interval: unbounded"

@@ -14,6 +14,7 @@ from ssmppl.gap.words import (
     headline,
     how_far,
     how_sure,
+    left_out,
     next_steps,
     untold,
     where,
@@ -120,6 +121,7 @@ def _rest(report: GapReport) -> list[tuple[str, list[str]]]:
     found = [
         ("Could not be told", untold(report)), ("What next", next_steps(report)),
         ("Notes", [sentence(n) for n in report.notes]),
+        ("Left out", left_out(report)),
     ]  # fmt: skip
     return [(name, items) for name, items in found if items]
 

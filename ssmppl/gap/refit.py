@@ -32,7 +32,10 @@ SAME = 0.95  # beyond which two candidates are one to begin with
 SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
 NEAR = 25.0  # nats behind the best, up to which other delays are tried
 ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
+OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
+AGAIN = 2  # times that a fit which left more is taken up where it ended
 LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
+LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
 LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
 
@@ -69,14 +72,26 @@ class Refit:
 
 
 def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """By the text of each component; 0 for what is fixed, NaN where there is no information."""
-    if not np.all(np.isfinite(fit.information)):
-        return {repr(s): np.nan for s in fit.problem.trace.parameter_symbols}
+    """By the text of each component; 0 for what is fixed, NaN where there is no information: for
+    what ran to a bound of its support, and for all where the information about the others is not
+    positive definite."""
+    symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
+    nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
+    information = fit.information[np.ix_(free, free)]
+    if not np.all(np.isfinite(information)):
+        return nothing
+    scale = np.sqrt(np.abs(np.diagonal(information)))
+    if not np.all(scale > 0.0):
+        return nothing
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if len(values) and values[0] <= LEAST_INFORMATION:
+        return nothing
     setup = Setup(fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0))
     jacobian = setup.chart.at(fit.z).jacobian
-    covariance = jacobian @ np.linalg.pinv(fit.information) @ jacobian.T
-    symbols = fit.problem.trace.parameter_symbols
-    spread = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    root = (jacobian[:, free] / scale) @ (vectors / np.sqrt(values))
+    spread = np.sqrt(np.sum(root**2, axis=1))
+    held = np.any(jacobian[:, fit.at_bound] != 0.0, axis=1)
+    spread = np.where(held, np.nan, spread)
     return {repr(s): float(v) for s, v in zip(symbols, spread, strict=True)}
 
 
@@ -103,11 +118,29 @@ def refit(
             information = None if fitter.exact else _information(fitter, screen, index, train)
             fit = fitter.fit(train, seed, start, searched=True, information=information,
                              quick=len(candidates) > 1)  # fmt: skip
+        for _ in range(AGAIN):
+            if not open_ended(fit, base):
+                break
+            more = fitter.fit(train, seed, fit.start, searched=True, quick=len(candidates) > 1)
+            fit = max(fit, more, key=lambda f: f.log_likelihood)
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
+    name = " and ".join(map(str, candidates))
     if not np.isfinite(fit.log_likelihood):
-        return NotApplicable(f"{' and '.join(map(str, candidates))}: the likelihood is zero")
-    return Refit(tuple(index), candidates, fitter, fit, fit.log_likelihood - base.log_likelihood)
+        return NotApplicable(f"{name}: the likelihood is zero")
+    gain = fit.log_likelihood - base.log_likelihood
+    if open_ended(fit, base):  # what it happened to reach is no rank
+        return NotApplicable(
+            f"{name}: its fit did not settle: it gains {gain:.0f} nats at least, and about "
+            f"{fit.distance:.0f} may be left"
+        )
+    return Refit(tuple(index), candidates, fitter, fit, gain)
+
+
+def open_ended(fit: Fit, base: Fit) -> bool:
+    """Whether a fit is so far from its top that what it gains says little."""
+    gain = fit.log_likelihood - base.log_likelihood
+    return not fit.converged and fit.distance > max(OPEN, OPEN_SHARE * abs(gain))
 
 
 def _shortened(
@@ -272,6 +305,9 @@ def refit_all(
     done, reasons = [], []
     results = kept.each(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
+        name = " and ".join(map(str, candidates))
+        if kept.failures.of_task(f"the refit with {name}", numbers):
+            continue
         if "reason" in numbers:
             reasons.append(str(numbers["reason"]))
             continue
@@ -279,8 +315,9 @@ def refit_all(
         fit = fitter.restored(train, numbers)
         gain = fit.log_likelihood - base.log_likelihood
         if gain < -LOST - 3.0 * np.hypot(fit.error, base.error):
-            reasons.append(f"{' and '.join(map(str, candidates))}: its fit lost its way, and ended "
-                           f"{-gain:.0f} nats below the model's own")  # fmt: skip
+            reasons.append(
+                f"{name}: its fit lost its way, and ended {-gain:.0f} nats below the model's own"
+            )
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
         done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))

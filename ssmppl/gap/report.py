@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssmppl.errors import ArgumentError, listing
+from ssmppl.gap.failures import Failures
 from ssmppl.gap.printed import report_html, report_text
 from ssmppl.language.model import Model
 
@@ -44,6 +45,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "after_low", "after_high",
     ),
     "not_applicable": ("part", "equation", "reason"),
+    "left_out": ("part", "reason"),
 }  # fmt: skip
 
 # Entered by `ssmppl.plots`: "plot" (report) -> Figure, "save" (report, folder) -> Path.
@@ -114,6 +116,7 @@ class GapReport:
         `model` (name), `samples`, `seed`, `experiment` (whose rows `parts` tells, of several).
     seconds, mode, interrupted : run time; "full" or "fast" (which stops after the screen); whether
         it was interrupted, and only the stages done before are here.
+    failures : the parts that an error ended, while the rest went on: see `left_out`.
     """
 
     verdict: str
@@ -137,6 +140,7 @@ class GapReport:
     seconds: float = 0.0
     mode: str = "full"
     interrupted: bool = False
+    failures: Failures = field(default_factory=Failures)
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -162,12 +166,18 @@ class GapReport:
         Returns
         -------
         dict of DataFrames
-            `where`, `causes`, `classes`, `closed` and the others above; `missing` only if there is
-            one.
+            `where`, `causes`, `classes`, `closed` and the others above, and `left_out`; `missing`
+            only if there is one.
         """
         names = [f.name for f in fields(self) if f.name in COLUMNS]
-        found = {name: getattr(self, name) for name in names}
+        found = {name: getattr(self, name) for name in [*names, "left_out"]}
         return {name: table for name, table in found.items() if table is not None}
+
+    @property
+    def left_out(self) -> pd.DataFrame:
+        """What an error ended: the part (a candidate, a refit, a block, a table, a panel) and the
+        reason in one line; no rows where the answer is complete."""
+        return tabulate("left_out", [{"part": p, "reason": r} for p, r in self.failures])
 
     @property
     def title(self) -> str:

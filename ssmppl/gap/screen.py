@@ -14,7 +14,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.data import Experiment
-from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.gap import detect, series
 from ssmppl.gap.ahead import mean_scores
 from ssmppl.gap.augment import augment
@@ -22,8 +22,9 @@ from ssmppl.gap.basis import Term, basis, lifted
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import Chosen, Refused, offers
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
-from ssmppl.gap.columns import score_columns
+from ssmppl.gap.columns import Columns, score_columns
 from ssmppl.gap.efficient import Efficient, Null, efficient
+from ssmppl.gap.failures import FAULT, Failures
 from ssmppl.gap.familywise import FamilyWise, familywise
 from ssmppl.gap.profiles import Profiles, dated
 from ssmppl.gap.realised import excess, typical
@@ -63,27 +64,35 @@ class Question:
         self, trace: Trace, scales: Scales, missing: Missing, held: Sequence[str],
         settings: Settings, effects: Chosen = None, *,
         candidates: Sequence[Candidate] | None = None, simulator: Simulator | None = None,
+        failures: Failures | None = None,
     ):  # fmt: skip
         """candidates : these instead of what the catalogue offers, and no basis. simulator : of the
-        model, where it is not the plain one."""
+        model, where it is not the plain one. failures : takes the candidates that a fault ends."""
+        failures = failures or Failures()
         self._simulator = simulator
         self.trace, self.settings, self.scales = trace, settings, scales
         self.refused: list[Refused] = []
         self.terms: list[Term] = []
         if candidates is None:
-            offered, self.refused = offers(trace, scales, effects)
+            offered, self.refused = offers(trace, scales, effects, failures)
             offered = dated(offered, scales.rows)
-            self.terms = basis(trace, scales)
+            with failures.part("the basis of smooth functions"):
+                self.terms = basis(trace, scales)
         else:
             offered = list(candidates)
         unique: dict[str, Candidate] = {}
         for c in offered:
             unique.setdefault(c.increment.key, c.increment)
         plain = [*unique.values(), *(t.candidate for t in self.terms)]
-        made, self.shapes = lifted(plain)
-        superset = with_parameters(augment(trace, made), self.shapes)
-        names = [c.strength for c in made]
-        self.columns = score_columns(trace, superset, names, held, missing)
+        try:
+            self.columns, self.shapes = _columns(trace, plain, held, missing)
+        except ModelError:  # of the user's own effect
+            raise
+        except Exception:
+            if failures.raised:
+                raise
+            plain = _sound(trace, plain, held, missing, failures)
+            self.columns, self.shapes = _columns(trace, plain, held, missing)
         self.smoother = Smoother(self.columns, missing, settings)
         for name, reason in self.columns.refused.items():
             at = next((c for c in plain if c.strength == name), None)
@@ -127,8 +136,7 @@ class Question:
     @cached_property
     def sided(self) -> np.ndarray:
         """(K,) the sign that each strength must have."""
-        bounds = [(c.effect.lower, c.effect.upper) for c in self.candidates]
-        return np.array([int(low >= 0.0) - int(high <= 0.0) for low, high in bounds], dtype=int)
+        return np.array([c.sided for c in self.candidates], dtype=int)
 
     @cached_property
     def _sums(self) -> np.ndarray:
@@ -244,6 +252,29 @@ class Screen:
         return groups_of(self.question.candidates)
 
 
+def _columns(
+    trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing
+) -> tuple[Columns, dict[str, float]]:
+    """The score columns of the model with all candidates, and the values of their shapes."""
+    made, shapes = lifted(list(candidates))
+    superset = with_parameters(augment(trace, made), shapes)
+    names = [c.strength for c in made]
+    return score_columns(trace, superset, names, held, missing), dict(shapes)
+
+
+def _sound(
+    trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing,
+    failures: Failures,
+) -> list[Candidate]:  # fmt: skip
+    """The candidates that have columns by themselves; the others are said to have failed."""
+    out = []
+    for c in candidates:
+        with failures.part(f"the candidate {c}"):
+            _columns(trace, [c], held, missing)
+            out.append(c)
+    return out
+
+
 def groups_of(candidates: Sequence[Candidate]) -> np.ndarray:
     """(K,) a number for each group: candidates that differ in their shape only."""
     labels = {g: i for i, g in enumerate(dict.fromkeys(c.group for c in candidates))}
@@ -266,11 +297,13 @@ def ask(
     _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
     one = partial(_one_set, question, tuple(experiments), whole, seed)
     results = kept.each(stage, OWN_RUNS + sets, one)
-    own = [r for r in results[:OWN_RUNS] if r]
-    null = [r for r in results[OWN_RUNS:] if r]
+    faults = [r for r in results if kept.failures.of_task(f"a data set of {stage}", r)]
+    own = [r for r in results[:OWN_RUNS] if r and FAULT not in r]
+    null = [r for r in results[OWN_RUNS:] if r and FAULT not in r]
     if not own or len(null) < min(FEWEST, sets):
+        why = f": {faults[0][FAULT]}" if faults else ""
         raise ArgumentError(
-            f"{len(null)} of {sets} data sets simulated at the fit went through the smoother",
+            f"{len(null)} of {sets} data sets simulated at the fit went through the smoother{why}",
             fix="use more particles, or check the fit: the model may leave its domain",
         )
     names = Statistics.__dataclass_fields__

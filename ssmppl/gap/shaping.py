@@ -65,6 +65,8 @@ def shaped_all(
 
     one = partial(_one, workshop, scales, [out[i] for i in tried], tuple(train), seed)
     for i, numbers in zip(tried, kept.each(stage, len(tried), one), strict=True):
+        name = " and ".join(map(str, out[i].candidates))
+        kept.failures.of_task(f"the shapes of {name}", numbers)
         if "shapes" in numbers:
             old, shapes = out[i], numbers["shapes"]
             made = _reshaped(old.candidates, scales, shapes)
@@ -92,12 +94,12 @@ def _shaped(
     """The values of the shapes, in order, and the fit with them; empty where there is none, or one
     of them runs to its bound."""
     known = _bounded(r, scales)
-    fitter = workshop.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
     start = {n: v for n, v in r.fit.start.items() if n not in known}
     for name, (low, high, value) in known.items():
         share = (value - low) / (high - low)
         start[share_of(name)] = np.asarray(np.clip(share, INSIDE, 1.0 - INSIDE))
     try:
+        fitter = workshop.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
         fit = fitter.fit(train, seed, start, searched=True, quick=len(r.candidates) > 1)
     except SSMError:
         return {}
@@ -117,7 +119,7 @@ def _shaped(
     rest = slice(0, len(fit.z) - len(shapes))  # the shapes are the last parameters
     return {
         **fit.numbers, "shapes": shapes, "theta": np.array(theta), "z": fit.z[rest],
-        "information": fit.information[rest, rest],
+        "information": fit.information[rest, rest], "at_bound": fit.at_bound[rest],
     }  # fmt: skip
 
 

@@ -99,8 +99,9 @@ def _measure(
     ).gain
     runs = out.after or [free_run(*model, e, seed) for e in experiments]
     mean = gain_of_mean(plain, found)
+    low, high = interval_of(share)
     out.rows.append({
-        "effect": label, "F": share.F, "F_low": share.low, "F_high": share.high,
+        "effect": label, "F": share.F, "F_low": low, "F_high": high,
         "nats_per_sample": share.gain.nats_per_sample, "gain_mean": mean,
         "gain_noise": share.gain.nats - mean,
         "rmse_before": rmse(out.before, experiments, counts),
@@ -109,12 +110,21 @@ def _measure(
     out.notes += notes_of(share, chosen is not None)
 
 
+def own_reference(share: Closed) -> bool:
+    """Whether the reference is the chosen model itself, so that the share is no comparison."""
+    return abs(share.gain.nats - share.reference.nats) <= SAME * abs(share.reference.nats)
+
+
+def interval_of(share: Closed) -> tuple[float, float]:
+    """The interval of the share; NaN where it compares a model with itself."""
+    return (np.nan, np.nan) if own_reference(share) else (share.low, share.high)
+
+
 def notes_of(share: Closed, chosen: bool) -> list[str]:
     """What has to be known beside the share."""
     if share.reason:
         return [share.reason]
-    same = abs(share.gain.nats - share.reference.nats) <= SAME * abs(share.reference.nats)
-    if not same:
+    if not own_reference(share):
         return []
     low, high = (share.gain.nats + s * 1.96 * share.gain.error for s in (-1.0, 1.0))
     what = "nothing beyond the chosen effect was found" if chosen else "no effect was chosen"

@@ -27,10 +27,18 @@ if TYPE_CHECKING:
 CURVE_POINTS = 41
 AT_BOUND = 1e-3  # standard errors of the screen, below which a one-sided strength is none
 STANDS_OUT = 3.0  # |z| of a region that is named
+# Of the error rate, for the places and for the checks of the predictions: with the whole of it for
+# the effects, at most 1.4 times as much in all.
+SHARED = 0.2
+
+
+def shared(p: Any) -> Any:
+    """p of the places, or of the checks, with what else is looked at counted (Bonferroni)."""
+    return np.minimum(1.0, np.asarray(p, dtype=float) / SHARED)
 
 
 def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, Group]]:
-    """Equation, moment, stretch of time and region of each group of the basis; by z."""
+    """Equation, moment, stretch of time and region of each group of the basis; by p (`shared`)."""
     observed, nuisance = screen.observed, screen.stacked("nuisance")
     columns, terms = screen.stacked("basis"), screen.question.terms
     keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
@@ -50,7 +58,7 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, G
     bins, own = screen.stacked("basis_bins"), screen.stacked("nuisance_bins")
     rows = []
     for row in table.itertuples():
-        key, p = row.key, row.p_either
+        key, p = row.key, float(shared(row.p_either))
         stretch = (0, sum(sizes))
         if p <= alpha and len(edges) > 3:
             at = when(
@@ -193,7 +201,6 @@ def causes_table(
     tests, tested = (1, {}) if tested is None else (2, tested)
     by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
     significant = screen.significant
-    times = [e.time for e in screen.experiments]
     rows = []
     for i, k in enumerate(order):
         c, s = screen.question.candidates[k], screen.found
@@ -205,27 +212,40 @@ def causes_table(
             strength = float(np.sqrt(max(strength, 0.0)))
             error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
         if own is not None:
-            least = AT_BOUND * error
-            strength, error = own.strengths[0], own.errors[c.strength]
-            if sided and abs(strength) < least:  # the search runs towards the bound for ever
-                strength, error = 0.0, np.nan
+            told = estimated(screen, own, own.candidates[0], error)
         elif sided * strength < 0.0:  # the screen knows no bounds
-            strength, error = 0.0, np.nan
-        shaped = own.candidates[0].shape if own is not None else c.shape
-        shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in shaped)
+            told = _told(screen, c, 0.0, np.nan)
+        else:
+            told = _told(screen, c, strength, error)
         p = tested.get(k, np.nan)
         if screened:
             p = min(float(significant[k]), tested.get(k, 1.0))
         rows.append({
-            "effect": c.effect.name, "form": ", ".join(filter(None, [c.form, shape])),
-            "equation": c.equation, "z": float(s.z[k]),
+            "effect": c.effect.name, "equation": c.equation, "z": float(s.z[k]),
             "p": float(np.minimum(1.0, tests * p)),
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
-            "class_id": int(found.class_id[i]),
-            "sign": "one-sided" if sided else ("+" if strength > 0 else "-"),
-            "estimate": strength, "se": float(error),
+            "class_id": int(found.class_id[i]), **told,
         })  # fmt: skip
     return tabulate("causes", rows)
+
+
+def estimated(screen: Screen, refit: Refit, c: Candidate, error: float = np.nan) -> dict[str, Any]:
+    """Form, sign, estimate and se of one of a refit's effects, whose shape need not be among those
+    that the screen tried. error : of the strength by the screen, about, where it is known."""
+    strength = refit.fit.values()[c.strength]
+    if c.sided and (abs(strength) < AT_BOUND * error or c.strength in refit.fit.bounds):
+        return _told(screen, c, 0.0, np.nan)  # the search runs towards the bound for ever
+    return _told(screen, c, strength, refit.errors[c.strength])
+
+
+def _told(screen: Screen, c: Candidate, strength: float, error: float) -> dict[str, Any]:
+    times = [e.time for e in screen.experiments]
+    shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in c.shape)
+    return {
+        "form": ", ".join(filter(None, [c.form, shape])),
+        "sign": "one-sided" if c.sided else ("+" if strength > 0 else "-"),
+        "estimate": float(strength), "se": float(error),
+    }  # fmt: skip
 
 
 def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:

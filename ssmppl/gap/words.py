@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from ssmppl.gap.report import GapReport
 
 __all__ = [
-    "GLOSSARY", "headline", "how_far", "how_sure", "next_steps", "place", "untold", "where",
-    "which",
+    "GLOSSARY", "headline", "how_far", "how_sure", "left_out", "next_steps", "outstanding", "place",
+    "untold", "where", "which",
 ]  # fmt: skip
 
 CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
@@ -91,6 +91,12 @@ def _when(report: GapReport, part: Sequence[Any]) -> str:
     return span(first, last, _experiment(report))
 
 
+def outstanding(report: GapReport, table: Any) -> list[dict[str, Any]]:
+    """The rows of `where` or `detection` that are more than chance."""
+    alpha = report.settings.get("alpha", 0.05)
+    return [r for r in rows(table) if is_number(r["p"]) and r["p"] <= alpha]
+
+
 # -- the three answers
 def headline(report: GapReport) -> str:
     """The verdict in a sentence or two, with its number and its uncertainty."""
@@ -136,9 +142,17 @@ def _lacks(groups: list[list[str]]) -> tuple[str, str]:
 
 
 def _none_of_these(report: GapReport) -> str:
-    first, measured = rows(report.where)[:1], share(report)
-    spot = f" in {place(first[0])} ({p_text(first[0]['p'])})" if first else ""
+    measured = share(report)
+    found, failed = outstanding(report, report.where), outstanding(report, report.detection)
+    spot = ""
+    if found:
+        when = span(found[0]["t_from"], found[0]["t_to"], found[0]["experiment"])
+        spot = f" in {place(found[0])}{f', strongest at {when}' if when else ''}" \
+               f" ({p_text(found[0]['p'])})"  # fmt: skip
     text = f"{named(report)} lacks something{spot}, and none of the {tried(report)} explains it."
+    if failed and not found:
+        check = f"{failed[0]['statistic']} of {failed[0]['channel']}, {p_text(failed[0]['p'])}"
+        text += f" What shows it is a check of the one-step predictions ({check})."
     if measured and _best_tried(report):
         text += f" The best of them, {_best_tried(report)}, {measured}: curves estimated from " \
                 "the data do clearly better."  # fmt: skip
@@ -179,8 +193,7 @@ def place(row: dict[str, Any]) -> str:
 
 def where(report: GapReport) -> list[str]:
     """Which equation, which moment, when and in which region: the three strongest places."""
-    alpha = report.settings.get("alpha", 0.05)
-    found = [r for r in rows(report.where) if is_number(r["p"]) and r["p"] <= alpha]
+    found = outstanding(report, report.where)
     if not found:
         return ["No equation stands out from chance."]
     out = []
@@ -296,9 +309,8 @@ def how_sure(report: GapReport) -> list[str]:
             once = len(used) > 1 and "choice" not in report.parts
             out.append(text + " No row served twice." * once)
     out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
-    alpha = report.settings.get("alpha", 0.05)
     tests = [r for r in rows(report.detection) if is_number(r["p"])]
-    bad = [r for r in tests if r["p"] <= alpha]
+    bad = outstanding(report, report.detection)
     if bad:
         names = [f"{r['statistic']} of {r['channel']} ({p_text(r['p'])})" for r in bad[:4]]
         out.append(f"Before any effect was tried, the one-step predictions failed {len(bad)} of "
@@ -328,12 +340,20 @@ def untold(report: GapReport) -> list[str]:
     return out
 
 
+def left_out(report: GapReport) -> list[str]:
+    """The parts that failed, each with its reason."""
+    return [sentence(f"{r['part']}: {r['reason']}") for r in rows(report.left_out)]
+
+
 def next_steps(report: GapReport) -> list[str]:
     """What to do now: what to measure, and what to do with the model."""
     out = []
     if report.interrupted:
         out.append("The run was interrupted: run it again, and it goes on from the stages done.")
-    elif report.mode == "fast" and report.verdict != "no measurable gap":
+    elif len(report.left_out):
+        out.append("Parts of this answer are missing (left out, below). Another run tries them "
+                   "again; with debug=True (--debug) it stops at the first fault.")  # fmt: skip
+    if report.mode == "fast" and report.verdict != "no measurable gap":
         out.append("Run it again in full mode: it refits the leading effects and measures how far "
                    "the gap closes.")  # fmt: skip
     for row in leaders(report):
@@ -349,9 +369,12 @@ def next_steps(report: GapReport) -> list[str]:
             out.append(f"None of the simple inputs considered would tell "
                        f"{listed(alternatives(report, row), 'from')}; measure another quantity, "
                        "or look at the machine.")  # fmt: skip
-    if report.verdict == "none of these":
+    if report.verdict == "none of these" and report.missing is not None:
         out.append("Look at the estimated curve, think what could have its shape, write it as an "
                    "@ssm.effect and run again with it.")  # fmt: skip
+    elif report.verdict == "none of these":
+        out.append("Think what could change the noise so, or what acts in that stretch only; write "
+                   "it as an @ssm.effect and run again with it.")  # fmt: skip
     elif report.verdict == "no measurable gap":
         out.append("To look closer, record more data, or drive the system over more of its range.")
     if report.model_text:

@@ -65,10 +65,12 @@ def panel_figures(report: GapReport, width: float) -> dict[str, Any]:
     found: dict[str, Any] = {}
     with look():
         for name in TITLES:
-            height = _height(report, name, width)
-            if height:
-                found[name] = Figure(figsize=(width, height), layout="constrained")
-                _draw(report, name, found[name], width)
+            with report.failures.part(f"the panel {name!r}"):
+                height = _height(report, name, width)
+                if height:
+                    figure = Figure(figsize=(width, height), layout="constrained")
+                    _draw(report, name, figure, width)
+                    found[name] = figure
     return found
 
 
@@ -76,9 +78,10 @@ def pictures(report: GapReport, width: float = DESK) -> dict[str, bytes]:
     """`panel_figures` as PNG files."""
     found = {}
     for name, figure in panel_figures(report, width).items():
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=DPI)
-        found[name] = buffer.getvalue()
+        with report.failures.part(f"the panel {name!r}"):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format="png", dpi=DPI)
+            found[name] = buffer.getvalue()
     return found
 
 

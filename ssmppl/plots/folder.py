@@ -32,10 +32,11 @@ def save(report: GapReport, folder: str | os.PathLike[str]) -> Path:
         target.mkdir(parents=True, exist_ok=True)
         before = _of_a_report(target)
         written = {PAGE_FILE, TEXT_FILE}
+        drawn = pictures(report)
+        text = page(report, drawn)  # what fails in it is a row of a table
         for name, table in report.tables().items():
             table.to_csv(target / f"{name}.csv", index=False)
             written.add(f"{name}.csv")
-        drawn = pictures(report)
         for name, picture in drawn.items():
             (target / f"{name}.png").write_bytes(picture)
             written.add(f"{name}.png")
@@ -43,7 +44,7 @@ def save(report: GapReport, folder: str | os.PathLike[str]) -> Path:
             (target / MODEL_FILE).write_text(report.model_text, encoding="utf-8")
             written.add(MODEL_FILE)
         (target / TEXT_FILE).write_text(f"{report}\n", encoding="utf-8")
-        (target / PAGE_FILE).write_text(page(report, drawn), encoding="utf-8")
+        (target / PAGE_FILE).write_text(text, encoding="utf-8")
         for name in before - written:
             (target / name).unlink(missing_ok=True)
     except OSError as error:

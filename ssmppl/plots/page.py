@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from ssmppl.gap.words import (
     headline,
     how_far,
     how_sure,
+    left_out,
     next_steps,
     place,
     sentence,
@@ -49,6 +50,13 @@ def page(report: GapReport, wide: dict[str, bytes] | None = None) -> str:
     """
     title = f"Diagnosis of {report.title}" if report.title else "Diagnosis of a model"
     kind = report.verdict.replace(" ", "-")
+    # These first: what fails in them is told among what is left out.
+    evidence = _part(
+        report,
+        "the page's pictures",
+        lambda: _evidence(report, pictures(report) if wide is None else wide),
+    )
+    tables = _part(report, "the page's tables", lambda: _section("Tables", _tables(report)))
     parts = [
         "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', GENERATOR,
@@ -59,14 +67,21 @@ def page(report: GapReport, wide: dict[str, bytes] | None = None) -> str:
         _answers(report),
         _section("How sure", _list(how_sure(report)) + _unknown(report)),
         _section("What to do next", _list(next_steps(report))),
-        _evidence(report, pictures(report) if wide is None else wide),
-        _section("Tables", _tables(report)),
+        evidence,
+        tables,
         _section("Words used here", _glossary()),
         _model(report),
         f"<footer><p>{_text(_colophon(report))}</p></footer>",
         "</main>", "</body>", "</html>",
     ]  # fmt: skip
     return "\n".join(p for p in parts if p) + "\n"
+
+
+def _part(report: GapReport, name: str, make: Callable[[], str]) -> str:
+    """A part of the page; nothing where an error ended it, which the report then says."""
+    with report.failures.part(name):
+        return make()
+    return ""
 
 
 def _text(value: Any) -> str:
@@ -125,6 +140,7 @@ def _unknown(report: GapReport) -> str:
     for title, items in (
         ("What these data could not tell", untold(report)),
         ("To be kept in mind", [sentence(n) for n in report.notes]),
+        ("Left out, as they failed", left_out(report)),
     ):
         if items:
             out += f"\n<h3>{title}</h3>\n{_list(items)}"
@@ -140,6 +156,7 @@ def _evidence(report: GapReport, wide: dict[str, bytes]) -> str:
         f'<img src="{_png(narrow[name])}" alt="{_text(_alt(report, name))}"></picture>\n'
         f"<p>{_text(CAPTIONS[name])}</p></figure>"
         for name in narrow
+        if name in wide
     )
     return _section("The evidence", body)
 
@@ -173,8 +190,8 @@ def _alt(report: GapReport, name: str) -> str:
         items = [f"{row_label(r)} {number(_gain(r), 2)}" for r in bars(report)]
         return f"Bars of the gain in nats: {'; '.join(items)}."
     if name == "gap_closed":
-        items = [f"{r['effect']} {percent(r['F'])} ({percent(r['F_low'])} to "
-                 f"{percent(r['F_high'])})" for r in rows(report.closed)]  # fmt: skip
+        items = [f"{r['effect']} {percent(r['F'])} ({interval(r['F_low'], r['F_high'])})"
+                 for r in rows(report.closed)]  # fmt: skip
         return f"Share of the gap closed with its 95% interval: {'; '.join(items)}."
     if name == "missing_term":
         return "Curves with bands: " + listed([f"what is missing in {e} over {v}"

@@ -83,9 +83,10 @@ def update(p, h, g, toward, z, step):
 
     p (D, D) : covariance predicted. h, g : minus curvature and slope of log g at a point x.
     toward (D,) : x less the predicted mean. Writes z (D, D) = (I + P H)^-1 P, the covariance after,
-    and step (D,) = z (g + H toward), from the predicted mean; False where that is singular.
+    and step (D,) = z (g + H toward), from the predicted mean; returns log det(I + P H), infinite
+    where that is singular.
     """
-    d = g.size
+    d, log_det = g.size, 0.0
     s = np.empty((d, d))
     for i in range(d):
         for j in range(d):
@@ -100,7 +101,8 @@ def update(p, h, g, toward, z, step):
             if abs(s[k, i]) > abs(s[best, i]):
                 best = k
         if not abs(s[best, i]) > 0.0:
-            return False
+            return np.inf
+        log_det += math.log(abs(s[best, i]))
         for j in range(d):
             s[i, j], s[best, j] = s[best, j], s[i, j]
             z[i, j], z[best, j] = z[best, j], z[i, j]
@@ -126,7 +128,7 @@ def update(p, h, g, toward, z, step):
                 pull += h[k, j] * toward[j]
             total += z[i, k] * pull
         step[i] = total
-    return True
+    return log_det
 
 
 @exact
@@ -171,16 +173,19 @@ def most_likely(
     """x_t after the filter's update: the mode of N(x; rest, P) g(y_t | x), by Newton's method.
 
     now (D, 1), g (D,), h (D, D), after (D, D) : the mode, slope and curvature of log g there, and
-    the covariance, written; False where it comes to no number. The rest is room to work in. P may
-    be singular: x - rest is P times `lead`, so that the density of x is known without P's inverse.
+    the covariance, written. The rest is room to work in. P may be singular: x - rest is P times
+    `lead`, so that the density of x is known without P's inverse. Returns Laplace's approximation
+    of log p(y_t | y_1, ..., y_{t-1}), exact where log g is quadratic; -inf where it comes to no
+    number.
     """
     d = g.size
     for i in range(d):
         now[i, 0], lead[i], toward[i] = rest[i], 0.0, 0.0
     value = look_at(theta, c, s, now, seen_so, g, h)
     height = value
-    if not update(p, h, g, toward, after, move):
-        return False
+    log_det = update(p, h, g, toward, after, move)
+    if not log_det < np.inf:
+        return -np.inf
     for _ in range(1 if flat else NEWTON_STEPS):
         for i in range(d):
             target[i] = g[i]
@@ -209,11 +214,14 @@ def most_likely(
             toward[i] = now[i, 0] - rest[i]
         if flat:
             break
-        if not update(p, h, g, toward, after, move):
-            return False
+        log_det = update(p, h, g, toward, after, move)
+        if not log_det < np.inf:
+            return -np.inf
         if gained < CLOSE:
             break
-    return abs(value) < np.inf
+    if not abs(value) < np.inf:
+        return -np.inf
+    return height - 0.5 * log_det
 
 
 @exact
@@ -221,7 +229,8 @@ def follow_filter(
     prepare, step, linear_initial, linear, look_at, most_likely, sizes, flat,
     theta, y, seen, u, x, covariance, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
-    """The first reference: an extended Kalman filter; False where it comes to no number.
+    """The first reference: an extended Kalman filter; returns its log-likelihood, -inf where it
+    comes to no number.
 
     x (T, D) its means, covariance (T, D, D), rest (T, D), jacobian (T, D, D), spread (T, D, R),
     spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
@@ -235,6 +244,7 @@ def follow_filter(
     seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     p, after, jp = np.zeros((d, d)), np.empty((d, d)), np.empty((d, d))
     toward, move, target, lead = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
+    log_likelihood = 0.0
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
@@ -264,19 +274,19 @@ def follow_filter(
                     for k in range(r):
                         total += spread[t, i, k] * spread[t, j, k]
                     p[i, j] = total
-        fine = most_likely(
+        log_likelihood += most_likely(
             theta, c, s, rest[t], p, seen_so, now, g[t], h[t], after, toward, move, lead, target
         )
-        if not fine:
-            return False
+        if not abs(log_likelihood) < np.inf:
+            return -np.inf
         for i in range(d):
             if not abs(now[i, 0]) < np.inf:
-                return False
+                return -np.inf
             x[t, i] = now[i, 0]
             before[i, 0] = now[i, 0]
             for j in range(d):
                 covariance[t, i, j] = after[i, j]
-    return True
+    return log_likelihood
 
 
 @exact

@@ -1,0 +1,133 @@
+"""Newton's ascent of a smooth function that has no derivatives of its own, by its differences.
+
+Coordinates are measured in widths, over which the function changes by about one, so that parameters
+of any unit are alike. Where the function is not concave, eigenvalues count by their size, so that a
+step climbs (Nocedal and Wright 2006, sections 3.4 and 8.1; Dauphin et al. 2014). For functions that
+take a millisecond and few coordinates, as a Kalman filter's log-likelihood: F^2 + F calls a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+FINE = 0.05  # of a width: differences at the end of a climb, far above rounding
+CHANGE = (0.05, 5.0)  # of the function over one width, between which that is a width
+WIDEST, FIRST, TIMES = 4.0, 0.1, 4.0  # of a width in z; where the search for it begins; its factor
+TRIES = 24
+STEPS = 40
+FARTHEST = 2.0  # of a step in any coordinate, in units of it where it is larger than one
+SHARES = (1.0, 0.5, 0.2, 0.05, 0.01)  # of a step that are tried
+GOOD = 0.01  # nats that the quadratic still expects where a climb is at its end
+LEAST = 1e-3  # of the eigenvalues of the scaled second derivatives
+
+Function = Callable[[np.ndarray], float]
+
+
+@dataclass(frozen=True)
+class Top:
+    """Where a climb ended.
+
+    z : (F,). value : there. information : (F, F) minus the second derivatives, symmetric, not
+    always positive definite. distance : what a quadratic still expects to gain.
+    """
+
+    z: np.ndarray
+    value: float
+    information: np.ndarray
+    distance: float
+
+
+def climb(function: Function, z: np.ndarray) -> Top | None:
+    """The top near z (F,); None where the function has no value there. -inf is no value."""
+    z = np.array(z, dtype=float)
+    value = function(z)
+    if not np.isfinite(value):
+        return None
+    if not len(z):
+        return Top(z, value, np.zeros((0, 0)), 0.0)
+    width = np.full(len(z), FIRST)
+    information, distance = np.eye(len(z)), np.inf
+    for _ in range(STEPS):
+        width = widths(function, z, value, width)
+        slope, curvature = _derivatives(function, z, value, width)
+        information = curvature / np.outer(width, width)
+        step, distance = _step(slope, curvature)
+        if distance < GOOD:
+            break
+        move = step * width
+        move *= min(1.0, FARTHEST / np.max(np.abs(move) / np.maximum(1.0, np.abs(z))))
+        for share in SHARES:
+            new = function(z + share * move)
+            if new > value:
+                break
+        else:
+            break
+        z, gained, value = z + share * move, new - value, new
+        if gained < GOOD:
+            break
+    return Top(z, value, information, distance)
+
+
+def widths(function: Function, z: np.ndarray, value: float, first: np.ndarray) -> np.ndarray:
+    """(F,) steps over which the function falls or rises by about one, either way; `first` (F,)
+    where to begin."""
+    out = np.array(first)
+    for i in range(len(z)):
+        low, high, step = 0.0, np.inf, float(first[i])  # steps that are too short, too long
+        widest = WIDEST * max(1.0, abs(z[i]))
+        for _ in range(TRIES):
+            change = max(abs(function(_moved(z, i, s * step)) - value) for s in (-1.0, 1.0))
+            if CHANGE[0] <= change <= CHANGE[1] or (change < CHANGE[0] and step >= widest):
+                break
+            if change < CHANGE[0]:
+                low = step
+                step = min(step * TIMES, widest) if high == np.inf else np.sqrt(low * high)
+            else:
+                high = step
+                step = step / TIMES if low == 0.0 else np.sqrt(low * high)
+        out[i] = step
+    return out
+
+
+def _moved(z: np.ndarray, i: int, by: float) -> np.ndarray:
+    out = z.copy()
+    out[i] += by
+    return out
+
+
+def _derivatives(
+    function: Function, z: np.ndarray, value: float, width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F,) slope and (F, F) minus second differences, in widths; 0 where there are none, the slope
+    one-sided next to where there is no value."""
+    n, h = len(z), 0.5
+    ends = np.array([[function(_moved(z, i, s * size * width[i])) for s in (1.0, -1.0)]
+                     for size in (FINE, h) for i in range(n)])  # fmt: skip
+    fine, (plus, minus) = ends[:n], ends[n:].T
+    with np.errstate(invalid="ignore"):
+        slope = (fine[:, 0] - fine[:, 1]) / (2.0 * FINE)
+        one_sided = np.where(np.isfinite(fine[:, 0]), fine[:, 0] - value, value - fine[:, 1]) / FINE
+    slope = np.where(np.isfinite(slope), slope, one_sided)
+    out = np.zeros((n, n))
+    with np.errstate(invalid="ignore"):
+        for i in range(n):
+            out[i, i] = -(plus[i] - 2.0 * value + minus[i]) / h**2
+            for j in range(i):
+                up, down = (
+                    function(_moved(_moved(z, i, s * h * width[i]), j, s * h * width[j]))
+                    for s in (1.0, -1.0)
+                )
+                twice = up - plus[i] - plus[j] + 2.0 * value - minus[i] - minus[j] + down
+                out[i, j] = out[j, i] = -twice / (2.0 * h**2)
+    return np.where(np.isfinite(slope), slope, 0.0), np.where(np.isfinite(out), out, 0.0)
+
+
+def _step(slope: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float]:
+    """(F,) a step that climbs, in widths, and what a quadratic expects of it."""
+    values, vectors = np.linalg.eigh(curvature)
+    values = np.maximum(np.abs(values), LEAST * max(float(np.max(np.abs(values))), LEAST))
+    step = vectors @ ((vectors.T @ slope) / values)
+    return step, 0.5 * float(slope @ step)
