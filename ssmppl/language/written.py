@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.compiling import once
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
@@ -258,7 +259,7 @@ class Written(Distribution):
         return self.has_cdf and (self._has("quantile") or self.bounds.values is not None)
 
 
-@cache
+@once
 def written_class(name: str) -> type[Written]:
     """The class of the laws of this name."""
     return type(name, (Written,), {"__doc__": f"{name}, as its user wrote it."})
