@@ -118,7 +118,8 @@ def test_two_threads_that_ask_at_once_get_the_same():
 def test_a_property_that_is_made_once_is_a_cached_property():
     thing = Thing(lambda value: value)
     assert (thing.whole, vars(thing)) == (1, {**vars(thing), "whole": 1, "part": 1})
-    assert isinstance(Thing.whole, cached_property) and Thing.whole.__doc__ == "All of it."
+    assert isinstance(Thing.whole, cached_property)
+    assert Thing.whole.__doc__ == "All of it."
     vars(thing).clear()
     thing.whole = 2
     assert thing.whole == 2
