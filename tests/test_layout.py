@@ -12,7 +12,7 @@ PACKAGE = "ssmppl"
 LONGEST = 800
 
 # Each layer and what it may import besides itself. The main chain, in its one direction:
-CHAIN = ["errors", "markup", "expressions", "language", "analysis", "codegen"]
+CHAIN = ["errors", "markup", "compiling", "expressions", "language", "analysis", "codegen"]
 ALLOWED = {layer: set(CHAIN[:i]) for i, layer in enumerate(CHAIN)}
 # Arrays in, ArviZ out, and the embedded series stand beside it ...
 ALLOWED["counts"] = {"errors"}
@@ -32,6 +32,9 @@ ALLOWED["cli"] = ALLOWED["plots"] | OWN
 ALLOWED["__main__"] = {"cli"}
 # The package itself holds the public names: it may import all but those who are above it.
 ALLOWED[PACKAGE] = set(ALLOWED) - {"demo", "cli", "__main__"}
+
+# They fail beside another thread's in Python 3.11.
+PARSERS = {"ast.parse", "ast.literal_eval", "ast.PyCF_ONLY_AST"}
 
 SLOW = (
     "arviz", "matplotlib", "pandas", "scipy.linalg", "scipy.optimize", "scipy.sparse",
@@ -96,6 +99,23 @@ def within(name, package):
     return name == package or name.startswith(package + ".")
 
 
+def beside_the_lock(name, source):
+    """What parses, or makes generated code, and does not hold the lock of `ssmppl.compiling`."""
+    for node in ast.walk(ast.parse(source)):
+        place = f"{name}:{getattr(node, 'lineno', 0)}"
+        if isinstance(node, ast.Attribute) and ast.unparse(node) in PARSERS:
+            yield f"{place} uses {ast.unparse(node)}, and not ssmppl.compiling"
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        decorators = set(map(ast.unparse, node.decorator_list))
+        if not decorators & {"cached_property", "cache", "lru_cache"}:
+            continue
+        made = [n.func for n in ast.walk(node) if isinstance(n, ast.Call)]
+        made = [n.id for n in made if isinstance(n, ast.Name) and n.id.startswith("compile_")]
+        if made:
+            yield f"{place} calls {made[0]} where ssmppl.compiling has no lock"
+
+
 def faults(name, source, is_package=False):
     """What a module does that the layout forbids."""
     layer = layer_of(name)
@@ -112,10 +132,14 @@ def faults(name, source, is_package=False):
                 yield f"{place} imports {imported} inside of a function"
             if target != layer and target not in ALLOWED[layer]:
                 yield f"{place} imports {imported}, which is not below {layer}"
+        elif within(imported, "ast") and imported != "ast" and layer != "compiling":
+            yield f"{place} imports {imported} by itself: ssmppl.compiling parses"
         elif layer == "analysis" and within(imported, "numba"):
             yield f"{place}: analyses do not import numba"
         elif not in_function and not for_types and any(within(imported, slow) for slow in SLOW):
             yield f"{place} imports {imported} at the top of the module, which is slow"
+    if layer != "compiling":
+        yield from beside_the_lock(name, source)
     if (length := len(source.splitlines())) > LONGEST:
         yield f"{name} has {length} lines; does it still have one reason to exist?"
 
@@ -147,6 +171,10 @@ def test_module_keeps_to_the_layout(name):
         ("ssmppl.language.continuous", "from scipy import stats"),
         ("ssmppl", "from ssmppl.cli import main"),
         ("ssmppl.helpers", ""),
+        ("ssmppl.codegen.specialise", "import ast\nast.walk(ast.parse(text))"),
+        ("ssmppl.inference.problem", "import ast\nf = ast.literal_eval"),
+        ("ssmppl.gap.writing", "from ast import literal_eval"),
+        ("ssmppl.gap.smoothing", "@cached_property\ndef run(self):\n    return compile_rows(1)"),
         ("ssmppl.data", "\n" * (LONGEST + 1)),
     ],
 )
@@ -160,6 +188,8 @@ def test_faults_are_found(name, source):
         ("ssmppl.language.model", "from ssmppl.expressions.expr import Expr\nfrom . import trace"),
         ("ssmppl.inference.chains.pgas", "from ssmppl import data, results\nimport numba"),
         ("ssmppl.results", "def f():\n    import arviz"),
+        ("ssmppl.codegen.text", "import ast\nast.unparse(node)"),
+        ("ssmppl.gap.smoothing", "@once_property\ndef run(self):\n    return compile_rows(1)"),
         ("ssmppl.results", "if TYPE_CHECKING:\n    import xarray as xr"),
         ("ssmppl.language.continuous", "from scipy import special"),
         ("ssmppl.cli", "import ssmppl as ssm\nfrom ssmppl import Model, plots"),

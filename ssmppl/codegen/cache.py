@@ -13,7 +13,6 @@ import hashlib
 import linecache
 import pickle
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -24,10 +23,10 @@ from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 
 from ssmppl.codegen import folder
+from ssmppl.compiling import one_at_a_time
 
-_lock = threading.Lock()
 
-
+@one_at_a_time
 def load(name: str, text: str) -> ModuleType:
     """The module of this text, written to the cache folder if it is not there, and imported.
 
@@ -36,25 +35,24 @@ def load(name: str, text: str) -> ModuleType:
     """
     stem = f"{name}_{folder.digest_of(text)}"
     module_name = f"ssmppl_generated.{stem}"
-    with _lock:
-        if module_name in sys.modules:
-            return sys.modules[module_name]
-        path = folder.written(f"{stem}.py", text)
-        module = ModuleType(module_name)
-        module.__file__ = str(path or f"<{stem}>")
-        if path is None:  # tracebacks and Numba's errors show lines all the same
-            lines = text.splitlines(keepends=True)
-            linecache.cache[module.__file__] = len(text), None, lines, module.__file__
-        sys.modules[module_name] = module
-        try:
-            exec(compile(text, module.__file__, "exec"), module.__dict__)
-        except BaseException:
-            del sys.modules[module_name]
-            raise
-        for value in vars(module).values():
-            if isinstance(value, CPUDispatcher) and value.py_func.__module__ == module_name:
-                cast(Any, value)._cache = Kept(value.py_func, stem)
-        return module
+    if module_name in sys.modules:
+        return sys.modules[module_name]
+    path = folder.written(f"{stem}.py", text)
+    module = ModuleType(module_name)
+    module.__file__ = str(path or f"<{stem}>")
+    if path is None:  # tracebacks and Numba's errors show lines all the same
+        lines = text.splitlines(keepends=True)
+        linecache.cache[module.__file__] = len(text), None, lines, module.__file__
+    sys.modules[module_name] = module
+    try:
+        exec(compile(text, module.__file__, "exec"), module.__dict__)
+    except BaseException:
+        del sys.modules[module_name]
+        raise
+    for value in vars(module).values():
+        if isinstance(value, CPUDispatcher) and value.py_func.__module__ == module_name:
+            cast(Any, value)._cache = Kept(value.py_func, stem)
+    return module
 
 
 class Kept:

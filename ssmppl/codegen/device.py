@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import functools
 import inspect
 import re
 from collections.abc import Callable
@@ -31,6 +30,7 @@ from ssmppl.codegen.module import Layout, Section
 from ssmppl.codegen.render import MATRIX_CALLS, identifier
 from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.text import MODULES, ModuleText
+from ssmppl.compiling import once, one_at_a_time, parse
 from ssmppl.errors import ArgumentError
 from ssmppl.language.primitive import REGISTRY
 from ssmppl.language.traced import Trace
@@ -89,11 +89,11 @@ def simulated() -> bool:
 
 def on_device(function: Any) -> Any:
     """A kernel of ours as a function of the device, with all that it calls."""
-    plain = function.py_func if isinstance(function, Kernel) else inspect.unwrap(function)
+    plain: Any = function.py_func if isinstance(function, Kernel) else inspect.unwrap(function)
     return _on_device(plain)
 
 
-@functools.cache
+@once
 def _on_device(plain: FunctionType) -> Any:
     from numba import cuda
 
@@ -117,7 +117,7 @@ def _of_device(value: Any) -> Any:
     return on_device(value) if isinstance(value, Kernel) or _is_ours(value) else value
 
 
-@functools.cache
+@once
 def _numbers() -> ModuleType:
     """NumPy's names in our kernels, with functions that devices have for those they lack."""
     from numba.cuda import libdevice
@@ -164,6 +164,7 @@ class DeviceFilter:
     join: Any
 
 
+@one_at_a_time
 def compile_device(trace: Trace, proposal: Proposal, tile: int = TILE) -> DeviceFilter:
     """The filter for the device, by a proposal without look-ahead.
 
@@ -189,7 +190,7 @@ def compile_device(trace: Trace, proposal: Proposal, tile: int = TILE) -> Device
 
 def _check(section: Section, proposal: Proposal) -> None:
     """Refuse what a thread of a device cannot do."""
-    nodes = ast.walk(ast.parse("\n".join(section.functions)))  # comments name what is computed once
+    nodes = ast.walk(parse("\n".join(section.functions)))  # comments name what is computed once
     words = {n.func.id for n in nodes if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
     found = ""
     if words & set(MATRIX_CALLS.values()):

@@ -21,11 +21,13 @@ from ssmppl.codegen.loading import Loaded, load
 from ssmppl.codegen.module import Layout, Section, Target
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.traced import Trace
 
 
+@one_at_a_time
 def compile_elimination(
     trace: Trace, missing: Missing, eliminable: Eliminable
 ) -> tuple[Elimination, Loaded] | NotApplicable:

@@ -7,7 +7,6 @@ the digest of all kernels. The text of an entry point is copied, not called: it 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache as once
 from typing import Any
 
 from ssmppl.codegen import cache
@@ -20,6 +19,7 @@ from ssmppl.codegen.kernels import (
     kalman_smoother,
 )
 from ssmppl.codegen.specialise import specialise
+from ssmppl.compiling import once
 
 # No name here may be one of a function that another of them calls: all stand in one module.
 ENTRIES: dict[str, Callable[..., Any]] = {

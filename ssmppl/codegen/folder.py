@@ -20,6 +20,8 @@ from pathlib import Path
 import numba
 import numpy as np
 
+from ssmppl.compiling import once
+
 
 def cache_folder() -> Path:
     """`$SSMPPL_CACHE`, else ssmppl's folder in the user's cache; a temporary one in place of one
@@ -125,6 +127,6 @@ def _write_atomically(path: Path, content: str | bytes) -> None:
         raise
 
 
-@cache
+@once
 def _temporary_folder() -> str:
     return tempfile.mkdtemp(prefix="ssmppl_")

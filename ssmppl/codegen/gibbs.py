@@ -12,6 +12,7 @@ from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
+from ssmppl.compiling import one_at_a_time
 from ssmppl.language.traced import Trace
 
 
@@ -20,6 +21,7 @@ def statistics_name(update: Update) -> str:
     return "statistics_" + "_".join(identifier(repr(c)) for c in update.components)
 
 
+@one_at_a_time
 def compile_updates(trace: Trace, updates: Sequence[Update]) -> ModuleType:
     """Generate, write and import the statistics of the updates that have any."""
     layout = Layout(trace)

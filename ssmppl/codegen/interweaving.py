@@ -12,6 +12,7 @@ from ssmppl.codegen.module import Layout, Section, Target
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import linear_passes
+from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.traced import Trace
@@ -19,6 +20,7 @@ from ssmppl.language.traced import Trace
 STEERED = ("linear_initial", "linear")
 
 
+@one_at_a_time
 def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     """Generate, write and import `noise_of` and `path_of`; where steered also `linearise`."""
     layout = Layout(trace)

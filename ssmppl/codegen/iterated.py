@@ -12,10 +12,12 @@ from ssmppl.codegen.loading import load
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 
 BEGIN = "theta, c, s, states_prev, states, normals, uniforms, rng"
 
 
+@one_at_a_time
 def compile_iterated_filter(model: Perturbed) -> Callable[..., Any]:
     """Generate, write and import `iterated_filter(theta, y, seen, u, rng, swarm, log_increment,
     means)`, see the kernel."""

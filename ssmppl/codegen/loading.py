@@ -8,7 +8,6 @@ Numba from the very same text.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
@@ -25,6 +24,7 @@ from ssmppl.codegen.native.entries import Aside, entry
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.waiting import notice
+from ssmppl.compiling import LOCK, one_at_a_time
 
 event.register("numba:compile", notice)
 
@@ -51,15 +51,16 @@ class Loaded:
         self.module, self.why = module, dict[str, str]()
         self._out, self._name = out, name
         self._made: dict[str, Callable[..., Any]] = {}
-        self._lock = threading.RLock()
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
+        if (made := self._made.get(name)) is not None:  # without the lock: others may compile long
+            return made
         algorithm = self._out.algorithms.get(name)
         if algorithm is None or algorithm.decorator != "entry":
             return getattr(self.module, name)
-        with self._lock:
+        with LOCK:
             if name not in self._made:
                 self._made[name] = self._algorithm(name)
             return self._made[name]
@@ -92,6 +93,7 @@ class Loaded:
         return {r: found[section.name(r)] for r in section.roles}
 
 
+@one_at_a_time
 def load(out: ModuleText, name: str, lines: list[str]) -> Loaded:
     """Write and import a generated module; `lines` is its docstring."""
     return Loaded(out, name, cache.load(name, out.finish(lines)))

@@ -24,6 +24,7 @@ from ssmppl.codegen.loading import Loaded, load
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.language.traced import Trace
 
@@ -47,6 +48,7 @@ class MarginalFilter:
         return getattr(self.module, name)
 
 
+@one_at_a_time
 def compile_marginal(
     trace: Trace, missing: Missing, split: ConditionallyLinear | None = None
 ) -> MarginalFilter | NotApplicable:

@@ -23,6 +23,7 @@ from ssmppl.codegen.module import Layout, Section, Target
 from ssmppl.codegen.program import Program
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
@@ -48,6 +49,7 @@ class ScoredFilter:
     wanted: tuple[Expr, ...]
 
 
+@one_at_a_time
 def scored_filter(
     program: Program, proposal: Proposal, wanted: Sequence[Expr], second: bool
 ) -> ScoredFilter | NotApplicable:
@@ -107,6 +109,7 @@ class NumberedFilter:
     uniforms: int
 
 
+@one_at_a_time
 def numbered_filter(program: Program, proposal: Proposal) -> NumberedFilter | NotApplicable:
     """The filter of a proposal on given numbers.
 

@@ -11,7 +11,6 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -52,6 +51,7 @@ from ssmppl.codegen.render import identifier
 from ssmppl.codegen.tempered import TemperedFilter, compile_tempered
 from ssmppl.codegen.text import ModuleText
 from ssmppl.codegen.twisted import TwistedFilter, compile_twisted
+from ssmppl.compiling import LOCK, once_property
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.traced import Trace
@@ -78,17 +78,17 @@ class Program:
     def __reduce__(self):  # another process generates the module again, or finds it in its cache
         return compile_trace, (self.trace, self.missing)
 
-    @cached_property
+    @once_property
     def twisted(self) -> TwistedFilter | NotApplicable:
         """The twisted filter, in a module of its own; generated when it is first asked for."""
         return compile_twisted(self.trace, self.missing)
 
-    @cached_property
+    @once_property
     def marginal(self) -> MarginalFilter | NotApplicable:
         """The Rao-Blackwellised filters, likewise."""
         return compile_marginal(self.trace, self.missing)
 
-    @cached_property
+    @once_property
     def tempered(self) -> TemperedFilter | NotApplicable:
         """The tempered filter, likewise."""
         return compile_tempered(self.trace, self.missing)
@@ -104,7 +104,9 @@ class Program:
         if key not in self._on_device:
             found = self.proposals[proposal]
             assert isinstance(found, Proposal), found
-            self._on_device[key] = compile_device(self.trace, found, tile)
+            with LOCK:
+                if key not in self._on_device:
+                    self._on_device[key] = compile_device(self.trace, found, tile)
         return self._on_device[key]
 
     def proposal(self, name: str) -> Proposal | NotApplicable | None:
@@ -151,7 +153,9 @@ class Program:
         ArgumentError : it belongs to a proposal that could not be derived; gives the reason.
         """
         if name not in self._entries:
-            self._entries[name] = self._entry(name)
+            with LOCK:
+                if name not in self._entries:
+                    self._entries[name] = self._entry(name)
         return self._entries[name]
 
     def _entry(self, name: str) -> Callable[..., Any]:
@@ -185,17 +189,24 @@ def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
     ModelError : a state has a flat initial law, and the model is not linear and Gaussian.
     """
     key = id(trace), missing
-    program = _programs.get(key)
-    if program is None:
-        check_start(trace)
-        proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
-        out, lines = _write(trace, missing, proposals)
-        loaded = load(out, identifier(trace.name), lines)
-        program = Program(trace, missing, proposals, out.finish(lines), loaded.module, loaded)
-        _programs[key] = program
-        while len(_programs) > _MOST_PROGRAMS:
-            _programs.popitem(last=False)
-    return program
+    program = _programs.get(key)  # without the lock: others may compile for long
+    if program is not None:
+        return program
+    with LOCK:
+        program = _programs.get(key)
+        if program is None:
+            program = _programs[key] = _compiled(trace, missing)
+            while len(_programs) > _MOST_PROGRAMS:
+                _programs.popitem(last=False)
+        return program
+
+
+def _compiled(trace: Trace, missing: Missing) -> Program:
+    check_start(trace)
+    proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
+    out, lines = _write(trace, missing, proposals)
+    loaded = load(out, identifier(trace.name), lines)
+    return Program(trace, missing, proposals, out.finish(lines), loaded.module, loaded)
 
 
 def _write(

@@ -13,12 +13,14 @@ from ssmppl.codegen.metropolis import XI, XI_INITIAL
 from ssmppl.codegen.module import Layout, Section, Target
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.traced import Trace
 
 TOGETHER = 48  # derivatives in one loop
 
 
+@one_at_a_time
 def compile_row_scores(
     trace: Trace, predicted: Trace, initial: Sequence[Expr], later: Sequence[Expr],
     missing: Missing, follows: Mapping[str, Sequence[tuple[Expr, Expr]]],

@@ -12,9 +12,11 @@ from ssmppl.codegen.loading import load
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.language.traced import Trace
 
 
+@one_at_a_time
 def compile_filter_rows(trace: Trace, proposal: Proposal) -> Callable[..., Any]:
     """Generate, write and import `filter_rows(theta, y, seen, u, start, stop, rng, x, w,
     log_increment)`, see the kernel; for a proposal without look-ahead."""

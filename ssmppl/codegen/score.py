@@ -14,6 +14,7 @@ from ssmppl.codegen.render import identifier
 from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
+from ssmppl.compiling import one_at_a_time
 from ssmppl.expressions.calculus import NotDifferentiable
 
 
@@ -33,6 +34,7 @@ class ScoreProgram:
     missing: dict[str, str]
 
 
+@one_at_a_time
 def compile_score(score: CompleteScore) -> ScoreProgram:
     """Generate, write and import the functions of a derived score."""
     trace = score.trace

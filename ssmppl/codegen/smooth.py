@@ -13,9 +13,11 @@ from ssmppl.codegen.loading import load
 from ssmppl.codegen.module import Layout
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.language.traced import Trace
 
 
+@one_at_a_time
 def compile_smooth_filter(trace: Trace, missing: Missing) -> Callable[..., Any]:
     """Generate, write and import the filter, for models to which it applies."""
     layout = Layout(trace)

@@ -18,12 +18,9 @@ import tokenize
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from threading import Lock
 from typing import Any
 
-# Python's own parser counts its depth for all threads together: two at once can fail with "AST
-# constructor recursion depth mismatch" (python/cpython issue 106905).
-_ONE_AT_A_TIME = Lock()
+from ssmppl.compiling import literal, one_at_a_time, parse
 
 
 @dataclass(frozen=True)
@@ -34,11 +31,11 @@ class Specialised:
     imports: dict[str, str]
 
 
+@one_at_a_time
 def specialise(function: Callable[..., Any], name: str, bound: Mapping[str, str]) -> Specialised:
     """The text of `function`, renamed, without the parameters in `bound`, which stand for text."""
     plain = getattr(function, "py_func", inspect.unwrap(function))
-    with _ONE_AT_A_TIME:
-        return _specialised(plain, name, tuple(sorted(bound.items())))
+    return _specialised(plain, name, tuple(sorted(bound.items())))
 
 
 _source = lru_cache(inspect.getsource)
@@ -92,7 +89,7 @@ def _specialised(
 def _entry(text: str, following: list[tokenize.TokenInfo]) -> str | None:
     """What `text` followed by these tokens, `[`, a number and `]`, is, if it is a tuple."""
     if [t.string for t in following[::2]] == ["[", "]"] and text.startswith("("):
-        return repr(ast.literal_eval(text)[int(following[1].string)])
+        return repr(literal(text)[int(following[1].string)])
     return None
 
 
@@ -111,7 +108,7 @@ def _decided(source: str, known: Mapping[str, Any], bound: Mapping[str, str]) ->
         except (NameError, SyntaxError):  # a function
             continue
     while True:
-        for node in ast.walk(ast.parse(source)):
+        for node in ast.walk(parse(source)):
             if not isinstance(node, ast.If):
                 continue
             names = {n.id for n in ast.walk(node.test) if isinstance(n, ast.Name)}

@@ -12,8 +12,10 @@ from ssmppl.codegen.render import identifier
 from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.sums import time_sum
 from ssmppl.codegen.text import ModuleText, heading
+from ssmppl.compiling import one_at_a_time
 
 
+@one_at_a_time
 def compile_statistics(step: MStep) -> ModuleType:
     """Generate, write and import `statistics` of one path and `weighted_statistics` of several.
 

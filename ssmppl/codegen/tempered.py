@@ -27,6 +27,7 @@ from ssmppl.codegen.loading import Loaded, load
 from ssmppl.codegen.module import Layout, Section
 from ssmppl.codegen.render import identifier
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.traced import Trace
 
@@ -101,6 +102,7 @@ class TemperedFilter:
         return status, t, float(log_increment.sum())
 
 
+@one_at_a_time
 def compile_tempered(trace: Trace, missing: Missing) -> TemperedFilter | NotApplicable:
     """Generate, write and import the tempered filter; the reason where there is none."""
     found = tempered(trace, missing)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache as once
 from functools import cached_property
 from types import ModuleType
 from typing import Any
@@ -32,6 +31,7 @@ from ssmppl.codegen.render import identifier
 from ssmppl.codegen.specialise import specialise
 from ssmppl.codegen.steering import steered_moves, steered_section
 from ssmppl.codegen.text import ModuleText
+from ssmppl.compiling import once, one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.traced import Trace
@@ -208,6 +208,7 @@ class _Back:
         return self.precision, self.pull, self.aim, self.gain
 
 
+@one_at_a_time
 def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplicable:
     """Generate, write and import the twisted filter; the reason where there is none."""
     found, proposal = guided(trace, missing), twisted(trace, missing)

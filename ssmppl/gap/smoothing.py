@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtr
@@ -20,6 +19,7 @@ from ssmppl.codegen.loading import Loaded
 from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.codegen.row_scores import compile_row_scores
 from ssmppl.codegen.twisted import TwistedFilter
+from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
 from ssmppl.gap.ahead import crps_ahead
@@ -71,20 +71,20 @@ class Smoother:
         generated = ("program", "module", "problem")
         return {k: v for k, v in self.__dict__.items() if k not in generated}
 
-    @cached_property
+    @once_property
     def program(self) -> Program:
         return compile_trace(self.columns.base, self.missing)
 
-    @cached_property
+    @once_property
     def module(self) -> Loaded:
         c = self.columns
         return compile_row_scores(c.given, c.base, c.initial, c.later, self.missing, c.follows)
 
-    @cached_property
+    @once_property
     def kalman(self) -> KalmanModel | NotApplicable:
         return kalman_model(self.columns.base)
 
-    @cached_property
+    @once_property
     def problem(self) -> Problem:
         return Problem(self.columns.base, (), self.program)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.program import Program, compile_trace
+from ssmppl.compiling import LOCK
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.gap.augment import augment
@@ -46,8 +47,12 @@ class Workshop:
         made, shapes = lift(candidates)
         key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
         if key not in self._made:
-            trace = with_parameters(augment(self.trace, made), shapes) if made else self.trace
-            self._made[key] = self.made(trace, shapes)
+            with LOCK:  # refits in threads ask for the same models
+                if key not in self._made:
+                    trace = self.trace
+                    if made:
+                        trace = with_parameters(augment(trace, made), shapes)
+                    self._made[key] = self.made(trace, shapes)
         return self._made[key].with_fixed(shapes)
 
     def with_free_shapes(
@@ -68,12 +73,15 @@ class Workshop:
             inside[symbol("parameter", name, ())] = a + b * u
         key = (*((c.key, c.strength) for c in made), *((n, "free") for n in free))
         if key not in self._made:
-            made = [
-                replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape)) for c in made
-            ]
-            trace = with_parameters(augment(self.trace, made), given)
-            trace = with_parameters(trace, map(share_of, free), lambda: Uniform(0, 1))
-            self._made[key] = self.made(trace, given)
+            with LOCK:
+                if key not in self._made:
+                    made = [
+                        replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape))
+                        for c in made
+                    ]
+                    trace = with_parameters(augment(self.trace, made), given)
+                    trace = with_parameters(trace, map(share_of, free), lambda: Uniform(0, 1))
+                    self._made[key] = self.made(trace, given)
         return self._made[key].with_fixed(given)
 
     def made(self, trace: Trace, given: Mapping[str, float]) -> Fitter:

@@ -18,6 +18,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array, scalar_or_array
 from ssmppl.expressions.expr import Expr
@@ -90,6 +91,7 @@ def _by_name(module: str, name: str) -> Primitive:
     return found
 
 
+@one_at_a_time
 def _restored(name: str, function: Callable[..., float]) -> Primitive:
     """The primitive of this name, compiled once in each process."""
     if name not in _made:

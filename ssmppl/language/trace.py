@@ -7,6 +7,7 @@ import weakref
 from collections.abc import Callable
 from typing import Any
 
+from ssmppl.compiling import LOCK
 from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.expr import Expr, recording, symbol
@@ -49,9 +50,13 @@ def trace(model: Model) -> Trace:
             f"expected a Model, found {type(model).__name__}",
             fix="pass the object made by ssm.Model(...), not its name or a function of it",
         )
+    signature = model.signature
     cached = _traces.get(model)
-    if cached is None or cached[0] != model.signature:
-        _traces[model] = cached = (model.signature, _Tracer(model).run())
+    if cached is None or cached[0] != signature:
+        with LOCK:
+            cached = _traces.get(model)
+            if cached is None or cached[0] != signature:
+                _traces[model] = cached = (signature, _Tracer(model).run())
     return cached[1]
 
 

@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ssmppl.compiling import LOCK
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbol
@@ -141,8 +142,10 @@ def once_per_trace(derive: Callable[[Trace], Derived]) -> Callable[[Trace], Deri
     def derived(trace: Trace) -> Derived:
         key = id(trace)
         if key not in kept:
-            reference = weakref.ref(trace, lambda _: kept.pop(key, None))
-            kept[key] = reference, derive(trace)
+            with LOCK:
+                if key not in kept:
+                    reference = weakref.ref(trace, lambda _: kept.pop(key, None))
+                    kept[key] = reference, derive(trace)
         return kept[key][1]
 
     return derived

@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 
+from ssmppl.compiling import once
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
@@ -258,7 +258,7 @@ class Written(Distribution):
         return self.has_cdf and (self._has("quantile") or self.bounds.values is not None)
 
 
-@cache
+@once
 def written_class(name: str) -> type[Written]:
     """The class of the laws of this name."""
     return type(name, (Written,), {"__doc__": f"{name}, as its user wrote it."})

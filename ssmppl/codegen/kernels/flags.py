@@ -9,11 +9,13 @@ the vector registers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, update_wrapper, wraps
+from functools import update_wrapper, wraps
 from typing import Any
 
 import numba
 import numpy as np
+
+from ssmppl.compiling import once_property
 
 FAST = frozenset({"reassoc", "contract", "arcp", "nsz", "afn"})
 """For loops over particles: sums may be reordered (so that they vectorise), a*b+c fused."""
@@ -41,7 +43,7 @@ class Kernel:
     def _numba_type_(self) -> Any:
         return self.bare._numba_type_
 
-    @cached_property
+    @once_property
     def compiled(self) -> Any:
         """The variant that Python can call."""
         return numba.njit(**self.options)(self.py_func)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
-from functools import cache as once
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -12,13 +10,14 @@ import llvmlite.binding as llvm
 from ssmppl.codegen import folder
 from ssmppl.codegen.native.library import function_ir
 from ssmppl.codegen.native.translate import Untranslatable, translate
+from ssmppl.compiling import once, one_at_a_time
 
 OLDEST = 16  # LLVM from which pointers have no type, as in the text that is written here
-_lock = threading.Lock()
 _kept: list[Any] = []  # engines own the code that addresses point to
 _built: dict[str, Mapping[str, int]] = {}
 
 
+@one_at_a_time
 def addresses(name: str, text: str) -> Mapping[str, int]:
     """Address of each function of a generated text, compiled or found on disk.
 
@@ -28,14 +27,13 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
     """
     if llvm.llvm_version_info[0] < OLDEST:
         raise Untranslatable(f"LLVM {llvm.llvm_version_info[0]} has typed pointers", fix="")
-    with _lock:
-        try:
-            key = f"{name}_{folder.digest_of(text + _machine())}"
-            if key not in _built:
-                _built[key] = _load(key, text)
-            return _built[key]
-        except RuntimeError as error:  # an LLVM that knows another dialect, or not this machine
-            raise Untranslatable(f"LLVM refuses: {error}", fix="") from None
+    try:
+        key = f"{name}_{folder.digest_of(text + _machine())}"
+        if key not in _built:
+            _built[key] = _load(key, text)
+        return _built[key]
+    except RuntimeError as error:  # an LLVM that knows another dialect, or not this machine
+        raise Untranslatable(f"LLVM refuses: {error}", fix="") from None
 
 
 def _load(key: str, text: str) -> Mapping[str, int]:

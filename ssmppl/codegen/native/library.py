@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import re
-from functools import cache as once
 from typing import Any
 
 from numba import float64, types
@@ -16,6 +15,7 @@ from numba import float64, types
 from ssmppl.codegen import folder
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.text import MODULES
+from ssmppl.compiling import once
 
 HOMES = {n: file for file, names in MODULES.items() for n in names.split() if file != "flags"}
 STREAM = types.Array(types.uint64, 1, "C")

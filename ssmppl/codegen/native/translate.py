@@ -26,6 +26,7 @@ from ssmppl.codegen.native.arithmetic import (
     Untranslatable,
     Value,
 )
+from ssmppl.compiling import parse
 
 PLANES = frozenset(
     ["y_data", "seen_data", "u_data", "states", "states_prev", "fits", "out"]
@@ -50,7 +51,7 @@ def translate(text: str) -> Translated:
     ------
     Untranslatable : naming the function and what was found in it.
     """
-    tree = ast.parse(text)
+    tree = parse(text)
     functions = [n for n in tree.body if isinstance(n, ast.FunctionDef)]
     known = {f.name for f in functions}
     calls: set[tuple[str, int, bool]] = set()

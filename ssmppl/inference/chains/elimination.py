@@ -31,6 +31,7 @@ from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.elimination import compile_elimination
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.codegen.loading import Loaded
+from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
@@ -70,7 +71,7 @@ class Eliminating(ParameterSteps):
     adapting: int
     worth: float = WORTH
 
-    @cached_property
+    @once_property
     def made(self) -> tuple[Elimination, Loaded]:
         found = compile_elimination(
             self.problem.trace, self.problem.program.missing, Eliminable(self.updates, {})

@@ -19,6 +19,7 @@ from ssmppl.analysis.noises import Noises
 from ssmppl.codegen.interweaving import compile_noises
 from ssmppl.codegen.loading import Loaded
 from ssmppl.codegen.twisted import TwistedFilter, backward_passes
+from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import symbols_of
@@ -57,7 +58,7 @@ class NoiseMove:
     def __setstate__(self, state: dict) -> None:
         self.__dict__.update(state)
 
-    @cached_property
+    @once_property
     def module(self) -> Loaded:
         return compile_noises(self.problem.trace, self.found, self.steered)
 

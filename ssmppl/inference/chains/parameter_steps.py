@@ -15,6 +15,7 @@ import numpy as np
 
 from ssmppl.analysis.conjugacy import Update, derive_updates, draw
 from ssmppl.codegen.gibbs import compile_updates, statistics_name
+from ssmppl.compiling import once_property
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.problem import Problem
@@ -27,7 +28,7 @@ class ParameterSteps:
     problem: Problem
     updates: tuple[Update, ...]
 
-    @cached_property
+    @once_property
     def module(self) -> ModuleType:
         return compile_updates(self.problem.trace, self.updates)
 

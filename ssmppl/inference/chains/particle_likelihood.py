@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from ssmppl.codegen.metropolis import (
     numbered_filter,
     scored_filter,
 )
+from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.walk import Point, Run
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
@@ -121,7 +121,7 @@ class ScoredLikelihood(_WithFilter):
     second: bool
     states: bool = True
 
-    @cached_property
+    @once_property
     def filter(self) -> ScoredFilter:
         program, name = self.problem.program, self.settings.proposal
         symbols = [self.problem.trace.parameter_symbols[i] for i in self.wanted]
@@ -176,7 +176,7 @@ class CorrelatedLikelihood(_WithFilter):
     correlation: float
     states: bool = True
 
-    @cached_property
+    @once_property
     def filter(self) -> NumberedFilter:
         program, name = self.problem.program, self.settings.proposal
         made = numbered_filter(program, self.problem.proposal(name))

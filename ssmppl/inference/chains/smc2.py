@@ -18,7 +18,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from ssmppl.analysis.density import terms
 from ssmppl.codegen.kernels.resampling import PADDING, systematic
 from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
 from ssmppl.codegen.rowwise import compile_filter_rows
+from ssmppl.compiling import once_property
 from ssmppl.counts import check_count
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
@@ -59,7 +60,7 @@ class Filters:
     def problem(self) -> Problem:
         return self.space.problem
 
-    @cached_property
+    @once_property
     def run(self) -> Callable[..., Any]:
         return compile_filter_rows(self.problem.trace, self.problem.proposal(self.proposal))
 

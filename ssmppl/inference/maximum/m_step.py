@@ -17,6 +17,7 @@ from ssmppl.analysis.expectation import unsuited
 from ssmppl.analysis.mstep import MStep, counted, derive_m_step
 from ssmppl.analysis.sufficient import complete_data, restricted
 from ssmppl.codegen.statistics import compile_statistics
+from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.draws import Block, stack
 from ssmppl.inference.maximum.ascent import Setup
@@ -47,13 +48,13 @@ class Maximiser:
     def problem(self) -> Problem:
         return self.space.problem
 
-    @cached_property
+    @once_property
     def step(self) -> MStep | NotApplicable:
         """The M-step from statistics; the reason where the densities do not separate."""
         missing = self.problem.program.missing
         return derive_m_step(self.problem.trace, self.fixed, missing, self.posterior)
 
-    @cached_property
+    @once_property
     def module(self) -> ModuleType:
         assert isinstance(self.step, MStep)
         return compile_statistics(self.step)

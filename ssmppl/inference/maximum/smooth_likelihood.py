@@ -10,7 +10,7 @@ Carlo error.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import scipy
 
 from ssmppl.codegen.kernels.weights import OK
 from ssmppl.codegen.smooth import compile_smooth_filter
+from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import DirectOptimization
@@ -41,7 +42,7 @@ class SmoothLikelihood:
             for k in range(seeds)
         ]
 
-    @cached_property
+    @once_property
     def run(self) -> Any:
         return compile_smooth_filter(self.problem.trace, self.problem.program.missing)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from ssmppl.analysis.perturbed import Perturbed, perturbed
 from ssmppl.codegen.iterated import compile_iterated_filter
 from ssmppl.codegen.kernels.weights import OK
+from ssmppl.compiling import once_property
 from ssmppl.inference.draws import Block
 from ssmppl.inference.particles.filtering import failure
 from ssmppl.inference.particles.pilot import Space
@@ -37,7 +37,7 @@ class Swarms:
     def problem(self) -> Problem:
         return self.space.problem
 
-    @cached_property
+    @once_property
     def run(self) -> Callable[..., Any]:
         return compile_iterated_filter(perturbed_model(self.space, self.with_prior))
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from functools import cached_property
 
 import numpy as np
 
 from ssmppl.analysis.score import CompleteScore
 from ssmppl.codegen.score import ScoreProgram, compile_score
+from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.problem import Problem
 from ssmppl.inference.singular import need_density
@@ -34,7 +34,7 @@ class CompleteScores:
         place = {s: i for i, s in enumerate(problem.trace.parameter_symbols)}
         self.where = np.array([place[p] for p in derived.parameters], dtype=int)
 
-    @cached_property
+    @once_property
     def program(self) -> ScoreProgram:
         return compile_score(self.derived)
 
