@@ -6,7 +6,6 @@ them are worth having where one fails. So an error ends its part and no other, a
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -42,7 +41,6 @@ class Failures:
     def __init__(self, raised: bool = False):
         self.raised = raised
         self._reasons: dict[str, str] = {}
-        self._lock = threading.Lock()
 
     def __iter__(self) -> Iterator[tuple[str, str]]:
         return iter(list(self._reasons.items()))
@@ -52,8 +50,7 @@ class Failures:
 
     def add(self, part: str, reason: str) -> None:
         """Say that a part failed, and why in one line."""
-        with self._lock:
-            self._reasons.setdefault(part, reason)
+        self._reasons.setdefault(part, reason)
 
     def of_task(self, part: str, numbers: Mapping[str, Any]) -> bool:
         """Whether a task failed by a fault; then that is said of the part."""

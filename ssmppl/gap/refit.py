@@ -66,6 +66,11 @@ class Refit:
         return [values[c.strength] for c in self.candidates]
 
     @property
+    def bounds(self) -> list[str]:
+        """Components that ran to a bound of their support."""
+        return self.fit.bounds
+
+    @property
     def errors(self) -> dict[str, float]:
         """Standard errors of all free parameters, from the information at the fit."""
         return standard_errors(self.fit, self.fitter.fixed)

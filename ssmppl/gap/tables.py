@@ -232,8 +232,9 @@ def causes_table(
 def estimated(screen: Screen, refit: Refit, c: Candidate, error: float = np.nan) -> dict[str, Any]:
     """Form, sign, estimate and se of one of a refit's effects, whose shape need not be among those
     that the screen tried. error : of the strength by the screen, about, where it is known."""
-    strength = refit.fit.values()[c.strength]
-    if c.sided and (abs(strength) < AT_BOUND * error or c.strength in refit.fit.bounds):
+    strengths = {own.strength: v for own, v in zip(refit.candidates, refit.strengths, strict=True)}
+    strength = strengths[c.strength]
+    if c.sided and (abs(strength) < AT_BOUND * error or c.strength in refit.bounds):
         return _told(screen, c, 0.0, np.nan)  # the search runs towards the bound for ever
     return _told(screen, c, strength, refit.errors[c.strength])
 

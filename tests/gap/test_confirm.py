@@ -24,7 +24,8 @@ def fitted(problem, theta, **settings):
     fitter = Fitter(problem, {}, Settings(**settings))
     n = len(theta)
     numbers = {"theta": theta, "z": np.zeros(n), "log_likelihood": 0.0, "error": 0.0,
-               "information": np.eye(n), "distance": 0.0, "converged": True}  # fmt: skip
+               "information": np.eye(n), "distance": 0.0, "converged": True,
+               "at_bound": np.zeros(n)}  # fmt: skip
     return fitter, fitter.restored(problem.experiments, numbers)
 
 

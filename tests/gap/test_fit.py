@@ -147,9 +147,9 @@ def test_a_step_over_a_cliff_is_taken_back(monkeypatch, after):
     start = particles.fit(problem.experiments, seed, {}).start
     whole, calls = particles.gradient, []
 
-    def gradient(space, z, stream):
+    def gradient(space, z, stream, chart):
         calls.append(z)
-        value, slope = whole(space, z, stream)
+        value, slope = whole(space, z, stream, chart)
         return (value - 1e5, 1e5 * slope) if len(calls) == after + 1 else (value, slope)
 
     monkeypatch.setattr(particles, "gradient", gradient)

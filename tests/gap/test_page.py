@@ -170,7 +170,11 @@ def test_vectors_among_the_parameters_take_a_line_each():
 
 @pytest.mark.parametrize("verdict", ["effect", "none of these", "no measurable gap"])
 def test_an_empty_report_has_a_page(verdict):
-    reader = Reader(plots.page(GapReport(verdict, **{name: tabulate(name) for name in COLUMNS})))
+    reader = Reader(
+        plots.page(
+            GapReport(verdict, **{name: tabulate(name) for name in COLUMNS if name != "left_out"})
+        )
+    )
     assert reader.faults == []
 
 

@@ -21,7 +21,7 @@ from tests.gap.made_up import ALL, NAN, effect_found, fast, no_gap, none_of_thes
 
 def empty(verdict="no measurable gap", **fields):
     """A report that holds nothing."""
-    tables = {name: tabulate(name) for name in COLUMNS if name != "missing"}
+    tables = {name: tabulate(name) for name in COLUMNS if name not in ("missing", "left_out")}
     return GapReport(verdict=verdict, **tables, **fields)
 
 
@@ -44,7 +44,7 @@ def empty(verdict="no measurable gap", **fields):
         (interval(0.4, math.inf), "95% interval: at least 40%"),
         (interval(-math.inf, 0.9), "95% interval: at most 90%"),
         (interval(-math.inf, math.inf), "95% interval: unbounded"),
-        (interval(NAN, 1), "no interval could be computed"),
+        (interval(NAN, 1), "no comparison: the reference is this model itself"),
         (span(1, 400), "t = 1 to 400"), (span(1899.0, 1899), "t = 1899"), (span(NAN, 3), ""),
         (span(np.datetime64("2024-01-01").astype(object), "2024-02-01 00:00:00"),
          "t = 2024-01-01 to 2024-02-01"),
