@@ -132,12 +132,12 @@ class TwistedFilter:
     ) -> float:
         """log p(y | theta) by the extended Kalman filter, whose update is the mode of each row: an
         approximation, exact where the model is linear and Gaussian; -inf where it comes to no
-        number."""
+        number, or to none that floating point resolves."""
         found, covariance = self._empty(len(y))
         value = self.module.follow_filter(
             theta, y, seen, u, found.x, covariance, *found.derivatives
         )
-        return float(value)
+        return float(value) if value < np.inf else -np.inf
 
     def _climbed(self, given: tuple[np.ndarray, ...], first: _Reference) -> _Reference:
         """The mode of the noise, from a first trajectory that need not follow the model."""

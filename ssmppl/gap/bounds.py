@@ -9,16 +9,18 @@ the other numbers' scores and curvatures of a moderate size (Self and Liang 1987
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 
 import numpy as np
 
 from ssmppl.inference.particles.pilot import Space
 from ssmppl.language.transforms import transforms
 
-OUTWARDS = (3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 20, 1,100, 160,000
+OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
 FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
 COST = 0.05  # nats that the value which is held may cost
-INWARDS, STEPS = 40.0, 40  # how far inside it is looked for, and how finely by halving
+GRID = np.linspace(0.5, 40.0, 80).tolist()  # inwards, where the value that is held is looked for
+STEPS = 40  # of halving
 FALL = 0.5  # nats by which the function has to fall inside: else the number is not identified
 
 
@@ -39,15 +41,15 @@ def bounded(
             return function(there)
 
         for sign in (-1.0, 1.0):
-            if not all(at(sign * s) >= here - FREE for s in OUTWARDS):
+            # As far as there are values: nothing is resolved any more where a noise is tiny.
+            out = list(takewhile(lambda v: v > -np.inf, (at(sign * s) for s in OUTWARDS)))
+            if not out or min(out) < here - FREE:
                 continue
-            top = max(here, *(at(sign * s) for s in OUTWARDS))
-            inside = [s for s in np.linspace(0.5, INWARDS, 80) if not at(-sign * s) > top - FALL]
-            if not inside:  # flat either way: nothing tells of this number
+            top = max(here, *out)
+            inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
+            if inside is None:  # flat either way: nothing tells of this number
                 continue
-            good, bad = -OUTWARDS[0], inside[0]  # inwards, from a place that costs nothing
-            if not at(-sign * good) >= top - COST:
-                good = -OUTWARDS[-1]
+            good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
             for _ in range(STEPS):
                 middle = 0.5 * (good + bad)
                 good, bad = (middle, bad) if at(-sign * middle) >= top - COST else (good, middle)

@@ -73,7 +73,7 @@ def offers(
     shared = Flows.of(anatomy)
     out: list[Candidate] = []
     refused: list[Refused] = []
-    failures = failures or Failures(raised=True)
+    failures = Failures(raised=True) if failures is None else failures
     for effect in chosen(effects):
         try:
             found, not_for = _of_effect(effect, anatomy, scales, shared)

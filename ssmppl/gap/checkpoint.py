@@ -63,7 +63,7 @@ class Checkpoint:
         failures: Failures | None = None,
     ):  # fmt: skip
         self.made_from = Origin(dict(made_from))
-        self.failures = failures or Failures()
+        self.failures = Failures() if failures is None else failures
         self.executor, self.progress = executor, progress
         self.prefix = ""
         self.file = None if path is None else _file(Path(path), made_from.get("mode", "stages"))

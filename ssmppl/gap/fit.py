@@ -28,7 +28,7 @@ from ssmppl.gap.smoothing import Settings, Smoother
 from ssmppl.gap.started import FirstStates, Start
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.maximum.by_differences import climb
+from ssmppl.inference.maximum.by_differences import Top, climb
 from ssmppl.inference.maximum.chart import Chart
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
@@ -189,10 +189,21 @@ class Fitter:
 
             z, _ = climb_to_mode(space, seed, estimate)
             space = at(space, space.parameters(z)[0].copy())
-        if smooth is not None:
-            space, curvature = self._by_extended(space, smooth, seed)
-            information = curvature if curvature is not None else information
-        return self._climb(space, seed, information, smooth)
+        if smooth is None:
+            return self._climb(space, seed, information)
+        space, top = self._by_extended(space, smooth, seed)
+        if top is not None:
+            information = steady(top.information, ~space.on_the_line)
+        fit = self._climb(space, seed, information)
+        if top is not None:
+            fit = self._settled(fit, space, top, seed)
+        z, mask = bounded(density_of(space, smooth), fit.z, ~space.on_the_line)
+        if not mask.any():
+            return fit
+        theta = space.parameters(z)[0].copy()
+        value, error = self.log_likelihood(problem.experiments, theta, seed)
+        return replace(fit, space=at(space, theta), theta=theta, z=z, log_likelihood=value,
+                       error=error, at_bound=mask)  # fmt: skip
 
     # -- by the extended Kalman filter
     def _extended(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
@@ -212,9 +223,9 @@ class Fitter:
 
     def _by_extended(
         self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence
-    ) -> tuple[Space, np.ndarray | None]:
-        """The top of that, and minus the second derivatives there (F, F), from where the space
-        stands; as it is, and None, where the particle filter knows better."""
+    ) -> tuple[Space, Top | None]:
+        """The space at the top of that, from where it stands; as it is, and None, where the
+        particle filter knows better."""
         function = density_of(space, smooth)
         tops = []
         for share in QUIETER:
@@ -222,17 +233,29 @@ class Fitter:
             top = climb(function, begin.z[begin.where])
             if top is not None:
                 tops.append(top)
-        if not tops:
-            return space, None
-        best = max(tops, key=lambda top: top.value)
-        there = at(space, space.parameters(best.z)[0].copy())
-        was, now = (
-            self._estimate(s.problem, s.theta, self.settings.particles, random_state(seed, 8))
-            for s in (space, there)
-        )
-        if not now >= was - ASTRAY:
-            return space, None
-        return there, steady(best.information, ~space.on_the_line)
+
+        def estimate(s: Space) -> float:
+            n = self.settings.particles
+            return self._estimate(s.problem, s.theta, n, random_state(seed, 8))
+
+        was = estimate(space)
+        for top in sorted(tops, key=lambda top: -top.value):
+            there = at(space, space.parameters(top.z)[0].copy())
+            if estimate(there) >= was - ASTRAY:
+                return there, top
+        return space, None
+
+    def _settled(self, fit: Fit, space: Space, top: Top, seed: np.random.SeedSequence) -> Fit:
+        """The fit, or the top of the approximation where the particles' score led to nothing
+        higher: with next to no noise in a law that score is mostly Monte Carlo error."""
+        value, error = self.log_likelihood(space.problem.experiments, space.theta, seed)
+        prior = density_of(space, lambda theta: 0.0)
+        gained = fit.log_likelihood + prior(fit.z) - value - prior(top.z)
+        if gained > 2.0 * np.hypot(error, fit.error):
+            return fit
+        return replace(fit, space=space, theta=space.theta, z=top.z, log_likelihood=value,
+                       error=error, information=steady(top.information, ~space.on_the_line),
+                       distance=top.distance, converged=top.distance < 3.0 * NEAR)  # fmt: skip
 
     def _quieter(self, space: Space, share: float) -> Space:
         """The space with the scales of the transition's noise at a share of what they are."""
@@ -322,9 +345,8 @@ class Fitter:
         return value + point.log_prior, slope
 
     def _climb(
-        self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None,
-        smooth: Callable[[np.ndarray], float] | None,
-    ) -> Fit:  # fmt: skip
+        self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
+    ) -> Fit:
         stream = random_state(seed, 1)
         z = space.z[space.where]
         if information is None:
@@ -341,13 +363,11 @@ class Fitter:
         z, h, distance = noisy_climb(
             lambda z: self.gradient(space, z, stream, chart), z, found, information
         )
-        mask = np.zeros(len(z), dtype=bool)
-        if smooth is not None:
-            z, mask = bounded(density_of(space, smooth), z, ~space.on_the_line)
         theta = space.parameters(z)[0].copy()
         value, error = self.log_likelihood(space.problem.experiments, theta, seed)
-        converged = distance < 3.0 * NEAR
-        return Fit(at(space, theta), theta, z, value, error, h, distance, converged, mask)
+        nowhere = np.zeros(len(z), dtype=bool)
+        return Fit(at(space, theta), theta, z, value, error, h, distance, distance < 3.0 * NEAR,
+                   nowhere)  # fmt: skip
 
     def log_likelihood(
         self, experiments: Sequence[Experiment], theta: np.ndarray, seed: np.random.SeedSequence,

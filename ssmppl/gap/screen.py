@@ -68,7 +68,7 @@ class Question:
     ):  # fmt: skip
         """candidates : these instead of what the catalogue offers, and no basis. simulator : of the
         model, where it is not the plain one. failures : takes the candidates that a fault ends."""
-        failures = failures or Failures()
+        failures = Failures() if failures is None else failures
         self._simulator = simulator
         self.trace, self.settings, self.scales = trace, settings, scales
         self.refused: list[Refused] = []

@@ -24,6 +24,7 @@ from ssmppl.codegen.kernels.flags import exact
 NEWTON_STEPS = 10  # at most, of the filter's update where the curvature varies
 HALVINGS = 40  # of one of them, until the density grows: a slope can lead a thousand sds astray
 CLOSE = 0.05  # nats of improvement with which they end
+RESOLVED = 1e-13  # of a predicted variance, below which the variance after is mostly rounding
 SWEEPS = 12  # of Jacobi's method; a handful suffice
 ROUND = 1e-14
 
@@ -230,7 +231,8 @@ def follow_filter(
     theta, y, seen, u, x, covariance, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
     """The first reference: an extended Kalman filter; returns its log-likelihood, -inf where it
-    comes to no number.
+    comes to no number, +inf where its covariances do and rounding has eaten the log-likelihood: an
+    observation told a state better than `RESOLVED`.
 
     x (T, D) its means, covariance (T, D, D), rest (T, D), jacobian (T, D, D), spread (T, D, R),
     spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
@@ -244,7 +246,7 @@ def follow_filter(
     seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     p, after, jp = np.zeros((d, d)), np.empty((d, d)), np.empty((d, d))
     toward, move, target, lead = np.empty(d), np.empty(d), np.empty(d), np.empty(d)
-    log_likelihood = 0.0
+    log_likelihood, resolved = 0.0, True
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
@@ -280,13 +282,14 @@ def follow_filter(
         if not abs(log_likelihood) < np.inf:
             return -np.inf
         for i in range(d):
+            resolved = resolved and after[i, i] >= RESOLVED * p[i, i]
             if not abs(now[i, 0]) < np.inf:
                 return -np.inf
             x[t, i] = now[i, 0]
             before[i, 0] = now[i, 0]
             for j in range(d):
                 covariance[t, i, j] = after[i, j]
-    return log_likelihood
+    return log_likelihood if resolved else np.inf
 
 
 @exact

@@ -18,10 +18,13 @@ CHANGE = (0.05, 5.0)  # of the function over one width, between which that is a 
 WIDEST, FIRST, TIMES = 4.0, 0.1, 4.0  # of a width in z; where the search for it begins; its factor
 TRIES = 24
 STEPS = 40
-FARTHEST = 2.0  # of a step in any coordinate, in units of it where it is larger than one
+FARTHEST = 2.0  # of a first step in any coordinate, in units of it where it is larger than one
 SHARES = (1.0, 0.5, 0.2, 0.05, 0.01)  # of a step that are tried
-GOOD = 0.01  # nats that the quadratic still expects where a climb is at its end
-LEAST = 1e-3  # of the eigenvalues of the scaled second derivatives
+GOOD = 1e-3  # that the quadratic still expects where a climb is at its end
+LITTLE = 0.01  # that two steps in a row gain where it is, too: on the way to a bound at infinity
+CONVEX = 0.05  # minus an eigenvalue, in widths, beyond which the place is no top whatever its slope
+LEAST = 1e-3  # of the eigenvalues of the second derivatives as correlations
+FLAT = 1e-10  # second derivative in widths that is rounding
 
 Function = Callable[[np.ndarray], float]
 
@@ -49,26 +52,44 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
     if not len(z):
         return Top(z, value, np.zeros((0, 0)), 0.0)
     width = np.full(len(z), FIRST)
-    information, distance = np.eye(len(z)), np.inf
+    information, distance, reach, gained = np.eye(len(z)), np.inf, FARTHEST, np.inf
     for _ in range(STEPS):
         width = widths(function, z, value, width)
-        slope, curvature = _derivatives(function, z, value, width)
+        slope, coarse, curvature = _derivatives(function, z, value, width)
         information = curvature / np.outer(width, width)
-        step, distance = _step(slope, curvature)
-        if distance < GOOD:
+        step, distance, lowest = _step(slope, curvature)
+        if distance < GOOD and lowest > -CONVEX:
             break
-        move = step * width
-        move *= min(1.0, FARTHEST / np.max(np.abs(move) / np.maximum(1.0, np.abs(z))))
-        for share in SHARES:
-            new = function(z + share * move)
-            if new > value:
+        # On a rough function the differences over half a width may know better than the fine ones.
+        found = None
+        for move in (step * width, _step(coarse, curvature)[0] * width, coarse * width):
+            size = float(np.max(np.abs(move) / np.maximum(1.0, np.abs(z))))
+            move = move * min(1.0, reach / max(size, 1e-300))
+            found = _further(function, z, value, move)
+            if found is not None:
                 break
-        else:
+        if found is None:
             break
-        z, gained, value = z + share * move, new - value, new
-        if gained < GOOD:
+        at, new, share = found
+        if size > reach or share < 1.0:
+            reach = max(FARTHEST, 2.0 * reach if share == 1.0 else share * reach)
+        before, gained = gained, new - value
+        z, value = at, new
+        if max(before, gained) < LITTLE:
             break
     return Top(z, value, information, distance)
+
+
+def _further(
+    function: Function, z: np.ndarray, value: float, move: np.ndarray
+) -> tuple[np.ndarray, float, float] | None:
+    """A point along a move that lies higher, its value, and the share of the move; None for none."""
+    for share in SHARES:
+        at = z + share * move
+        new = function(at)
+        if new > value:
+            return at, new, share
+    return None
 
 
 def widths(function: Function, z: np.ndarray, value: float, first: np.ndarray) -> np.ndarray:
@@ -100,9 +121,9 @@ def _moved(z: np.ndarray, i: int, by: float) -> np.ndarray:
 
 def _derivatives(
     function: Function, z: np.ndarray, value: float, width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(F,) slope and (F, F) minus second differences, in widths; 0 where there are none, the slope
-    one-sided next to where there is no value."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(F,) slope, fine and over half a width, and (F, F) minus second differences, in widths; 0
+    where there are none, the slope one-sided next to where there is no value."""
     n, h = len(z), 0.5
     ends = np.array([[function(_moved(z, i, s * size * width[i])) for s in (1.0, -1.0)]
                      for size in (FINE, h) for i in range(n)])  # fmt: skip
@@ -122,12 +143,16 @@ def _derivatives(
                 )
                 twice = up - plus[i] - plus[j] + 2.0 * value - minus[i] - minus[j] + down
                 out[i, j] = out[j, i] = -twice / (2.0 * h**2)
-    return np.where(np.isfinite(slope), slope, 0.0), np.where(np.isfinite(out), out, 0.0)
+        coarse = (plus - minus) / (2.0 * h)
+    slope, coarse, out = (np.where(np.isfinite(a), a, 0.0) for a in (slope, coarse, out))
+    return slope, coarse, out
 
 
-def _step(slope: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float]:
-    """(F,) a step that climbs, in widths, and what a quadratic expects of it."""
-    values, vectors = np.linalg.eigh(curvature)
-    values = np.maximum(np.abs(values), LEAST * max(float(np.max(np.abs(values))), LEAST))
-    step = vectors @ ((vectors.T @ slope) / values)
-    return step, 0.5 * float(slope @ step)
+def _step(slope: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """(F,) a step that climbs, in widths, what a quadratic expects of it, the least eigenvalue."""
+    lowest = float(np.linalg.eigvalsh(curvature)[0])
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), FLAT))
+    values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
+    values = np.maximum(np.abs(values), LEAST)
+    step = (vectors @ ((vectors.T @ (slope / scale)) / values)) / scale
+    return step, 0.5 * float(slope @ step), lowest

@@ -1,0 +1,62 @@
+"""Newton's ascent by differences: quadratics exactly, any units, curved valleys, edges."""
+
+import numpy as np
+import pytest
+
+from ssmppl.inference.maximum.by_differences import GOOD, LITTLE, climb, widths
+from tests.statistics.checks import seed_of
+
+
+@pytest.mark.parametrize("units", [1e-8, 1.0, 1e8])
+def test_a_quadratic_is_climbed_to_its_top_with_its_curvature(units):
+    rng = np.random.default_rng(seed_of("quadratic"))
+    root = rng.standard_normal((4, 4))
+    h, top = root @ root.T + np.eye(4), rng.standard_normal(4) * units
+
+    def function(z):
+        away = (z - top) / units
+        return 3.0 - 0.5 * away @ h @ away
+
+    found = climb(function, top + 40.0 * units * rng.standard_normal(4))
+    away = (found.z - top) / units
+    assert 0.5 * away @ h @ away < GOOD
+    np.testing.assert_allclose(found.information * units**2, h, rtol=1e-4, atol=1e-4)
+
+
+def test_a_curved_valley_is_followed_to_its_end():
+    """Rosenbrock's, from where Newton's matrix is not definite."""
+    found = climb(lambda z: -100.0 * (z[1] - z[0] ** 2) ** 2 - (1.0 - z[0]) ** 2,
+                  np.array([-1.2, 1.0]))  # fmt: skip
+    assert found.value > -LITTLE
+    np.testing.assert_allclose(found.z, 1.0, atol=0.2)
+
+
+def test_a_place_that_is_no_top_is_left():
+    """A saddle has no slope: what is beside it has."""
+    found = climb(lambda z: -((z[0] ** 2 - 1.0) ** 2) - z[1] ** 2, np.array([1e-2, 0.3]))
+    assert found.value > -GOOD
+    assert abs(abs(found.z[0]) - 1.0) < 0.1
+
+
+def test_next_to_where_there_is_no_value():
+    """The top lies on an edge: the climb ends there, with a slope that is one-sided."""
+
+    def function(z):
+        return float(z[0]) if z[0] < 2.0 else -np.inf
+
+    found = climb(function, np.array([0.0]))
+    assert 1.9 < found.z[0] < 2.0
+
+
+def test_where_there_is_no_value_there_is_no_climb():
+    assert climb(lambda z: -np.inf, np.zeros(2)) is None
+    found = climb(lambda z: 1.5, np.zeros(0))
+    assert (found.value, found.distance) == (1.5, 0.0)
+
+
+def test_a_width_is_what_changes_the_function_by_about_one():
+    scale = np.array([1e-6, 1.0, 300.0])
+    found = widths(lambda z: -0.5 * np.sum((z / scale) ** 2), np.zeros(3), 0.0, np.full(3, 0.1))
+    change = 0.5 * (found / scale) ** 2
+    assert np.all((change[:2] >= 0.05) & (change <= 5.0)[:2])
+    assert found[2] == 4.0  # as far as any
