@@ -71,8 +71,8 @@ def attribute(
     """Refit, choose, and step forward; into `out`.
 
     always : choose the best one even where the screen finds nothing. singles : how many are
-    refitted; None: the leading ones and their class mates. steps : effects in all. quick : without
-    standard errors.
+    refitted; None: the leading ones and their class mates. steps : effects in all. quick : by rough
+    fits (`Fitter.fit`), without standard errors.
     """
     refits: list[Refit] = []
     stages: dict[str, Callable[[], list[int]]] = {"refitting": lambda: leading(screen)[:singles]}
@@ -85,7 +85,7 @@ def attribute(
             heads = which()
             more, failed = refit_all(
                 workshop, out.base, screen, [[k] for k in heads], train, _seed(seed, 1), kept,
-                stage, afresh=stage == AFRESH,
+                stage, afresh=stage == AFRESH, rough=quick,
             )  # fmt: skip
             refits = best_of_groups(screen, refits + more)
             out.notes += [f"not refitted: {reason}" for reason in failed]
@@ -116,16 +116,20 @@ def attribute(
     if steps > 1:
         rival = None
         with kept.failures.part("pairs of effects"):
-            rival = _best_pair(out, workshop, screen, train, _seed(seed, 2), alpha, kept)
+            rival = _best_pair(
+                out, workshop, screen, train, _seed(seed, 2), alpha, kept, rough=quick
+            )
         # a step from the best one, against the best pair
         with kept.failures.part("whether a second effect is missing"):
-            _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, 2)
+            _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, 2, rough=quick)
         if rival is not None and rival.merit > out.chosen.merit:
             out.chosen = rival
         if len(out.chosen.candidates) == 2:
             pair = out.chosen
             with kept.failures.part("whether a third effect is missing"):
-                _forward(out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps)
+                _forward(
+                    out, workshop, screen, train, _seed(seed, 3), alpha, kept, steps, rough=quick
+                )
     out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen]
     if not quick and len(out.chosen.candidates) > 1:
         with kept.failures.part("the shapes of all that was chosen"):
@@ -150,13 +154,13 @@ def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | No
 
 def _best_pair(
     out: Attribution, workshop: Workshop, screen: Screen, train: Sequence[Experiment],
-    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint,
+    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint, *, rough: bool = False,
 ) -> Refit | None:  # fmt: skip
     """The best of the pairs of which the screen promises most, where it is clearly better than the
     best one."""
     out.doubles, failed = refit_all(
         workshop, out.base, screen, pairs(screen, out.refits), train, seed, kept,
-        "refitting pairs",
+        "refitting pairs", rough=rough,
     )  # fmt: skip
     out.notes += [f"not refitted: {reason}" for reason in failed]
     if not out.doubles or out.doubles[0].merit - out.refits[0].merit < needed_gain(screen, alpha):
@@ -221,7 +225,7 @@ def _by_refit(
         found = {k: p for k, p in found.items() if k in anew}
         if min(rest.values(), default=1.0) <= LAX * alpha:
             best = min(rest, key=lambda k: rest[k])
-            found[best] = refit_p(workshop, out.base, screen, out.refits, alpha, seed, kept)
+            found[best] = refit_p(workshop, out.base, screen, alpha, seed, kept)
     if not found:
         return False
     out.p |= found
@@ -236,7 +240,8 @@ def needed_gain(screen: Screen, alpha: float) -> float:
 
 def _forward(
     out: Attribution, workshop: Workshop, screen: Screen, train: Sequence[Experiment],
-    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint, steps: int,
+    seed: np.random.SeedSequence, alpha: float, kept: Checkpoint, steps: int, *,
+    rough: bool = False,
 ) -> None:  # fmt: skip
     """Ask again around the chosen model, and add what stands out."""
     chosen = out.chosen
@@ -262,7 +267,7 @@ def _forward(
         heads = leading(again)[:FOLLOWERS]
         more, _ = refit_all(
             workshop, chosen.fit, again, [[k] for k in heads], train, _seed(seed, 10 + number),
-            own, "refitting", chosen.candidates,
+            own, "refitting", chosen.candidates, rough=rough,
         )  # fmt: skip
         if not more or more[0].merit < needed_gain(again, alpha):
             return

@@ -45,22 +45,23 @@ def gain_p(screen: Screen, refit: Refit) -> float:
     return tail_p(height, screen.family.maxima)
 
 
-def best_of_tried(screen: Screen, refits: Sequence[Refit]) -> float:
-    """The largest gain among the refits of the `TRIED` best by the score."""
-    tried = _best(screen, screen.found.gain, np.array([bool(s) for s in screen.found.status]))
-    return max((r.gain for r in refits if r.index[0] in tried), default=0.0)
-
-
 def refit_p(
-    workshop: Workshop, base: Fit, screen: Screen, refits: Sequence[Refit], alpha: float,
-    seed: np.random.SeedSequence, kept: Checkpoint,
+    workshop: Workshop, base: Fit, screen: Screen, alpha: float, seed: np.random.SeedSequence,
+    kept: Checkpoint,
 ) -> float:  # fmt: skip
-    """p of the largest gain among the `TRIED` best; by their count 1 / (sets + 1) at least, smaller
-    by their tail.
+    """p of the largest gain among the `TRIED` best, of the data fitted in the way in which the
+    simulated sets are; by their count 1 / (sets + 1) at least, smaller by their tail.
 
     base : the model's fit to the screen's experiments.
     """
-    gain, beyond, done = best_of_tried(screen, refits), 0, 0
+    beyond, done = 0, 0
+    seen = kept.of(
+        "the gain that is tested",
+        lambda: {"gain": np.asarray(_gain(workshop, base, screen, screen.experiments, seed, 0))},
+    )
+    gain = float(seen["gain"])
+    if not np.isfinite(gain):
+        return 1.0
     one = partial(_one, workshop, base, screen, seed)
     for last in range(CHUNK, SETS + CHUNK, CHUNK):
         found = kept.each("refitting simulated data", min(last, SETS), one)
@@ -82,30 +83,34 @@ def refit_p(
 def _one(
     workshop: Workshop, base: Fit, screen: Screen, seed: np.random.SeedSequence, k: int
 ) -> Numbers:
-    return {"gain": np.asarray(_gain(workshop, base, screen, random_state(seed, k), seed, k))}
+    """Of one simulated data set."""
+    question, stream = screen.question, random_state(seed, k)
+    given = question.theta(screen.theta)[: len(question.columns.base.parameter_symbols)]
+    try:
+        data = question.simulator.sets(screen.experiments, given, stream)
+    except SSMError:
+        return {"gain": np.asarray(np.nan)}
+    return {"gain": np.asarray(_gain(workshop, base, screen, data, seed, k + 1))}
 
 
 def _gain(
-    workshop: Workshop, base: Fit, screen: Screen, stream: np.ndarray,
+    workshop: Workshop, base: Fit, screen: Screen, data: Sequence[Experiment],
     seed: np.random.SeedSequence, k: int,
 ) -> float:  # fmt: skip
-    """Of one simulated data set; NaN where a fit failed."""
+    """Of one data set; NaN where a fit failed."""
     question, plain = screen.question, workshop.fitter(())
-    whole = question.theta(screen.theta)
-    given = whole[: len(question.columns.base.parameter_symbols)]
+    stream = random_state(seed, 200, k)
     own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 100, k))
     try:
-        data = question.simulator.sets(screen.experiments, given, stream)
-        fit = plain.fit(data, own, base.start, searched=True, quick=True)
+        fit = plain.fit(data, own, base.start, searched=True, rough=True)
         at = question.theta(fit.theta)
         passes = question.smoother.run(data, at, stream)
-        seen = question.statistics(data, passes, stream)
-        found = compared(screen.law, screen.usual, seen)
+        found = compared(screen.law, screen.usual, question.statistics(data, passes, stream))
         out = []
         for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
             fitter = workshop.fitter((question.candidates[j],))
             start = start_at(fit, screen.question, found, [j])
-            again = fitter.fit(data, own, start, searched=True, quick=True)
+            again = fitter.fit(data, own, start, searched=True, rough=True)
             out.append(again.log_likelihood - fit.log_likelihood)
     except SSMError:
         return float("nan")

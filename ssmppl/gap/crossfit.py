@@ -35,8 +35,8 @@ from ssmppl.gap.share import NOT_GIVEN, HowFar, interval_of, notes_of
 from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.simulation import feeds_back
 
-SETS = 100  # simulated data sets in each fold
-SINGLES = 5  # refits in each fold
+SETS = 60  # simulated data sets in each fold
+SINGLES = 4  # refits in each fold
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class CrossFit:
         start = unpack_parameters(whole.problem.trace, whole.theta)
         numbers = kept.of(
             "fitting",
-            lambda: fitter.fit(fold.train, seed, start, searched=True, quick=True).numbers,
+            lambda: fitter.fit(fold.train, seed, start, searched=True, rough=True).numbers,
         )
         fit = fitter.restored(fold.train, numbers)
         screen = ask(self.question, fold.train, fit.theta, SETS, seed, kept)

@@ -160,12 +160,13 @@ class Fitter:
     def fit(
         self, experiments: Sequence[Experiment], seed: np.random.SeedSequence,
         start: Mapping[str, np.ndarray], *, searched: bool = False,
-        information: np.ndarray | None = None, quick: bool = False,
+        information: np.ndarray | None = None, quick: bool = False, rough: bool = False,
     ) -> Fit:  # fmt: skip
         """The mode from `start`, or, unless that was `searched`, from a pilot's mode near it.
 
         information : (P, P) of the parameters where it starts, about; None: by simulation.
-        quick : no information is needed at the end.
+        quick : no information is needed at the end. rough : nor more than the extended Kalman
+        filter's top near the start, where there is one: for what is fitted many times.
 
         Raises
         ------
@@ -176,7 +177,7 @@ class Fitter:
         space = space_of(problem, self.fixed, dict(start))
         if isinstance(self.kalman, KalmanModel):
             climbs = 0 if searched else 1  # from another start too
-            return self._exactly(self.kalman, space, dict(start), seed, quick, climbs)
+            return self._exactly(self.kalman, space, dict(start), seed, quick or rough, climbs)
         if information is not None:
             information = self._unconstrained(space, space.theta, information, seed)
         smooth = self._extended(problem)
@@ -191,12 +192,15 @@ class Fitter:
             space = at(space, space.parameters(z)[0].copy())
         if smooth is None:
             return self._climb(space, seed, information)
-        space, top = self._by_extended(space, smooth, seed)
+        space, top = self._by_extended(space, smooth, seed, QUIETER[: 1 if rough else None])
         if top is not None:
             information = steady(top.information, ~space.on_the_line)
-        fit = self._climb(space, seed, information)
+        fit = None if rough and top is not None else self._climb(space, seed, information)
         if top is not None:
             fit = self._settled(fit, space, top, seed)
+        assert fit is not None
+        if rough:
+            return fit
         z, mask = bounded(density_of(space, smooth), fit.z, ~space.on_the_line)
         if not mask.any():
             return fit
@@ -222,13 +226,14 @@ class Fitter:
         return value
 
     def _by_extended(
-        self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence
-    ) -> tuple[Space, Top | None]:
+        self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence,
+        shares: Sequence[float],
+    ) -> tuple[Space, Top | None]:  # fmt: skip
         """The space at the top of that, from where it stands; as it is, and None, where the
         particle filter knows better."""
         function = density_of(space, smooth)
         tops = []
-        for share in QUIETER:
+        for share in shares:
             begin = self._quieter(space, share)
             top = climb(function, begin.z[begin.where])
             if top is not None:
@@ -245,17 +250,21 @@ class Fitter:
                 return there, top
         return space, None
 
-    def _settled(self, fit: Fit, space: Space, top: Top, seed: np.random.SeedSequence) -> Fit:
+    def _settled(
+        self, fit: Fit | None, space: Space, top: Top, seed: np.random.SeedSequence
+    ) -> Fit:
         """The fit, or the top of the approximation where the particles' score led to nothing
         higher: with next to no noise in a law that score is mostly Monte Carlo error."""
         value, error = self.log_likelihood(space.problem.experiments, space.theta, seed)
-        prior = density_of(space, lambda theta: 0.0)
-        gained = fit.log_likelihood + prior(fit.z) - value - prior(top.z)
-        if gained > 2.0 * np.hypot(error, fit.error):
-            return fit
-        return replace(fit, space=space, theta=space.theta, z=top.z, log_likelihood=value,
-                       error=error, information=steady(top.information, ~space.on_the_line),
-                       distance=top.distance, converged=top.distance < 3.0 * NEAR)  # fmt: skip
+        if fit is not None:
+            prior = density_of(space, lambda theta: 0.0)
+            gained = fit.log_likelihood + prior(fit.z) - value - prior(top.z)
+            if gained > 2.0 * np.hypot(error, fit.error):
+                return fit
+        information = steady(top.information, ~space.on_the_line)
+        nowhere = np.zeros(len(top.z), dtype=bool)
+        return Fit(space, space.theta, top.z, value, error, information, top.distance,
+                   top.distance < 3.0 * NEAR, nowhere)  # fmt: skip
 
     def _quieter(self, space: Space, share: float) -> Space:
         """The space with the scales of the transition's noise at a share of what they are."""
@@ -292,7 +301,10 @@ class Fitter:
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Setup(problem, space, "posterior", self.fixed, start, seed)
-        function = density_of(space, lambda t: kalman.log_likelihood(problem.experiments, t))
+        smooth = self._extended(problem) if quick else None  # the same, and less to put together
+        function = density_of(
+            space, smooth or (lambda t: kalman.log_likelihood(problem.experiments, t))
+        )
         top = None
         if quick and not climbs:  # from near the top, and to within what a decision needs
             top = climb(function, space.z[space.where])

@@ -88,7 +88,9 @@ def fit_reference(
         fitter, begin = superset(workshop, chosen, start, groups[:count])
 
         def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:
-            return fitter.fit(train, seed, begin, searched=True, quick=True).numbers
+            return fitter.fit(
+                train, seed, begin, searched=True, quick=True, rough=parts is None
+            ).numbers
 
         stage = "reference" if count == len(groups) else "reference with one group"
         fit = fitter.restored(train, kept.of(stage, numbers))

@@ -103,12 +103,13 @@ def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, floa
 def refit(
     workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
     train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
-    afresh: bool = False,
+    afresh: bool = False, rough: bool = False,
 ) -> Refit | NotApplicable:  # fmt: skip
     """Fit the model with the effects of `candidates`, of which the last are the screen's at
     `index`, and the others are in `base`. Several have no standard errors: `Fitter.measured`.
 
     afresh : from the model's own start, with the strengths that the effects declare for that.
+    rough : as of `Fitter.fit`.
     """
     candidates = tuple(candidates)
     try:
@@ -122,11 +123,12 @@ def refit(
             start = _shortened(fitter, start, new, train, seed)
             information = None if fitter.exact else _information(fitter, screen, index, train)
             fit = fitter.fit(train, seed, start, searched=True, information=information,
-                             quick=len(candidates) > 1)  # fmt: skip
+                             quick=len(candidates) > 1, rough=rough)  # fmt: skip
         for _ in range(AGAIN):
             if not open_ended(fit, base):
                 break
-            more = fitter.fit(train, seed, fit.start, searched=True, quick=len(candidates) > 1)
+            more = fitter.fit(train, seed, fit.start, searched=True, quick=len(candidates) > 1,
+                              rough=rough)  # fmt: skip
             fit = max(fit, more, key=lambda f: f.log_likelihood)
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
@@ -300,13 +302,15 @@ def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
 def refit_all(
     workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
-    given: Sequence[Candidate] = (), *, afresh: bool = False,
+    given: Sequence[Candidate] = (), *, afresh: bool = False, rough: bool = False,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
-    """The refits that came to an end, best first, and why the others did not. afresh : `refit`."""
+    """The refits that came to an end, best first, and why the others did not. afresh, rough :
+    `refit`."""
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
-    one = partial(_one, workshop, base, screen, list(sets), tuple(train), seed, added, afresh)
+    one = partial(_one, workshop, base, screen, list(sets), tuple(train), seed, added, afresh,
+                  rough)  # fmt: skip
     done, reasons = [], []
     results = kept.each(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
@@ -333,11 +337,11 @@ def refit_all(
 def _one(
     workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
-    added: Sequence[tuple[Candidate, ...]], afresh: bool, k: int,
+    added: Sequence[tuple[Candidate, ...]], afresh: bool, rough: bool, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
     own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-    found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh)
+    found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh, rough)
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
     return found.fit.numbers

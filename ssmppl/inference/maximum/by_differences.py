@@ -83,7 +83,7 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
 def _further(
     function: Function, z: np.ndarray, value: float, move: np.ndarray
 ) -> tuple[np.ndarray, float, float] | None:
-    """A point along a move that lies higher, its value, and the share of the move; None for none."""
+    """A higher point along a move, its value, and the share of the move; None for none."""
     for share in SHARES:
         at = z + share * move
         new = function(at)
