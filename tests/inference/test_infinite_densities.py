@@ -7,6 +7,7 @@ with -inf there: the same numbers, to the last digit.
 from __future__ import annotations
 
 import itertools
+import re
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -17,9 +18,12 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.analysis.conjugacy import draw
 from ssmppl.analysis.density import terms
+from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.chains.noise_moves import Collapsed
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, draw_parameters, plan_updates
+from ssmppl.inference.exact.hidden_markov import hidden_markov
+from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
 from ssmppl.language.traced import seen
@@ -253,6 +257,56 @@ def test_conjugate_draws_that_underflow_are_none():
         drawn = [draw(update, totals, current, rest, rng)[0] for _ in range(200)]
         assert np.min(drawn) > 0.0, update.block
         assert len(np.unique(drawn)) > 100
+
+
+# -- a value of the states that tells some rows exactly
+
+
+def exact_rows() -> tuple[ssm.Model, np.ndarray]:
+    """States of two values, one of which has measurements without noise."""
+    model = ssm.Model("two values")
+    model.prior(lambda: {"s": ssm.HalfNormal(sd=np.ones(2)), "p": ssm.Beta(2, 2)})
+    model.initial(lambda: {"z": ssm.Bernoulli(0.5)})
+    model.transition(lambda z, p: {"z": ssm.Bernoulli(p + (1 - 2 * p) * z)})
+    model.observation(lambda z, s: {"y": ssm.Normal(2 * z, sd=s[0] + (s[1] - s[0]) * z)})
+    rng = np.random.default_rng(1)
+    z = rng.random(40) < 0.3
+    return model, np.where(z, 2.0 + 0.3 * rng.standard_normal(40), 0.0)
+
+
+TOLD = r"no maximum: the data of y are told exactly by a value of the states in \d+ rows"
+
+
+@pytest.mark.parametrize(
+    "method", [ssm.DirectOptimization(), pytest.param(ssm.EM(), marks=pytest.mark.slow)]
+)
+@pytest.mark.filterwarnings("ignore")
+def test_rows_told_exactly_leave_no_maximum(method):
+    model, y = exact_rows()
+    found = ssm.maximize(model, {"y": y}, method, seed=1, progress=False)
+    assert not found.attrs["converged"]
+    assert re.search(TOLD, found.attrs["stopped"])
+
+
+@pytest.mark.parametrize(
+    "method", [ssm.MetropolisHastings(), pytest.param(ssm.Gibbs(), marks=pytest.mark.slow)]
+)
+def test_rows_told_exactly_leave_no_posterior(method):
+    """All draws were 5e-324, the smallest number there is."""
+    model, y = exact_rows()
+    with pytest.raises(ssm.SamplingError, match=TOLD):
+        ssm.sample(model, {"y": y}, method, seed=1, **SHORT)
+
+
+def test_a_single_row_told_exactly_may_have_a_posterior():
+    """That of a mean which is free: it has to meet the row, the less likely the smaller s."""
+    model, y = exact_rows()
+    y = np.where(np.arange(40) == np.flatnonzero(y == 0.0)[0], 0.0, y + 0.1)
+    problem = pose(model, {"y": y})
+    form, theta = hidden_markov(problem.trace), np.array([1e-20, 2.0, 0.5])
+    assert not isinstance(form, NotApplicable)
+    assert without_maximum(form, problem.experiments, theta) is not None
+    assert without_maximum(form, problem.experiments, theta, rows=2) is None
 
 
 # -- what errors say
