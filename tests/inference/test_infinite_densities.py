@@ -18,12 +18,15 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.analysis.conjugacy import draw
 from ssmppl.analysis.density import terms
+from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.chains.noise_moves import Collapsed
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, draw_parameters, plan_updates
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.exact.vanishing import without_maximum
+from ssmppl.inference.particles.backward import pair_failure
+from ssmppl.inference.particles.filtering import failure
 from ssmppl.inference.problem import pose
 from ssmppl.language.trace import trace
 from ssmppl.language.traced import seen
@@ -316,10 +319,22 @@ NO_COVARIANCE = r"the covariance of MvNormal, \[0, 2.4e-201; 2.4e-201, 0.64\], i
 
 
 def test_a_filter_names_the_law_without_a_density():
-    with pytest.raises(ssm.SamplingError, match=NO_COVARIANCE) as caught:
+    problem, theta = pose(vector("covariance"), {"y": ROWS}), np.array([1e-200, 0.8, 0.3])
+    (e,) = problem.experiments
+    for error in (
+        failure(problem, theta, ALL_ZERO, 0, e),
+        failure(problem, theta, INFINITE, 0, e),
+        pair_failure(problem, theta, NAN, 0, e),
+    ):
+        assert re.search(NO_COVARIANCE, str(error))
+        for fragment in ("s = [1.e-200", "in the law of y", "ssm.InverseWishart", __file__):
+            assert fragment in str(error)
+
+
+@pytest.mark.slow
+def test_the_verb_of_filters_names_the_law_without_a_density():
+    with pytest.raises(ssm.SamplingError, match=NO_COVARIANCE):
         ssm.particle_filter(vector("covariance"), {"y": ROWS}, AT, seed=1, proposal="bootstrap")
-    for fragment in ("s = [1.e-200", "in the law of y", "ssm.InverseWishart", __file__):
-        assert fragment in str(caught.value)
 
 
 def test_a_start_names_the_law_without_a_density():

@@ -88,12 +88,12 @@ def test_the_particles_of_the_oracle():
     assert abs(means[0].mean() - means[1].mean()) < 4.0 * error
 
 
-@pytest.mark.parametrize("interweave", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("interweave", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore:the chains have not mixed")  # the errors know how far they are
 def test_gibbs_with_scales_at_zero(interweave):
     """It fell to a scale of 1e-170 and below, whose square is 0, and never came back."""
     method = ssm.Gibbs(interweave=interweave)
-    assert_small(deviations(False, method, 0, draws=300, warmup=200))
+    assert_small(deviations(False, method, 2, draws=300, warmup=200))
 
 
 @pytest.mark.slow
