@@ -56,9 +56,9 @@ def deviations(nonlinear: bool, method, seed: int, **options) -> np.ndarray:
     return np.array(out)
 
 
-def assert_small(found: np.ndarray) -> None:
-    """Bonferroni at LEVEL over all of them."""
-    limit = stats.norm.isf(LEVEL / (2 * found.size))
+def assert_small(found: np.ndarray, tables: int = 1) -> None:
+    """Bonferroni at LEVEL over all of them, and over the tables of this kind."""
+    limit = stats.norm.isf(LEVEL / (2 * found.size * tables))
     assert np.abs(found).max() < limit, (limit, np.round(found, 1))
 
 
@@ -97,8 +97,11 @@ def test_gibbs_with_scales_at_zero(interweave):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the chains have not mixed")
+@pytest.mark.parametrize("seed", range(SEEDS))
 @pytest.mark.parametrize("nonlinear", [False, True])
-def test_ten_seeds_with_scales_at_zero(nonlinear):
+@pytest.mark.filterwarnings("ignore:the chains have not mixed")
+def test_ten_seeds_with_scales_at_zero(nonlinear, seed):
+    """Of 2000 draws: near zero the scales mix slowly given the states, and the error of a mean over
+    few effective draws is not known."""
     method = ssm.PGAS() if nonlinear else ssm.Gibbs()
-    assert_small(np.array([deviations(nonlinear, method, seed) for seed in range(SEEDS)]))
+    assert_small(deviations(nonlinear, method, seed, draws=2000), tables=2 * SEEDS)
