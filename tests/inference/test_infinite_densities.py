@@ -148,7 +148,7 @@ def test_maximisers_take_an_infinite_density_for_none(build, method):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the chains have not mixed")
+@pytest.mark.filterwarnings("ignore:the chains")
 def test_evidence_of_a_model_with_an_infinite_density():
     """What is integrated is the rest of the likelihood, also where the bridge has points beyond."""
     found = [
