@@ -16,6 +16,7 @@ from ssmppl.expressions.expr import Expr, apply, attributed, constant
 from ssmppl.expressions.linear import inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import MvNormal
+from ssmppl.language.multivariate import surely_positive, where_definite
 from ssmppl.language.traced import Site, Trace, seen
 
 
@@ -81,7 +82,7 @@ def _observed(site: Site, missing: Missing, guard: bool) -> list[Term]:
     masks = array([seen(s) for s in site.components])
     if d.joint:
         if site.name in missing.partial and isinstance(d, MvNormal):
-            return [Term(site, marginal_normal(d, site.value, masks), any_of(masks))]
+            return [Term(site, marginal_normal(d, site.value, masks, guard), any_of(masks))]
         return [Term(site, d.log_density(site.value, guard), masks[0])]
     densities = d.guarded_log_densities(site.value) if guard else d.log_densities(site.value)
     flat = array(np.broadcast_to(array(densities).view(np.ndarray), site.shape)).ravel()
@@ -96,16 +97,24 @@ def any_of(masks: ExprArray) -> Expr:
     return total
 
 
-def marginal_normal(d: MvNormal, value: ExprArray, masks: ExprArray) -> Expr:
+def marginal_normal(d: MvNormal, value: ExprArray, masks: ExprArray, guard: bool = True) -> Expr:
     """Log density of the measured components of a Gaussian vector.
 
     With m the 0/1 vector of measured components, the marginal law of these is that of m * y
     under covariance (m m') * C + diag(1 - m), less the unit variances of the others.
+
+    guard : -inf where what was measured has no covariance that is positive definite. The formula
+        may have any value there, +inf too: [[0, c], [c, 1]], whose 0 is a square that underflowed,
+        has an inverse and a determinant.
     """
+    whole = d.covariance_matrix()
     residual = where_measured(masks, value - d.mean_)
-    covariance = mask_covariance(d.covariance_matrix(), masks)
+    covariance = mask_covariance(whole, masks)
     quadratic = residual @ inverse(covariance) @ residual
-    return -0.5 * (np.sum(masks) * LOG_2PI + log_determinant(covariance) + quadratic)
+    density = -0.5 * (np.sum(masks) * LOG_2PI + log_determinant(covariance) + quadratic)
+    if not guard or surely_positive(whole):
+        return density
+    return where_definite(covariance, density)
 
 
 def where_measured(masks: ExprArray, values: ExprArray) -> ExprArray:

@@ -62,7 +62,7 @@ class Gamma:
         if not (shape > 0.0 and rate > 0.0):
             return None
         g = rng.standard_gamma(shape) / rate
-        return (_root(g, self.power),)
+        return (root_of(g, self.power),)
 
     def log_q(self, c: Statistics, v: np.ndarray) -> float:
         shape, rate = self.parameters(c)
@@ -70,12 +70,16 @@ class Gamma:
         return (shape * self.power - 1.0) * log_v - rate * math.exp(self.power * log_v)
 
 
-def _root(g: float, power: float) -> float:
+def root_of(g: float, power: float) -> float:
+    """v for v**power = g >= 0; 0 or inf where it leaves what floating point holds."""
     if power == 1.0:
         return g
     if power == -1.0:
         return 1.0 / g if g > 0.0 else math.inf
-    return g ** (1.0 / power) if g > 0.0 else (0.0 if power > 0 else math.inf)
+    try:
+        return g ** (1.0 / power) if g > 0.0 else (0.0 if power > 0 else math.inf)
+    except OverflowError:
+        return math.inf
 
 
 @dataclass(frozen=True)
@@ -171,7 +175,7 @@ class NormalGamma:
             if g <= 0.0:
                 return (math.nan, math.nan)
             theta = h / precision + rng.standard_normal() / math.sqrt(g * precision)
-            return theta, _root(g, self.power)
+            return theta, root_of(g, self.power)
         solved = normal.solve(c)
         if solved is None:
             return None
@@ -181,7 +185,7 @@ class NormalGamma:
         g = rng.standard_gamma(shape) / rate
         if g <= 0.0:
             return (math.nan,) * (n + 1)
-        return (*normal.draw_solved(solved, rng, g), _root(g, self.power))
+        return (*normal.draw_solved(solved, rng, g), root_of(g, self.power))
 
     def given(self, c: Statistics, theta: np.ndarray) -> tuple[float, float]:
         """(shape, rate) of v**power given theta."""

@@ -34,6 +34,7 @@ from ssmppl.expressions.expr import (
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import Draws
+from ssmppl.language.multivariate import surely_positive, where_definite
 from ssmppl.language.traced import Trace, seen
 
 DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
@@ -106,11 +107,14 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         h, d, r = observation.matrix, observation.offset, observation.covariance
         block = split.gaussian
         residual = y - h @ block.mean - d
+        sure = surely_positive(r)
         if masks is not None:
             h = where_measured(array(masks[:, None]), h)
             residual = where_measured(masks, residual)
             r = mask_covariance(r, masks)
         draw, predictive = _condition(block, h, r, residual, masks)
+        if not sure:  # the sum of the covariances of x and of no law may be one all the same
+            predictive = where_definite(array(r), predictive)
         return split.complete(draw), predictive
 
     draw, predictive = law(move)

@@ -24,10 +24,10 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 
 from ssmppl.analysis.bounds import WHOLE, interval
-from ssmppl.analysis.families import Beta, Gamma, Normal, NormalGamma, Values
+from ssmppl.analysis.families import Beta, Dirichlet, Gamma, Normal, NormalGamma, Values
 from ssmppl.analysis.families_matrix import MatrixNormalWishart
 from ssmppl.analysis.pythontext import DOMAIN, python_function, python_sum
-from ssmppl.analysis.slices import Density, sweep_matrix, sweep_real, sweep_simplex
+from ssmppl.analysis.slices import Density, comparable, sweep_matrix, sweep_real, sweep_simplex
 from ssmppl.analysis.truncated_draws import truncated_draw
 from ssmppl.analysis.update import Update
 from ssmppl.errors import SamplingError
@@ -115,6 +115,11 @@ class Sampler:
             return None if value is None else (value,)
         return family.draw(c, rng)
 
+    def possible(self, v: Sequence[float]) -> bool:
+        """Whether a draw of the conjugate part is inside of the family's support: a scale of zero,
+        or a share, is a number that underflowed, and has no density."""
+        return all(low < x < high for x, (low, high) in zip(v, self.natural, strict=True))
+
     def draw(
         self,
         totals: np.ndarray,
@@ -138,15 +143,13 @@ class Sampler:
             v = self.conjugate(c, limits, rng)
             if v is None:
                 return self.slices(totals, current, limits, rng, None, tries - 1)
-            if truncated and not _inside(v, limits):
+            if not self.possible(v) or (truncated and not _inside(v, limits)):
                 continue
             if weights:
                 excess = self.correct(v, weights) - ceiling
                 if not (excess >= 0.0 or rng.standard_exponential() >= -excess):
                     continue
-            value = np.array(v)
-            if math.isfinite(value.sum()):
-                return value, DrawInfo("conjugate", tries, True)
+            return np.array(v), DrawInfo("conjugate", tries, True)
         return self.slices(totals, current, limits, rng, None, MAX_TRIES)
 
     def metropolis(
@@ -173,7 +176,7 @@ class Sampler:
             v = self.conjugate(c, limits, rng)
             if v is None:
                 break
-            if self.truncated and not _inside(v, limits):
+            if not self.possible(v) or (self.truncated and not _inside(v, limits)):
                 continue
             change = excess(v) - excess(current.tolist())
             accepted = change >= 0.0 or rng.standard_exponential() > -change
@@ -191,7 +194,12 @@ class Sampler:
                 fix="pass log_joint=, a function of the block's values",
                 where=self.update.where,
             )
-        return lambda v: float(log_joint(np.array(v)))
+        return lambda v: comparable(float(log_joint(np.array(v))))
+
+    def _what(self, log_joint: LogJoint | None, values: list[float]) -> str:
+        """What the density is where it is no positive number."""
+        infinite = log_joint is not None and log_joint(np.array(values)) == math.inf
+        return "infinite" if infinite else "zero"
 
     def slices(
         self,
@@ -218,7 +226,8 @@ class Sampler:
                 f"{to_text(s)} = {x:.6g}" for s, x in zip(update.components, values, strict=True)
             )
             raise SamplingError(
-                f"the conditional density is zero at the current value: {named}",
+                f"the conditional density is {self._what(log_joint, values)} at the current value: "
+                f"{named}",
                 fix="start inside the support; given these states no value near is possible. Where "
                 "a covariance is singular no density exists: give components that follow without "
                 "a noise of their own the law Dirac",
@@ -304,15 +313,14 @@ def draw(
 
 
 def _guarded(function: Callable[..., float]) -> Callable[..., float]:
-    """The function with -inf where it is not defined, and where it is inf: a single point, or an
-    overflow, that a slice would never leave again."""
+    """The function as `comparable` has it, and -inf where it is not defined."""
 
     def run(*args: Sequence[float]) -> float:
         try:
             value = function(*args)
         except DOMAIN:
             return -math.inf
-        return value if value < math.inf else -math.inf
+        return comparable(value)
 
     return run
 
@@ -340,6 +348,8 @@ def natural_bounds(update: Update) -> list[tuple[float, float]]:
         return [(0.0, 1.0)]
     if isinstance(family, NormalGamma):
         return [WHOLE] * (n - 1) + [(0.0, math.inf)]
+    if isinstance(family, Dirichlet):
+        return [(0.0, 1.0)] * n
     return [WHOLE] * n
 
 

@@ -23,6 +23,16 @@ _DOUBLINGS = 60
 _SHRINKS = 200
 
 
+def comparable(log_density: float) -> float:
+    """A log density as it is compared with others: -inf where it is NaN or +inf.
+
+    A point where a density is infinite has no probability, and every step from it to another is
+    refused: whoever takes it for the best of all stays there. It is a single point, as of a scale
+    of zero, or the work of rounding, as where a square underflowed.
+    """
+    return log_density if log_density < math.inf else -math.inf
+
+
 def slice_step(
     log_density: Callable[[float], float],
     x: float,
@@ -33,9 +43,14 @@ def slice_step(
 ) -> float:
     """One draw that leaves exp(log_density) on (lower, upper) invariant.
 
-    Returns x unmoved where the density at x is not positive: there is no slice to draw from.
+    Returns x unmoved where the density at x is not positive and finite: there is no slice to draw
+    from. Nowhere else is a point taken at which it is not.
     """
-    level = log_density(x)
+
+    def at(point: float) -> float:
+        return comparable(log_density(point))
+
+    level = at(x)
     if not level > -math.inf:
         return x
     level -= rng.standard_exponential()
@@ -45,21 +60,21 @@ def slice_step(
     else:
         left = x - width * rng.random()
         right = left + width
-        low, high = log_density(left), log_density(right)
+        low, high = at(left), at(right)
         for _ in range(_DOUBLINGS):
             if not (low > level or high > level):
                 break
             if rng.random() < 0.5:
                 left -= right - left
-                low = log_density(left)
+                low = at(left)
             else:
                 right += right - left
-                high = log_density(right)
+                high = at(right)
     a, b = left, right
     for _ in range(_SHRINKS):
         proposal = a + rng.random() * (b - a)
-        if log_density(proposal) > level and (
-            finite or _acceptable(log_density, x, proposal, level, left, right, width)
+        if at(proposal) > level and (
+            finite or _acceptable(at, x, proposal, level, left, right, width)
         ):
             return proposal
         if proposal < x:

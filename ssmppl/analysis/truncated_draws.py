@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.special as sp
 
-from ssmppl.analysis.families import Beta, Gamma, Normal
+from ssmppl.analysis.families import Beta, Gamma, Normal, root_of
 
 
 # -- truncated laws of one number
@@ -51,7 +51,8 @@ def truncated_draw(
         )  # fmt: skip
     if g is None or not 0.0 < g < math.inf:
         return None
-    return g if k == 1.0 else g ** (1.0 / k)
+    value = root_of(g, k)
+    return value if 0.0 < value < math.inf else None
 
 
 def _to_power(x: float, k: float) -> float:

@@ -1,4 +1,5 @@
-"""Which argument of a law left its range, and what to write so that it cannot."""
+"""Which argument of a law left its range, what to write so that it cannot, and which law has no
+density at some parameters."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
@@ -17,11 +19,13 @@ from ssmppl.language.distributions import (
     Categorical,
     Distribution,
     Mixture,
+    MvNormal,
     Truncated,
 )
 from ssmppl.language.shares import SUM_ROUNDING
+from ssmppl.language.traced import Trace
 
-__all__ = ["DOMAIN", "out_of_range"]
+__all__ = ["DOMAIN", "out_of_range", "without_density"]
 
 _SHARES = (
     "that are shares of 1 whatever the state, such as [1 - p, p] with "
@@ -42,6 +46,44 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
         if found is not None:
             return found
     return might[0] if might else None
+
+
+def without_density(trace: Trace, theta: np.ndarray) -> tuple[str, str, Location] | None:
+    """Which law has no density at theta (P,) whatever the states are, a spread being none there:
+    what was found, the fix, and the user's line. None where every law has one, as far as the
+    parameters alone tell.
+    """
+    known = dict(zip(trace.parameter_symbols, theta.tolist(), strict=True))
+    for sites in (trace.observations, trace.transition, trace.initial):
+        for name, site in sites.items():
+            for law in _laws_in(site.distribution):
+                found = _of_one(law, known, []) or _covariance(law, known)
+                if found is not None:
+                    return f"{found[0]}, in the law of {name}", found[1], site.distribution.location
+    return None
+
+
+def _covariance(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, str] | None:
+    """A covariance, or the inverse of one, that is not positive definite at these values."""
+    if not isinstance(law, MvNormal) or law.spread == "cholesky" or law.root is not None:
+        return None
+    entries = list(law.parameters[law.spread].ravel())
+    if not symbols_of(entries) <= set(values):
+        return None
+    n = len(law.mean_)
+    with np.errstate(all="ignore"):
+        matrix = np.array(evaluate(entries, values), dtype=float).reshape(n, n)
+    try:
+        if np.all(np.isfinite(matrix)) and np.all(np.diag(np.linalg.cholesky(matrix)) > 0.0):
+            return None
+    except np.linalg.LinAlgError:
+        pass
+    rows = "; ".join(", ".join(f"{x:.6g}" for x in row) for row in matrix)
+    return (
+        f"the {law.spread} of MvNormal, [{rows}], is not positive definite there",
+        "give its parameters priors that keep variances off zero and correlations off -1 and 1, as "
+        "ssm.InverseGamma does, or ssm.InverseWishart for the whole matrix",
+    )
 
 
 def _laws_in(law: Distribution) -> list[Distribution]:

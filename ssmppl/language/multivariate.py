@@ -16,7 +16,7 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
-from ssmppl.expressions.expr import as_expr, constant
+from ssmppl.expressions.expr import Expr, as_expr, constant
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.language.constructing import one_of
 from ssmppl.language.continuous import LOG_2PI
@@ -34,12 +34,8 @@ class _Joint(Distribution):
         return checked_matrix(self, name)
 
     def _where_definite(self, m: ExprArray, density: ExprArray) -> ExprArray:
-        """A density in which the matrix m stands, and -inf where m is not positive definite: its
-        determinant may be positive all the same."""
-        if _surely_positive(m):
-            return density
-        last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
-        return array(ew("where", ew("lt", 0.0, last), density[()], -math.inf))
+        """`where_definite`, unless m surely is."""
+        return density if surely_positive(m) else array(where_definite(m, density[()]))
 
 
 class MvNormal(_Joint):
@@ -130,7 +126,14 @@ class MvNormal(_Joint):
         return array(self.mean_ + self.factor() @ z)
 
 
-def _surely_positive(m: ExprArray) -> bool:
+def where_definite(m: ExprArray, density: Expr) -> Expr:
+    """A density in which the matrix m stands, and -inf where m is not positive definite: its
+    determinant may be positive all the same."""
+    last = cholesky(m)[-1, -1]  # nan where the matrix is not positive definite
+    return array(ew("where", ew("lt", 0.0, last), density, -math.inf))[()]
+
+
+def surely_positive(m: ExprArray) -> bool:
     """Whether a matrix is one of numbers (checked before), a parameter with that support, or the
     inverse of one: what its own law keeps positive definite. Of a diagonal one the logs see to it.
     """

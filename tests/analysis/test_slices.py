@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import pytest
+from scipy import stats
 
 from ssmppl.analysis.pythontext import python_sum
 from ssmppl.analysis.sampler import _guarded
@@ -42,3 +44,22 @@ def test_an_infinite_density_is_no_place_to_stay():
     density = _guarded(python_sum([apply("log", a - 1.0), a], [a]))
     assert density([1.0], [-0.5, -1.0]) == -np.inf
     assert density([2.0], [-0.5, -1.0]) == -2.0
+
+
+@pytest.mark.parametrize("edge", [0.5, 5.0])
+def test_no_step_leads_to_where_the_density_is_infinite(edge):
+    """A normal law, and +inf beyond an edge: draws of it up to the edge, by doubling that looks
+    beyond; and from there no step is made."""
+
+    def log_density(x):
+        return np.inf if x > edge else -0.5 * x * x
+
+    rng = np.random.default_rng(seed_of("slices", "infinite", edge))
+    x, draws = 0.0, []
+    for k in range(8000):
+        x = slice_step(log_density, x, rng)
+        if k % 4 == 0:
+            draws.append(x)
+    law = stats.truncnorm(-np.inf, edge)
+    assert stats.kstest(draws, law.cdf).pvalue > 1e-3
+    assert slice_step(log_density, edge + 1.0, rng) == edge + 1.0

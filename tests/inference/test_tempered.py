@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.tempered_filter import accept
 from ssmppl.inference.particles.proposal_choice import choose
 from ssmppl.inference.problem import pose
 
@@ -180,3 +182,13 @@ def test_it_is_explained_and_chosen_where_nothing_better_is_derived():
     assert choose(problem, np.empty(0), whole=True, temper=True).name == "tempered"
     assert choose(problem, np.empty(0), whole=True).name == "bootstrap"
     assert "rising powers" not in str(ssm.explain(PAIR))
+
+
+def test_no_particle_moves_to_where_the_density_is_infinite():
+    rng = new_state(np.random.SeedSequence(1))
+    x, log_f, log_g = np.zeros((1, 4)), np.zeros(4), np.zeros(4)
+    x_new = np.arange(4.0)[None]
+    log_f_new, log_g_new = np.array([0.0, np.inf, 0.0, np.nan]), np.array([np.inf, 0.0, 9.0, 0.0])
+    assert accept(rng, 0.5, x, log_f, log_g, x_new, log_f_new, log_g_new) == 0.25
+    np.testing.assert_array_equal(x, [[0.0, 0.0, 2.0, 0.0]])
+    np.testing.assert_array_equal(log_g, [0.0, 0.0, 9.0, 0.0])

@@ -17,6 +17,7 @@ from ssmppl.codegen.kernels.weights import (
     largest,
     normalise,
     relative_weights,
+    rule_out,
 )
 
 
@@ -148,3 +149,9 @@ def test_loops_that_add_up_store_nothing():
                     and isinstance(n.ctx, ast.Store)
                 ]  # fmt: skip
                 assert not (sums and stores), f"{file.name}, line {loop.lineno}"
+
+
+def test_what_is_no_number_or_infinite_is_ruled_out():
+    log_v = np.array([np.nan, np.inf, -np.inf, 1.0])
+    rule_out(log_v)
+    np.testing.assert_array_equal(log_v, [-np.inf, -np.inf, -np.inf, 1.0])

@@ -125,7 +125,9 @@ def accept(rng, at, x, log_f, log_g, x_new, log_f_new, log_g_new):
     total = 0.0
     for i in range(n):
         change = log_f_new[i] - log_f[i] + at * (log_g_new[i] - log_g[i])
-        if not change > -np.inf:  # also where it is undefined
+        here = log_f_new[i] + at * log_g_new[i]
+        # a density that is infinite would never be left; also where it is undefined
+        if not (change > -np.inf and here < np.inf):
             continue
         chance = 1.0 if change >= 0.0 else exp(change)
         total += chance

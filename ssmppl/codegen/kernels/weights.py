@@ -25,6 +25,9 @@ NAN = 2
 INFINITE = 3
 """Some log-weight is +inf, and none is NaN."""
 
+NO_POINT = (ALL_ZERO, INFINITE)
+"""Statuses of a likelihood at parameters that are none: impossible, or with an infinite density."""
+
 STRETCH = 32
 _INF = np.inf
 _NON_SIGN = np.int64(0x7FFFFFFFFFFFFFFF)
@@ -51,11 +54,11 @@ def largest(values):
 
 @exact
 def rule_out(log_v):
-    """-inf in place of NaN: for states that no filter has drawn, but a path recomputed from another
-    ancestor leads to, and for parameters that walk. What leads a law out of its range there is
-    impossible."""
+    """-inf in place of NaN and +inf: for states that no filter has drawn, but a path recomputed
+    from another ancestor leads to, and for parameters that walk. What leads a law out of its range
+    there, or to where its density is infinite, is impossible."""
     for i in range(log_v.size):
-        if log_v[i] != log_v[i]:
+        if not log_v[i] < _INF:
             log_v[i] = -_INF
 
 

@@ -80,7 +80,7 @@ class ExactLikelihood:
             value, slope = model.log_likelihood(self.problem.experiments, theta), None
         else:
             value, slope = model.score(self.problem.experiments, theta, self.scored)
-        return Run(value, score=slope) if value > -np.inf else None
+        return Run(value, score=slope) if np.isfinite(value) else None
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
         if not self.states:

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.noises import Noises
+from ssmppl.analysis.slices import comparable
 from ssmppl.codegen.interweaving import compile_noises
 from ssmppl.codegen.loading import Loaded
 from ssmppl.codegen.twisted import TwistedFilter, backward_passes
@@ -87,7 +88,7 @@ class NoiseMove:
                 return -np.inf, held
             total += self.module.noise_of(theta, e.y, e.seen, e.u, *guide, path, noise)
             total += self._log_joint(theta, e, path)
-        return _number(total), held
+        return comparable(float(total)), held
 
     def at(self, theta: np.ndarray, held: Paths, paths: Paths) -> tuple[float, Paths]:
         total, moved = 0.0, []
@@ -102,7 +103,7 @@ class NoiseMove:
                 return -np.inf, paths
             total += self._log_joint(theta, e, new)
             moved.append(new)
-        return _number(total), moved
+        return comparable(float(total)), moved
 
     def _log_joint(self, theta: np.ndarray, e: Experiment, path: np.ndarray) -> float:
         """log p(x, y | theta); deterministic components are set on the way."""
@@ -162,11 +163,7 @@ class Collapsed:
     model: ExactModel
 
     def stand(self, theta: np.ndarray, paths: Paths) -> tuple[float, None]:
-        return _number(self.model.log_likelihood(self.problem.experiments, theta)), None
+        return comparable(self.model.log_likelihood(self.problem.experiments, theta)), None
 
     def at(self, theta: np.ndarray, held: None, paths: Paths) -> tuple[float, Paths]:
         return self.stand(theta, paths)[0], paths
-
-
-def _number(value: float) -> float:
-    return -np.inf if np.isnan(value) else float(value)

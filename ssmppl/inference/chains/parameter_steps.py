@@ -16,9 +16,11 @@ import numpy as np
 from ssmppl.analysis.conjugacy import Update, derive_updates, draw
 from ssmppl.codegen.gibbs import compile_updates, statistics_name
 from ssmppl.compiling import once_property
+from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.ranges import without_density
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,13 @@ def draw_parameters(
     paths: list[np.ndarray],
     generator: np.random.Generator,
 ) -> list[bool]:
-    """One pass over the updates, in place; whether each was accepted."""
+    """One pass over the updates, in place; whether each was accepted.
+
+    Raises
+    ------
+    SamplingError : the density is zero, or infinite, where the chain stands; names the block's
+        values, and the law that has no density there, if there is one.
+    """
     infos = []
     for k, update in enumerate(steps.updates):
         where = steps.where[k]
@@ -93,7 +101,13 @@ def draw_parameters(
         totals = _totals(steps, k, theta, paths)
         exact = update.needs_log_joint or update.left
         density = partial(_with, steps, theta, where, paths=paths) if exact else None
-        values, info = draw(update, totals, theta[where], rest, generator, density)
+        try:
+            values, info = draw(update, totals, theta[where], rest, generator, density)
+        except SamplingError as error:
+            none = without_density(steps.problem.trace, theta)
+            if none is None:
+                raise
+            raise SamplingError(f"{error.found}; {none[0]}", fix=none[1], where=none[2]) from None
         theta[where] = values
         if update.needs_log_joint:
             log_joint(steps, theta, paths)  # sets what is deterministic in the trajectories
@@ -130,7 +144,10 @@ def _totals(
 
 
 def log_joint(steps: ParameterSteps, theta: np.ndarray, paths: list[np.ndarray]) -> float:
-    """log p(theta, x, y), deterministic components of x set on the way; -inf for nan."""
+    """log p(theta, x, y), deterministic components of x set on the way; -inf for nan.
+
+    +inf where a density is infinite, which is no point to go to: see `slices.comparable`.
+    """
     program = steps.problem.program
     value = program.entry("log_prior")(theta) if len(theta) else 0.0
     if value == -np.inf:

@@ -9,7 +9,7 @@ import numpy as np
 from ssmppl.codegen.kernels.conditional_smc import draw_index
 from ssmppl.codegen.kernels.genealogy import ancestral_path
 from ssmppl.codegen.kernels.random import fill_normal, uniform
-from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
+from ssmppl.codegen.kernels.weights import NO_POINT, OK
 from ssmppl.codegen.metropolis import (
     NumberedFilter,
     ScoredFilter,
@@ -47,7 +47,7 @@ class ParticleLikelihood:
             status, t, log_z = entry(
                 theta, e.y, e.seen, e.u, self.settings.particles, stream, path, increment
             )
-            if status == ALL_ZERO:
+            if status in NO_POINT:
                 return None
             if status != OK:
                 raise failure(self.problem, theta, status, t, e)
@@ -71,7 +71,7 @@ class ParticleLikelihood:
             status, t = run_filter(
                 self.problem, theta, self.settings, e, stream, increment, ess, kept=kept
             )
-            if status == ALL_ZERO:
+            if status in NO_POINT:
                 return None
             if status != OK:
                 raise failure(self.problem, theta, status, t, e)
@@ -145,7 +145,7 @@ class ScoredLikelihood(_WithFilter):
                 theta, e.y, e.seen, e.u, self.settings.particles, stream, path, increment,
                 self.lag, own_slope, own,
             )  # fmt: skip
-            if status == ALL_ZERO:
+            if status in NO_POINT:
                 return None
             if status != OK:
                 raise failure(self.problem, theta, status, t, e)
@@ -201,7 +201,7 @@ class CorrelatedLikelihood(_WithFilter):
             status, t, log_z = made.module.correlated_path(
                 theta, e.y, e.seen, e.u, n, *own, path, increment
             )
-            if status == ALL_ZERO:
+            if status in NO_POINT:
                 return None
             if status != OK:
                 raise failure(self.problem, theta, status, t, e)

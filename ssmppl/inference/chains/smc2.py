@@ -25,7 +25,7 @@ import numpy as np
 
 from ssmppl.analysis.density import terms
 from ssmppl.codegen.kernels.resampling import PADDING, systematic
-from ssmppl.codegen.kernels.weights import ALL_ZERO, OK
+from ssmppl.codegen.kernels.weights import NO_POINT, OK
 from ssmppl.codegen.rowwise import compile_filter_rows
 from ssmppl.compiling import once_property
 from ssmppl.counts import check_count
@@ -78,7 +78,7 @@ class Filters:
         status, t = self.run(
             theta, e.y, e.seen, e.u, start, stop, stream, particles.x, particles.w, out
         )
-        if status == ALL_ZERO:
+        if status in NO_POINT:
             return -np.inf
         if status != OK:
             raise failure(self.problem, theta, status, t, e)

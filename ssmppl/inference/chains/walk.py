@@ -54,7 +54,8 @@ class Likelihood(Protocol):
     """Where log-likelihoods come from."""
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
-        """A run at theta, from the run of the current point; None where it is zero."""
+        """A run at theta, from the run of the current point; None where it is zero, or is none:
+        infinite."""
 
     def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
         """What a kept draw has besides theta: path_<i>, increment_<i>."""

@@ -24,6 +24,7 @@ from ssmppl.inference.exact.finite_passes import Filtered, forward
 from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman_moments import SmoothedMoments
 from ssmppl.inference.exact.mixtures import inverted
+from ssmppl.inference.ranges import without_density
 from ssmppl.language.traced import Trace, once_per_trace
 
 
@@ -273,13 +274,16 @@ class HiddenMarkov(FiniteLaws):
             if np.any(ends >= 0):
                 i, t = min(zip(h.members[ends >= 0], ends[ends >= 0], strict=True))
                 of = f" of data set {i + 1}" if len(experiments) > 1 else ""
-                site = next(iter(self.trace.observations.values()))
+                where = next(iter(self.trace.observations.values())).distribution.location
+                why, fix = "", ("check this row of the data, and whether the laws leave each value "
+                                "a chance")  # fmt: skip
+                if none := without_density(self.trace, theta):
+                    why, fix, where = none
                 raise SamplingError(
                     f"no value of the states is possible at t={t + 1}{of}; parameters: "
-                    f"{spelled(self.trace, theta)}",
-                    fix="check this row of the data, and whether the laws leave each value a "
-                    "chance",
-                    where=site.distribution.location,
+                    f"{spelled(self.trace, theta)}" + (why and f"; {why}"),
+                    fix=fix,
+                    where=where,
                 )
             yield h, found
 

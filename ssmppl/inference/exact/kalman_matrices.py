@@ -11,6 +11,7 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.ranges import without_density
 from ssmppl.language.traced import Trace, previous
 
 CAUSE = {
@@ -62,9 +63,12 @@ def _by_row(entries: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
 def failure(trace: Trace, theta: np.ndarray, status: int, t: int) -> SamplingError:
     """The error of a filter that stopped with this status at step t (from 0)."""
     found, fix = CAUSE[status]
-    site = next(iter((trace.transition if t else trace.initial).values()))
+    where = next(iter((trace.transition if t else trace.initial).values())).distribution.location
+    why = ""
+    if none := without_density(trace, theta):
+        why, fix, where = none
     return SamplingError(
-        f"{found} at t={t + 1}; parameters: {spelled(trace, theta)}",
+        f"{found} at t={t + 1}; parameters: {spelled(trace, theta)}" + (why and f"; {why}"),
         fix=fix,
-        where=site.distribution.location,
+        where=where,
     )

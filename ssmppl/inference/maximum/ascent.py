@@ -14,11 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.exact.models import ExactModel, exact_model
 from ssmppl.inference.maximum.chart import Chart
-from ssmppl.inference.particles.pilot import Pilot, Space, at, find_mode, finite_point
+from ssmppl.inference.particles.pilot import (
+    Pilot,
+    Space,
+    at,
+    explained,
+    find_mode,
+    finite_point,
+)
 from ssmppl.inference.problem import Problem
 
 
@@ -100,7 +107,10 @@ class Setup:
             return z
         if isinstance(self.exact, NotApplicable):
             return self.pilot.z
-        return finite_point(z, self.exact_at, np.random.default_rng(self.root))
+        try:
+            return finite_point(z, self.exact_at, np.random.default_rng(self.root))
+        except ArgumentError as error:
+            raise explained(error, self.space) from None
 
     def exact_objective(self, z: np.ndarray) -> float:
         """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""

@@ -31,6 +31,7 @@ from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.problem import Problem
+from ssmppl.inference.ranges import without_density
 from ssmppl.inference.totals import total_of
 
 __all__ = [
@@ -239,9 +240,12 @@ def pair_failure(
     elif status == ABOVE_BOUND:
         what = "lies above the bound that was derived for it"
         fix = 'a fault of ssmppl: use kernel="exact", and report the model'
+    where, why = site.distribution.location, ""
+    if none := without_density(problem.trace, theta):
+        why, fix, where = none
     return SamplingError(
         f"the transition density into t={t + 2}{label} {what}; "
-        f"parameters: {spelled(problem.trace, theta)}",
+        f"parameters: {spelled(problem.trace, theta)}" + (why and f"; {why}"),
         fix=fix,
-        where=site.distribution.location,
+        where=where,
     )

@@ -21,7 +21,7 @@ from ssmppl.errors import ArgumentError, Location, SamplingError, listing
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
 from ssmppl.inference.problem import Problem
-from ssmppl.inference.ranges import DOMAIN, out_of_range
+from ssmppl.inference.ranges import DOMAIN, out_of_range, without_density
 from ssmppl.inference.totals import total_of
 
 SCHEMES = {
@@ -284,6 +284,8 @@ def failure(
             if found := out_of_range(law, known):
                 (why, fix), where = found, law.location
                 break
+    if not why and (none := without_density(problem.trace, theta)):
+        why, fix, where = none
     return SamplingError(
         f"{_WHAT.get(status, 'the filter failed')} at t={t + 1}{label}, where {row}; "
         f"parameters: {spelled(problem.trace, theta)}" + (why and f"; {why}"),

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 import scipy
 
-from ssmppl.data import unpack_parameters
+from ssmppl.data import spelled, unpack_parameters
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.exact.models import exact_log_likelihood
 from ssmppl.inference.particles.filtering import (
@@ -25,6 +25,7 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.particles.ordinary import ordinary_values
 from ssmppl.inference.problem import EXACT, Problem
+from ssmppl.inference.ranges import without_density
 from ssmppl.language.transforms import transforms, unconstrain
 
 PILOT_PARTICLES = 200
@@ -113,7 +114,10 @@ def find_mode(
     ------
     ArgumentError : the likelihood is zero at every point that was tried.
     """
-    best, value = climb_to_mode(space, seed, pilot_likelihood(space.problem, proposal, rescue))
+    try:
+        best, value = climb_to_mode(space, seed, pilot_likelihood(space.problem, proposal, rescue))
+    except ArgumentError as error:
+        raise explained(error, space) from None
     if not len(best):
         return Pilot(best, best, value)
     averaged = averaged_density(space, seed, proposal, SCALE_REPEATS, rescue)
@@ -216,6 +220,19 @@ def averaged_density(
         return float(np.logaddexp.reduce(log_z) - np.log(len(log_z))) + log_prior
 
     return averaged
+
+
+def explained(error: ArgumentError, space: Space) -> ArgumentError:
+    """The error of `finite_point`, with the law that has no density at the space's own point."""
+    none = without_density(space.problem.trace, space.theta)
+    if none is None:
+        return error
+    return ArgumentError(
+        f"{error.found}; at the first of them, {spelled(space.problem.trace, space.theta)}, "
+        f"{none[0]}",
+        fix=error.fix,
+        where=none[2],
+    )
 
 
 def finite_point(
