@@ -46,7 +46,7 @@ def _specialised(
     plain: Callable[..., Any], name: str, items: tuple[tuple[str, str], ...]
 ) -> Specialised:
     bound = dict(items)
-    source = _decided(_source(plain), plain.__globals__, bound)
+    source = _decided(plain, _known(plain, items))
     tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))
     start = next(i for i, t in enumerate(tokens) if t.string == "def")
     depth, end = 0, start
@@ -99,20 +99,35 @@ def _edit(
     return first.start[0], first.start[1], last.end[1], text
 
 
-def _decided(source: str, known: Mapping[str, Any], bound: Mapping[str, str]) -> str:
-    """`source` without the `if` statements whose condition follows from the bound parameters."""
-    values = {name: v for name, v in known.items() if isinstance(v, int)}
-    for name, text in bound.items():
+def _known(
+    plain: Callable[..., Any], items: tuple[tuple[str, str], ...]
+) -> tuple[tuple[str, str], ...]:
+    """The bound parameters that stand for a value, not for a function."""
+    values, out = _constants(plain), []
+    for name, text in items:
         try:
-            values[name] = eval(text, values.copy())
+            eval(text, values.copy())
         except (NameError, SyntaxError):  # a function
             continue
+        out.append((name, text))
+    return tuple(out)
+
+
+def _constants(plain: Callable[..., Any]) -> dict[str, Any]:
+    return {name: v for name, v in plain.__globals__.items() if isinstance(v, int)}
+
+
+@lru_cache(maxsize=1024)  # models differ in the names of their functions, and seldom in these
+def _decided(plain: Callable[..., Any], bound: tuple[tuple[str, str], ...]) -> str:
+    """Its text without the `if` statements whose condition follows from the bound values."""
+    source, values = _source(plain), _constants(plain)
+    values |= {name: eval(text, _constants(plain)) for name, text in bound}
     while True:
         for node in ast.walk(parse(source)):
             if not isinstance(node, ast.If):
                 continue
             names = {n.id for n in ast.walk(node.test) if isinstance(n, ast.Name)}
-            if names & set(bound) and names <= set(values):
+            if names & set(dict(bound)) and names <= set(values):
                 truth = bool(eval(ast.unparse(node.test), values.copy()))
                 source = _keep_branch(source, node, truth)
                 break

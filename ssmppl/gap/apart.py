@@ -131,12 +131,12 @@ def _tried(
     own = theta[: len(question.columns.base.parameter_symbols)]
     try:
         data = question.simulator.sets(inputs[which], own, stream)
-        passes = question.smoother.run(data, theta, stream)
+        passes = question.smoother.run(data, theta, stream, predicted=False)
     except SamplingError:
         return {}
     if not all(np.all(np.isfinite(p.rows)) for p in passes):
         return {}
-    found = question.statistics(data, passes, stream)
+    found = question.statistics(data, passes, stream, checks=False)
     return {"columns": found.columns[columns], "nuisance": found.nuisance}
 
 

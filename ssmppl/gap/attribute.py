@@ -305,7 +305,9 @@ def _screen_again(
     )  # fmt: skip
     stage = f"screening for effect {number + 1}"
     sets = min(screen.sets, AGAIN)
-    return ask(question, train, chosen.fit.theta, sets, _seed(seed, number), kept, stage)
+    return ask(
+        question, train, chosen.fit.theta, sets, _seed(seed, number), kept, stage, checks=False
+    )
 
 
 def _seed(seed: np.random.SeedSequence, stage: int) -> np.random.SeedSequence:

@@ -104,8 +104,9 @@ def _gain(
     try:
         fit = plain.fit(data, own, base.start, searched=True, rough=True)
         at = question.theta(fit.theta)
-        passes = question.smoother.run(data, at, stream)
-        found = compared(screen.law, screen.usual, question.statistics(data, passes, stream))
+        passes = question.smoother.run(data, at, stream, predicted=False)
+        seen = question.statistics(data, passes, stream, checks=False)
+        found = compared(screen.law, screen.usual, seen)
         out = []
         for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
             fitter = workshop.fitter((question.candidates[j],))

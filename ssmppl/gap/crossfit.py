@@ -110,7 +110,7 @@ class CrossFit:
             lambda: fitter.fit(fold.train, seed, start, searched=True, rough=True).numbers,
         )
         fit = fitter.restored(fold.train, numbers)
-        screen = ask(self.question, fold.train, fit.theta, SETS, seed, kept)
+        screen = ask(self.question, fold.train, fit.theta, SETS, seed, kept, checks=False)
         found = Attribution(fit)
         if self.chosen is not None:
             attribute(

@@ -149,23 +149,26 @@ class Question:
         return np.array([not c.first_order for c in self.candidates])
 
     def statistics(
-        self, experiments: Sequence[Experiment], passes: Sequence[Pass], stream: np.ndarray
-    ) -> Statistics:
-        """Everything that is asked of one data set."""
+        self, experiments: Sequence[Experiment], passes: Sequence[Pass], stream: np.ndarray,
+        checks: bool = True,
+    ) -> Statistics:  # fmt: skip
+        """Everything that is asked of one data set; without `checks` nothing of its predictions."""
         rows = np.concatenate([p.rows for p in passes])
         starts = np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()
         edges = bin_edges(len(rows), starts)
         p = len(self.columns.nuisance)
         bins = binned(rows, edges)
-        pits = np.concatenate(probability_transforms(passes, experiments, stream))
+        found = np.empty(0)
+        if checks:
+            pits = np.concatenate(probability_transforms(passes, experiments, stream))
+            ahead = [p.ahead for p in passes if p.ahead is not None]
+            found = self._detection(pits, experiments, starts, ahead).values
         return Statistics(
             rows[:, :p].sum(axis=0),
             self._of_candidates(rows, starts),
             np.where(self._sums, np.sum(rows**2, axis=0)[self.place], np.nan),
             rows[:, self.basis_place].sum(axis=0),
-            self._detection(
-                pits, experiments, starts, [p.ahead for p in passes if p.ahead is not None]
-            ).values,
+            found,
             bins[:, :p],
             bins[:, self.basis_place],
         )
@@ -246,7 +249,7 @@ class Screen:
         """(K,) family-wise p of the group of each candidate."""
         return self.family.of_columns(self.groups)
 
-    @property
+    @cached_property
     def groups(self) -> np.ndarray:
         """(K,) labels of the candidates' groups."""
         return groups_of(self.question.candidates)
@@ -283,11 +286,13 @@ def groups_of(candidates: Sequence[Candidate]) -> np.ndarray:
 
 def ask(
     question: Question, experiments: Sequence[Experiment], theta: np.ndarray, sets: int,
-    seed: np.random.SeedSequence, kept: Checkpoint, stage: str = "screening",
+    seed: np.random.SeedSequence, kept: Checkpoint, stage: str = "screening", *,
+    checks: bool = True,
 ) -> Screen:  # fmt: skip
     """Simulate, smooth, and put the data's statistics beside the simulated ones.
 
     theta : (P,) the fitted parameters. kept : takes every set as soon as it is done, as `stage`.
+    checks : whether those of the predictions are wanted, which cost something.
 
     Raises
     ------
@@ -295,7 +300,7 @@ def ask(
     """
     smoother, whole = question.smoother, question.theta(theta)
     _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
-    one = partial(_one_set, question, tuple(experiments), whole, seed)
+    one = partial(_one_set, question, tuple(experiments), whole, seed, checks)
     results = kept.each(stage, OWN_RUNS + sets, one)
     faults = [r for r in results if kept.failures.of_task(f"a data set of {stage}", r)]
     own = [r for r in results[:OWN_RUNS] if r and FAULT not in r]
@@ -329,7 +334,7 @@ def ask(
 
 def _one_set(
     question: Question, experiments: Sequence[Experiment], theta: np.ndarray,
-    seed: np.random.SeedSequence, number: int,
+    seed: np.random.SeedSequence, checks: bool, number: int,
 ) -> Numbers:  # fmt: skip
     """The statistics of the data (the first `OWN_RUNS`) or of a simulated set; empty where it did
     not go through. theta : of the columns."""
@@ -339,7 +344,7 @@ def _one_set(
         if number >= OWN_RUNS:
             own = theta[: len(question.columns.base.parameter_symbols)]
             data = question.simulator.sets(experiments, own, stream)
-        passes = smoother.run(data, theta, stream, ahead=True)
+        passes = smoother.run(data, theta, stream, predicted=checks, ahead=checks)
     except SamplingError:
         if number < OWN_RUNS:
             raise
@@ -347,7 +352,7 @@ def _one_set(
     if not all(np.all(np.isfinite(p.rows)) for p in passes):
         return {}
     with np.errstate(over="ignore", invalid="ignore"):
-        found = question.statistics(data, passes, stream)
+        found = question.statistics(data, passes, stream, checks)
     if not np.all(np.isfinite(found.columns)) or np.any(np.isinf(found.squares)):
         return {}  # rows whose squares are beyond what a number can be
     return dict(vars(found))
