@@ -124,6 +124,7 @@ CHOICES: dict[str, Callable[[Expr, Expr], Expr]] = {
 _VANISHING = {"exp", "ndtr", "erf", "erfc"}
 # Piecewise constant: derivative zero wherever there is one.
 FLAT = BOOLEAN | {"sign", "floor", "ceil"}
+LONGEST = 80  # characters of an expression in an error
 
 
 class NotDifferentiable(SSMError):
@@ -194,15 +195,23 @@ def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
         slope = np.sum(_inverse_of(node).T * _entries(node, tangent))
         return _Slope(slope * node if node.op == "det" else slope)
     if node.op not in PARTIALS:
-        raise NotDifferentiable(f"{node!r} has no derivative in closed form")
+        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
     total = _NONE
     partials = PARTIALS[node.op](node, *node.args)
     for place, (argument, partial) in enumerate(zip(node.args, partials, strict=True)):
         if argument in tangent and not _is_zero(tangent[argument].value):
             if partial is None:
-                raise NotDifferentiable(f"{node!r} has no derivative in {argument!r}")
+                raise NotDifferentiable(f"{_told(node)} has no derivative in {_told(argument)}")
             total = total.plus(_summand(node, place, partial, tangent))
     return total
+
+
+def _told(node: Expr) -> str:
+    """The expression in a message, of which nobody reads more than a line."""
+    text = repr(node)
+    if node.op == "call":  # a primitive, by the name that its user gave it
+        text = getattr(node.data, "__name__", node.op) + text.removeprefix(node.op)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 def _either(condition: Expr, first: _Slope, second: _Slope) -> _Slope:

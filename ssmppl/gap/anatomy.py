@@ -12,6 +12,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, symbol, symbols_of
+from ssmppl.gap.augmented import as_it_was
 from ssmppl.gap.laws import Index, noise_free, scale_of_mean
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.traced import Trace, previous, symbols
@@ -51,7 +52,9 @@ class Anatomy:
     """
 
     def __init__(self, trace: Trace, base: Anatomy | None = None):
-        """base : of the same model before inputs and parameters were changed over time."""
+        """base : of the same model before effects were added; of itself where it has none."""
+        if base is None and as_it_was(trace) is not trace:
+            base = Anatomy(as_it_was(trace))
         self.trace = trace
         self.parts: dict[str, Part] = {}
         for role, sites in (("state", trace.initial), ("channel", trace.observations),

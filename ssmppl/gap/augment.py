@@ -2,7 +2,8 @@
 
 Inputs and parameters are replaced first, in transitions and observations; means, variances, tails
 and starts are changed after that. Several effects on one equation add up. Auxiliary states join the
-model's own; those with the same laws are shared.
+model's own; those with the same laws are shared. Each effect is bound to the model as it was, not
+to what others make of it: one after the other they are the same as all at once (`augmented`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
 from ssmppl.gap.anatomy import Anatomy, Part
+from ssmppl.gap.augmented import Augmented, as_it_was
 from ssmppl.gap.binding import bind
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import slug
@@ -39,10 +41,11 @@ _LAWS = {"transition": shifted, "observation": shifted, "initial": shifted, "noi
 
 
 def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True) -> Trace:
-    """The model with the effects added.
+    """The model with the effects added, as an `Augmented` one.
 
     Parameters
     ----------
+    trace : the model; where effects were added to it before, these join them.
     candidates : their strengths become scalar parameters, in this order behind the model's own.
     prior : whether they get a prior: Flat, HalfFlat where the strength is at least 0, Uniform
         between two bounds. False leaves them as symbols that no site declares, for derivatives.
@@ -52,37 +55,53 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     ArgumentError : two candidates have a strength of the same name, or one does not fit the model.
     ModelError : an effect's function does not do what its kind says.
     """
-    anatomy = Anatomy(trace)
-    _check_names(candidates, anatomy)
+    origin = as_it_was(trace)
+    anatomy = Anatomy(origin)
+    _check(candidates, trace, anatomy)
+    before = trace if isinstance(trace, Augmented) else None
+    every = [*(before.added if before else ()), *candidates]
     places = dict(trace.locations)
-    auxiliary = _Auxiliary(trace)
-    parameters = dict(trace.parameters)
-    early = [c for c in candidates if c.change in ("input", "parameter")]
-    late = [c for c in candidates if c.change not in ("input", "parameter")]
+    auxiliary = _Auxiliary(trace, origin, before.names if before else {})
+    early = [c for c in every if c.change in ("input", "parameter")]
+    late = [c for c in every if c.change not in ("input", "parameter")]
     names: dict[str, dict[str, str]] = {}  # strength -> its auxiliary states
     for c in early:
         names[c.strength] = auxiliary.add(c, anatomy, places)
-    trace = _replaced(trace, early, anatomy, names, places)
-    anatomy = Anatomy(trace, anatomy)
+    new = _replaced(origin, early, anatomy, names, places)
+    anatomy = Anatomy(new, anatomy)
     for c in late:
         names[c.strength] = auxiliary.add(c, anatomy, places)
-    trace = _moved(trace, late, anatomy, names, places)
+    new = _moved(new, late, anatomy, names, places)
+    parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:
         if prior:
             with attributed(places, c.effect.where):
                 parameters[c.strength] = _prior_site(c)
-    return replace(
-        trace,
+    return Augmented(
+        name=trace.name,
         parameters=parameters,
-        initial={**trace.initial, **auxiliary.initial},
-        transition={**trace.transition, **auxiliary.transition},
-        proposal={**trace.proposal, **auxiliary.transition} if trace.proposal else {},
+        initial=_in_order(trace.initial, {**new.initial, **auxiliary.initial}),
+        transition=_in_order(trace.transition, {**new.transition, **auxiliary.transition}),
+        observations=new.observations,
+        proposal={**new.proposal, **auxiliary.transition} if new.proposal else {},
+        inputs=trace.inputs,
         locations=places,
+        functions=trace.functions,
+        choices=trace.choices,
+        origin=origin,
+        added=tuple(every),
+        names=names,
     )
 
 
-def _check_names(candidates: Sequence[Candidate], anatomy: Anatomy) -> None:
-    taken = {p.name: f"the model's {p.role}" for p in anatomy.parts.values()}
+def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Site]:
+    """The sites with those that there were before first, in their order."""
+    return {n: new[n] for n in [*before, *(n for n in new if n not in before)]}
+
+
+def _check(candidates: Sequence[Candidate], trace: Trace, anatomy: Anatomy) -> None:
+    """That their names are free, and that they fit the model. anatomy : of it as it was."""
+    taken = {p.name: f"the model's {p.role}" for p in Anatomy(trace, anatomy).parts.values()}
     for c in candidates:
         if c.strength in taken:
             raise ArgumentError(
@@ -90,11 +109,13 @@ def _check_names(candidates: Sequence[Candidate], anatomy: Anatomy) -> None:
                 fix="give each candidate a name of its own: replace(candidate, strength=...)",
             )
         taken[c.strength] = f"the strength of {c}"
-        if c.equation not in anatomy.parts:
-            raise ArgumentError(
-                f"{c}: the model {anatomy.trace.name!r} has no {c.equation!r}",
-                fix="make the candidates by offers() of the same model",
-            )
+        moved = [label for label, _ in (*c.reaction, *c.carried)]
+        for label in (c.equation, *dict(c.bound).values(), *moved):
+            if label not in anatomy.parts:
+                raise ArgumentError(
+                    f"{c}: the model {anatomy.trace.name!r} has no {label!r}",
+                    fix="make the candidates by offers() of the same model",
+                )
         _check_law(c, anatomy)
 
 
@@ -123,10 +144,15 @@ def _prior_site(c: Candidate) -> Site:
 
 # -- auxiliary states
 class _Auxiliary:
-    """The auxiliary states of all candidates, by name in the model."""
+    """The auxiliary states of all candidates, by name in the model.
 
-    def __init__(self, trace: Trace):
-        self.taken = {*trace.parameters, *trace.initial, *trace.observations, *trace.inputs}
+    earlier : the names of those that are in it already.
+    """
+
+    def __init__(self, trace: Trace, origin: Trace, earlier: Mapping[str, Mapping[str, str]]):
+        self.earlier = {strength: dict(names) for strength, names in earlier.items()}
+        self.kept = {n for names in self.earlier.values() for n in names.values()}
+        self.taken = {*trace.parameters, *origin.initial, *trace.observations, *trace.inputs}
         self.initial: dict[str, Site] = {}
         self.transition: dict[str, Site] = {}
 
@@ -137,7 +163,10 @@ class _Auxiliary:
         for number in itertools.count(1):
             suffix = "" if number == 1 else f"_{number}"
             names = {n: slug(f"{n} {c.equation}") + suffix for n in c.effect.states}
-            if self.taken & set(names.values()):
+            names = self.earlier.get(c.strength, names)
+            # A name that an earlier candidate keeps is not given away before it is asked for.
+            kept = self.kept if c.strength not in self.earlier else set()
+            if (self.taken | kept - set(self.initial)) & set(names.values()):
                 continue
             with attributed(places, c.effect.where):
                 first = bind(c, anatomy, "initial", names).initial

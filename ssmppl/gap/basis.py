@@ -18,6 +18,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol, symbols_of
 from ssmppl.gap.anatomy import Anatomy, Part
+from ssmppl.gap.augmented import as_it_was
 from ssmppl.gap.bases import Smooth, bases
 from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.candidates import Scales, slug
@@ -67,7 +68,7 @@ class Term:
 
 def basis(trace: Trace, scales: Scales) -> list[Term]:
     """The terms of all equations that have noise."""
-    anatomy = Anatomy(trace)
+    anatomy = Anatomy(as_it_was(trace))
     states, inputs = anatomy.of_role("state"), anatomy.of_role("input")
     varying = [p for p in [*states, *inputs] if scales.scale[p.label].sd > 0.0]
     noisy = [p for p in states if not anatomy.deterministic(p)]

@@ -243,8 +243,13 @@ def _given(
         return _value(anatomy.second_order(part), effect)
     if what == "moved":
         position = anatomy.position(part)
-        assert position is not None  # given only where there is one
+        if position is None:
+            raise _refuse(effect, f"no state is the integral of {part.label}, whose move it asks "
+                          "for", "bind it to the rate of a position")  # fmt: skip
         return _value(anatomy.step(position), effect)
+    if name not in bound:
+        raise _refuse(effect, f"nothing is bound to {name!r}, which is to be {what!r}",
+                      "make its candidates by offers()")  # fmt: skip
     return anatomy.parts[bound[name]].seen_from(role)
 
 

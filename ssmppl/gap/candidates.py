@@ -12,6 +12,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.gap.anatomy import Anatomy, Part
+from ssmppl.gap.augmented import as_it_was
 from ssmppl.gap.binding import bind, check_base, quantity, unknown
 from ssmppl.gap.candidate import OF_ROLE, Candidate
 from ssmppl.gap.catalogue import effects as catalogue
@@ -69,7 +70,7 @@ def offers(
     ArgumentError : a name is not in the catalogue.
     ModelError : an effect's function does not fit its kind or the model; names its line.
     """
-    anatomy = Anatomy(trace)
+    anatomy = Anatomy(as_it_was(trace))  # what was added is no part of the model
     shared = Flows.of(anatomy)
     out: list[Candidate] = []
     refused: list[Refused] = []
@@ -84,7 +85,7 @@ def offers(
             continue
         out += found
         refused += not_for
-    return _named(out, anatomy), refused
+    return _named(out, Anatomy(trace)), refused
 
 
 def chosen(effects: Chosen = None) -> list[Effect]:

@@ -8,7 +8,7 @@ further deterministic components of a model whose other laws are the base model'
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from ssmppl.codegen.render import identifier
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
-from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol
+from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol, topological
 from ssmppl.gap.laws import substituted
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.traced import Site, Trace, previous
@@ -58,16 +58,18 @@ def score_columns(
     strengths : names of the superset's parameters that are strengths; other further parameters
         (shapes) stay.
     """
-    wanted, refused = [], {}
+    wanted: list[Expr] = []
+    refused: dict[str, NotApplicable] = {}
     own = set(base.parameter_symbols)
     # Auxiliary states come in multiplied by a strength, which is zero.
     inert = frozenset(superset.state_symbols) - frozenset(base.state_symbols)
-    superset = _linear_in(superset, strengths, inert)
+    superset = _linear_in(superset, strengths, inert, refused)
     free = [s for s in superset.parameter_symbols if not {s.data[1], repr(s)} & set(held)]
     free = [s for s in free if s in own or s.data[1] in strengths]
+    free = [s for s in free if repr(s) not in refused]
     derived = CompleteScore(superset, free, missing, inert)
     for s in free:
-        reason = derived.obstacle(s)
+        reason = derived.obstacle(s) or opaque_in(derived, s)
         if reason is None:
             wanted.append(s)
         else:
@@ -109,10 +111,38 @@ def score_columns(
     )  # fmt: skip
 
 
-def _linear_in(superset: Trace, strengths: Collection[str], inert: Collection[Expr]) -> Trace:
+def opaque_in(derived: CompleteScore, s: Expr) -> NotApplicable | None:
+    """Why the score in a parameter has no closed form: a primitive that changes with it."""
+    node = _opaque(_derived_from(derived), derived.involved(s))
+    return None if node is None else _called(node)
+
+
+def _derived_from(derived: CompleteScore) -> list[Expr]:
+    """What the score is derived of."""
+    known = [e for values in derived.value.values() for s, e in values.items()
+             if s not in derived.inert]  # fmt: skip
+    return [*derived.density.values(), *known]
+
+
+def _opaque(roots: Iterable[Expr], symbols: Iterable[Expr]) -> Expr | None:
+    """The first call of a primitive that changes with one of the symbols."""
+    changing = dependent(roots, symbols)
+    if not any(node.op == "call" for node in changing):
+        return None
+    return next(n for n in topological(roots) if n.op == "call" and n in changing)
+
+
+def _called(node: Expr) -> NotApplicable:
+    return NotApplicable(f"it would need a derivative of the @ssm.primitive {node.data.__name__}")
+
+
+def _linear_in(
+    superset: Trace, strengths: Collection[str], inert: Collection[Expr],
+    refused: dict[str, NotApplicable],
+) -> Trace:  # fmt: skip
     """With the deterministic laws linear in the strengths, which is all that first derivatives at
     zero see: products of two of them would have to be carried for nothing. In the laws of what is
-    inert the strengths are zero."""
+    inert the strengths are zero, as are those without a derivative, which are `refused`."""
     own = [s for s in superset.parameter_symbols if s.data[1] in strengths]
     zero: dict[Expr, Expr] = {s: constant(0.0) for s in own}
 
@@ -124,7 +154,12 @@ def _linear_in(superset: Trace, strengths: Collection[str], inert: Collection[Ex
         values = substitute(roots, zero)
         for s in () if site.value.ravel()[0] in inert else own:
             if dependent(roots, [s]).intersection(roots):
-                slopes = substitute(differentiate(roots, s), zero)
+                try:
+                    slopes = substitute(differentiate(roots, s), zero)
+                except NotDifferentiable as error:
+                    node = _opaque(roots, [s])
+                    refused[repr(s)] = NotApplicable(error.found) if node is None else _called(node)
+                    continue
                 values = [v + s * d for v, d in zip(values, slopes, strict=True)]
         law = Dirac(array(np.array(values, dtype=object).reshape(site.shape)))
         law.location = site.distribution.location
@@ -155,7 +190,7 @@ def _gradient(
                 CompleteScore(superset, [s], missing, inert).gradient()
                 kept.append(s)
             except NotDifferentiable as error:
-                refused[repr(s)] = NotApplicable(f"no derivative in closed form: {error}")
+                refused[repr(s)] = NotApplicable(error.found)
         derived = CompleteScore(superset, kept, missing, inert)
         return derived, derived.gradient()
 

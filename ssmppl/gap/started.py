@@ -18,6 +18,7 @@ import numpy as np
 from ssmppl.analysis.structure import flat_start, linear_gaussian
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
+from ssmppl.gap.augmented import Augmented, as_it_was
 from ssmppl.gap.smoothing import LAG, Smoother
 from ssmppl.inference.particles.filtering import random_state
 from ssmppl.language.distributions import Normal
@@ -48,6 +49,8 @@ class Start:
             law = Normal(mean, sd=spread)
             law.location = site.distribution.location
             initial[name] = replace(site, distribution=law)
+        if isinstance(trace, Augmented):  # what is added later is added to a model with this start
+            return replace(trace, initial=initial, origin=self.given(as_it_was(trace)))
         return replace(trace, initial=initial)
 
     def __str__(self) -> str:

@@ -78,7 +78,7 @@ class Trace:
         found again by its identity."""
         content = self.__dict__.get("_packed")
         if content is None:
-            content = packed(tuple(getattr(self, f.name) for f in fields(self)))
+            content = packed((type(self), *(getattr(self, f.name) for f in fields(self))))
             object.__setattr__(self, "_packed", content)
         _received.put(digest_of(content), self)
         return _receive, (content,)
@@ -108,7 +108,12 @@ _received: Known[Trace] = Known(most=64)
 
 
 def _receive(content: bytes) -> Trace | None:
-    return _received.get(digest_of(content), lambda: Trace(*unpacked(content)))
+    def made() -> Trace:
+        kind, *values = unpacked(content)
+        trace: Trace = kind(*values)
+        return trace
+
+    return _received.get(digest_of(content), made)
 
 
 def previous(s: Expr) -> Expr:
