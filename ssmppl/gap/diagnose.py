@@ -26,6 +26,7 @@ from ssmppl.gap.candidates import chosen as chosen_effects
 from ssmppl.gap.checkpoint import Checkpoint, Numbers, digests
 from ssmppl.gap.confirm import Predictions, predict
 from ssmppl.gap.crossfit import CrossFit
+from ssmppl.gap.differentiable import check_differentiable
 from ssmppl.gap.expected import Timed, in_words, timed
 from ssmppl.gap.expected import seconds as expected
 from ssmppl.gap.failures import Failures, reason_of
@@ -140,6 +141,7 @@ class _Diagnosis:
         check_samplers(self.trace)
         self.experiments = self.problem.experiments
         self.fixed = check_values(self.trace, fixed, argument="fixed")
+        check_differentiable(self.trace, self.fixed)
         self.effects, self.mode, self.alpha = effects, mode, alpha
         self.root = seed_sequence(seed)
         self.parts: Parts | None = None
