@@ -102,15 +102,24 @@ def _edit(
 def _known(
     plain: Callable[..., Any], items: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
-    """The bound parameters that stand for a value, not for a function."""
-    values, out = _constants(plain), []
+    """The bound parameters that conditions ask for and that stand for a value, not a function."""
+    values, out, asked = _constants(plain), [], _asked(plain)
     for name, text in items:
+        if name not in asked:
+            continue
         try:
             eval(text, values.copy())
         except (NameError, SyntaxError):  # a function
             continue
         out.append((name, text))
     return tuple(out)
+
+
+@lru_cache
+def _asked(plain: Callable[..., Any]) -> frozenset[str]:
+    """The names in the conditions of its `if` statements."""
+    tests = [n.test for n in ast.walk(parse(_source(plain))) if isinstance(n, ast.If)]
+    return frozenset(n.id for t in tests for n in ast.walk(t) if isinstance(n, ast.Name))
 
 
 def _constants(plain: Callable[..., Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ of the inputs, so that the filter's kernels are the same as for any other propos
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -51,6 +52,7 @@ class TwistedFilter:
     trace: Trace
     found: Guided
     module: Loaded = field(repr=False)
+    _room: threading.local = field(default_factory=threading.local, repr=False, compare=False)
 
     def entry(self, name: str, horizon: int = 0) -> Callable[..., Any]:
         """`filter`, `alive_filter`, `filtered_path` or `conditional_smc`, called like those of
@@ -133,10 +135,11 @@ class TwistedFilter:
         """log p(y | theta) by the extended Kalman filter, whose update is the mode of each row: an
         approximation, exact where the model is linear and Gaussian; -inf where it comes to no
         number, or to none that floating point resolves."""
-        found, covariance = self._empty(len(y))
-        value = self.module.follow_filter(
-            theta, y, seen, u, found.x, covariance, *found.derivatives
-        )
+        if getattr(self._room, "steps", None) != len(y):  # kept: it is called a thousand times
+            found, covariance = self._empty(len(y))
+            self._room.arrays = found.x, covariance, *found.derivatives
+            self._room.follow, self._room.steps = self.module.follow_filter, len(y)
+        value = self._room.follow(theta, y, seen, u, *self._room.arrays)
         return float(value) if value < np.inf else -np.inf
 
     def _climbed(self, given: tuple[np.ndarray, ...], first: _Reference) -> _Reference:

@@ -89,8 +89,7 @@ class Checkpoint:
         with self._lock:
             self._done[name] = {k: np.asarray(v) for k, v in numbers.items()}
             self._new = True
-            wait = max(SECONDS, self._cost / SHARE)
-            if time.monotonic() - self._written > wait:
+            if time.monotonic() - self._written > max(SECONDS, self._cost / SHARE):
                 self._write()
 
     def flush(self) -> None:
@@ -108,7 +107,6 @@ class Checkpoint:
         """The numbers under this name, made where they are not there yet."""
         if name not in self:
             self.put(name, make())
-            self.flush()
         return self.get(name)
 
     def each(
@@ -130,15 +128,11 @@ class Checkpoint:
             else:
                 self.put(f"{stage}/{todo[i]}", numbers)
 
-        try:
-            if todo:
-                run_tasks(
-                    task if self.failures.raised else Tolerant(task), todo,
-                    executor=self.executor, progress=self.progress, title=self.prefix + stage,
-                    take=take,
-                )  # fmt: skip
-        finally:
-            self.flush()
+        if todo:
+            run_tasks(
+                task if self.failures.raised else Tolerant(task), todo, executor=self.executor,
+                progress=self.progress, title=self.prefix + stage, take=take,
+            )  # fmt: skip
         return [lost[k] if k in lost else self.get(f"{stage}/{k}") for k in range(count)]
 
     # -- the file

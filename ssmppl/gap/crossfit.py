@@ -34,6 +34,7 @@ from ssmppl.gap.screen import Question, ask
 from ssmppl.gap.share import NOT_GIVEN, HowFar, interval_of, notes_of
 from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.simulation import feeds_back
+from ssmppl.inference.tasks import run_tasks
 
 SETS = 60  # simulated data sets in each fold
 SINGLES = 4  # refits in each fold
@@ -60,18 +61,21 @@ class CrossFit:
         out.runs(self.base, self.experiments, self.chosen, seed)
         fed_back = feeds_back(self.workshop.trace)
         parts = folds(self.experiments, FOLDS, fed_back=fed_back)
-        each = []
-        try:
-            for k, fold in enumerate(parts):
-                own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 20, k))
-                name = f"block {k + 1} of {len(parts)}"
-                where = kept.within(name)
-                try:
-                    each.append(where.of("held out", partial(self._one, fold, own, where)))
-                except SSMError:  # a block that a model cannot predict is no block to leave out
-                    raise
-                except Exception as error:
-                    kept.failures.met(name, error)
+
+        def one(k: int) -> Numbers:
+            own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 20, k))
+            name = f"block {k + 1} of {len(parts)}"
+            where = kept.within(name)
+            try:
+                return where.of("held out", partial(self._one, parts[k], own, where))
+            except SSMError:  # a block that a model cannot predict is no block to leave out
+                raise
+            except Exception as error:
+                kept.failures.met(name, error)
+                return {}
+
+        try:  # in threads of this process: their tasks go over the executor
+            each = [v for v in run_tasks(one, range(len(parts))) if v]
         except SSMError as error:
             out.notes.append(NOT_GIVEN.format(error.found))
             return out

@@ -21,6 +21,7 @@ its own prediction. Both are Student's t with about B - P degrees of freedom.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -179,7 +180,7 @@ class Efficient:
     sided: np.ndarray
     status: tuple[str, ...]
 
-    @property
+    @cached_property
     def covariance(self) -> np.ndarray:
         """(K, K) of S~: rho scaled to the variances V."""
         size = np.sqrt(self.variance)

@@ -260,7 +260,8 @@ class Fitter:
             prior = density_of(space, lambda theta: 0.0)
             gained = fit.log_likelihood + prior(fit.z) - value - prior(top.z)
             if gained > 2.0 * np.hypot(error, fit.error):
-                return fit
+                distance = min(fit.distance, top.distance)
+                return replace(fit, distance=distance, converged=distance < 3.0 * NEAR)
         information = steady(top.information, ~space.on_the_line)
         nowhere = np.zeros(len(top.z), dtype=bool)
         return Fit(space, space.theta, top.z, value, error, information, top.distance,

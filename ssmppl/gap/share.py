@@ -21,7 +21,7 @@ from ssmppl.gap.screen import Screen
 from ssmppl.gap.workshop import Workshop
 
 NOT_GIVEN = "the share of the gap that is closed is not given: {}"
-SAME = 1e-6  # relative difference of two gains that are the same model's
+SAME = 1e-3  # relative difference of two gains up to which they are the same model's
 
 
 @dataclass

@@ -18,6 +18,7 @@ CHANGE = (0.05, 5.0)  # of the function over one width, between which that is a 
 WIDEST, FIRST, TIMES = 4.0, 0.1, 4.0  # of a width in z; where the search for it begins; its factor
 TRIES = 24
 STEPS = 40
+KEPT = 2  # steps for which the mixed second differences are kept, while whole steps climb
 FARTHEST = 2.0  # of a first step in any coordinate, in units of it where it is larger than one
 SHARES = (1.0, 0.5, 0.2, 0.05, 0.01)  # of a step that are tried
 GOOD = 1e-3  # that the quadratic still expects where a climb is at its end
@@ -53,13 +54,21 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
         return Top(z, value, np.zeros((0, 0)), 0.0)
     width = np.full(len(z), FIRST)
     information, distance, reach, gained = np.eye(len(z)), np.inf, FARTHEST, np.inf
+    together, age = None, 0  # how the curvatures of two coordinates go together, and for how long
     for _ in range(STEPS):
         width = widths(function, z, value, width)
-        slope, coarse, curvature = _derivatives(function, z, value, width)
-        information = curvature / np.outer(width, width)
+        slope, coarse, curvature = _derivatives(function, z, value, width, together)
         step, distance, lowest = _step(slope, curvature)
+        if together is not None and distance < GOOD:  # not on the word of an old matrix
+            slope, coarse, curvature = _derivatives(function, z, value, width)
+            step, distance, lowest = _step(slope, curvature)
+            together = None
+        information = curvature / np.outer(width, width)
         if distance < GOOD and lowest > -CONVEX:
             break
+        if together is None:
+            scale = np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), FLAT))
+            together, age = np.clip(curvature / np.outer(scale, scale), -1.0, 1.0), 0
         # On a rough function the differences over half a width may know better than the fine ones.
         found = None
         for move in (step * width, _step(coarse, curvature)[0] * width, coarse * width):
@@ -73,6 +82,9 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
         at, new, share = found
         if size > reach or share < 1.0:
             reach = max(FARTHEST, 2.0 * reach if share == 1.0 else share * reach)
+        age += 1
+        if age >= KEPT or share < 1.0:
+            together = None
         before, gained = gained, new - value
         z, value = at, new
         if max(before, gained) < LITTLE:
@@ -120,10 +132,15 @@ def _moved(z: np.ndarray, i: int, by: float) -> np.ndarray:
 
 
 def _derivatives(
-    function: Function, z: np.ndarray, value: float, width: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    function: Function, z: np.ndarray, value: float, width: np.ndarray,
+    together: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """(F,) slope, fine and over half a width, and (F, F) minus second differences, in widths; 0
-    where there are none, the slope one-sided next to where there is no value."""
+    where there are none, the slope one-sided next to where there is no value.
+
+    together : (F, F) in place of the mixed differences, which then are not taken: these over the
+    roots of the two pure ones.
+    """
     n, h = len(z), 0.5
     ends = np.array([[function(_moved(z, i, s * size * width[i])) for s in (1.0, -1.0)]
                      for size in (FINE, h) for i in range(n)])  # fmt: skip
@@ -136,13 +153,16 @@ def _derivatives(
     with np.errstate(invalid="ignore"):
         for i in range(n):
             out[i, i] = -(plus[i] - 2.0 * value + minus[i]) / h**2
-            for j in range(i):
+            for j in range(i if together is None else 0):
                 up, down = (
                     function(_moved(_moved(z, i, s * h * width[i]), j, s * h * width[j]))
                     for s in (1.0, -1.0)
                 )
                 twice = up - plus[i] - plus[j] + 2.0 * value - minus[i] - minus[j] + down
                 out[i, j] = out[j, i] = -twice / (2.0 * h**2)
+        if together is not None:
+            scale = np.sqrt(np.abs(np.diagonal(out)))
+            out += (together - np.diag(np.diagonal(together))) * np.outer(scale, scale)
         coarse = (plus - minus) / (2.0 * h)
     slope, coarse, out = (np.where(np.isfinite(a), a, 0.0) for a in (slope, coarse, out))
     return slope, coarse, out
