@@ -30,7 +30,7 @@ from ssmppl.gap.parts import FOLDS, Fold, folds
 from ssmppl.gap.profiles import one_off
 from ssmppl.gap.reference import fit_reference
 from ssmppl.gap.refit import Refit
-from ssmppl.gap.screen import Question, ask
+from ssmppl.gap.screen import Question, Screen, ask, held_against
 from ssmppl.gap.share import NOT_GIVEN, HowFar, interval_of, notes_of
 from ssmppl.gap.workshop import Workshop
 from ssmppl.inference.simulation import feeds_back
@@ -45,7 +45,9 @@ class CrossFit:
     """What every fold works with.
 
     question : the screen's. base : the model's fitter and its fit to all rows. alpha : family-wise
-    error rate of the selection. chosen : on all rows; None: the reference stands for it.
+    error rate of the selection. chosen : on all rows; None: the reference stands for it. whole :
+    the screen of all rows by that question, whose simulated sets serve all blocks; None: each
+    block has its own.
     """
 
     workshop: Workshop
@@ -54,6 +56,7 @@ class CrossFit:
     experiments: tuple[Experiment, ...]
     alpha: float
     chosen: Refit | None
+    whole: Screen | None = None
 
     def how_far(self, label: str, seed: np.random.SeedSequence, kept: Checkpoint) -> HowFar:
         """Share of the gap that is closed on the blocks left out."""
@@ -114,7 +117,10 @@ class CrossFit:
             lambda: fitter.fit(fold.train, seed, start, searched=True, rough=True).numbers,
         )
         fit = fitter.restored(fold.train, numbers)
-        screen = ask(self.question, fold.train, fit.theta, SETS, seed, kept, checks=False)
+        if self.whole is None:
+            screen = ask(self.question, fold.train, fit.theta, SETS, seed, kept, checks=False)
+        else:
+            screen = held_against(self.whole, fold.train, fit.theta, seed)
         found = Attribution(fit)
         if self.chosen is not None:
             attribute(

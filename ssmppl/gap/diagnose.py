@@ -293,9 +293,10 @@ class _Diagnosis:
             )  # fmt: skip
             fitter = workshop.fitter(())
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
-        return CrossFit(workshop, question, base, self.experiments, self.alpha, r.chosen).how_far(
-            r.label, self._seed(8), self.kept
-        )
+        whole = None if self.parts or (r.attribution and r.attribution.rebased) else r.screen
+        return CrossFit(
+            workshop, question, base, self.experiments, self.alpha, r.chosen, whole
+        ).how_far(r.label, self._seed(8), self.kept)
 
     def _separated(self, r: Results) -> None:
         """The input that would separate the class of the best, where there is a class."""

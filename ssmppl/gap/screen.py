@@ -332,6 +332,35 @@ def ask(
     )
 
 
+def held_against(
+    whole: Screen, experiments: Sequence[Experiment], theta: np.ndarray,
+    seed: np.random.SeedSequence,
+) -> Screen:  # fmt: skip
+    """The screen of a part of the data by the law of the sets that were simulated for all of them.
+
+    theta : (P,) fitted to the part. The scale is that of the information which the part holds
+    (`compared`), so that little changes where a tenth is missing, and nothing is simulated.
+    """
+    question, at = whole.question, whole.question.theta(theta)
+    one = partial(_one_set, question, tuple(experiments), at, seed, False)
+    own = [r for r in map(one, range(OWN_RUNS)) if r]
+    if not own:
+        raise SamplingError(
+            "the rows without the block did not go through the smoother", fix="use more particles"
+        )
+    empty = np.empty(0)
+    observed = Statistics(**{
+        n: np.mean([s[n] for s in own], axis=0) if n != "detection" else empty
+        for n in Statistics.__dataclass_fields__
+    })  # fmt: skip
+    found = compared(whole.law, whole.usual, observed)
+    family = familywise(found.statistic, found.null, sided=found.sided, groups=whole.groups)
+    return replace(
+        whole, theta=theta, observed=observed, found=found, family=family,
+        experiments=tuple(experiments),
+    )  # fmt: skip
+
+
 def _one_set(
     question: Question, experiments: Sequence[Experiment], theta: np.ndarray,
     seed: np.random.SeedSequence, checks: bool, number: int,
