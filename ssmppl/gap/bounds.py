@@ -74,10 +74,9 @@ def note(names: Sequence[str], values: dict[str, float], what: str) -> str:
     if not names:
         return ""
     told = ", ".join(f"{n} at {values[n]:.3g}" if n in values else n for n in names)
-    many = len(names) > 1
     return (
-        f"{' and '.join(names)} ran to {'their bounds' if many else 'its bound'} in {what}: held "
-        f"({told}, which costs less than {COST:g} nats) and left out of the information"
+        f"in {what} the best value of {' and '.join(names)} is a bound: held where it begins to "
+        f"count ({told}, which costs {COST:g} nats), and left out of the information"
     )
 
 

@@ -98,6 +98,12 @@ class Checkpoint:
             if self._new:
                 self._write()
 
+    def _keep_up(self) -> None:
+        """Write what is new at the end of a stage, unless so much is kept that writing it again
+        and again would take long."""
+        if time.monotonic() - self._written >= self._cost / SHARE:
+            self.flush()
+
     def say(self, text: str) -> None:
         """A line about what goes on, where progress is shown."""
         if self.progress:
@@ -107,6 +113,7 @@ class Checkpoint:
         """The numbers under this name, made where they are not there yet."""
         if name not in self:
             self.put(name, make())
+            self._keep_up()
         return self.get(name)
 
     def each(
@@ -128,11 +135,17 @@ class Checkpoint:
             else:
                 self.put(f"{stage}/{todo[i]}", numbers)
 
-        if todo:
-            run_tasks(
-                task if self.failures.raised else Tolerant(task), todo, executor=self.executor,
-                progress=self.progress, title=self.prefix + stage, take=take,
-            )  # fmt: skip
+        try:
+            if todo:
+                run_tasks(
+                    task if self.failures.raised else Tolerant(task), todo,
+                    executor=self.executor, progress=self.progress, title=self.prefix + stage,
+                    take=take,
+                )  # fmt: skip
+        except BaseException:  # what is done is kept, whatever ends the run
+            self.flush()
+            raise
+        self._keep_up()
         return [lost[k] if k in lost else self.get(f"{stage}/{k}") for k in range(count)]
 
     # -- the file
@@ -185,6 +198,9 @@ class _Part(Checkpoint):
 
     def flush(self) -> None:
         self._whole.flush()
+
+    def _keep_up(self) -> None:
+        self._whole._keep_up()
 
 
 def _file(path: Path, mode: str) -> Path:

@@ -343,9 +343,10 @@ class _Diagnosis:
         for_fit, _ = timed(
             lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
         )
+        of_climbs, _ = timed(lambda: base.value(experiments, fit.theta))
         blocks = 0 if self.parts else FOLDS
         rest = expected(
-            Timed(for_screen, for_fit, generating), SETS[self.mode], self.mode, blocks,
+            Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
             self.kept.executor,
         )  # fmt: skip
         self.kept.say(f"{self.mode} mode: {in_words(rest)} expected from here on")

@@ -10,20 +10,24 @@ from dataclasses import dataclass
 
 from ssmppl.inference.executors import workers_of
 
-REFITS = 24  # of single effects, their shapes, pairs and the reference, about
-FIT_PASSES = 36  # over the data in a fit, about
-SCREENS = 2.0  # as long as the first one that follow it: for further effects, under other inputs
-FOLD_REFITS = 5
+REFITS = 18  # of single effects, their shapes, pairs and the reference, about
+EVALUATIONS, FIT_PASSES = 1500, 36  # likelihoods and passes over the data in a fit, about
+ROUGH = 400  # likelihoods in a rough fit
+SCREENS = 1.0  # as long as the first one that follow it: for further effects, under other inputs
+TEXT = 0.25  # of the time that the screen's code took, which a fit's takes, one at a time
+SIMULATED = 3 * 50  # rough fits of simulated data in short records, about
+FOLD_FITS, FOLD_PASSES = 8, 12  # rough fits, and passes, for a block that is left out
 
 
 @dataclass(frozen=True)
 class Timed:
     """Seconds. screen_pass : over the data with all candidates. fit_pass : with the parameters
-    only. generating : the code that a fit needs, made anew for each kind of effect."""
+    only. generating : the screen's code. likelihood : one evaluation of those that climbs make."""
 
     screen_pass: float
     fit_pass: float
     generating: float
+    likelihood: float = 0.0
 
 
 def timed(run: Callable[[], object]) -> tuple[float, float]:
@@ -45,9 +49,14 @@ def seconds(found: Timed, sets: int, mode: str, folds: int, executor: Executor |
     screen = sets * found.screen_pass / workers
     if mode == "fast":
         return screen
-    one = FIT_PASSES * found.fit_pass + found.generating
-    total = screen * (1.0 + SCREENS) + REFITS * one / workers
-    return total + folds * (0.5 * screen + FOLD_REFITS * one)
+    one = EVALUATIONS * found.likelihood + FIT_PASSES * found.fit_pass
+    rough, text = ROUGH * found.likelihood, TEXT * found.generating
+    total = screen * (1.0 + SCREENS) + REFITS * (one / workers + text)
+    if folds:
+        total += SIMULATED * (rough + found.screen_pass) / workers
+        block = FOLD_FITS * rough + FOLD_PASSES * found.screen_pass
+        total += folds * (block / workers + 2.0 * text)
+    return total
 
 
 def in_words(value: float) -> str:

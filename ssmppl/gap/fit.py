@@ -209,6 +209,15 @@ class Fitter:
         return replace(fit, space=at(space, theta), theta=theta, z=z, log_likelihood=value,
                        error=error, at_bound=mask)  # fmt: skip
 
+    def value(self, experiments: Sequence[Experiment], theta: np.ndarray) -> float:
+        """log p(y | theta) as climbs see it: exact, by the extended filter, or by particles."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        smooth = self._extended(problem)
+        if smooth is None and isinstance(self.kalman, KalmanModel):
+            return self.kalman.log_likelihood(experiments, theta)
+        return smooth(theta) if smooth else self.estimate(experiments, theta, random_state(
+            np.random.SeedSequence(0)))  # fmt: skip
+
     # -- by the extended Kalman filter
     def _extended(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
         """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no

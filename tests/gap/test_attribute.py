@@ -274,14 +274,14 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
     """Where one effect stands for the best, and each step forward adds one."""
     taken = []
 
-    def forward(out, *args):
+    def forward(out, *args, rough):
         taken.append(args[-1])
         more = args[-1] - len(out.chosen.candidates)
         out.chosen = replace(out.chosen, candidates=out.chosen.candidates + ("more",) * more)
 
     one = Refit((0,), ("first",), None, None, 9.0)
     monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
-    monkeypatch.setattr(module, "_best_pair", lambda *_: None)
+    monkeypatch.setattr(module, "_best_pair", lambda *_, **__: None)
     monkeypatch.setattr(module, "_forward", forward)
     screen = screen_of([6.0, 3.0], np.eye(2))
     screen.question = SimpleNamespace(scales=None)

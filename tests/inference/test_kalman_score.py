@@ -193,7 +193,7 @@ def test_what_has_no_derivative_is_named():
     experiments = bind(traced, {"y": [0.1, 0.5, -0.2]})
     theta = np.array([0.3, 0.4])
     found = kalman_model(traced)
-    with pytest.raises(ArgumentError, match=r"score in a .*transition law: call\(a\)") as raised:
+    with pytest.raises(ArgumentError, match=r"score in a .*transition law: opaque\(a\)") as raised:
         found.score(experiments, theta)
     assert "x + opaque(a)" in str(raised.value)  # the line itself
     fixed = np.array([False, True])
