@@ -54,12 +54,12 @@ class Results:
     screen: Screen
     settings: dict[str, Any]
     notes: list[str]
-    failures: Failures = field(default_factory=Failures)
     attribution: Attribution | None = None
     far: HowFar | None = None
     blocks: int = 0
     separating: dict[int, str] = field(default_factory=dict)
     interrupted: bool = False
+    failures: Failures = field(default_factory=Failures)
 
     @property
     def refits(self) -> list[Refit]:
@@ -131,7 +131,9 @@ def answer(r: Results, seconds: float) -> GapReport:
                     verdict, missing = NOTHING, None
                 elif verdict == UNLIKE:
                     verdict, missing = _effect(r, where)
-    if verdict == NOTHING and _stands_out(r.alpha, where, checks):
+    if verdict == NOTHING and not r.screened:  # they tell of a fit that was not the best one
+        where["p"], checks["p"] = np.nan, np.nan
+    elif verdict == NOTHING and _stands_out(r.alpha, where, checks):
         verdict, missing = UNLIKE, _curve_of(r, where)
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}

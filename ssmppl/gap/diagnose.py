@@ -217,7 +217,7 @@ class _Diagnosis:
         }  # fmt: skip
         return Results(
             self.trace, self.experiments, self.parts, self.mode, self.alpha, base, fit, screen,
-            settings, self.notes, self.failures,
+            settings, self.notes, failures=self.failures,
         )  # fmt: skip
 
     def _explained(self, r: Results) -> None:

@@ -121,9 +121,9 @@ def _only_later(patch):
     """`Question.statistics`, forbidden until the refits have begun."""
     begun, original, attributed = [], screen.Question.statistics, attribute.attribute
 
-    def statistics(self, *args):
+    def statistics(self, *args, **kwargs):
         assert begun, "a simulated set of the first screen was drawn again"
-        return original(self, *args)
+        return original(self, *args, **kwargs)
 
     def later(*args, **kwargs):
         begun.append(True)
@@ -139,11 +139,11 @@ def _only_later(patch):
 def test_the_screen_resumes_where_it_was_interrupted(tmp_path, monkeypatch):
     count, original = [], screen.Question.statistics
 
-    def statistics(self, *args):
+    def statistics(self, *args, **kwargs):
         count.append(1)
         if len(count) == 25:
             raise KeyboardInterrupt
-        return original(self, *args)
+        return original(self, *args, **kwargs)
 
     kept = tmp_path / "kept.npz"
     with monkeypatch.context() as patch:
