@@ -1,6 +1,7 @@
 """Models with a flat start to which an effect is added that they cannot have with it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -117,6 +118,7 @@ def test_the_likelihood_with_an_effect_is_that_of_a_flat_start():
     fit = fitter.restored(experiments, {
         "theta": theta, "z": np.zeros(5), "log_likelihood": 0.0, "error": 0.0,
         "information": np.eye(5), "distance": 0.0, "converged": True,
+        "at_bound": np.zeros(5),
     })  # fmt: skip
     told = predict(fitter, fit, experiments, [np.ones(15, bool)], seed_sequence(2))
     total = told.log_density.sum(axis=1)
@@ -178,7 +180,9 @@ def test_drag_is_refitted_though_the_model_starts_flat():
     assert abs(found.strengths[0] - DRAG) < 4.0 * error < 2.0 * DRAG
     assert found.gain > 10.0
     notes = []
-    model, text = _written(problem.trace, found, ["quadratic drag"], notes)
+    model, text = _written(
+        SimpleNamespace(trace=problem.trace, names=["quadratic drag"]), found, notes
+    )
     assert not notes
     assert "ssm.Flat()" not in text.split("@model.initial")[1]
     given = {n: v for n, v in found.fit.values().items() if not n.startswith("size")}
