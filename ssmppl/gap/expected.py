@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from ssmppl.inference.executors import workers_of
 
 REFITS = 18  # of single effects, their shapes, pairs and the reference, about
-EVALUATIONS, FIT_PASSES = 1500, 36  # likelihoods and passes over the data in a fit, about
-ROUGH = 400  # likelihoods in a rough fit
+EVALUATIONS, FIT_PASSES = 4000, 60  # likelihoods and passes over the data in a fit, about
+ROUGH = 800  # likelihoods in a rough fit
 SCREENS = 1.0  # as long as the first one that follow it: for further effects, under other inputs
-TEXT = 0.25  # of the time that the screen's code took, which a fit's takes, one at a time
+TEXT = 0.5  # of the time that the screen's code took, which a fit's takes, one at a time
+BESIDE = 1.5  # times as long as what is timed here alone: Python between the passes, and waiting
 SIMULATED = 3 * 50  # rough fits of simulated data in short records, about
 FOLD_FITS, FOLD_PASSES = 8, 12  # rough fits, and passes, for a block that is left out
 
@@ -56,7 +57,7 @@ def seconds(found: Timed, sets: int, mode: str, folds: int, executor: Executor |
         total += SIMULATED * (rough + found.screen_pass) / workers
         block = FOLD_FITS * rough + FOLD_PASSES * found.screen_pass
         total += folds * (block / workers + 2.0 * text)
-    return total
+    return BESIDE * total
 
 
 def in_words(value: float) -> str:
