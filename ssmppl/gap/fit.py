@@ -271,9 +271,9 @@ class Fitter:
             if gained > 2.0 * np.hypot(error, fit.error):
                 distance = min(fit.distance, top.distance)
                 return replace(fit, distance=distance, converged=distance < 3.0 * NEAR)
-        information = steady(top.information, ~space.on_the_line)
+        # As it is: a matrix made positive definite for steps would give standard errors of nothing.
         nowhere = np.zeros(len(top.z), dtype=bool)
-        return Fit(space, space.theta, top.z, value, error, information, top.distance,
+        return Fit(space, space.theta, top.z, value, error, top.information, top.distance,
                    top.distance < 3.0 * NEAR, nowhere)  # fmt: skip
 
     def _quieter(self, space: Space, share: float) -> Space:
