@@ -447,7 +447,8 @@ class Fitter:
                 return fit
             setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
             found = observed_information(setup, self.kalman, fit.z)
-            if np.all(np.isfinite(found)) and np.linalg.eigvalsh(found)[0] > 0.0:
+            inside = found[np.ix_(~fit.at_bound, ~fit.at_bound)]  # at a bound it says nothing
+            if np.all(np.isfinite(found)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
                 return replace(fit, information=found)
         return replace(fit, information=self._simulated_information(fit.space, fit.theta, seed))
 
