@@ -15,7 +15,7 @@ import inspect
 import io
 import textwrap
 import tokenize
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -47,7 +47,7 @@ def _specialised(
 ) -> Specialised:
     bound = dict(items)
     source = _decided(plain, _known(plain, items))
-    tokens = list(tokenize.generate_tokens(io.StringIO(source).readline))
+    tokens = _tokens(source)
     start = next(i for i, t in enumerate(tokens) if t.string == "def")
     depth, end = 0, start
     for i in range(start, len(tokens)):
@@ -86,7 +86,12 @@ def _specialised(
     return Specialised(text.replace("(\n    \n", "(\n"), imports)
 
 
-def _entry(text: str, following: list[tokenize.TokenInfo]) -> str | None:
+@lru_cache(maxsize=1024)
+def _tokens(source: str) -> tuple[tokenize.TokenInfo, ...]:
+    return tuple(tokenize.generate_tokens(io.StringIO(source).readline))
+
+
+def _entry(text: str, following: Sequence[tokenize.TokenInfo]) -> str | None:
     """What `text` followed by these tokens, `[`, a number and `]`, is, if it is a tuple."""
     if [t.string for t in following[::2]] == ["[", "]"] and text.startswith("("):
         return repr(literal(text)[int(following[1].string)])
@@ -101,47 +106,65 @@ def _edit(
 
 def _known(
     plain: Callable[..., Any], items: tuple[tuple[str, str], ...]
-) -> tuple[tuple[str, str], ...]:
-    """The bound parameters that conditions ask for and that stand for a value, not a function."""
-    values, out, asked = _constants(plain), [], _asked(plain)
+) -> tuple[tuple[str, bool], ...]:
+    """The conditions, as text, that the bound parameters decide, and whether they hold."""
+    values, bound = _constants(plain), set()
     for name, text in items:
-        if name not in asked:
+        if name not in _asked(plain):
             continue
         try:
-            eval(text, values.copy())
+            values[name] = eval(text, _constants(plain))
         except (NameError, SyntaxError):  # a function
             continue
-        out.append((name, text))
-    return tuple(out)
+        bound.add(name)
+    return tuple(
+        (test, bool(eval(test, values.copy())))
+        for test, names in _conditions(plain).items()
+        if names & bound and names <= set(values)
+    )
+
+
+@lru_cache
+def _conditions(plain: Callable[..., Any]) -> dict[str, frozenset[str]]:
+    """The conditions of its `if` statements, as text, and the names in each."""
+    tests = [n.test for n in ast.walk(parse(_source(plain))) if isinstance(n, ast.If)]
+    return {
+        ast.unparse(t): frozenset(n.id for n in ast.walk(t) if isinstance(n, ast.Name))
+        for t in tests
+    }
 
 
 @lru_cache
 def _asked(plain: Callable[..., Any]) -> frozenset[str]:
-    """The names in the conditions of its `if` statements."""
-    tests = [n.test for n in ast.walk(parse(_source(plain))) if isinstance(n, ast.If)]
-    return frozenset(n.id for t in tests for n in ast.walk(t) if isinstance(n, ast.Name))
+    return frozenset().union(*_conditions(plain).values())
 
 
 def _constants(plain: Callable[..., Any]) -> dict[str, Any]:
     return {name: v for name, v in plain.__globals__.items() if isinstance(v, int)}
 
 
-@lru_cache(maxsize=1024)  # models differ in the names of their functions, and seldom in these
-def _decided(plain: Callable[..., Any], bound: tuple[tuple[str, str], ...]) -> str:
-    """Its text without the `if` statements whose condition follows from the bound values."""
-    source, values = _source(plain), _constants(plain)
-    values |= {name: eval(text, _constants(plain)) for name, text in bound}
-    while True:
-        for node in ast.walk(parse(source)):
-            if not isinstance(node, ast.If):
-                continue
-            names = {n.id for n in ast.walk(node.test) if isinstance(n, ast.Name)}
-            if names & set(dict(bound)) and names <= set(values):
-                truth = bool(eval(ast.unparse(node.test), values.copy()))
-                source = _keep_branch(source, node, truth)
-                break
-        else:
-            return source
+@lru_cache(maxsize=1024)  # models differ in names and sizes, and seldom in these
+def _decided(plain: Callable[..., Any], known: tuple[tuple[str, bool], ...]) -> str:
+    """Its text without the `if` statements whose condition is known."""
+    source, truths = _source(plain), dict(known)
+    while nodes := _outermost(parse(source), truths):
+        for node, truth in reversed(nodes):  # from below: the lines above keep their numbers
+            source = _keep_branch(source, node, truth)
+    return source
+
+
+def _outermost(tree: ast.AST, truths: Mapping[str, bool]) -> list[tuple[ast.If, bool]]:
+    """The `if` statements with a known condition, from the top of the text, and whether it holds;
+    of one inside another the outer."""
+    out: list[tuple[ast.If, bool]] = []
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and (test := ast.unparse(node.test)) in truths:
+            out.append((node, truths[test]))
+        elif not isinstance(node, ast.expr):
+            waiting += ast.iter_child_nodes(node)
+    return sorted(out, key=lambda pair: pair[0].lineno)
 
 
 def _keep_branch(source: str, node: ast.If, truth: bool) -> str:

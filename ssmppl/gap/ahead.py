@@ -56,13 +56,13 @@ def crps_ahead(
     """
     simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
     origins = np.unique(np.linspace(0, max(steps - 2, 0), ORIGINS).astype(int))
-    out = np.full((len(origins), len(horizons), channels), np.nan)
     if steps < 2:
-        return out
+        return np.full((len(origins), len(horizons), channels), np.nan)
     levels = np.empty(1)
+    samples = np.full((len(origins), len(horizons), channels, DRAWS), np.nan)
+    known = np.isfinite(particles[origins]).all(axis=(1, 2))  # not a flat start before it is
     for o, t in enumerate(origins.tolist()):
-        unknown = not np.all(np.isfinite(particles[t]))  # a flat start before it is known
-        if unknown or (feedback and not np.all(e.seen[t] == 1.0)):
+        if not known[o] or (feedback and not np.all(e.seen[t] == 1.0)):
             continue
         fill_uniform(stream, levels)
         chosen = _systematic(weights[t], float(levels[0]))
@@ -74,9 +74,11 @@ def crps_ahead(
         simulate(theta, y, e.seen, e.u, t + 1, start, stream, states, drawn, feedback)
         for h, horizon in enumerate(horizons):
             if horizon <= reach:
-                known = np.where(e.seen[t + horizon] == 1.0, e.y[t + horizon], np.nan)
-                out[o, h] = crps(drawn[horizon - 1], known)
-    return out
+                samples[o, h] = drawn[horizon - 1]
+    rows = origins[:, None] + np.array(horizons)
+    inside = np.minimum(rows, steps - 1)
+    measured = (rows < steps)[..., None] & (e.seen[inside] == 1.0)
+    return crps(samples, np.where(measured, e.y[inside], np.nan))
 
 
 def _systematic(weights: np.ndarray, level: float) -> np.ndarray:

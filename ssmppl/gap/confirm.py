@@ -142,7 +142,9 @@ def free_run(fitter: Fitter, fit: Fit, e: Experiment, seed: np.random.SeedSequen
     """Mean and central 95% of simulated observations with the experiment's inputs."""
     draws = fitter.simulator.observations(e, fit.theta, random_state(seed, 7), FREE_RUNS)
     with np.errstate(all="ignore"):
-        low, high = np.nanquantile(draws, (0.025, 0.975), axis=2)
+        known = not np.any(np.isnan(draws))  # nanquantile goes row by row
+        quantile = np.quantile if known else np.nanquantile
+        low, high = quantile(draws, (0.025, 0.975), axis=2)
         return FreeRun(draws.mean(axis=2), low, high)
 
 

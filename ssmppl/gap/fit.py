@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from ssmppl.gap.smoothing import Settings, Smoother
 from ssmppl.gap.started import FirstStates, Start
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.maximum.by_differences import Top, climb
+from ssmppl.inference.maximum.by_differences import Top, climb, information_at
 from ssmppl.inference.maximum.chart import Chart
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
@@ -311,12 +311,11 @@ class Fitter:
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Setup(problem, space, "posterior", self.fixed, start, seed)
-        smooth = self._extended(problem) if quick else None  # the same, and less to put together
-        function = density_of(
-            space, smooth or (lambda t: kalman.log_likelihood(problem.experiments, t))
-        )
+        # The extended filter's is the same here, and needs no matrices to be put together.
+        smooth = self._extended(problem) or partial(kalman.log_likelihood, problem.experiments)
+        function = density_of(space, smooth)
         top = None
-        if quick and not climbs:  # from near the top, and to within what a decision needs
+        if not climbs:  # from near the top, and to within what a decision needs
             top = climb(function, space.z[space.where])
         if top is not None and top.distance < NEAR:
             theta, converged = space.parameters(top.z)[0].copy(), True
@@ -445,8 +444,12 @@ class Fitter:
         if isinstance(self.kalman, KalmanModel):
             if np.all(np.isfinite(fit.information)):  # known already, or nothing is free
                 return fit
-            setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
-            found = observed_information(setup, self.kalman, fit.z)
+            smooth = self._extended(fit.problem)
+            if smooth is not None:
+                found = information_at(density_of(fit.space, smooth), fit.z)
+            else:
+                setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
+                found = observed_information(setup, self.kalman, fit.z)
             inside = found[np.ix_(~fit.at_bound, ~fit.at_bound)]  # at a bound it says nothing
             if np.all(np.isfinite(found)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
                 return replace(fit, information=found)
@@ -505,13 +508,12 @@ def density_of(
     space: Space, log_likelihood: Callable[[np.ndarray], float]
 ) -> Callable[[np.ndarray], float]:
     """z (F,) -> log likelihood + log prior density of theta, -inf off the support."""
-    log_prior = space.problem.program.entry("log_prior") if len(space.theta) else None
 
     def value(z: np.ndarray) -> float:
-        theta, inside = space.parameters(z)
-        if inside == -np.inf or log_prior is None:
-            return -np.inf if inside == -np.inf else log_likelihood(theta)
-        found = log_likelihood(theta) + float(log_prior(theta))
+        theta, log_prior, log_jacobian = space.point(z)
+        if not log_prior + log_jacobian > -np.inf:
+            return -np.inf
+        found = log_likelihood(theta) + log_prior
         return found if np.isfinite(found) else -np.inf
 
     return value

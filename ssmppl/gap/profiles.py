@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -112,8 +113,7 @@ class Profiles:
         """(K,) sums of the columns of rows (T, F), weighted by the functions of time."""
         out = np.zeros(len(self.candidates))
         places = np.array(self.columns, dtype=int)
-        index = np.array([_index(c) for c in self.candidates], dtype=int)
-        kind = np.array([c.effect.profile if one_off(c) else "" for c in self.candidates])
+        index, kind = self._begins
         for s in segments(len(rows), starts):
             part, n = rows[s], s.stop - s.start
             onwards = np.concatenate(
@@ -128,6 +128,12 @@ class Profiles:
             if len(other):
                 out[other] += np.sum(self._weights(n) * part[:, places[other]], axis=0)
         return out
+
+    @cached_property
+    def _begins(self) -> tuple[np.ndarray, np.ndarray]:
+        """(K,) rows, from 0, in which dated ones begin, and (K,) their kind, "" for others."""
+        index = np.array([_index(c) for c in self.candidates], dtype=int)
+        return index, np.array([c.effect.profile if one_off(c) else "" for c in self.candidates])
 
     def _weights(self, n: int) -> np.ndarray:
         """(n, K) of those that are no one-off event."""

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from ssmppl.errors import ArgumentError
 
@@ -36,16 +37,18 @@ def autoregressive(
     scores: np.ndarray, rho: Sequence[float], starts: Sequence[int] = WHOLE
 ) -> np.ndarray:
     """1/2 sum_st rho^|s - t| S_s S_t for each rho: (..., K, R), of an AR(1) load of variance 1."""
-    from scipy.signal import lfilter  # takes a second to import
-
     scores = np.asarray(scores, float)
     found = np.zeros((*scores.shape[:-2], scores.shape[-1], len(rho)))
     for s in segments(scores.shape[-2], starts):
         part = scores[..., s, :]
         own = 0.5 * np.sum(part**2, axis=-2)
+        rows = np.moveaxis(part, -2, 0)  # (T, ..., K)
         for i, r in enumerate(rho):
-            past = lfilter([0.0, r], [1.0, -r], part, axis=-2)  # sum_{j >= 1} r^j S_{t-j}
-            found[..., i] += own + np.sum(part * past, axis=-2)
+            moved = np.concatenate([np.zeros_like(rows[:1]), r * rows[:-1]])
+            bands = np.stack([np.ones(len(rows)), np.full(len(rows), -r)])
+            past = solve_banded((1, 0), bands, moved.reshape(len(rows), -1))
+            # past_t = sum_{j >= 1} r^j S_{t-j}
+            found[..., i] += own + np.sum(rows * past.reshape(rows.shape), axis=0)
     return found
 
 

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from ssmppl.inference.maximum.by_differences import GOOD, LITTLE, climb, widths
+from ssmppl.inference.maximum.by_differences import (
+    GOOD,
+    LITTLE,
+    climb,
+    information_at,
+    widths,
+)
 from tests.statistics.checks import seed_of
 
 
@@ -21,6 +27,20 @@ def test_a_quadratic_is_climbed_to_its_top_with_its_curvature(units):
     away = (found.z - top) / units
     assert 0.5 * away @ h @ away < GOOD
     np.testing.assert_allclose(found.information * units**2, h, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("units", [1e-6, 1.0, 1e6])
+def test_the_information_is_the_curvature_also_where_the_third_derivative_is_large(units):
+    """Of a gamma law's logarithm beside a normal one that leans on it: by hand."""
+
+    def function(z):
+        a, b = z[0] / units, z[1]
+        return 7.0 * a - 7.0 * np.exp(a) - 0.5 * 30.0 * (b - 0.4 * a) ** 2
+
+    at = np.array([0.3 * units, 0.2])
+    aa = (7.0 * np.exp(0.3) + 30.0 * 0.16) / units**2
+    exact = np.array([[aa, -12.0 / units], [-12.0 / units, 30.0]])
+    np.testing.assert_allclose(information_at(function, at), exact, rtol=3e-4)
 
 
 def test_a_curved_valley_is_followed_to_its_end():

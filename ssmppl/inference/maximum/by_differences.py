@@ -92,6 +92,18 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
     return Top(z, value, information, distance)
 
 
+def information_at(function: Function, z: np.ndarray) -> np.ndarray:
+    """(F, F) minus the second derivatives at z (F,), by differences over a small share of a width;
+    0 where there is a point without a value."""
+    z = np.array(z, dtype=float)
+    if not len(z):
+        return np.zeros((0, 0))
+    value = function(z)
+    width = widths(function, z, value, np.full(len(z), FIRST))
+    _, _, curvature = _derivatives(function, z, value, width, half=FINE)
+    return curvature / np.outer(width, width)
+
+
 def _further(
     function: Function, z: np.ndarray, value: float, move: np.ndarray
 ) -> tuple[np.ndarray, float, float] | None:
@@ -133,7 +145,7 @@ def _moved(z: np.ndarray, i: int, by: float) -> np.ndarray:
 
 def _derivatives(
     function: Function, z: np.ndarray, value: float, width: np.ndarray,
-    together: np.ndarray | None = None,
+    together: np.ndarray | None = None, half: float = 0.5,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """(F,) slope, fine and over half a width, and (F, F) minus second differences, in widths; 0
     where there are none, the slope one-sided next to where there is no value.
@@ -141,7 +153,7 @@ def _derivatives(
     together : (F, F) in place of the mixed differences, which then are not taken: these over the
     roots of the two pure ones.
     """
-    n, h = len(z), 0.5
+    n, h = len(z), half
     ends = np.array([[function(_moved(z, i, s * size * width[i])) for s in (1.0, -1.0)]
                      for size in (FINE, h) for i in range(n)])  # fmt: skip
     fine, (plus, minus) = ends[:n], ends[n:].T

@@ -70,16 +70,23 @@ class Space:
 
     def parameters(self, z_free: np.ndarray) -> tuple[np.ndarray, float]:
         """(theta, log prior + log Jacobian) at unconstrained values of the free parameters."""
+        theta, log_prior, log_jacobian = self.point(z_free)
+        total = log_prior + log_jacobian
+        return theta, total if total < np.inf else -np.inf
+
+    def point(self, z_free: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """(theta, log prior density of theta, log Jacobian) at unconstrained values of the free
+        parameters; -inf for the prior where theta is not finite, or the density is not."""
         if not self.problem.trace.parameters:
-            return self.theta, 0.0
+            return self.theta, 0.0, 0.0
         z, theta = self.z.copy(), self.theta.copy()
         z[self.where] = z_free
         program = self.problem.program
-        log_jacobian = program.entry("constrain")(z, self.free, theta)
-        log_prior = program.entry("log_prior")(theta) + log_jacobian
-        if not np.all(np.isfinite(theta)) or not log_prior < np.inf:
-            return theta, -np.inf
-        return theta, float(log_prior)
+        log_jacobian = float(program.entry("constrain")(z, self.free, theta))
+        log_prior = float(program.entry("log_prior")(theta))
+        if not np.isfinite(theta).all() or not log_prior < np.inf:
+            log_prior = -np.inf
+        return theta, log_prior, log_jacobian
 
 
 def space_of(problem: Problem, fixed: dict[str, np.ndarray], start: dict[str, np.ndarray]) -> Space:
