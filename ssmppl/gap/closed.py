@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.series import WHOLE, segments
+from ssmppl.gap.profiles import WHOLE, segments
 
 REPLICATES = 2000
 LEAST_CHOSEN = 10  # blocks that the choice of their length leaves

@@ -18,7 +18,7 @@ from scipy.special import ndtri
 from ssmppl.errors import ArgumentError
 from ssmppl.gap.efficient import Null, efficient
 from ssmppl.gap.familywise import familywise
-from ssmppl.gap.series import WHOLE, segments
+from ssmppl.gap.profiles import WHOLE, segments
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,14 +7,17 @@ it costs a sum.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
+from ssmppl.errors import ArgumentError
 from ssmppl.gap.candidate import Candidate
-from ssmppl.gap.series import segments
+
+WHOLE = (0,)  # one experiment
 
 # Rows up to which every date is tried, and how many dates beyond: a break that is dated some rows
 # off is still seen, a pulse is not.
@@ -148,3 +151,19 @@ def _index(c: Candidate) -> int:
     if not one_off(c):
         return 0
     return int(dict(c.shape)["date"]) - 1 + (c.change == "transition")
+
+
+def segments(rows: int, starts: Sequence[int] = WHOLE) -> Iterator[slice]:
+    """The rows of each experiment.
+
+    Raises
+    ------
+    ArgumentError : starts that are not increasing from 0 within the rows.
+    """
+    edges = [*starts, rows]
+    if edges[0] != 0 or any(a >= b for a, b in pairwise(edges)):
+        raise ArgumentError(
+            f"experiments that start at rows {list(starts)}, of {rows} rows",
+            fix="give the first row of each experiment, increasing, the first one 0",
+        )
+    return (slice(a, b) for a, b in pairwise(edges))

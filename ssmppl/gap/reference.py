@@ -8,7 +8,7 @@ estimate: E z^2 = 1 + tau^2 V of a group of basis functions with strengths of va
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,10 +22,11 @@ from ssmppl.gap.candidate import Candidate
 from ssmppl.gap.checkpoint import Checkpoint, Numbers
 from ssmppl.gap.confirm import predict
 from ssmppl.gap.efficient import Null, efficient
+from ssmppl.gap.familywise import familywise
 from ssmppl.gap.fit import Fit, Fitter
+from ssmppl.gap.localise import group_score
 from ssmppl.gap.parts import Parts
 from ssmppl.gap.screen import Screen, with_parameters
-from ssmppl.gap.tables import residual_groups
 from ssmppl.gap.workshop import Workshop, lift
 from ssmppl.language.distributions import Normal
 
@@ -142,3 +143,33 @@ def superset(
     begin = {n: v for n, v in values.items() if n in trace.parameters and n not in given}
     begin |= {t.candidate.strength: np.asarray(0.0) for terms, _ in groups for t in terms}
     return fitter, begin
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How much a group of the basis stands out: z, and its family-wise p."""
+
+    z: float
+    p: float
+
+
+def residual_groups(
+    screen: Screen, others: Sequence[Candidate]
+) -> dict[tuple[str, str, str], Residual]:
+    """Each group of the basis with `others` projected out, by equation, moment and variable: the
+    functions of one variable, or of one pair, are a group."""
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, seen = screen.stacked("basis"), screen.observed.basis
+    rest = screen.columns_of(others)
+    keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
+    if not keys:
+        return {}
+    groups = []
+    for key in keys:
+        own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
+        groups.append(
+            group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        )
+    z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
+    p = familywise(z, null, sided=1).p
+    return {k: Residual(float(z[i]), float(p[i])) for i, k in enumerate(keys)}

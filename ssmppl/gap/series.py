@@ -6,37 +6,19 @@ row of each experiment in `starts`, and cost a pass over the rows. A row without
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solve_banded
 
-from ssmppl.errors import ArgumentError
-
-WHOLE = (0,)  # one experiment
-
-
-def segments(rows: int, starts: Sequence[int] = WHOLE) -> Iterator[slice]:
-    """The rows of each experiment.
-
-    Raises
-    ------
-    ArgumentError : starts that are not increasing from 0 within the rows.
-    """
-    edges = [*starts, rows]
-    if edges[0] != 0 or any(a >= b for a, b in pairwise(edges)):
-        raise ArgumentError(
-            f"experiments that start at rows {list(starts)}, of {rows} rows",
-            fix="give the first row of each experiment, increasing, the first one 0",
-        )
-    return (slice(a, b) for a, b in pairwise(edges))
+from ssmppl.gap.profiles import WHOLE, segments
 
 
 def autoregressive(
     scores: np.ndarray, rho: Sequence[float], starts: Sequence[int] = WHOLE
 ) -> np.ndarray:
     """1/2 sum_st rho^|s - t| S_s S_t for each rho: (..., K, R), of an AR(1) load of variance 1."""
+    from scipy.linalg import solve_banded  # slow to import
+
     scores = np.asarray(scores, float)
     found = np.zeros((*scores.shape[:-2], scores.shape[-1], len(rho)))
     for s in segments(scores.shape[-2], starts):

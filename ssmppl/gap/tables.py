@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,10 +11,10 @@ from ssmppl.data import Experiment
 from ssmppl.gap.candidate import Candidate, shape_text
 from ssmppl.gap.classes import Classes
 from ssmppl.gap.confirm import FreeRun
-from ssmppl.gap.familywise import familywise
 from ssmppl.gap.localise import Group, curve, group_score, localise, regions
 from ssmppl.gap.numerals import label
 from ssmppl.gap.profiles import one_off
+from ssmppl.gap.reference import residual_groups
 from ssmppl.gap.refit import Refit
 from ssmppl.gap.report import tabulate
 from ssmppl.gap.screen import Screen
@@ -156,36 +155,6 @@ def residual_group(
         return 1.0, None
     best = max(groups, key=lambda key: groups[key].z)
     return groups[best].p, best[:2]
-
-
-@dataclass(frozen=True)
-class Residual:
-    """How much a group of the basis stands out: z, and its family-wise p."""
-
-    z: float
-    p: float
-
-
-def residual_groups(
-    screen: Screen, others: Sequence[Candidate]
-) -> dict[tuple[str, str, str], Residual]:
-    """Each group of the basis with `others` projected out, by equation, moment and variable: the
-    functions of one variable, or of one pair, are a group."""
-    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
-    columns, seen = screen.stacked("basis"), screen.observed.basis
-    rest = screen.columns_of(others)
-    keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
-    if not keys:
-        return {}
-    groups = []
-    for key in keys:
-        own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
-        groups.append(
-            group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
-        )
-    z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
-    p = familywise(z, null, sided=1).p
-    return {k: Residual(float(z[i]), float(p[i])) for i, k in enumerate(keys)}
 
 
 def causes_table(

@@ -12,8 +12,8 @@ from ssmppl.data import Experiment, check_parameters
 from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.filters import LEVELS, filter_dataset, quantile_levels
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import FilterRun, seed_sequence
+from ssmppl.inference.particles.proposal_choice import resolve_settings
 from ssmppl.inference.problem import pose
 from ssmppl.language.model import Model
 
@@ -48,7 +48,7 @@ def kalman_filter(
     """
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
-    settle(problem, theta, 1, "kalman")
+    resolve_settings(problem, theta, 1, "kalman")
     levels = quantile_levels(quantiles)
     attrs = {"model": problem.trace.name, "proposal": "kalman"}
     root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
@@ -121,7 +121,7 @@ def forward_filter(
     """
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
-    settle(problem, theta, 1, "forward")
+    resolve_settings(problem, theta, 1, "forward")
     exact = hidden_markov(problem.trace)
     assert isinstance(exact, HiddenMarkov)
     levels, root = quantile_levels(quantiles), seed_sequence(seed)

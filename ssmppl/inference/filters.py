@@ -15,7 +15,6 @@ from ssmppl.data import Experiment, check_parameters, unpack_observations, unpac
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.labels import component_dims, observes, with_data
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterRun,
     FilterSettings,
@@ -24,7 +23,7 @@ from ssmppl.inference.particles.filtering import (
     seed_sequence,
 )
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
-from ssmppl.inference.particles.proposal_choice import choose
+from ssmppl.inference.particles.proposal_choice import choose, resolve_settings
 from ssmppl.inference.problem import EXACT, Problem, pose
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
@@ -112,7 +111,7 @@ def particle_filter(
             f'history=True with proposal="{proposal}", whose particles are of some states only',
             fix='use proposal="auto", which then takes one with particles of all states',
         )
-    settings = settle(
+    settings = resolve_settings(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, integrate=True
     )
     if settings.proposal in EXACT:

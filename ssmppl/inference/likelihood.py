@@ -4,26 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.resampling import SYSTEMATIC
-from ssmppl.counts import check_count, check_room
+from ssmppl.counts import check_count
 from ssmppl.data import check_parameters
-from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.exact.models import NEEDED, exact_log_likelihood, form_of
+from ssmppl.inference.exact.models import exact_log_likelihood
 from ssmppl.inference.executors import check_executor
 from ssmppl.inference.particles.filtering import (
-    FilterSettings,
     estimates_task,
-    filter_settings,
     seed_sequence,
 )
-from ssmppl.inference.particles.on_device import check_device
-from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.problem import EXACT, Problem, pose
+from ssmppl.inference.particles.proposal_choice import resolve_settings
+from ssmppl.inference.problem import EXACT, pose
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
 
@@ -100,7 +94,7 @@ def log_likelihood(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
-    settings = settle(
+    settings = resolve_settings(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, whole=True,
         integrate=True, device=device,
     )  # fmt: skip
@@ -112,59 +106,3 @@ def log_likelihood(
     pieces = [r for r in np.array_split(np.arange(repeats), tasks) if len(r)]
     ranges = [range(int(p[0]), int(p[-1]) + 1) for p in pieces]
     return np.concatenate(run_tasks(task, ranges, executor=executor))
-
-
-def settle(
-    problem: Problem,
-    theta: np.ndarray,
-    particles: Any,
-    proposal: str,
-    resampling: str = "systematic",
-    ess_threshold: float = 1.0,
-    rescue: int = 0,
-    *,
-    whole: bool = False,
-    integrate: bool = False,
-    device: str = "cpu",
-) -> FilterSettings:
-    """The settings of a call with "auto" resolved, checked against what could be derived.
-
-    whole, integrate : as in `choose`.
-    """
-    settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
-    each = 2 * len(problem.trace.state_symbols) + 2  # of this row and the last; weight and ancestor
-    check_room(f"particles={particles}", each * settings.particles, "give fewer particles")
-    if device != "cpu":
-        return _on_device(problem, theta, settings, resampling, device)
-    if proposal == "auto":
-        fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
-        flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
-        chosen = choose(problem, theta, **flags).name
-        return replace(settings, proposal=chosen)
-    if proposal in EXACT:
-        found = form_of(proposal, problem.trace)
-        if isinstance(found, NotApplicable):
-            raise ArgumentError(
-                f'proposal="{proposal}" needs a {NEEDED[proposal]}: {found}',
-                fix='use proposal="auto"',
-            )
-    else:
-        problem.proposal(proposal, integrate, EXACT)
-    return settings
-
-
-def _on_device(
-    problem: Problem, theta: np.ndarray, settings: FilterSettings, resampling: str, device: str
-) -> FilterSettings:
-    """The settings for a device other than the processor; exact likelihoods need none."""
-    if device != "cuda":
-        raise ArgumentError(f"device={device!r} is unknown", fix="use 'cpu' or 'cuda'")
-    name = settings.proposal
-    if name == "auto":
-        name = choose(problem, theta, look_ahead=False).name
-    if name not in EXACT:
-        check_device(
-            problem, name, resampling=(resampling, "systematic"),
-            ess_threshold=(settings.ess_threshold, 1.0), rescue=(settings.rescue, 0),
-        )  # fmt: skip
-    return replace(settings, proposal=name, device=device)

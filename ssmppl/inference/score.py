@@ -17,7 +17,6 @@ from ssmppl.inference.estimate import by_name, free_components, table
 from ssmppl.inference.exact.exact_score import ExactScore, exact_score
 from ssmppl.inference.exact.models import exact_model
 from ssmppl.inference.executors import check_executor
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.complete_score import complete_scores
 from ssmppl.inference.particles.filtering import seed_sequence
 from ssmppl.inference.particles.particle_score import (
@@ -27,6 +26,7 @@ from ssmppl.inference.particles.particle_score import (
     run_weights,
     several_runs,
 )
+from ssmppl.inference.particles.proposal_choice import resolve_settings
 from ssmppl.inference.problem import EXACT, Problem, pose
 from ssmppl.language.model import Model
 
@@ -138,7 +138,7 @@ def score(
         )
     check_count("repeats", repeats, 2)
     check_count("trajectories", trajectories, 1)
-    settings = settle(problem, theta, particles, proposal)
+    settings = resolve_settings(problem, theta, particles, proposal)
     root = seed_sequence(seed)
     attrs: dict[str, Any] = {"model": problem.trace.name, "fixed": dict(fixed or {})}
     form = exact_model(problem.trace)

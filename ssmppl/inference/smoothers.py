@@ -16,7 +16,6 @@ from ssmppl.inference.chains import pgas
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.methods import PGAS
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.degeneracy import collapse, distinct
@@ -25,7 +24,7 @@ from ssmppl.inference.particles.fixed_lag import LAG, lag_moments
 from ssmppl.inference.particles.marginal import is_marginal
 from ssmppl.inference.particles.marginal_backward import marginal_paths, may_integrate
 from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.particles.proposal_choice import choose
+from ssmppl.inference.particles.proposal_choice import choose, resolve_settings
 from ssmppl.inference.problem import EXACT, Problem
 from ssmppl.inference.runner import run_chains
 from ssmppl.inference.singular import need_density
@@ -119,7 +118,7 @@ def _filter(call: Call, method: FFBSi | FixedLag, integrate: bool = False) -> Fi
     if proposal == "auto":
         proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name
     n = PARTICLES if call.particles is None else call.particles
-    settings = settle(
+    settings = resolve_settings(
         call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
         method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
     )  # fmt: skip

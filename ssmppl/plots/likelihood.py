@@ -15,13 +15,13 @@ from ssmppl.errors import ArgumentError, SamplingError, listing
 from ssmppl.inference.estimate import Estimate
 from ssmppl.inference.exact.models import EXACT, exact_log_likelihood
 from ssmppl.inference.executors import check_executor
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     log_of_mean,
     repeated_estimates,
     seed_sequence,
 )
+from ssmppl.inference.particles.proposal_choice import resolve_settings
 from ssmppl.inference.problem import Problem, pose
 from ssmppl.inference.tasks import run_tasks
 from ssmppl.language.model import Model
@@ -106,7 +106,7 @@ def plot_likelihood(
             )
     x, y = (np.linspace(low, high, points) for low, high in ends)
     theta[where] = [x[points // 2], y[points // 2]]
-    settings = settle(problem, theta, particles, proposal, whole=True, integrate=True)
+    settings = resolve_settings(problem, theta, particles, proposal, whole=True, integrate=True)
     root = seed_sequence(seed)
     heights = surface(problem, theta, where, x, y, settings, repeats, root, executor)
     for values, name, axis in ((x, pair[0], 1), (y, pair[1], 0)):  # beyond it there is no model

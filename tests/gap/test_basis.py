@@ -5,7 +5,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.gap import tables
+from ssmppl.gap import reference, tables
 from ssmppl.gap.augment import augment
 from ssmppl.gap.basis import CURVES, REACH, TURNS, basis, lifted
 from ssmppl.gap.checkpoint import Checkpoint
@@ -161,7 +161,7 @@ def test_a_resonance_is_found_at_its_own_frequency(turn):
         x, ring = (0.8 * x + 0.5 * u[t] + 0.1 * ring.real / np.sqrt(turn / 14.0)
                    + 0.2 * rng.standard_normal(), pole * ring + u[t])  # fmt: skip
     screen = asked({"u": u, "y": np.array(out)})
-    groups = tables.residual_groups(screen, ())
+    groups = reference.residual_groups(screen, ())
     best = max(groups, key=lambda key: groups[key].z)
     print(sorted(((round(g.z, 1), k[2]) for k, g in groups.items()), reverse=True)[:4])
     assert groups[best].p <= 0.01

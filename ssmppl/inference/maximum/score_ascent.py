@@ -25,7 +25,6 @@ import scipy
 
 from ssmppl.data import spelled
 from ssmppl.errors import SamplingError
-from ssmppl.inference.likelihood import settle
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.methods import ScoreAscent
 from ssmppl.inference.particles.backward import choose_kernel
@@ -37,7 +36,7 @@ from ssmppl.inference.particles.particle_score import (
     run_weights,
     several_runs,
 )
-from ssmppl.inference.particles.proposal_choice import choose
+from ssmppl.inference.particles.proposal_choice import choose, resolve_settings
 from ssmppl.inference.progress import Progress
 from ssmppl.inference.singular import need_density
 from ssmppl.language.transforms import transforms
@@ -96,7 +95,7 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     proposal = method.proposal
     if proposal == "auto":
         proposal = choose(setup.problem, theta, exact=False).name
-    settings = settle(setup.problem, theta, counts["particles"], proposal)
+    settings = resolve_settings(setup.problem, theta, counts["particles"], proposal)
     kernel, why = choose_kernel(
         setup.problem, settings, counts["trajectories"], method.kernel,
         passes=counts["runs"] * counts["iterations"],

@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ssmppl.analysis.moves import Proposal
+from ssmppl.codegen.kernels.resampling import SYSTEMATIC
 from ssmppl.codegen.marginal import MarginalFilter
 from ssmppl.codegen.module import PARTICLE, level_of
 from ssmppl.codegen.render import depends, is_small_power, topological_until
-from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.counts import check_room
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.exact.models import exact_model, filter_of
-from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.exact.models import NEEDED, exact_model, filter_of, form_of
+from ssmppl.inference.particles.filtering import FilterSettings, filter_settings, repeated_estimates
+from ssmppl.inference.particles.on_device import check_device
+from ssmppl.inference.problem import EXACT, Problem
 
 # Nanoseconds per particle, from timings of single passes; what they weigh matters, not the unit.
 COST = {"exp": 1.0, "log": 1.0, "log1p": 1.5, "expm1": 1.5, "sin": 1.3, "cos": 1.3, "tanh": 2.0,
@@ -197,3 +201,59 @@ def _beginning(problem: Problem) -> Problem:
         for e in problem.experiments[:3]
     )  # fmt: skip
     return replace(problem, experiments=short)
+
+
+def resolve_settings(
+    problem: Problem,
+    theta: np.ndarray,
+    particles: Any,
+    proposal: str,
+    resampling: str = "systematic",
+    ess_threshold: float = 1.0,
+    rescue: int = 0,
+    *,
+    whole: bool = False,
+    integrate: bool = False,
+    device: str = "cpu",
+) -> FilterSettings:
+    """The settings of a call with "auto" resolved, checked against what could be derived.
+
+    whole, integrate : as in `choose`.
+    """
+    settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
+    each = 2 * len(problem.trace.state_symbols) + 2  # of this row and the last; weight and ancestor
+    check_room(f"particles={particles}", each * settings.particles, "give fewer particles")
+    if device != "cpu":
+        return _on_device(problem, theta, settings, resampling, device)
+    if proposal == "auto":
+        fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
+        flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
+        chosen = choose(problem, theta, **flags).name
+        return replace(settings, proposal=chosen)
+    if proposal in EXACT:
+        found = form_of(proposal, problem.trace)
+        if isinstance(found, NotApplicable):
+            raise ArgumentError(
+                f'proposal="{proposal}" needs a {NEEDED[proposal]}: {found}',
+                fix='use proposal="auto"',
+            )
+    else:
+        problem.proposal(proposal, integrate, EXACT)
+    return settings
+
+
+def _on_device(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings, resampling: str, device: str
+) -> FilterSettings:
+    """The settings for a device other than the processor; exact likelihoods need none."""
+    if device != "cuda":
+        raise ArgumentError(f"device={device!r} is unknown", fix="use 'cpu' or 'cuda'")
+    name = settings.proposal
+    if name == "auto":
+        name = choose(problem, theta, look_ahead=False).name
+    if name not in EXACT:
+        check_device(
+            problem, name, resampling=(resampling, "systematic"),
+            ess_threshold=(settings.ess_threshold, 1.0), rescue=(settings.rescue, 0),
+        )  # fmt: skip
+    return replace(settings, proposal=name, device=device)
