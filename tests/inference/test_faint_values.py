@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 import ssmppl as ssm
-from ssmppl.inference.exact import finite_passes
+from ssmppl.inference.exact import finite_passes as passes
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
 from ssmppl.inference.problem import pose
@@ -132,14 +132,14 @@ def test_both_passes_agree(name, monkeypatch):
         )  # fmt: skip
 
     plain = everything()
-    entry = finite_passes.exact_entry
+    entry = passes.exact_entry
 
     def unsure(name):
         def run(*arguments):
-            arguments[-1][:] = finite_passes.UNSURE
+            arguments[-1][:] = passes.UNSURE
 
         return run if name == "finite_forward" else entry(name)
 
-    monkeypatch.setattr(finite_passes, "exact_entry", unsure)
+    monkeypatch.setattr(passes, "exact_entry", unsure)
     for a, b in zip(itertools.chain(*plain), itertools.chain(*everything()), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)

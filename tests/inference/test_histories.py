@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 import ssmppl as ssm
 from ssmppl.data import bind
 from ssmppl.errors import SamplingError
-from ssmppl.inference.exact import finite_laws
+from ssmppl.inference.exact import finite_laws as tables
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.particles.filtering import random_state, seed_sequence
@@ -80,8 +80,8 @@ def test_scores_and_expectations_are_sums(case, monkeypatch):
     traced, experiments, theta, _ = case
     model = hidden_markov(traced)
     alone = [model.score([e], theta) for e in experiments]
-    for entries in (finite_laws.ENTRIES, 40, 1):  # in pieces of data sets, and of rows
-        monkeypatch.setattr(finite_laws, "ENTRIES", entries)
+    for entries in (tables.ENTRIES, 40, 1):  # in pieces of data sets, and of rows
+        monkeypatch.setattr(tables, "ENTRIES", entries)
         value, gradient = model.score(experiments, theta)
         assert value == pytest.approx(sum(v for v, _ in alone), rel=1e-12)
         scale = np.sum([abs(g) for _, g in alone], axis=0)
@@ -140,8 +140,8 @@ def test_equal_data_sets_stand_once_and_inputs_apart(case):
 
 def test_the_laws_are_evaluated_once_for_all_of_a_shape(monkeypatch):
     traced, calls = trace(weather()), []
-    evaluate = finite_laws.evaluate
-    monkeypatch.setattr(finite_laws, "evaluate", lambda *a: calls.append(1) or evaluate(*a))
+    evaluate = tables.evaluate
+    monkeypatch.setattr(tables, "evaluate", lambda *a: calls.append(1) or evaluate(*a))
     rng = np.random.default_rng(1)
     experiments = bind(traced, [{"y": rng.normal(size=7)} for _ in range(100)])
     hidden_markov(traced).log_likelihood(experiments, np.array(MODELS["weather"][1]))
