@@ -29,14 +29,14 @@ from models import varves
 from table import machine, show
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.datasets import ice_varves
 from ssmppl.inference.chains import pgas, pmmh
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.particles.blocks import run_in_blocks
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
-from ssmppl.inference.runner import run_chains
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.problem import pose
 
 WORKERS = 2
 DATA = {"y": ice_varves()}

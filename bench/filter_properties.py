@@ -23,12 +23,12 @@ import numpy as np
 from table import show
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_filter, kalman_model
 from ssmppl.inference.particles.backward import draw_paths, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings, full_run, log_likelihood_estimate
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.run.problem import Problem, pose
 
 OUT = Path(__file__).parents[1] / "docs" / "figures" / "filter_properties.csv"
 Row = tuple[str, str, float, float, float]

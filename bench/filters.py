@@ -18,11 +18,11 @@ from particles import distributions as law
 from particles import state_space_models
 from table import show
 
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.datasets import ice_varves
 from ssmppl.demo import varves
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 
 HERE = Path(__file__).parent
 SERIES = HERE.parent / "ssmppl" / "datasets" / "ice_varves.csv"

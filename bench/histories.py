@@ -14,7 +14,7 @@ from table import show
 
 import ssmppl as ssm
 from ssmppl.inference.exact.hidden_markov import hidden_markov
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 
 ANIMALS, OCCASIONS, ROUNDS, DRAWS = (150, 2_000), 7, 20, 200
 SURVIVAL, CAPTURE = 0.6, 0.7

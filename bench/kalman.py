@@ -10,10 +10,10 @@ import time
 import numpy as np
 from table import show
 
-from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman_adjoint import zeros_like
-from ssmppl.codegen.kernels.kalman_steps import Matrices
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.kalman.adjoint import zeros_like
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.modules.exact import exact_entry
 
 STEPS, ROUNDS = 20_000, 5
 SIZES = [(1, 1), (4, 2), (10, 3)]

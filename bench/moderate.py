@@ -27,15 +27,15 @@ import ssmppl as ssm
 from examples.check.rows import files
 from ssmppl.data import check_parameters
 from ssmppl.errors import NotApplicable, SSMError
-from ssmppl.inference.exact.models import exact_model
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     log_likelihood_estimate,
     log_of_mean,
-    random_state,
 )
-from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.preparation.exact_models import exact_model
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.run.problem import Problem, pose
+from ssmppl.inference.run.seeds import random_state
 
 PARTICLES = (100, 1000, 10000)
 REPEATS = 20

@@ -18,13 +18,13 @@ import numpy as np
 from models import Case, cases
 from table import show
 
-from ssmppl.analysis.moves import Proposal
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.analysis.proposals.proposals import Proposal
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
-from ssmppl.inference.particles.proposal_choice import TEMPERING, choose, cost
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.preparation.proposal_choice import TEMPERING, choose, cost
+from ssmppl.inference.run.problem import Problem, pose
 
 PARTICLES = (100, 1000)
 REPEATS = 200

@@ -23,10 +23,10 @@ import numpy as np
 from table import machine, show
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.inference.chains.pgas import Sweeper, pgas_block, plan_updates, start_chain
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.run.problem import Problem, pose
 
 TABLE = Path(__file__).parents[1] / "docs" / "figures" / "scaling.csv"
 LONG = 1.0  # seconds of a point from which it is run once only

@@ -18,13 +18,13 @@ import numpy as np
 from table import show
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.exact.kalman_moments import SmoothedMoments
+from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.particles.backward import backward_draws, draw_paths, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.run.problem import Problem, pose
 
 STEPS = 50
 RUNS = {20: 8000, 40: 4000, 80: 2000, 160: 1000, 320: 500}

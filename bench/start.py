@@ -44,7 +44,7 @@ def stage(name):
     last = now()
 import ssmppl as ssm
 stage("import ssmppl")
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 """
 VARVES = """
 from ssmppl.datasets import ice_varves
@@ -62,7 +62,7 @@ ssm.log_likelihood(varves, y, at, proposal="bootstrap", seed=1)
 stage("first log-likelihood, N = 1,000")
 ssm.log_likelihood(varves, y, at, proposal="bootstrap", seed=1)
 stage("second log-likelihood")
-verb = importlib.import_module("ssmppl.inference.sample")
+verb = importlib.import_module("ssmppl.inference.verbs.sample")
 result = verb._to_arviz
 def drawn(*args, **more):
     stage("first draw of sample, METHOD")

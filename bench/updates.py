@@ -14,7 +14,7 @@ import numpy as np
 from table import show
 
 import ssmppl as ssm
-from ssmppl.analysis.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
 from ssmppl.demo import varves
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol

@@ -16,15 +16,7 @@ from ssmppl.errors import (
     SamplingError,
     SSMError,
 )
-from ssmppl.inference.evidence import Evidence, evidence
-from ssmppl.inference.exact_filters import forward_filter, kalman_filter
-from ssmppl.inference.explain import compile, explain
-from ssmppl.inference.filters import particle_filter
-from ssmppl.inference.forecast import forecast
-from ssmppl.inference.leave_future_out import leave_future_out
-from ssmppl.inference.likelihood import log_likelihood
-from ssmppl.inference.maximize import maximize
-from ssmppl.inference.methods import (
+from ssmppl.inference.methods.methods import (
     EM,
     IF2,
     PGAS,
@@ -32,18 +24,27 @@ from ssmppl.inference.methods import (
     PSAEM,
     SMC2,
     DirectOptimization,
+    FFBSi,
+    FixedLag,
+    ForwardBackward,
     Gibbs,
+    KalmanSmoother,
     MetropolisHastings,
     ParticleEM,
     ScoreAscent,
 )
-from ssmppl.inference.predict import predict
-from ssmppl.inference.sample import sample
-from ssmppl.inference.score import score
-from ssmppl.inference.simulation import simulate
-from ssmppl.inference.smooth import smooth
-from ssmppl.inference.smoothing_methods import FFBSi, FixedLag, ForwardBackward, KalmanSmoother
-from ssmppl.language.declaring import distribution
+from ssmppl.inference.verbs.evidence import Evidence, evidence
+from ssmppl.inference.verbs.explain import compile, explain
+from ssmppl.inference.verbs.filters import forward_filter, kalman_filter, particle_filter
+from ssmppl.inference.verbs.forecast import forecast
+from ssmppl.inference.verbs.leave_future_out import leave_future_out
+from ssmppl.inference.verbs.log_likelihood import log_likelihood
+from ssmppl.inference.verbs.maximize import maximize
+from ssmppl.inference.verbs.predict import predict
+from ssmppl.inference.verbs.sample import sample
+from ssmppl.inference.verbs.score import score
+from ssmppl.inference.verbs.simulate import simulate
+from ssmppl.inference.verbs.smooth import smooth
 from ssmppl.language.distributions import (
     Bernoulli,
     Beta,
@@ -76,17 +77,18 @@ from ssmppl.language.distributions import (
     Wishart,
     ZeroInflated,
 )
-from ssmppl.language.elsewhere import advice
-from ssmppl.language.model import Model
-from ssmppl.language.primitive import primitive
+from ssmppl.language.model.calling import advice
+from ssmppl.language.model.model import Model
+from ssmppl.language.user_defined.distribution import distribution
+from ssmppl.language.user_defined.primitive import primitive
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:
     from ssmppl import plots
-    from ssmppl.gap.catalogue import effects
-    from ssmppl.gap.diagnose import diagnose
-    from ssmppl.gap.effect import effect
-    from ssmppl.gap.report import GapReport
+    from ssmppl.diagnosis.diagnose import diagnose
+    from ssmppl.diagnosis.effects.catalogue import effects
+    from ssmppl.diagnosis.effects.effect import effect
+    from ssmppl.diagnosis.report.report import GapReport
     from ssmppl.plots import (
         plot_ancestry,
         plot_filter,
@@ -101,10 +103,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _LATER = {
-    "GapReport": "gap.report",
-    "diagnose": "gap.diagnose",
-    "effect": "gap.effect",
-    "effects": "gap.catalogue",
+    "GapReport": "diagnosis.report.report",
+    "diagnose": "diagnosis.diagnose",
+    "effect": "diagnosis.effects.effect",
+    "effects": "diagnosis.effects.catalogue",
     "plot_ancestry": "plots.filters",
     "plot_filter": "plots.filters",
     "plot_forecast": "plots.states",
@@ -209,9 +211,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(
             f"module {__name__!r} has no attribute {name!r}" + (f": {told}" if told else "")
         )
-    plots = importlib.import_module(f"{__name__}.plots")  # a report has to know who draws it
     if name == "plots":
-        return plots
+        return importlib.import_module(f"{__name__}.plots")
     globals()[name] = value = getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
     return value
 

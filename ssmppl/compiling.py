@@ -6,7 +6,7 @@ while it is looked up or runs. It is the lock under which Numba compiles, also w
 function is first called, by a thread that knows nothing of us: with a lock of our own beside it two
 threads could each hold one and wait for the other. It is re-entrant, as making one thing asks for
 others.
-A function that a thread makes of text for itself (`analysis/pythontext.py`) needs no lock: `exec`
+A function that a thread makes of text for itself (`analysis/lambdify.py`) needs no lock: `exec`
 builds none of the trees of `ast`.
 
 Under it nothing may wait for another thread. `functools.cached_property` locks until Python 3.11,

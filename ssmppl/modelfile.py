@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from ssmppl.data.times import as_dates
 from ssmppl.errors import ArgumentError, DataError, Location, ModelError, SSMError, listing
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 
 if TYPE_CHECKING:
     import pandas as pd

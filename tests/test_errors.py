@@ -30,7 +30,7 @@ from ssmppl.errors import (
     UnsupportedOperation,
 )
 from ssmppl.language import distributions as ssm
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 
 GOOD = {

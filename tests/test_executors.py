@@ -24,12 +24,12 @@ import pandas as pd
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference import executors
-from ssmppl.inference.draws import stack
-from ssmppl.inference.executors import Absent, Sent, workers_of
-from ssmppl.inference.runner import run_chains
-from ssmppl.inference.tasks import run_tasks
-from ssmppl.language import packing
+from ssmppl.inference.run import executors
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import stack
+from ssmppl.inference.run.executors import Absent, Sent, workers_of
+from ssmppl.inference.run.tasks import run_tasks
+from ssmppl.language.model import pickling
 from ssmppl.language.trace import trace
 
 from .statistics import models
@@ -285,7 +285,7 @@ def test_a_worker_says_what_it_does_not_know():
 
 
 def test_a_worker_forgets_what_was_long_unused():
-    known = packing.Known(most=2)
+    known = pickling.Known(most=2)
     for digest in (b"1", b"2", b"1", b"3"):
         known.get(digest, lambda digest=digest: digest)
     assert [known.get(d) for d in (b"1", b"2", b"3")] == [b"1", None, b"3"]
@@ -307,7 +307,7 @@ class Forgetful(ThreadPoolExecutor):
     def there(sent, forget):
         function, args = pickle.loads(sent)
         if forget:
-            executors._functions = packing.Known(executors.MOST)
+            executors._functions = pickling.Known(executors.MOST)
         return function(*args)
 
 
@@ -331,7 +331,7 @@ def test_a_trace_is_one_object_in_a_process():
     t = trace(models.varves)
     assert pickle.loads(pickle.dumps(t)) is t
     code = (
-        "import pickle, sys; from ssmppl.codegen.program import compile_trace\n"
+        "import pickle, sys; from ssmppl.codegen.modules.program import compile_trace\n"
         "content = sys.stdin.buffer.read(); a, b = pickle.loads(content), pickle.loads(content)\n"
         "print(a is b, a.name, len(a.locations), compile_trace(a) is compile_trace(b))"
     )

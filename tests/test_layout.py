@@ -1,15 +1,18 @@
 """The layers of the package, read from its sources: who may import whom, and when."""
 
 import ast
+import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = "ssmppl"
-LONGEST = 800
+LONGEST = 800  # lines of a module
+MOST = 12  # modules of a room
 
 # Each layer and what it may import besides itself. The main chain, in its one direction:
 CHAIN = ["errors", "markup", "compiling", "expressions", "language", "analysis", "codegen"]
@@ -22,8 +25,9 @@ ALLOWED["tables"] = {"errors", "results"}
 ALLOWED["datasets"] = {"errors"}
 # ... and serve what follows.
 ALLOWED["inference"] = {*CHAIN, "counts", "data", "results"}
-ALLOWED["gap"] = ALLOWED["inference"] | {"inference"}
-ALLOWED["plots"] = ALLOWED["gap"] | {"gap", "tables"}
+ALLOWED["drawing"] = {"errors", "data"}
+ALLOWED["diagnosis"] = ALLOWED["inference"] | {"inference", "drawing"}
+ALLOWED["plots"] = ALLOWED["diagnosis"] | {"diagnosis", "tables"}
 # What the command line is made of: the demonstration, written as a user would, and files read.
 ALLOWED["demo"] = {PACKAGE, "datasets", "results"}
 ALLOWED["modelfile"] = {"data", "errors", "language"}
@@ -155,26 +159,29 @@ def test_module_keeps_to_the_layout(name):
     ("name", "source"),
     [
         ("ssmppl.errors", "from ssmppl.expressions import expr"),
-        ("ssmppl.expressions.expr", "import ssmppl.language.model"),
+        ("ssmppl.expressions.expr", "import ssmppl.language.model.model"),
         ("ssmppl.expressions.expr", "from ..language import model"),
         ("ssmppl.analysis.structure", "from ssmppl import codegen"),
-        ("ssmppl.language.model", "from ssmppl import Model"),
-        ("ssmppl.language.model", "if TYPE_CHECKING:\n    from ssmppl.analysis import plan"),
-        ("ssmppl.codegen.program", "from ssmppl import data"),
+        ("ssmppl.language.model.model", "from ssmppl import Model"),
+        ("ssmppl.language.model.model", "if TYPE_CHECKING:\n    from ssmppl.analysis import plan"),
+        ("ssmppl.codegen.modules.program", "from ssmppl import data"),
         ("ssmppl.results", "from ssmppl.data import read"),
         ("ssmppl.inference.chains.pgas", "def f():\n    from ssmppl.codegen import program"),
         ("ssmppl.inference.chains.pgas", "f = lambda: __import__\nclass A:\n  import ssmppl.cli"),
-        ("ssmppl.analysis.conjugacy", "from numba import njit"),
-        ("ssmppl.analysis.conjugacy", "def f():\n    import numba.typed"),
+        ("ssmppl.analysis.conjugacy.conjugacy", "from numba import njit"),
+        ("ssmppl.analysis.conjugacy.conjugacy", "def f():\n    import numba.typed"),
         ("ssmppl.plots", "import matplotlib.pyplot as plt"),
         ("ssmppl.cli", "try:\n    import pandas as pd\nexcept ImportError:\n    pass"),
-        ("ssmppl.language.continuous", "from scipy import stats"),
+        ("ssmppl.language.distributions.continuous", "from scipy import stats"),
         ("ssmppl", "from ssmppl.cli import main"),
         ("ssmppl.helpers", ""),
-        ("ssmppl.codegen.specialise", "import ast\nast.walk(ast.parse(text))"),
-        ("ssmppl.inference.problem", "import ast\nf = ast.literal_eval"),
-        ("ssmppl.gap.writing", "from ast import literal_eval"),
-        ("ssmppl.gap.smoothing", "@cached_property\ndef run(self):\n    return compile_rows(1)"),
+        ("ssmppl.codegen.text.specialise", "import ast\nast.walk(ast.parse(text))"),
+        ("ssmppl.inference.run.problem", "import ast\nf = ast.literal_eval"),
+        ("ssmppl.diagnosis.report.model_file", "from ast import literal_eval"),
+        (
+            "ssmppl.diagnosis.model.smoothing",
+            "@cached_property\ndef run(self):\n    return compile_rows(1)",
+        ),
         ("ssmppl.data", "\n" * (LONGEST + 1)),
     ],
 )
@@ -185,13 +192,19 @@ def test_faults_are_found(name, source):
 @pytest.mark.parametrize(
     ("name", "source"),
     [
-        ("ssmppl.language.model", "from ssmppl.expressions.expr import Expr\nfrom . import trace"),
+        (
+            "ssmppl.language.model.model",
+            "from ssmppl.expressions.expr import Expr\nfrom . import trace",
+        ),
         ("ssmppl.inference.chains.pgas", "from ssmppl import data, results\nimport numba"),
         ("ssmppl.results", "def f():\n    import arviz"),
-        ("ssmppl.codegen.text", "import ast\nast.unparse(node)"),
-        ("ssmppl.gap.smoothing", "@once_property\ndef run(self):\n    return compile_rows(1)"),
+        ("ssmppl.codegen.text.module", "import ast\nast.unparse(node)"),
+        (
+            "ssmppl.diagnosis.model.smoothing",
+            "@once_property\ndef run(self):\n    return compile_rows(1)",
+        ),
         ("ssmppl.results", "if TYPE_CHECKING:\n    import xarray as xr"),
-        ("ssmppl.language.continuous", "from scipy import special"),
+        ("ssmppl.language.distributions.continuous", "from scipy import special"),
         ("ssmppl.cli", "import ssmppl as ssm\nfrom ssmppl import Model, plots"),
         ("ssmppl.cli.states", "from ssmppl.cli.group import command\nfrom ssmppl import modelfile"),
     ],
@@ -200,9 +213,79 @@ def test_what_is_allowed_passes(name, source):
     assert list(faults(name, source)) == []
 
 
+def room_of(name):
+    """The folder that a module stands in; a package's own module stands beside its rooms."""
+    path = MODULES[name].relative_to(ROOT)
+    return ".".join(path.parent.parts)
+
+
+def arrows():
+    """Module -> modules that it imports, packages left out: they hold nothing but names."""
+    plain = {name for name, path in MODULES.items() if path.name != "__init__.py"}
+    out = {}
+    for name in plain:
+        source = MODULES[name].read_text(encoding="utf-8")
+        found = {imported for imported, _, _, typing in Imports(name, source).found if not typing}
+        targets = {m for i in found for m in (i, i.rpartition(".")[0]) if m in plain}
+        out[name] = targets - {name}
+    return out
+
+
+def circles(graph):
+    """The names that can be reached from themselves."""
+    left = {a: set(b) for a, b in graph.items()}
+    while True:
+        ends = {a for a, b in left.items() if not b & set(left)}
+        if not ends:
+            return sorted(left)
+        left = {a: b for a, b in left.items() if a not in ends}
+
+
+def test_no_circle_of_imports():
+    assert circles(arrows()) == []
+
+
+def test_no_circle_of_rooms():
+    """Between folders that hold no others: each of these has one reason to import another."""
+    parents = {room_of(n).rpartition(".")[0] for n in MODULES}
+    graph = {}
+    for a, targets in arrows().items():
+        if room_of(a) not in parents:
+            rooms = {room_of(b) for b in targets} - parents - {room_of(a)}
+            graph.setdefault(room_of(a), set()).update(rooms)
+    assert circles(graph) == []
+
+
+def test_circles_are_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"e"}, "e": set()}) == ["a", "b", "c"]
+
+
+def test_rooms_are_not_crowded():
+    size = Counter(room_of(n) for n, path in MODULES.items() if path.name != "__init__.py")
+    assert {room: n for room, n in size.items() if n > MOST} == {}
+
+
+USERS = {"augmented_model.py", "motor.py", "NAME.py", "mymodel.py", "file.py"}  # files of theirs
+MENTION = re.compile(r"`((?:\w+/)*\w+\.py)`")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_files_that_are_mentioned_exist(name):
+    """`file.py` in a docstring or a comment is one of the same folder, or below the package."""
+    text = MODULES[name].read_text(encoding="utf-8")
+    files = [str(p.relative_to(ROOT / PACKAGE)) for p in MODULES.values()]
+    known = {*files, *(str(p.relative_to(ROOT)) for p in (ROOT / "tests").rglob("*.py")), *USERS}
+    lacking = [
+        m for m in MENTION.findall(text) if not (MODULES[name].parent / m).exists() and not
+        any(f"/{k}".endswith("/" + m) for k in known)
+    ]  # fmt: skip
+    assert lacking == []
+
+
 def test_importing_the_package_imports_nothing_slow():
     """Neither directly nor through what it imports; the diagnosis belongs to it too."""
-    slow = (*SLOW, f"{PACKAGE}.gap", f"{PACKAGE}.plots")
+    slow = (*SLOW, f"{PACKAGE}.diagnosis", f"{PACKAGE}.plots")
     code = f"import sys, {PACKAGE}; print(*(m for m in {slow!r} if m in sys.modules))"
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
@@ -213,10 +296,4 @@ def test_importing_the_package_imports_nothing_slow():
 def test_all_public_names_are_there():
     """Those too that are imported later, and `dir` lists them."""
     code = f"import {PACKAGE} as p; assert all(hasattr(p, n) and n in dir(p) for n in p.__all__)"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-
-
-def test_whoever_can_diagnose_can_plot():
-    """A report finds its plots among what was imported, not only where somebody asked for them."""
-    code = f"import sys, {PACKAGE} as p; p.diagnose; assert '{PACKAGE}.plots' in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 import ssmppl.plots as plots
+from ssmppl.diagnosis.report.findings import COLUMNS, tabulate
+from ssmppl.diagnosis.report.panels import TITLES
+from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.drawing.style import AFTER, BEFORE, times
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.report import COLUMNS, GapReport, tabulate
-from ssmppl.plots.figure import TITLES
-from ssmppl.plots.style import AFTER, BEFORE, times
 from tests.gap.made_up import (
     ALL,
     NAN,

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssmppl.inference import runner
-from ssmppl.inference.draws import Block, stack
-from ssmppl.inference.runner import run_chains
-from ssmppl.inference.tasks import run_tasks
+from ssmppl.inference.run import chain_runner
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import Block, stack
+from ssmppl.inference.run.tasks import run_tasks
 
 TESTS = Path(__file__).parent
 
@@ -123,7 +123,7 @@ def test_warmup_statistics_on_request():
 
 
 def test_blocks_grow_to_the_time_they_should_take(monkeypatch):
-    monkeypatch.setattr(runner, "BLOCK_SECONDS", 0.05)
+    monkeypatch.setattr(chain_runner, "BLOCK_SECONDS", 0.05)
     sizes = []
 
     def noted(state, n):

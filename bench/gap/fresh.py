@@ -4,8 +4,9 @@
 
 The reference C is the true model, refitted to the first 70% of the rows (its parameters and its
 effects' strengths). F of the report's model and its interval are made by the tool's own
-`ssmppl.gap.closed.closed` on the confirm rows. F* is the same ratio at the same fitted parameters,
-over the confirm parts of 20 fresh runs of the true system with the same inputs. Opens the answers:
+`ssmppl.diagnosis.heldout.gain_ratio.closed` on the confirm rows. F* is the same ratio at the same
+fitted parameters, over the confirm parts of 20 fresh runs of the true system with the same inputs.
+Opens the answers:
 run it after the diagnosis, before `score.py`, which reads `cache/fresh.json`.
 """
 
@@ -30,8 +31,8 @@ from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
 from bench.gap.score import opened, records
 from bench.gap.truth import SYSTEMS, System
-from ssmppl.gap.closed import closed
-from ssmppl.language.model import Model
+from ssmppl.diagnosis.heldout.gain_ratio import closed
+from ssmppl.language.model.model import Model
 from ssmppl.modelfile import load_model
 
 CONFIRM = 0.7  # share of the rows before the confirm part

@@ -1,7 +1,7 @@
 """The catalogue's terms as columns of numbers, for the rivals, and the residuals they explain.
 
 Plain first-order forms, each with one or two usual shapes, evaluated at smoothed states and
-measured inputs. Written apart from `ssmppl.gap`, so that the rivals stand on their own.
+measured inputs. Written apart from `ssmppl.diagnosis`, so that the rivals stand on their own.
 """
 
 from __future__ import annotations

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 import ssmppl as ssm
-from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman_steps import Matrices
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.modules.exact import exact_entry
 from ssmppl.datasets import ice_varves
 from ssmppl.demo import varves
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 
 from .chains import COLUMNS, Chains
 from .tasks import (

@@ -16,12 +16,12 @@ from itertools import compress
 import numpy as np
 import scipy
 
-from ssmppl.analysis.pythontext import DOMAIN, Function, python_function
+from ssmppl.analysis.lambdify import DOMAIN, Function, python_function
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
 from ssmppl.expressions.expr import Expr, apply, substitute
-from ssmppl.language.traced import Trace
-from ssmppl.language.transforms import Transform, transforms
+from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.transforms import Transform, transforms
 
 NEWTON_SIZE = 8  # the number of unconstrained parameters up to which a Hessian is derived
 STEPS, HALVINGS = 100, 40
@@ -185,7 +185,7 @@ def uphill(slope: np.ndarray, curvature: np.ndarray) -> np.ndarray:
 
 
 def _free(value: Expr, lower: Expr, upper: Expr) -> Expr:
-    """The unconstrained number of a bounded one: the inverse of `language/transforms.py`."""
+    """The unconstrained number of a bounded one: the inverse of `language/model/transforms.py`."""
     low, high = (b.op == "const" and math.isinf(b.data) for b in (lower, upper))
     if low and high:
         return value

@@ -14,10 +14,10 @@ from ssmppl.errors import Location
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, attributed, constant
 from ssmppl.expressions.linear import inverse, log_determinant
-from ssmppl.language.continuous import LOG_2PI
 from ssmppl.language.distributions import MvNormal
-from ssmppl.language.multivariate import surely_positive, where_definite
-from ssmppl.language.traced import Site, Trace, seen
+from ssmppl.language.distributions.continuous import LOG_2PI
+from ssmppl.language.distributions.multivariate import surely_positive, where_definite
+from ssmppl.language.model.traced import Site, Trace, seen
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,19 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 
 from ssmppl.analysis.bounds import WHOLE, interval
-from ssmppl.analysis.families import Beta, Dirichlet, Gamma, Normal, NormalGamma, Values
-from ssmppl.analysis.families_matrix import MatrixNormalWishart
-from ssmppl.analysis.pythontext import DOMAIN, python_function, python_sum
+from ssmppl.analysis.conjugacy.families import (
+    Beta,
+    Dirichlet,
+    Gamma,
+    MatrixNormalWishart,
+    Normal,
+    NormalGamma,
+    Values,
+)
+from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.lambdify import DOMAIN, python_function, python_sum
 from ssmppl.analysis.slices import Density, comparable, sweep_matrix, sweep_real, sweep_simplex
 from ssmppl.analysis.truncated_draws import truncated_draw
-from ssmppl.analysis.update import Update
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.expr import Expr, symbols_of, to_text
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.special as sp
 
-from ssmppl.analysis.families import Beta, Gamma, Normal, root_of
+from ssmppl.analysis.conjugacy.families import Beta, Gamma, Normal, root_of
 
 
 # -- truncated laws of one number

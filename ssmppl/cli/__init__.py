@@ -15,8 +15,7 @@ from ssmppl.cli.group import Commands, plain_option
 from ssmppl.cli.likelihood import log_likelihood, score
 from ssmppl.cli.models import compile, explain, simulate
 from ssmppl.cli.prediction import forecast, leave_future_out, predict
-from ssmppl.cli.shell import completion
-from ssmppl.cli.starting import demo, new
+from ssmppl.cli.starting import completion, demo, new
 from ssmppl.cli.states import forward_filter, kalman_filter, particle_filter, smooth
 
 __all__ = ["main"]

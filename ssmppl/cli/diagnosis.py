@@ -16,7 +16,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.modelfile import load_model, parse_assignments
 
 if TYPE_CHECKING:
-    from ssmppl.gap.report import GapReport
+    from ssmppl.diagnosis.report.report import GapReport
 
 __all__ = ["diagnose"]
 

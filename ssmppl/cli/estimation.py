@@ -9,19 +9,21 @@ import click
 
 import ssmppl as ssm
 from ssmppl.cli.group import command
-from ssmppl.cli.methods import CLIMBERS, SAMPLERS, method_of
 from ssmppl.cli.options import (
+    CLIMBERS,
     FIXED,
     MODEL,
     NEEDED_DATA,
     POSTERIOR,
     PROGRESS,
+    SAMPLERS,
     SEED,
     SETTINGS,
     START,
     MethodName,
     Names,
     drawn_seed,
+    method_of,
     option,
     output,
 )
@@ -31,13 +33,14 @@ from ssmppl.cli.rendering import (
     fitting_rows,
     heading,
     labelled_matrix,
+    new_file,
     say,
     stop_interrupted,
     summary_lines,
+    target,
     write,
     wrote,
 )
-from ssmppl.cli.targets import new_file, target
 from ssmppl.modelfile import load_model, parse_assignments
 
 __all__ = ["evidence", "maximize", "sample", "summary"]

@@ -9,19 +9,9 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.cli.group import command
-from ssmppl.cli.options import (
-    DATA,
-    INPUTS,
-    MODEL,
-    PARAMETERS,
-    SEED,
-    drawn_seed,
-    option,
-    output,
-)
+from ssmppl.cli.options import DATA, INPUTS, MODEL, PARAMETERS, SEED, drawn_seed, option, output
 from ssmppl.cli.reading import as_table, read_data, read_table
-from ssmppl.cli.rendering import answer, say, write
-from ssmppl.cli.targets import file_of_model, target
+from ssmppl.cli.rendering import answer, file_of_model, say, target, write
 from ssmppl.data.channels import column_names
 from ssmppl.language.trace import trace
 from ssmppl.modelfile import load_model, parse_assignments

@@ -10,7 +10,6 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.cli.group import command
-from ssmppl.cli.methods import SAMPLERS, method_of
 from ssmppl.cli.options import (
     DATA,
     FIXED,
@@ -18,28 +17,32 @@ from ssmppl.cli.options import (
     MODEL,
     POSTERIOR,
     PROGRESS,
+    SAMPLERS,
     SEED,
     SERIES,
     SETTINGS,
     START,
     MethodName,
     drawn_seed,
+    method_of,
     option,
     output,
 )
 from ssmppl.cli.reading import read_data, read_posterior, read_table
 from ssmppl.cli.rendering import (
     answer,
+    file_of_model,
     heading,
+    new_file,
     records,
     say,
     spread,
     spread_table,
     table_text,
+    target,
     write,
     wrote,
 )
-from ssmppl.cli.targets import file_of_model, new_file, target
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.results import time_axes
 from ssmppl.tables import wide_table

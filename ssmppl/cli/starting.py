@@ -1,4 +1,7 @@
-"""Commands to begin with: the demonstration, and a model file of one's own with data beside it."""
+"""Commands to begin with: the demonstration, and a model file of one's own with data beside it.
+
+The command `completion`: what a shell needs to complete commands, options and files.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import re
 from pathlib import Path
 
 import click
+from click.shell_completion import get_completion_class
 
 import ssmppl as ssm
 from ssmppl import demo as varves_demo
@@ -15,8 +19,6 @@ from ssmppl.cli.rendering import answer, fitting_rows, note, say, stop_interrupt
 from ssmppl.cli.templates import TEMPLATES, skeleton
 from ssmppl.errors import ArgumentError
 from ssmppl.tables import wide_table
-
-__all__ = ["demo", "new"]
 
 
 @command("demo", "The ice varves: from the model to its posterior.")
@@ -108,3 +110,28 @@ def new(name: str, template: str) -> None:
     say(f"    ssmppl explain {model} {data}\n    ssmppl sample {model} {data} --seed 1")
     answer(model=path.name, template=template, parameters=kind.parameters, rows=len(table),
            columns=list(table.columns), seed=kind.seed, files=[model, data])  # fmt: skip
+
+
+PROGRAM, VARIABLE = "ssmppl", "_SSMPPL_COMPLETE"  # click's names, for a program of this name
+
+
+@command("completion", "The script that completes commands in bash, zsh, fish.", prints_json=False)
+@click.argument(
+    "shell", type=click.Choice(["bash", "zsh", "fish"]), metavar="bash|zsh|fish", cls=Argument,
+    about="The shell.",
+)  # fmt: skip
+def completion(shell: str) -> None:
+    """The script that completes commands, options and files in a shell.
+
+    Prints it. A line in the start-up file of the shell reads it; the file is ~/.bashrc, ~/.zshrc,
+    or for fish the script itself is kept where fish looks for it. Nothing is written.
+
+    \b
+        eval "$(ssmppl completion bash)"        # a line for ~/.bashrc
+        eval "$(ssmppl completion zsh)"         # a line for ~/.zshrc, after compinit
+        ssmppl completion fish > ~/.config/fish/completions/ssmppl.fish
+    """
+    kind = get_completion_class(shell)
+    assert kind is not None  # click has these three
+    root = click.get_current_context().find_root().command
+    click.echo(kind(root, {}, PROGRAM, VARIABLE).source())

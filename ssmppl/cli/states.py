@@ -21,9 +21,18 @@ from ssmppl.cli.options import (
     output,
 )
 from ssmppl.cli.reading import read_data
-from ssmppl.cli.rendering import answer, columns_of, heading, say, table_text, write, wrote
-from ssmppl.cli.targets import numbered, target
-from ssmppl.inference.smooth import NAMES as SMOOTHERS
+from ssmppl.cli.rendering import (
+    answer,
+    columns_of,
+    heading,
+    numbered,
+    say,
+    table_text,
+    target,
+    write,
+    wrote,
+)
+from ssmppl.inference.verbs.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.tables import state_table
 

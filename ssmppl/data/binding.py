@@ -23,9 +23,9 @@ from ssmppl.data.sources import Source, sources
 from ssmppl.data.values import name_of, number, outside
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
-from ssmppl.language.distribution import Support
 from ssmppl.language.distributions import MvNormal
-from ssmppl.language.traced import Site, Trace
+from ssmppl.language.distributions.base import Support
+from ssmppl.language.model.traced import Site, Trace
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from ssmppl.data.sources import Source
 from ssmppl.data.values import name_of, number
 from ssmppl.errors import DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of, to_text
-from ssmppl.expressions.undefined import Undefined, first_undefined, may_be_undefined
-from ssmppl.language.distribution import Distribution
-from ssmppl.language.traced import Site, Trace, once_per_trace, previous
+from ssmppl.expressions.properties import Undefined, first_undefined, may_be_undefined
+from ssmppl.language.distributions.base import Distribution
+from ssmppl.language.model.traced import Site, Trace, once_per_trace, previous
 
 CHUNK = 1 << 16  # rows that are looked at together
 

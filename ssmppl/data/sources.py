@@ -15,7 +15,7 @@ import numpy as np
 from ssmppl.data.times import as_dates, label_text
 from ssmppl.data.values import Fault, as_numbers, short
 from ssmppl.errors import DataError
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 
 FILE = "ssmppl_file"  # key of `attrs` for the name of the file that a table was read from
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.distribution import Support
 from ssmppl.language.distributions import Distribution, Truncated
+from ssmppl.language.distributions.base import Support
 
 Values = Mapping[Expr, np.ndarray]
 

@@ -11,8 +11,7 @@ from numpy.lib.array_utils import normalize_axis_tuple
 
 from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.expr import Expr, apply, as_expr, constant, pack, unpack, user_location
-from ssmppl.expressions.node import behaviour
-from ssmppl.expressions.provenance import CHOICES
+from ssmppl.expressions.node import CHOICES, behaviour
 
 
 def _any_operator(self: Any, other: Any) -> Any: ...

@@ -32,7 +32,7 @@ from ssmppl.expressions.expr import (
     without_exponentials,
 )
 from ssmppl.expressions.linear import inverse
-from ssmppl.expressions.signs import never_negative
+from ssmppl.expressions.properties import never_negative
 
 Partial = Callable[..., Sequence[Expr | float | None]]
 _ROOT_2PI = math.sqrt(2.0 * math.pi)

@@ -1,6 +1,12 @@
-"""Scalar expressions, for the rest of the project: every name of the modules below.
+"""Applying an operation: constants folded, neutral elements dropped, spellings brought together.
 
-    provenance.py  where the user wrote a node
+Walking the graph under expressions: order, tables for pickling, dependence, substitution.
+
+Expressions as a person writes them.
+
+Scalar expressions, for the rest of the project: every name of the modules below.
+
+    node.py  where the user wrote a node
     node.py        Expr: one interned, immutable node type
     simplify.py    apply: an operation, simplified
     graph.py       walking the nodes under an expression: order, dependence, substitution
@@ -9,17 +15,17 @@
 Import from here; the five modules are how it is made.
 """
 
-from ssmppl.expressions.graph import (
-    dependent,
-    depends_on,
-    pack,
-    rebuilt,
-    substitute,
-    symbols_of,
-    topological,
-    unpack,
-    unpack_one,
-)
+from __future__ import annotations
+
+import hashlib
+import math
+import operator
+from collections.abc import Callable, Container, Iterable
+from typing import Any
+
+import numpy as np
+
+from ssmppl.expressions import special
 from ssmppl.expressions.node import (
     BINARY,
     BOOLEAN,
@@ -31,14 +37,15 @@ from ssmppl.expressions.node import (
     UNARY,
     Expr,
     as_expr,
+    attributed,
+    behaviour,
     constant,
     item,
     matrix_op,
+    recording,
     symbol,
+    user_location,
 )
-from ssmppl.expressions.provenance import attributed, recording, user_location
-from ssmppl.expressions.simplify import apply, split_constant, without_exponentials
-from ssmppl.expressions.text import symbol_text, to_text
 
 __all__ = [
     "BINARY",
@@ -50,26 +57,422 @@ __all__ = [
     "TERNARY",
     "UNARY",
     "Expr",
-    "apply",
     "as_expr",
     "attributed",
     "constant",
-    "dependent",
-    "depends_on",
     "item",
     "matrix_op",
-    "pack",
-    "rebuilt",
     "recording",
-    "split_constant",
-    "substitute",
     "symbol",
-    "symbol_text",
-    "symbols_of",
-    "to_text",
-    "topological",
-    "unpack",
-    "unpack_one",
     "user_location",
-    "without_exponentials",
 ]
+
+
+def apply(op: str, *operands: Any) -> Expr:
+    """The node of `op` on nodes or numbers, with constants folded and neutral elements dropped.
+
+    As in the algebra of real numbers, 0 * x and x - x are 0 and log(exp(x)) is x whatever x is,
+    also where IEEE arithmetic would overflow or give nan.
+    """
+    args = tuple(as_expr(a) for a in operands)
+    if op not in BOOLEAN and op != "where":  # arithmetic on a condition: 1 where it holds
+        args = tuple(_as_number(a) for a in args)
+    elif op == "where":
+        args = (args[0], _as_number(args[1]), _as_number(args[2]))
+    if all(a.op == "const" for a in args) and op in FOLD:
+        with np.errstate(all="ignore"):
+            return constant(FOLD[op](*(np.float64(a.data) for a in args)))
+    for _, applies, result in RULES.get(op, ()):
+        if applies(*args):
+            return result(*args)
+    return Expr(op, args)
+
+
+behaviour["apply"] = apply
+
+
+def _as_number(a: Expr) -> Expr:
+    return Expr("where", (a, constant(1.0), constant(0.0))) if a.op in BOOLEAN else a
+
+
+def _gammaln(x: float) -> float:
+    if not math.isfinite(x):
+        return math.inf if x > 0 else math.nan
+    return math.inf if x <= 0 and x == int(x) else math.lgamma(x)
+
+
+# Constants are folded with NumPy's arithmetic, which is the meaning of these operations.
+FOLD: dict[str, Callable[..., Any]] = {
+    **{name: getattr(np, name) for name in UNARY if hasattr(np, name)},
+    "neg": operator.neg, "abs": abs, "add": operator.add, "sub": operator.sub,
+    "mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod,
+    "maximum": np.maximum, "minimum": np.minimum, "arctan2": np.arctan2,
+    "logaddexp": np.logaddexp, "gammaln": _gammaln, "where": np.where,
+    "gammaln_rise": special.gammaln_rise, "betaln": special.betaln,
+    "lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne,
+    "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
+}  # fmt: skip
+
+
+def _is(a: Expr, value: float) -> bool:
+    return a.op == "const" and a.data == value
+
+
+def _number(a: Expr) -> bool:
+    return a.op == "const"
+
+
+def _begins_with_number(a: Expr, op: str) -> bool:
+    """c x or c / x, as `op` says; the rules of "mul" put the number first."""
+    return a.op == op and a.args[0].op == "const"
+
+
+def _begins_with_positive(a: Expr, op: str) -> bool:
+    return _begins_with_number(a, op) and a.args[0].data > 0
+
+
+def without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
+    """(b, e) with a = b exp(e), for products and quotients; no e where no factor is an exp."""
+    done: dict[Expr, tuple[Expr, Expr | None]] = {}
+    waiting = [a]
+    while waiting:  # a product may have thousands of factors, and share them
+        node = waiting[-1]
+        missing = [f for f in node.args if f not in done] if node.op in _FACTORS else []
+        waiting += missing
+        if not missing:
+            done[waiting.pop()] = _gathered(node, done)
+    return done[a]
+
+
+_FACTORS = {"neg", "mul", "div"}
+
+
+def _gathered(a: Expr, done: dict[Expr, tuple[Expr, Expr | None]]) -> tuple[Expr, Expr | None]:
+    """As `without_exponentials`, from what is known of the factors."""
+    if a.op == "exp":
+        return constant(1.0), a.args[0]
+    if a.op == "neg":
+        rest, exponent = done[a.args[0]]
+        return (-rest, exponent) if exponent is not None else (a, None)
+    if a.op not in _FACTORS:
+        return a, None
+    (left, up), (right, down) = (done[f] for f in a.args)
+    if up is None and down is None:
+        return a, None
+    if down is not None and a.op == "div":
+        down = -down
+    parts = [e for e in (up, down) if e is not None]
+    return apply(a.op, left, right), parts[0] if len(parts) == 1 else parts[0] + parts[1]
+
+
+def _log_without_exponentials(a: Expr) -> Expr:
+    rest, exponent = without_exponentials(a)
+    assert exponent is not None
+    return apply("log", rest) + exponent
+
+
+# By operation: the mathematics (c, d are numbers), where the rule applies, what it gives. The first
+# that applies is taken. Arguments that are all numbers are folded before.
+Rule = tuple[str, Callable[..., bool], Callable[..., Expr]]
+RULES: dict[str, tuple[Rule, ...]] = {
+    "add": (
+        ("0 + b = b", lambda a, b: _is(a, 0.0), lambda a, b: b),
+        ("a + 0 = a", lambda a, b: _is(b, 0.0), lambda a, b: a),
+        ("a + (-b) = a - b", lambda a, b: b.op == "neg", lambda a, b: a - b.args[0]),
+    ),
+    "sub": (
+        ("a - 0 = a", lambda a, b: _is(b, 0.0), lambda a, b: a),
+        ("0 - b = -b", lambda a, b: _is(a, 0.0), lambda a, b: -b),
+        ("a - a = 0", lambda a, b: a is b, lambda a, b: constant(0.0)),
+        ("a - (-b) = a + b", lambda a, b: b.op == "neg", lambda a, b: a + b.args[0]),
+    ),
+    "mul": (
+        ("0 b = 0", lambda a, b: _is(a, 0.0), lambda a, b: constant(0.0)),
+        ("a 0 = 0", lambda a, b: _is(b, 0.0), lambda a, b: constant(0.0)),
+        ("a c = c a", lambda a, c: _number(c), lambda a, c: c * a),
+        ("(-a) b = -(a b)", lambda a, b: a.op == "neg", lambda a, b: -(a.args[0] * b)),
+        ("c (-b) = (-c) b", lambda c, b: _number(c) and b.op == "neg", lambda c, b: -c * b.args[0]),
+        ("a (-b) = -(a b)", lambda a, b: b.op == "neg", lambda a, b: -(a * b.args[0])),
+        ("c (d x) = (c d) x",
+         lambda c, b: _number(c) and _begins_with_number(b, "mul"),
+         lambda c, b: (c * b.args[0]) * b.args[1]),
+        ("1 b = b", lambda a, b: _is(a, 1.0), lambda a, b: b),
+        ("(-1) b = -b", lambda a, b: _is(a, -1.0), lambda a, b: -b),
+    ),
+    "div": (
+        ("a / 1 = a", lambda a, b: _is(b, 1.0), lambda a, b: a),
+        ("c / (d / x) = (c / d) x, d not 0",
+         lambda c, b: _number(c) and _begins_with_number(b, "div") and b.args[0].data != 0,
+         lambda c, b: (c / b.args[0]) * b.args[1]),
+        ("0 / b = 0", lambda a, b: _is(a, 0.0), lambda a, b: constant(0.0)),
+    ),
+    "pow": (
+        ("a ** 0 = 1", lambda a, b: _is(b, 0.0), lambda a, b: constant(1.0)),
+        ("a ** 1 = a", lambda a, b: _is(b, 1.0), lambda a, b: a),
+        ("a ** 0.5 = sqrt(a)", lambda a, b: _is(b, 0.5), lambda a, b: apply("sqrt", a)),
+        ("a ** -1 = 1 / a", lambda a, b: _is(b, -1.0), lambda a, b: 1.0 / a),
+    ),
+    "log": (
+        ("log(exp x) = x", lambda a: a.op == "exp", lambda a: a.args[0]),
+        ("log(b exp(x)) = log b + x, also where exp(x) under- or overflows",
+         lambda a: without_exponentials(a)[1] is not None, _log_without_exponentials),
+        ("log(c x) = log c + log x, c > 0",
+         lambda a: _begins_with_positive(a, "mul"),
+         lambda a: math.log(a.args[0].data) + apply("log", a.args[1])),
+        ("log(c / x) = log c - log x, c > 0",
+         lambda a: _begins_with_positive(a, "div"),
+         lambda a: math.log(a.args[0].data) - apply("log", a.args[1])),
+    ),
+    "neg": (
+        ("-(-x) = x", lambda a: a.op == "neg", lambda a: a.args[0]),
+        ("-(c x) = (-c) x",
+         lambda a: _begins_with_number(a, "mul"), lambda a: -a.args[0] * a.args[1]),
+    ),
+    "where": (
+        ("where(c, a, b) = a if c else b",
+         lambda c, a, b: _number(c), lambda c, a, b: a if c.data else b),
+        ("where(x, a, a) = a", lambda x, a, b: a is b, lambda x, a, b: a),
+    ),
+}  # fmt: skip
+
+
+def split_constant(e: Expr) -> tuple[float, Expr]:
+    """e = number * core."""
+    number, one = 1.0, constant(1.0)
+    while True:
+        if e.op == "const":
+            return number * e.data, one
+        if e.op == "neg":
+            number, e = -number, e.args[0]
+        elif e.op == "mul" and e.args[0].op == "const":
+            number, e = number * e.args[0].data, e.args[1]
+        elif e.op == "mul" and e.args[1].op == "const":
+            number, e = number * e.args[1].data, e.args[0]
+        elif e.op == "div" and e.args[1].op == "const":
+            number, e = number / e.args[1].data, e.args[0]
+        else:
+            return number, e
+
+
+def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) -> list[Expr]:
+    """Every node under `roots`, arguments before users, each once; without recursion.
+
+    within : other nodes are left out, with whatever is reached only through them.
+    """
+    order: list[Expr] = []
+    seen: set[Expr] = set()
+    stack = [(r, False) for r in reversed(list(roots)) if within is None or r in within]
+    while stack:
+        node, expanded = stack.pop()
+        if expanded:
+            order.append(node)
+        elif node not in seen:
+            seen.add(node)
+            stack.append((node, True))
+            stack.extend(
+                (a, False) for a in reversed(node.args)
+                if a not in seen and (within is None or a in within)
+            )  # fmt: skip
+    return order
+
+
+def pack(roots: Iterable[Expr]) -> list[tuple[str, tuple[int, ...], Any]]:
+    """Every node under `roots` as (operation, places of its arguments in this list, data)."""
+    place: dict[Expr, int] = {}
+    table: list[tuple[str, tuple[int, ...], Any]] = []
+    for node in topological(roots):
+        place[node] = len(table)
+        table.append((node.op, tuple(place[a] for a in node.args), node.data))
+    return table
+
+
+def unpack(table: list[tuple[str, tuple[int, ...], Any]]) -> list[Expr]:
+    """The nodes of a table made by `pack`, interned."""
+    nodes: list[Expr] = []
+    for op, args, data in table:
+        nodes.append(Expr(op, tuple(nodes[i] for i in args), data))
+    return nodes
+
+
+def unpack_one(table: list[tuple[str, tuple[int, ...], Any]]) -> Expr:
+    """The last node of a table: the root it was made for."""
+    return unpack(table)[-1]
+
+
+def _reduced(node: Expr) -> tuple[Callable[..., Expr], tuple[Any, ...]]:
+    """For pickling: as a flat table, for graphs deeper than Python's recursion limit."""
+    return unpack_one, (pack([node]),)
+
+
+behaviour["pickle"] = _reduced
+
+
+def symbols_in(node: Expr) -> frozenset[Expr]:
+    """The symbols that occur under one node; kept, as large models ask for them again and again."""
+    if node._symbols is not None:
+        return node._symbols
+    stack = [node]
+    while stack:
+        top = stack[-1]
+        unknown = [a for a in top.args if a._symbols is None]
+        if unknown:
+            stack += unknown
+            continue
+        stack.pop()
+        if top._symbols is None:
+            object.__setattr__(top, "_symbols", _united(top))
+    assert node._symbols is not None
+    return node._symbols
+
+
+def _united(node: Expr) -> frozenset[Expr]:
+    """Of the arguments' symbols; the largest of them itself where it holds the others, so that
+    few sets are made."""
+    if node.op == "symbol":
+        return frozenset((node,))
+    each = [a._symbols for a in node.args if a._symbols]
+    if not each:
+        return frozenset()
+    largest = max(each, key=len)
+    return largest if all(s <= largest for s in each) else frozenset().union(*each)
+
+
+def symbols_of(roots: Expr | Iterable[Expr]) -> frozenset[Expr]:
+    """The symbols that occur under `roots`."""
+    if isinstance(roots, Expr):
+        return symbols_in(roots)
+    return frozenset[Expr]().union(*(symbols_in(r) for r in roots))
+
+
+def dependent(roots: Iterable[Expr], on: Iterable[Expr]) -> set[Expr]:
+    """The nodes under `roots` (themselves included) that depend on some node of `on`."""
+    found = set(on)
+    if all(n.op == "symbol" for n in found):  # only where they occur
+        wanted = frozenset(found)
+        stack = [r for r in roots if not wanted.isdisjoint(symbols_in(r))]
+        while stack:
+            node = stack.pop()
+            if node in found:
+                continue
+            found.add(node)
+            stack += [a for a in node.args if not wanted.isdisjoint(symbols_in(a))]
+        return found
+    for node in topological(roots):
+        if any(a in found for a in node.args):
+            found.add(node)
+    return found
+
+
+def depends_on(expression: Expr, symbols: Iterable[Expr]) -> bool:
+    """Whether the expression depends on some symbol of `symbols`."""
+    return not symbols_in(expression).isdisjoint(symbols)
+
+
+def substitute(roots: list[Expr], replacement: dict[Expr, Expr]) -> list[Expr]:
+    """`roots` with nodes replaced, simplified again on the way up."""
+    done = dict(replacement)
+    for node in topological(roots):
+        if node in done:
+            continue
+        done[node] = rebuilt(node, tuple(done[a] for a in node.args))
+    return [done[r] for r in roots]
+
+
+def rebuilt(node: Expr, args: tuple[Expr, ...]) -> Expr:
+    """The node with other arguments, simplified."""
+    if all(new is old for new, old in zip(args, node.args, strict=True)):
+        return node
+    return apply(node.op, *args) if node.op in FOLD else Expr(node.op, args, node.data)
+
+
+_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "pow": ("**", 4)}
+_INFIX |= {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "mod": ("%", 2)}
+LONGEST = 10_000
+
+
+def symbol_text(node: Expr) -> str:
+    """The name of a symbol as a person writes it: `x`, `x_prev`, `beta[2]`; `measured(y[0])` of
+    what is 1 where y[0] is in the data."""
+    kind, name, index = node.data
+    suffix = "_prev" if kind.endswith("_prev") else ""
+    text = name + suffix + (f"[{', '.join(map(str, index))}]" if index else "")
+    return f"measured({text})" if kind.startswith("seen") else text
+
+
+def _matrix_name(node: Expr) -> str | None:
+    """The name of the parameter, or the text of the inverse, that a matrix node is made of."""
+    n, first = node.data, node.args[0]
+    cells = [(i, j) for i in range(n) for j in range(n)]
+    if first.op == "symbol":
+        kind, name, _ = first.data
+        for whole in (cells, [(max(c), min(c)) for c in cells]):  # any matrix; a symmetric one
+            if all(
+                a.op == "symbol" and a.data == (kind, name, c)
+                for a, c in zip(node.args, whole, strict=True)
+            ):
+                return symbol_text(first).partition("[")[0]
+    if first.op == "item" and first.args[0].data == n:
+        source = first.args[0]
+        if all(
+            a.op == "item" and a.args[0] is source and a.data == c
+            for a, c in zip(node.args, cells, strict=True)
+        ):
+            return to_text(source)
+    return None
+
+
+def _bare(a: Expr) -> Expr:
+    """a of where(0 <= a, a, nan): what the densities of laws put in place of their a."""
+    if a.op == "where" and a.args[2].op == "const" and math.isnan(a.args[2].data):
+        return a.args[1] if a.args[0] is behaviour["apply"]("le", 0.0, a.args[1]) else a
+    return a
+
+
+def to_text(root: Expr, longest: int = LONGEST) -> str:
+    """The expression as a person writes it.
+
+    Written out, an expression that shares its parts can be exponentially longer than its graph:
+    what has more than `longest` characters is cut, with a mark that differs where the rest does.
+    """
+    if root.op == "symbol":
+        return symbol_text(root)
+    done: dict[Expr, tuple[str, int]] = {}
+    for node in topological([root]):
+        parts = [done[a] for a in node.args]
+        if node.op == "const":
+            done[node] = (f"{node.data:.10g}", 9 if node.data >= 0 else 1)
+        elif node.op == "symbol":
+            done[node] = (symbol_text(node), 9)
+        elif node.op in _INFIX:
+            sign, level = _INFIX[node.op]
+            (a, la), (b, lb) = parts
+            chained = node.op == "pow" or level == 0  # in Python a < b == c is another thing
+            left = f"({a})" if la < level or (chained and la == level) else a
+            tight = sign not in "+*" or node.args[1].op == "mod"
+            right = f"({b})" if lb < level or (lb == level and tight) else b
+            done[node] = (f"{left}{sign}{right}" if level > 1 else f"{left} {sign} {right}", level)
+        elif node.op == "neg":
+            a, level = parts[0]
+            done[node] = (f"-({a})" if level < 2 else f"-{a}", 1)
+        elif node.op in MATRIX_OPS:
+            name = _matrix_name(node)
+            inside = ", ".join(p[0] for p in parts) if name is None else name
+            done[node] = (f"{node.op}({inside})", 9)
+        elif node.op == "item":
+            done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
+        elif node.op == "gammaln":
+            done[node] = (f"gammaln({done[_bare(node.args[0])][0]})", 9)
+        elif node.op in ("gammaln_rise", "digamma_rise"):
+            name, (a, b) = node.op.removesuffix("_rise"), (p[0] for p in parts)
+            done[node] = (f"{name}({a} + {b}) - {name}({a})", 1)
+        else:
+            name = node.data[0] if node.op == "random" else node.op
+            done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)
+        text, level = done[node]
+        if len(text) > longest:
+            mark = hashlib.sha256(text.encode()).hexdigest()[:8]
+            done[node] = (f"{text[:longest]}...{mark}", level)
+    return done[root][0]
+
+
+behaviour["text"] = to_text

@@ -7,20 +7,25 @@ small matrices (`MATRIX_OPS`) are nodes over the matrix's entries, whose results
 "item" nodes.
 
 What an operation means is defined by `evaluate.py`, how it is spelled in generated code by
-`codegen/render.py`, its derivative by `calculus.py`: three tables over the names below.
+`codegen/text/render.py`, its derivative by `calculus.py`: three tables over the names below.
+
+Where the user wrote each node, and which are elements of an array that a symbol chose.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 
-from ssmppl.errors import UnsupportedOperation
-from ssmppl.expressions.provenance import PLACES, note, user_location
+from ssmppl.errors import Location, UnsupportedOperation
 
 _UNARY = """neg exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
     arccosh arctanh abs sign floor ceil gammaln digamma trigamma ndtr log_ndtr ndtri erf erfc i0e
@@ -58,11 +63,11 @@ INDEX_BY_SYMBOL = (
 
 # What Expr does that is defined in modules above this one, which fill it when they are imported
 # (all of them by `ssmppl.expressions`):
-#   "apply"     (op, *operands): the node of an operation, simplified     simplify.py
-#   "pickle"    (node): what its __reduce__ gives                         graph.py
+#   "apply"     (op, *operands): the node of an operation, simplified     expr.py
+#   "pickle"    (node): what its __reduce__ gives                         expr.py
 #   "text"      (node): how a person writes it                            text.py
-#   "ufunc"     (ufunc, method, inputs, kwargs): NumPy's NEP 13           protocols.py
-#   "function"  (func, args, kwargs): NumPy's NEP 18                      protocols.py
+#   "ufunc"     (ufunc, method, inputs, kwargs): NumPy's NEP 13           numpy_protocols.py
+#   "function"  (func, args, kwargs): NumPy's NEP 18                      numpy_protocols.py
 behaviour: dict[str, Callable[..., Any]] = {}
 
 _interned: weakref.WeakValueDictionary[tuple, Expr] = weakref.WeakValueDictionary()
@@ -331,3 +336,69 @@ def as_expr(value: Any) -> Expr:
     if isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating)):
         return constant(float(value))
     raise TypeError(f"no expression can be made of {value!r} of type {type(value).__name__}")
+
+
+# Of the block that records; None where none does. And the place that its nodes are given.
+PLACES: ContextVar[dict[Expr, Location] | None] = ContextVar("places", default=None)
+CHOICES: ContextVar[dict[Expr, tuple[Expr, int]] | None] = ContextVar("choices", default=None)
+_given: ContextVar[Location | None] = ContextVar("given", default=None)
+# Frames of these folders are never the place "where the user wrote it".
+_OWN = tuple(
+    os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
+    for d in ("expressions", "language")
+)
+_OWN += tuple(  # SciPy lies beside NumPy
+    os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(np.__file__))), d) + os.sep
+    for d in ("numpy", "scipy")
+)
+
+
+@contextmanager
+def recording() -> Iterator[dict[Expr, Location]]:
+    """Within the block, the first place where the user wrote each node is kept in the result."""
+    places: dict[Expr, Location] = {}
+    token = PLACES.set(places)
+    try:
+        yield places
+    finally:
+        PLACES.reset(token)
+
+
+@contextmanager
+def choosing() -> Iterator[dict[Expr, tuple[Expr, int]]]:
+    """Within the block, each element that a symbol chose is kept in the result, with the index and
+    the number of elements. Its node alone does not tell: out of range it is the last element."""
+    choices: dict[Expr, tuple[Expr, int]] = {}
+    token = CHOICES.set(choices)
+    try:
+        yield choices
+    finally:
+        CHOICES.reset(token)
+
+
+@contextmanager
+def attributed(places: dict[Expr, Location], location: Location) -> Iterator[None]:
+    """Within the block, nodes that have no place in `places` yet get this one.
+
+    For what is derived from a line of the user's rather than written there.
+    """
+    tokens = PLACES.set(places), _given.set(location)
+    try:
+        yield
+    finally:
+        PLACES.reset(tokens[0])
+        _given.reset(tokens[1])
+
+
+def note(node: Expr, places: dict[Expr, Location]) -> None:
+    """Keep the place of a node that has none."""
+    if node not in places:
+        places[node] = _given.get() or user_location()
+
+
+def user_location() -> Location:
+    """The innermost frame that is neither ours nor NumPy's: where the user wrote it."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_OWN):
+        frame = frame.f_back
+    return Location(frame.f_code.co_filename, frame.f_lineno, frame.f_code.co_name)

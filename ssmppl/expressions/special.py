@@ -1,6 +1,6 @@
 """Functions of probability that SciPy has not as ufuncs, for the interpreter: arrays in, array out.
 
-The compiled kernels (`codegen/kernels/laws.py`) compute the same by other ways.
+The compiled kernels (`codegen/kernels/math/special.py`) compute the same by other ways.
 """
 
 from __future__ import annotations

@@ -22,7 +22,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssmppl.expressions.conditions import affirmed, conditions_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     MATRIX_OPS,
@@ -37,6 +36,7 @@ from ssmppl.expressions.expr import (
     to_text,
     topological,
 )
+from ssmppl.expressions.properties import affirmed, conditions_of
 
 NEAR = 3  # points of moderate size in each case of the conditions
 WIDE = 128  # points of all signs and sizes

@@ -11,12 +11,9 @@ from ssmppl.compiling import LOCK
 from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.expr import Expr, recording, symbol
-from ssmppl.expressions.provenance import choosing
-from ssmppl.language.calling import call, check_outer_names, return_location
-from ssmppl.language.covariances import find_root, independent
-from ssmppl.language.indexes import check_indexes
-from ssmppl.language.model import Model, location_of
-from ssmppl.language.rules import (
+from ssmppl.expressions.node import choosing
+from ssmppl.language.checks.indexes import check_indexes
+from ssmppl.language.checks.rules import (
     RESERVED,
     a,
     check_dims,
@@ -27,7 +24,10 @@ from ssmppl.language.rules import (
     check_states,
     is_symmetric,
 )
-from ssmppl.language.traced import Site, Trace, symbols
+from ssmppl.language.distributions.covariances import find_root, independent
+from ssmppl.language.model.calling import call, check_outer_names, return_location
+from ssmppl.language.model.model import Model, location_of
+from ssmppl.language.model.traced import Site, Trace, symbols
 
 
 def _time(role: str) -> str:

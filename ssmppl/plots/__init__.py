@@ -1,32 +1,32 @@
-"""What results look like: plots of what the verbs return, and the report of `diagnose`.
+"""What results look like: plots of what the verbs return.
 
-    style.py        colours, sizes and the axis of time
-    reading.py      results read for drawing: bands over time, data, names
+    language/model/closure_digest.py      results read for drawing: bands over time, data, names
     drawing.py      what the plots of results share: axes, fans, dots, legends
     density.py      densities of draws and of priors
     states.py       plot_states, plot_forecast
     filters.py      plot_filter, plot_ancestry
     predictions.py  plot_predictions
     parameters.py   plot_prior_posterior, plot_maximization
-    likelihood.py   plot_likelihood
+    inference/verbs/log_likelihood.py   plot_likelihood
 
-Of a report:
-
-    panels.py       one function for each panel, on axes that are given
-    figure.py       the panels put together
-    page.py         the report as one HTML file
-    folder.py       everything written to a folder
-
-Importing this package is what gives `GapReport` its `plot` and `save`.
+The panels of a report of `diagnose` are under these names too; they stand in
+`ssmppl.diagnosis.report`.
 """
 
-from ssmppl.gap.report import PRESENTERS
-from ssmppl.plots.figure import panel_figures, pictures, plot
+from ssmppl.diagnosis.report.folder import save
+from ssmppl.diagnosis.report.page import page
+from ssmppl.diagnosis.report.panels import (
+    free_run,
+    gap_closed,
+    missing_term,
+    panel_figures,
+    pictures,
+    plot,
+    ranked_effects,
+    residual_map,
+)
 from ssmppl.plots.filters import plot_ancestry, plot_filter
-from ssmppl.plots.folder import save
 from ssmppl.plots.likelihood import plot_likelihood
-from ssmppl.plots.page import page
-from ssmppl.plots.panels import free_run, gap_closed, missing_term, ranked_effects, residual_map
 from ssmppl.plots.parameters import plot_maximization, plot_prior_posterior
 from ssmppl.plots.predictions import plot_predictions
 from ssmppl.plots.states import plot_forecast, plot_states
@@ -51,6 +51,3 @@ __all__ = [
     "residual_map",
     "save",
 ]
-
-PRESENTERS["plot"] = plot
-PRESENTERS["save"] = save

@@ -10,10 +10,10 @@ import numpy as np
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.prior import draw_prior
-from ssmppl.language.model import Model
+from ssmppl.inference.run.prior import draw_prior
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.traced import Site, Trace
 from ssmppl.language.trace import trace
-from ssmppl.language.traced import Site, Trace
 from ssmppl.plots.reading import components
 from ssmppl.results import time_axes
 

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ssmppl.drawing.style import DATA, MAIN, bare, look, times
 from ssmppl.errors import ArgumentError
-from ssmppl.plots.style import DATA, MAIN, bare, look, times
 
 __all__ = [
     "MOST_PANELS", "dots", "fan", "few", "handed", "key", "line", "multiples", "only_below",

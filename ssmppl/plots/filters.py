@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.drawing.style import DATA, FAINT, MAIN, OTHER, bare
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.totals import total_of
+from ssmppl.inference.run.ranges import total_of
 from ssmppl.plots.drawing import few, handed, key, only_below, panels, shown_time, styled
 from ssmppl.plots.reading import components, is_dataset, pick, wrong_kind
-from ssmppl.plots.style import DATA, FAINT, MAIN, OTHER, bare
 
 __all__ = ["plot_ancestry", "plot_filter"]
 

@@ -11,25 +11,21 @@ import numpy as np
 
 from ssmppl.counts import check_count
 from ssmppl.data import check_values
+from ssmppl.drawing.style import DATA, OTHER, bare
 from ssmppl.errors import ArgumentError, SamplingError, listing
-from ssmppl.inference.estimate import Estimate
-from ssmppl.inference.exact.models import EXACT, exact_log_likelihood
-from ssmppl.inference.executors import check_executor
-from ssmppl.inference.particles.filtering import (
-    FilterSettings,
-    log_of_mean,
-    repeated_estimates,
-    seed_sequence,
-)
-from ssmppl.inference.particles.proposal_choice import resolve_settings
-from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.tasks import run_tasks
-from ssmppl.language.model import Model
+from ssmppl.inference.particles.filtering import FilterSettings, log_of_mean, repeated_estimates
+from ssmppl.inference.preparation.exact_models import EXACT, exact_log_likelihood
+from ssmppl.inference.preparation.proposal_choice import resolve_settings
+from ssmppl.inference.run.estimate import Estimate
+from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.problem import Problem, pose
+from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.inference.run.tasks import run_tasks
+from ssmppl.language.model.model import Model
 from ssmppl.plots.density import supports
 from ssmppl.plots.drawing import key, panels, styled
 from ssmppl.plots.parameters import iterates_of, parameter_draws
 from ssmppl.plots.reading import components, is_inference_data, pick, wrong_kind
-from ssmppl.plots.style import DATA, OTHER, bare
 
 __all__ = ["plot_likelihood", "surface"]
 

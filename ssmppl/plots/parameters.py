@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.drawing.numerals import with_error
+from ssmppl.drawing.style import MAIN, OTHER, bare
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.numerals import with_error
-from ssmppl.inference.estimate import Estimate, beside
-from ssmppl.inference.posterior_draws import group
-from ssmppl.language.model import Model
+from ssmppl.inference.run.estimate import Estimate, beside
+from ssmppl.inference.verbs.predict import group
+from ssmppl.language.model.model import Model
 from ssmppl.plots.density import Prior, estimated, prior_draws, priors_of, window
 from ssmppl.plots.drawing import few, handed, key, multiples, only_below, styled
 from ssmppl.plots.reading import components, group_of, is_inference_data, pick, wrong_kind
-from ssmppl.plots.style import MAIN, OTHER, bare
 from ssmppl.results import time_axes
 
 __all__ = ["parameter_draws", "plot_maximization", "plot_prior_posterior"]

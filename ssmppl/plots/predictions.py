@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.drawing.style import FAINT, MAIN, bare
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.posterior_draws import group
+from ssmppl.inference.verbs.predict import group
 from ssmppl.plots.drawing import dots, fan, few, handed, key, only_below, panels, shown_time, styled
 from ssmppl.plots.filters import filtered, titles
 from ssmppl.plots.reading import (
@@ -22,7 +23,6 @@ from ssmppl.plots.reading import (
     quantiles_at_levels,
     wrong_kind,
 )
-from ssmppl.plots.style import FAINT, MAIN, bare
 
 __all__ = ["pit_band", "plot_predictions"]
 

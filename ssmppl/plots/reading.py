@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
-from ssmppl.inference.posterior_draws import group
+from ssmppl.inference.verbs.predict import group
 from ssmppl.results import time_axes
 from ssmppl.tables import quantiles_of
 

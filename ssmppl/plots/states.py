@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.drawing.style import FAINT, OTHER
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.posterior_draws import group
+from ssmppl.inference.verbs.predict import group
 from ssmppl.plots.drawing import (
     dots,
     fan,
@@ -31,7 +32,6 @@ from ssmppl.plots.reading import (
     records,
     wrong_kind,
 )
-from ssmppl.plots.style import FAINT, OTHER
 
 __all__ = ["plot_forecast", "plot_states"]
 

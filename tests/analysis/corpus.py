@@ -29,7 +29,7 @@ from ssmppl.language.distributions import (
     Uniform,
     Wishart,
 )
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 
 CORPUS = {}
 

@@ -3,11 +3,11 @@
 import numpy as np
 from scipy import stats
 
-from ssmppl.analysis import check
-from ssmppl.analysis.conjugacy import draw
+from ssmppl.analysis.conjugacy import check
+from ssmppl.analysis.conjugacy.conjugacy import draw
+from ssmppl.analysis.conjugacy.families import lower_half
 from ssmppl.analysis.density import terms
-from ssmppl.analysis.families_matrix import lower_half
-from ssmppl.analysis.pythontext import DOMAIN, python_function
+from ssmppl.analysis.lambdify import DOMAIN, python_function
 from ssmppl.analysis.sampler import sampler_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbols_of

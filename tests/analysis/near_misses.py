@@ -30,7 +30,7 @@ from ssmppl.language.distributions import (
     Uniform,
     Wishart,
 )
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from tests.analysis.corpus import laws, with_inputs
 
 NEAR_MISSES = {}

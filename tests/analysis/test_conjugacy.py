@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.analysis import check
-from ssmppl.analysis.check import verify
-from ssmppl.analysis.conjugacy import derive_updates
-from ssmppl.analysis.sufficient import complete_data
+from ssmppl.analysis.conjugacy import check
+from ssmppl.analysis.conjugacy.check import verify
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.sufficient import complete_data
 from ssmppl.expressions.expr import to_text
 from ssmppl.language import distributions as ssm
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.analysis.corpus import CORPUS, build
 

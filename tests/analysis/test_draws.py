@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis import check
-from ssmppl.analysis.conjugacy import derive_updates
-from ssmppl.analysis.families_matrix import MatrixNormalWishart
+from ssmppl.analysis.conjugacy import check
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.families import MatrixNormalWishart
+from ssmppl.analysis.conjugacy.sufficient import complete_data
 from ssmppl.analysis.sampler import sampler_of
-from ssmppl.analysis.sufficient import complete_data
 from ssmppl.language.trace import trace
 from tests.analysis.corpus import CORPUS, build
 from tests.analysis.exact import Conditional, kolmogorov_smirnov, matrices

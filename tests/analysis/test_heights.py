@@ -7,7 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.analysis.density import terms
-from ssmppl.analysis.heights import transition_height
+from ssmppl.analysis.proposals.upper_bounds import transition_height
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import depends_on

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis import check
-from ssmppl.analysis.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy import check
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy.sufficient import complete_data
 from ssmppl.analysis.sampler import sampler_of
-from ssmppl.analysis.sufficient import complete_data
 from ssmppl.language.distributions import (
     Beta,
     Binomial,
@@ -34,7 +34,7 @@ from ssmppl.language.distributions import (
     Uniform,
     Wishart,
 )
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.analysis.exact import Conditional
 from tests.statistics.checks import LEVEL, seed_of

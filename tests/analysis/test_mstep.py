@@ -4,28 +4,27 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from ssmppl.analysis.check import random_series
-from ssmppl.analysis.families import (
+from ssmppl.analysis.conjugacy.check import random_series
+from ssmppl.analysis.conjugacy.families import (
     Beta,
     Dirichlet,
     Gamma,
     Normal,
     NormalGamma,
     Wishart,
+    symmetric,
 )
-from ssmppl.analysis.families_matrix import symmetric
-from ssmppl.analysis.modes import mode
-from ssmppl.analysis.mstep import counted, derive_m_step
-from ssmppl.analysis.sufficient import complete_data
+from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step, mode
+from ssmppl.analysis.conjugacy.sufficient import complete_data
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.distributions import Gamma as GammaLaw
 from ssmppl.language.distributions import Normal as NormalLaw
 from ssmppl.language.distributions import Uniform
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.transforms import transforms, unconstrain
 from ssmppl.language.trace import trace
-from ssmppl.language.transforms import transforms, unconstrain
 from tests.analysis.corpus import CORPUS, build
 from tests.statistics.checks import seed_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
 from ssmppl.language.trace import trace
 from tests.analysis.near_misses import NEAR_MISSES, build
 from tests.analysis.test_draws import compare, conditionals

@@ -10,14 +10,13 @@ from scipy.integrate import quad
 
 import ssmppl.language.distributions as D
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.moves import bootstrap
-from ssmppl.analysis.proposals import DEFENSIVE, derive
+from ssmppl.analysis.proposals.proposals import DEFENSIVE, bootstrap, derive
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.traced import previous, seen
 from ssmppl.language.trace import trace
-from ssmppl.language.traced import previous, seen
 
 DRAWS = 200_000
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ssmppl.analysis.pythontext import python_function, python_sum
+from ssmppl.analysis.lambdify import python_function, python_sum
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, symbol
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis.pythontext import python_sum
+from ssmppl.analysis.lambdify import python_sum
 from ssmppl.analysis.sampler import _guarded
 from ssmppl.analysis.slices import slice_step
 from ssmppl.expressions.expr import apply, symbol

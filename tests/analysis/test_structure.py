@@ -10,7 +10,7 @@ from ssmppl.analysis.structure import deterministic_memory, linear_gaussian
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 
 

@@ -10,8 +10,8 @@ import scipy.stats as st
 
 import ssmppl.language.distributions as D
 from ssmppl.analysis.density import Missing, terms
-from ssmppl.analysis.proposals import LARGEST_EXPONENT
-from ssmppl.analysis.twisted import (
+from ssmppl.analysis.proposals.proposals import LARGEST_EXPONENT
+from ssmppl.analysis.proposals.twisted import (
     DEFENSIVE,
     Guided,
     NoiseForm,
@@ -26,7 +26,7 @@ from ssmppl.analysis.twisted import (
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import topological
-from ssmppl.language.traced import previous, seen
+from ssmppl.language.model.traced import previous, seen
 from tests.analysis.test_proposals import model_of, total, values
 
 COMPLETE = Missing(none=True)
@@ -384,7 +384,7 @@ def test_what_psi_can_be_expected_to_be(name):
 def test_moves_have_the_law_that_they_are_weighed_by(name, role, monkeypatch):
     """Affine or not: what is drawn is, by its noise, a mixture of two Gaussians, and q / f is the
     mixture's density over the standard normal one."""
-    monkeypatch.setattr("ssmppl.analysis.twisted.WRITTEN_OUT", 50)  # however many noises
+    monkeypatch.setattr("ssmppl.analysis.proposals.twisted.WRITTEN_OUT", 50)  # however many noises
     rng = np.random.default_rng(4)
     traced = AFFINE[name]() if name in AFFINE else traced_of(name)
     found, order, form = twisted(traced, COMPLETE), traced.state_symbols, form_of(traced, role)

@@ -11,7 +11,7 @@ import pickle
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
 from ssmppl.analysis.sampler import MAX_TRIES, sampler_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, to_text

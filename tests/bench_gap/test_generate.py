@@ -185,7 +185,7 @@ def test_the_verb_of_the_package_is_called_unless_another_is_given(one_set):
     script = f"""
 from pathlib import Path
 from bench.gap import records, run
-from ssmppl.gap import diagnose as module
+from ssmppl.diagnosis import diagnose as module
 from tests.bench_gap import made_up
 
 run.SETS, records.CACHE = Path({str(run.SETS)!r}), Path({str(records.CACHE)!r})

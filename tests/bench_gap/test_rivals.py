@@ -8,7 +8,7 @@ import pytest
 from bench.gap.names import ITEMS
 from bench.gap.rivals import ALPHA, Refit, aic, correlation, sparse
 from bench.gap.terms import Residuals, library
-from ssmppl.gap.catalogue import effects
+from ssmppl.diagnosis.effects.catalogue import effects
 from tests.statistics.checks import LEVEL, seed_of
 
 

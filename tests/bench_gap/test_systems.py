@@ -8,10 +8,10 @@ from bench.gap.plan import SPLIT
 from bench.gap.run import MODELS
 from bench.gap.truth import SYSTEMS
 from bench.gap.truth.forms import SLOTS, delayed, driven, lagged, play
+from ssmppl.diagnosis.effects.catalogue import effects
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.gap.catalogue import effects
+from ssmppl.language.model.traced import previous
 from ssmppl.language.trace import trace
-from ssmppl.language.traced import previous
 from ssmppl.modelfile import load_model
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.cli import main
-from ssmppl.cli.methods import CLIMBERS, SAMPLERS, method_of
+from ssmppl.cli.options import CLIMBERS, SAMPLERS, method_of
 from ssmppl.errors import ArgumentError
 from tests.cli.shared import fails, run
 

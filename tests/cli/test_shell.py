@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference import progress as progress_module
-from ssmppl.inference.progress import Progress, announced
+from ssmppl.inference.run import progress as progress_module
+from ssmppl.inference.run.progress import Progress, announced
 from tests.cli.shared import QUICK, answer, fails, interrupted_after, run
 from tests.gap.made_up import effect_found
 
@@ -181,7 +181,7 @@ def test_the_time_left_is_that_of_draws_without_what_was_compiled_before_the_fir
 
 
 PROGRESS = """
-from ssmppl.inference.progress import Progress
+from ssmppl.inference.run.progress import Progress
 with Progress(4, "drawing") as progress:
     progress.advance(2)
 """
@@ -287,11 +287,11 @@ def test_an_interrupted_diagnosis_says_what_is_kept(series, monkeypatch):
 
 
 def test_an_interrupted_evidence_says_what_it_is_made_of(series, monkeypatch):
-    monkeypatch.setattr("ssmppl.inference.evidence.sample", interrupted_after(20))
+    monkeypatch.setattr("ssmppl.inference.verbs.evidence.sample", interrupted_after(20))
     words = ("evidence", "walk.py", series, "--draws", 60, "--warmup", 30, "--seed", 1)
     assert answer(*words, code=130)["interrupted"] is True
     assert "the estimate from 10 draws of each chain" in run(*words, code=130).stderr
-    monkeypatch.setattr("ssmppl.inference.evidence.sample", interrupted_after(5))
+    monkeypatch.setattr("ssmppl.inference.verbs.evidence.sample", interrupted_after(5))
     result = run(*words, "--json", code=130)
     assert result.stdout == "", "five draws are too few to make anything of"
 
@@ -303,7 +303,7 @@ def test_an_interrupt_ends_leave_future_out(series, monkeypatch):
         calls.append(args)
         return cut(*args, **kwargs)
 
-    monkeypatch.setattr("ssmppl.inference.leave_future_out.sample", interrupted)
+    monkeypatch.setattr("ssmppl.inference.verbs.leave_future_out.sample", interrupted)
     words = ("leave-future-out", "walk.py", series, "--draws", 60, "--warmup", 30, "--seed", 1)
     result = run(*words, "--json", code=130)
     assert len(calls) == 1

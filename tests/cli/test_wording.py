@@ -3,7 +3,7 @@
 import pytest
 
 from ssmppl.cli import main
-from ssmppl.cli.wording import in_words_of
+from ssmppl.cli.group import in_words_of
 from tests.cli.shared import fails
 
 TOLD = [  # the command, the fix as Python has it, and as the command line has it

@@ -21,9 +21,9 @@ import numba
 import numpy as np
 
 from ssmppl.analysis.density import Missing
+from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.translate import Untranslatable
-from ssmppl.codegen.program import Program, compile_trace
 from ssmppl.language.trace import trace
 from tests.codegen.models import MODELS
 

@@ -7,7 +7,7 @@ moderate for all of them.
 import numpy as np
 
 import ssmppl.language.distributions as D
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 
 MODELS = {}
 

@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.translate import PLANES
-from ssmppl.codegen.program import compile_trace
 from tests.codegen.harness import PARTICLES, ROOM, STEPS, plain_module
 
 MATRIX = re.compile(r"\b(cholesky|inverse|logdet|det)\(\(")  # what is left to Numba

@@ -13,19 +13,18 @@ import pytest
 import scipy.stats as st
 
 import ssmppl.language.distributions as D
-from ssmppl.codegen import cache
-from ssmppl.codegen.kernels.random import fill_normal, fill_uniform, new_state
-from ssmppl.codegen.kits import DRAW_INITIAL, WEIGH_INITIAL
-from ssmppl.codegen.module import Layout, Section, Target
-from ssmppl.codegen.program import compile_trace
-from ssmppl.codegen.text import ModuleText
+from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform, new_state
+from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.codegen.store import folder
+from ssmppl.codegen.text.kernel_functions import DRAW_INITIAL, WEIGH_INITIAL
+from ssmppl.codegen.text.module import Layout, ModuleText, Section, Target
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.draws import Draws
-from ssmppl.language.rules import is_symmetric
+from ssmppl.language.checks.rules import is_symmetric
+from ssmppl.language.distributions.base import Draws
+from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.trace import trace
-from ssmppl.language.traced import Site, Trace, symbols
 from tests.codegen.models import declare
 from tests.language.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
 from tests.language.test_truncated import COUNTS, check_counts
@@ -58,7 +57,7 @@ class Compiled:
         section.particle_pass("weigh", "Log density.", WEIGH_INITIAL, [density])
         text = ModuleText(section.layout)
         text.add("law", section)
-        self.module = cache.load("law", text.finish(["A law."]))
+        self.module = folder.load("law", text.finish(["A law."]))
         self.section, self.states = section, len(place)
         self.index = [place[s] for s in value.ravel()]  # flat value -> row of states
         self.noise = section.normals, section.uniforms

@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ssmppl.language.distributions as D
-from ssmppl.codegen.kernels import elementary, incomplete, laws, scalars, special
-from ssmppl.codegen.kernels.flags import exact, kernel
-from ssmppl.codegen.module import Layout, Section, Target
-from ssmppl.codegen.render import CALLS, INFIX, MATRIX_CALLS, is_small_power
-from ssmppl.codegen.sums import scalar_function
+from ssmppl.codegen.kernels.math import elementary, scalars, special
+from ssmppl.codegen.kernels.math.flags import exact, kernel
+from ssmppl.codegen.text.module import Layout, Section, Target
+from ssmppl.codegen.text.render import CALLS, INFIX, MATRIX_CALLS, is_small_power
+from ssmppl.codegen.text.sums import scalar_function
 from ssmppl.expressions import evaluate as interpreter
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
@@ -28,7 +28,7 @@ from ssmppl.expressions.expr import (
     item,
     matrix_op,
 )
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.codegen.harness import plain, run_plainly
 
@@ -62,7 +62,7 @@ NAMESPACE = {
     "maximum": scalars.maximum, "abs": abs,
 }  # fmt: skip
 for _name in {*CALLS.values(), *MATRIX_CALLS.values()} - {"abs"}:
-    for _module in (elementary, special, incomplete, laws, scalars):
+    for _module in (elementary, special, special, special, scalars):
         if hasattr(_module, _name):
             NAMESPACE[_name] = getattr(_module, _name)
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.analysis.channels import channel_draws, observation_draws
 from ssmppl.analysis.density import Missing, terms
-from ssmppl.analysis.moves import bootstrap
-from ssmppl.analysis.twisted import guided, jacobian
-from ssmppl.codegen.kits import filter_kit
-from ssmppl.codegen.module import Layout
-from ssmppl.codegen.program import compile_trace
+from ssmppl.analysis.proposals.channels import channel_draws, observation_draws
+from ssmppl.analysis.proposals.proposals import bootstrap
+from ssmppl.analysis.proposals.twisted import guided, jacobian
+from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.codegen.text.kernel_functions import filter_kit
+from ssmppl.codegen.text.module import Layout
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate

@@ -7,17 +7,18 @@ import pytest
 from numba.core.errors import TypingError
 
 import ssmppl as ssm
-from ssmppl.codegen import folder, loading
-from ssmppl.codegen.kernels.calls import address_of
-from ssmppl.codegen.kernels.flags import exact
-from ssmppl.codegen.kernels.random import new_state
-from ssmppl.codegen.loading import Loaded
-from ssmppl.codegen.metropolis import numbered_filter, scored_filter
+from ssmppl.codegen.kernels.math.calls import address_of
+from ssmppl.codegen.kernels.math.flags import exact
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.modules.filter_variants import numbered_filter, scored_filter
 from ssmppl.codegen.native import build as native_build
+from ssmppl.codegen.native import loading
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.library import HOMES
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.codegen.native.translate import Untranslatable, translate
-from ssmppl.inference.problem import pose
+from ssmppl.codegen.store import folder
+from ssmppl.inference.run.problem import pose
 from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
 from tests.codegen.models import MODELS, build
@@ -86,7 +87,7 @@ def test_the_meaning_of_expressions(expression, decorator):
 
 
 def _compiled(name):
-    module = __import__(f"ssmppl.codegen.kernels.{HOMES[name]}", fromlist=[name])
+    module = __import__(f"ssmppl.codegen.kernels.math.{HOMES[name]}", fromlist=[name])
     return getattr(module, name)
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen import cache, folder
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.codegen.store import folder
 from ssmppl.language.trace import trace
 from tests.codegen.models import MODELS, build
 
@@ -89,8 +89,8 @@ def test_the_digest_knows_text_kernels_and_versions(monkeypatch):
 # -- cache on disk, always in processes of their own
 SCRIPT = """
 import numpy as np, sys
-from ssmppl.codegen.program import compile_trace
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.language.trace import trace
 from tests.codegen.models import build
 program = compile_trace(trace(build("linear_scalar")))
@@ -233,7 +233,7 @@ def test_a_folder_that_others_write_to_is_not_used(tmp_path, monkeypatch, change
     path = _planted(tmp_path / "ssmppl", text)
     change(tmp_path / "ssmppl")
     with pytest.warns(UserWarning, match=words) as caught:
-        module = cache.load("planted", text)
+        module = folder.load("planted", text)
     assert "SSMPPL_CACHE" in str(caught[0].message)
     assert module.x == 1
     assert tmp_path not in Path(module.__file__).parents

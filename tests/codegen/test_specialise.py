@@ -3,8 +3,8 @@
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from ssmppl.codegen import specialise as module
-from ssmppl.codegen.specialise import specialise
+from ssmppl.codegen.text.module import specialise as module
+from ssmppl.codegen.text.specialise import specialise
 
 NONE, SOME = 0, 1
 

@@ -7,8 +7,8 @@ import pytest
 from llvmlite import binding
 
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen.kernels.random import new_state
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.language.trace import trace
 from tests.codegen.models import build
 

@@ -5,7 +5,7 @@ import io
 import numba
 import pytest
 
-from ssmppl.codegen import waiting
+from ssmppl.codegen.native import loading
 
 
 class Screen(io.StringIO):
@@ -26,29 +26,29 @@ def told(monkeypatch):
     """Makes a listener of its own, and returns what compilations write to stderr with it."""
 
     def run(terminal, silent, compilations=2):
-        screen, notice = Screen(terminal), waiting.Notice()
+        screen, notice = Screen(terminal), loading.Notice()
         monkeypatch.setattr("sys.stderr", screen)
-        monkeypatch.setattr(waiting, "SILENT_SECONDS", silent)
-        monkeypatch.setattr(waiting.notice, "told", True)
-        waiting.event.register("numba:compile", notice)
+        monkeypatch.setattr(loading, "SILENT_SECONDS", silent)
+        monkeypatch.setattr(loading.notice, "told", True)
+        loading.event.register("numba:compile", notice)
         try:
             for _ in range(compilations):
                 compile_something()
         finally:
-            waiting.event.unregister("numba:compile", notice)
+            loading.event.unregister("numba:compile", notice)
         return screen.getvalue()
 
     return run
 
 
 def test_a_terminal_is_told_once(told):
-    assert told(True, 0.0) == waiting.TEXT + "\n"
+    assert told(True, 0.0) == loading.TEXT + "\n"
 
 
 def test_short_compilations_add_up(told):
     compile_something()  # without what Numba loads for its first one
     assert told(True, 1e9) == ""
-    assert told(True, 0.05, compilations=12) == waiting.TEXT + "\n"
+    assert told(True, 0.05, compilations=12) == loading.TEXT + "\n"
 
 
 def test_what_is_no_terminal_is_told_nothing(told):
@@ -56,4 +56,4 @@ def test_what_is_no_terminal_is_told_nothing(told):
 
 
 def test_the_package_listens():
-    assert waiting.notice in waiting.event._registered["numba:compile"]
+    assert loading.notice in loading.event._registered["numba:compile"]

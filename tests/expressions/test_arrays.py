@@ -13,7 +13,7 @@ from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.expressions.instead import INSTEAD
+from ssmppl.expressions.numpy_protocols import INSTEAD
 
 NAMES = {"x": (), "y": (), "k": (), "v": (3,), "w": (3,), "A": (3, 3), "S": (3, 3), "B": (2, 3)}
 C = np.array([[1.0, 0.5, -1.0], [0.25, 2.0, 0.0], [0.0, 1.0, 3.0]])

@@ -6,7 +6,7 @@ import scipy.stats as st
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from ssmppl.codegen.kernels import scalars
+from ssmppl.codegen.kernels.math import scalars
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import MEANING, evaluate, numpy_draws
 from ssmppl.expressions.expr import MATRIX_OPS, OPS, Expr, apply, constant, symbol

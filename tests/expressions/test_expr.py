@@ -27,9 +27,9 @@ from ssmppl.expressions.expr import (
     substitute,
     symbol,
     symbols_of,
+    to_text,
     topological,
 )
-from ssmppl.expressions.text import to_text
 
 X, Y = symbol("state", "x"), symbol("state", "y")
 V = array([X, Y, 3.0])

@@ -10,7 +10,7 @@ from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.expressions.protocols import _COMPOSED, _DIRECT, _RENAMED, FUNCTIONS, STRUCTURAL
+from ssmppl.expressions.numpy_protocols import _COMPOSED, _DIRECT, _RENAMED, FUNCTIONS, STRUCTURAL
 
 RNG = np.random.default_rng(7)
 NUMBERS = {

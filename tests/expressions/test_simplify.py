@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, apply, constant, symbol
-from ssmppl.expressions.simplify import RULES
+from ssmppl.expressions.expr import RULES, Expr, apply, constant, symbol
 
 X, Y = symbol("state", "x"), symbol("state", "y")
 AT = {X: np.array([0.7, 1.3, 2.9]), Y: np.array([1.9, 0.4, 0.8])}

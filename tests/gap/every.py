@@ -15,15 +15,15 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import linear_gaussian
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.basis import lifted
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.initial_law import needs_start
+from ssmppl.diagnosis.model.score_columns import score_columns
+from ssmppl.diagnosis.screening.screen import with_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.gap.augment import augment
-from ssmppl.gap.basis import lifted
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.columns import score_columns
-from ssmppl.gap.screen import with_parameters
-from ssmppl.gap.started import needs_start
 from ssmppl.language.trace import trace
 from ssmppl.modelfile import load_model
 from tests.gap import harness

@@ -4,8 +4,8 @@ import functools
 
 import numpy as np
 
+from ssmppl.diagnosis.model.candidates import Scales, offers
 from ssmppl.expressions.arrays import array
-from ssmppl.gap.candidates import Scales, offers
 from ssmppl.language.distributions import Truncated
 from ssmppl.language.trace import trace
 from tests.analysis import corpus

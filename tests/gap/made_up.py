@@ -6,7 +6,8 @@ import dataclasses
 import numpy as np
 import pandas as pd
 
-from ssmppl.gap.report import GapReport, tabulate
+from ssmppl.diagnosis.report.findings import tabulate
+from ssmppl.diagnosis.report.report import GapReport
 
 NAN = float("nan")
 

@@ -11,12 +11,12 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.data import bind
+from ssmppl.diagnosis.model.smoothing import FEWEST, HORIZONS, crps, crps_ahead, mean_scores
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.ahead import FEWEST, HORIZONS, crps, crps_ahead, mean_scores
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.simulation import feeds_back
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.verbs.simulate import feeds_back
 from ssmppl.language.trace import trace
 from tests.statistics.checks import LEVEL, seed_of
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.gap import answer, diagnose, tables
-from ssmppl.gap.answer import _curves_beat
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.closed import Gain, closed
-from ssmppl.gap.numerals import interval
-from ssmppl.gap.share import interval_of
-from ssmppl.gap.words import headline
+from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, closed, interval_of
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.report import answer, tables
+from ssmppl.diagnosis.report.answer import _curves_beat
+from ssmppl.diagnosis.report.words import headline
+from ssmppl.drawing.numerals import interval
 from ssmppl.language.trace import trace
 from tests.gap import models
 from tests.gap.harness import scales

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ssmppl.data import bind
-from ssmppl.gap.apart import LEVELS, MOST_VARIED, separating, simple_inputs
+from ssmppl.diagnosis.selection.equivalence import LEVELS, MOST_VARIED, separating, simple_inputs
 from ssmppl.language.trace import trace
 from tests.gap.small import level, levels
 

@@ -6,22 +6,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ssmppl.gap import attribute as module
-from ssmppl.gap import catalogue_sensor as ssm_effects
-from ssmppl.gap import diagnose as diagnosis
-from ssmppl.gap import refit as refits_of
-from ssmppl.gap.attribute import Attribution, _rebase, attribute
-from ssmppl.gap.byrefit import gain_p
-from ssmppl.gap.candidate import Candidate
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.familywise import familywise, tail_p
-from ssmppl.gap.refit import Refit, asleep, best_of_groups, delays, leading, mates
-from ssmppl.gap.scales import Scale, Scales
-from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.workshop import Workshop
-from ssmppl.inference.particles.filtering import seed_sequence
-from ssmppl.inference.problem import missing_of, pose
+from ssmppl.diagnosis import diagnose as diagnosis
+from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.model.scales import Scale, Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.familywise import familywise, tail_p
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.selection import attribution as module
+from ssmppl.diagnosis.selection import refit as refits_of
+from ssmppl.diagnosis.selection.attribution import Attribution, _rebase, attribute
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.refit import Refit, asleep, best_of_groups, delays, leading, mates
+from ssmppl.diagnosis.selection.refit_test import gain_p
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import seed_sequence
 from tests.gap.small import level, levels
 from tests.statistics.checks import seed_of
 

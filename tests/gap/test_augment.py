@@ -11,16 +11,16 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.score import CompleteScore
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.diagnosis.effects.effect import Auxiliary, effect
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.changed_laws import NORMAL, heavier, noise_free, scaled, shifted
+from ssmppl.diagnosis.report.model_file import to_model
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbol, symbols_of
-from ssmppl.gap.augment import augment
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.effect import Auxiliary, effect
-from ssmppl.gap.laws import NORMAL, heavier, noise_free, scaled, shifted
-from ssmppl.gap.writing import to_model
 from ssmppl.language.trace import trace
 from tests.gap import models
 from tests.gap.harness import EVERY, content, nodes, offered, scales, traced

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.basis import basis
+from ssmppl.diagnosis.model.binding import bind
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.equations import Anatomy, Augmented, as_it_was
+from ssmppl.diagnosis.model.initial_law import Start
 from ssmppl.errors import ArgumentError, ModelError
-from ssmppl.gap.anatomy import Anatomy
-from ssmppl.gap.augment import augment
-from ssmppl.gap.augmented import Augmented, as_it_was
-from ssmppl.gap.basis import basis
-from ssmppl.gap.binding import bind
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.started import Start
 from ssmppl.language.distributions import Normal
 from ssmppl.language.trace import trace
 from tests.gap.every import candidates, different, traced

@@ -7,10 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
+from ssmppl.diagnosis.model.basis import bases
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.gap.bases import bases
 from tests.statistics.checks import seed_of
 
 X = np.random.default_rng(seed_of("bases")).gamma(3.0, 2.0, (200, 7))

@@ -5,16 +5,17 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.gap import reference, tables
-from ssmppl.gap.augment import augment
-from ssmppl.gap.basis import CURVES, REACH, TURNS, basis, lifted
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.reference import signal
-from ssmppl.gap.scales import Scales
-from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.smoothing import Settings
-from ssmppl.inference.particles.filtering import seed_sequence
-from ssmppl.inference.problem import missing_of, pose
+from ssmppl.diagnosis.heldout import reference
+from ssmppl.diagnosis.heldout.reference import signal
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.basis import CURVES, REACH, TURNS, basis, lifted
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.report import tables
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import seed_sequence
 from tests.statistics.checks import seed_of
 
 STEPS = 120

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.gap.bounds import COST, bounded, note
-from ssmppl.gap.fit import Fitter
-from ssmppl.gap.refit import standard_errors
-from ssmppl.gap.smoothing import Settings
-from ssmppl.inference.particles.filtering import seed_sequence
-from ssmppl.inference.problem import pose
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.selection.fit import COST, Fitter, bounded, note
+from ssmppl.diagnosis.selection.refit import standard_errors
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import seed_sequence
 from tests.gap.small import level
 from tests.statistics.checks import seed_of
 

@@ -5,9 +5,9 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.data import bind
+from ssmppl.diagnosis.effects.catalogue import effects
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, digests
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.catalogue import effects
-from ssmppl.gap.checkpoint import Checkpoint, digests
 from ssmppl.language.trace import trace
 from tests.gap.small import level, levels
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.errors import ArgumentError
-from ssmppl.gap.classes import (
+from ssmppl.diagnosis.selection.equivalence import (
     NATS_APART,
     classes,
     confidence_set,
@@ -17,6 +16,7 @@ from ssmppl.gap.classes import (
     separating_input,
     told_apart,
 )
+from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
 
 

@@ -9,8 +9,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl import cli
+from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.errors import DataError
-from ssmppl.gap.report import tabulate
 from tests.cli.shared import SEPARATE
 from tests.gap.made_up import effect_found
 

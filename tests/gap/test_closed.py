@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
+from ssmppl.diagnosis.heldout.gain_ratio import Fieller, block_length, closed, fieller
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.closed import Fieller, block_length, closed, fieller
 from tests.statistics.checks import LEVEL, seed_of
 
 

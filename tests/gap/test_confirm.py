@@ -8,13 +8,20 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
+from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.heldout.parts import three_parts, without
+from ssmppl.diagnosis.heldout.predictions import (
+    FreeRun,
+    Predictions,
+    gain_of_mean,
+    predict,
+    rmse,
+    stretches,
+)
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import SamplingError
-from ssmppl.gap import diagnose
-from ssmppl.gap.confirm import FreeRun, Predictions, gain_of_mean, predict, rmse, stretches
-from ssmppl.gap.fit import Fitter
-from ssmppl.gap.parts import three_parts, without
-from ssmppl.gap.smoothing import Settings
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 from tests.gap.small import level, levels
 from tests.statistics.checks import seed_of
 

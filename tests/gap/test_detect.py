@@ -7,14 +7,14 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
-from ssmppl.errors import ArgumentError
-from ssmppl.gap.detect import (
+from ssmppl.diagnosis.screening.detection import (
     LONG,
     Statistics,
     detection,
     normal_scores,
     statistics,
 )
+from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
 
 

@@ -8,9 +8,12 @@ import pytest
 
 import ssmppl as ssm
 import ssmppl.datasets
+from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.heldout import crossfit
+from ssmppl.diagnosis.run.expected_time import Timed, in_words, seconds
+from ssmppl.diagnosis.screening import screen
+from ssmppl.diagnosis.selection import attribution, refit
 from ssmppl.errors import ArgumentError, DataError
-from ssmppl.gap import attribute, crossfit, diagnose, refit, screen
-from ssmppl.gap.expected import Timed, in_words, seconds
 from tests.gap import models
 from tests.gap.small import BREAK, DATE, level, levels
 
@@ -119,7 +122,7 @@ def test_an_interrupt_keeps_the_stages_that_are_done(jump, tmp_path, monkeypatch
 
 def _only_later(patch):
     """`Question.statistics`, forbidden until the refits have begun."""
-    begun, original, attributed = [], screen.Question.statistics, attribute.attribute
+    begun, original, attributed = [], screen.Question.statistics, attribution.attribute
 
     def statistics(self, *args, **kwargs):
         assert begun, "a simulated set of the first screen was drawn again"

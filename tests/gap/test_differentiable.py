@@ -7,13 +7,13 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.analysis.density import Missing
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.differentiable import check_differentiable
+from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.errors import ModelError
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import symbol
-from ssmppl.gap.augment import augment
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.columns import score_columns
-from ssmppl.gap.differentiable import check_differentiable
 from ssmppl.language.trace import trace
 from tests.gap.every import MODELS, candidates, traced
 from tests.gap.harness import scales

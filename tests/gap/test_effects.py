@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.effects.catalogue import effects
+from ssmppl.diagnosis.effects.effect import Auxiliary, effect, sds
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.candidates import Scale, Scales, offers
+from ssmppl.diagnosis.model.changed_laws import has_scale
+from ssmppl.diagnosis.model.equations import Anatomy, time_symbol
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, symbols_of
-from ssmppl.gap.anatomy import Anatomy, time_symbol
-from ssmppl.gap.augment import augment
-from ssmppl.gap.candidates import Scale, Scales, offers
-from ssmppl.gap.catalogue import effects
-from ssmppl.gap.effect import Auxiliary, effect, sds
-from ssmppl.gap.laws import has_scale
 from ssmppl.language.trace import trace
 from tests.gap.harness import EVERY, offered, scales, traced
 

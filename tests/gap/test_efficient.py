@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.errors import ArgumentError
-from ssmppl.gap.efficient import (
+from ssmppl.diagnosis.screening.efficient_score import (
     CONSTANT,
     DROWNED,
     TAKEN,
@@ -17,6 +16,7 @@ from ssmppl.gap.efficient import (
     normal_score,
     regress,
 )
+from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
 
 K, P = 6, 4

@@ -9,8 +9,8 @@ import inspect
 
 import pytest
 
-from ssmppl.gap import binding
-from ssmppl.gap.augment import augment
+from ssmppl.diagnosis.model import binding
+from ssmppl.diagnosis.model.augment import augment
 from tests.gap.every import (
     MODELS,
     analysed,

@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.heldout import crossfit
+from ssmppl.diagnosis.model import candidates
+from ssmppl.diagnosis.report import panels, tables
+from ssmppl.diagnosis.report.findings import VERDICTS
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.run.failures import FAULT, Failures, Tolerant, reason_of
+from ssmppl.diagnosis.screening import screen
+from ssmppl.diagnosis.selection import attribution, refit
 from ssmppl.errors import ExecutorError, SSMError
-from ssmppl.gap import attribute, candidates, crossfit, diagnose, refit, screen, tables
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.failures import FAULT, Failures, Tolerant, reason_of
-from ssmppl.gap.report import VERDICTS
-from ssmppl.plots import panels
 from tests.gap.made_up import effect_found
 from tests.gap.small import BREAK, level, levels
 
@@ -110,7 +114,11 @@ FAST = [
     (tables, "causes_table", "the table 'causes'"),
     (tables, "classes_table", "the table 'classes'"),
     (tables, "map_table", "the table 'residual_map'"),
-    (importlib.import_module("ssmppl.gap.answer"), "_detection", "the table 'detection'"),
+    (
+        importlib.import_module("ssmppl.diagnosis.report.answer"),
+        "_detection",
+        "the table 'detection'",
+    ),
     (diagnose, "timed", "the time that is expected"),
     (screen, "basis", "the basis of smooth functions"),
 ]
@@ -169,11 +177,11 @@ def test_without_a_fit_the_error_is_one_of_ours(monkeypatch):
 
 
 FULL = [
-    (attribute, "refit_all", "refitting"),
-    (attribute, "shaped_all", "estimating shapes"),
-    (attribute, "_best_pair", "pairs of effects"),
-    (attribute, "_forward", "whether a second effect is missing"),
-    (attribute, "_by_refit", "the test of what a refit gains"),
+    (attribution, "refit_all", "refitting"),
+    (attribution, "shaped_all", "estimating shapes"),
+    (attribution, "_best_pair", "pairs of effects"),
+    (attribution, "_forward", "whether a second effect is missing"),
+    (attribution, "_by_refit", "the test of what a refit gains"),
     (refit, "refit", "the refit with level break in x with date = 31"),
     (crossfit.CrossFit, "how_far", "how far the gap closes"),
     (crossfit.CrossFit, "_one", "block 1 of 5"),
@@ -195,14 +203,14 @@ def test_a_stage_of_full_mode_that_fails_is_left_out(monkeypatch, module, name, 
 
 @pytest.mark.slow
 def test_an_interrupt_ends_the_run(monkeypatch):
-    broken(monkeypatch, attribute, "shaped_all", KeyboardInterrupt())
+    broken(monkeypatch, attribution, "shaped_all", KeyboardInterrupt())
     assert run(mode="full").interrupted
 
 
 # -- what is drawn and written
 def test_a_panel_that_fails_is_left_out(monkeypatch, tmp_path):
     report = dataclasses.replace(effect_found(), failures=Failures())
-    figure = importlib.import_module("ssmppl.plots.figure")
+    figure = importlib.import_module("ssmppl.diagnosis.report.panels")
     broken(monkeypatch, figure, "ranked_effects", ZeroDivisionError())
     page = report.save(tmp_path)
     assert report.left_out["part"].tolist() == ["the panel 'ranked_effects'"]
@@ -214,7 +222,7 @@ def test_a_panel_that_fails_is_left_out(monkeypatch, tmp_path):
 
 
 def test_tables_of_the_page_that_fail_are_left_out(monkeypatch):
-    module = importlib.import_module("ssmppl.plots.page")
+    module = importlib.import_module("ssmppl.diagnosis.report.page")
     report = dataclasses.replace(effect_found(), failures=Failures())
     broken(monkeypatch, module, "_cell", ZeroDivisionError())
     text = module.page(report)

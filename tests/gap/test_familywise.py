@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
+from ssmppl.diagnosis.screening.efficient_score import Null, efficient, regress
+from ssmppl.diagnosis.screening.familywise import Scale, familywise, heights, tail_p, threshold
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.efficient import Null, efficient, regress
-from ssmppl.gap.familywise import Scale, familywise, heights, tail_p, threshold
 from tests.statistics.checks import LEVEL, seed_of
 
 

@@ -5,13 +5,13 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import NotApplicable
-from ssmppl.gap.fit import Fitter
-from ssmppl.gap.smoothing import Settings
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.gap import models
 from tests.gap.small import level, levels
 from tests.statistics.checks import LEVEL, seed_of, some

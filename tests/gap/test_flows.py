@@ -5,13 +5,12 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.analysis.density import Missing
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.equations import Anatomy, carried, flows
+from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.gap.anatomy import Anatomy
-from ssmppl.gap.augment import augment
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.columns import score_columns
-from ssmppl.gap.flows import carried, flows
 from ssmppl.language.trace import trace
 from tests.gap.harness import scales, traced
 

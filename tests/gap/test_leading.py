@@ -7,24 +7,22 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.gap import tables
-from ssmppl.gap.answer import Results, answer, labels
-from ssmppl.gap.attribute import Attribution
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.closed import Gain
-from ssmppl.gap.naming import leaders
-from ssmppl.gap.parts import GAP, head, three_parts
-from ssmppl.gap.printed import cause_rows
-from ssmppl.gap.refit import refit, refit_all
-from ssmppl.gap.scales import Scales
-from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.share import HowFar
-from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.words import headline, how_far, how_sure, which
-from ssmppl.gap.workshop import Workshop
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.problem import missing_of, pose
-from ssmppl.plots.panels import bars, ranked_effects
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, HowFar
+from ssmppl.diagnosis.heldout.parts import GAP, head, three_parts
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.report import tables
+from ssmppl.diagnosis.report.answer import Results, answer, labels
+from ssmppl.diagnosis.report.panels import bars, ranked_effects
+from ssmppl.diagnosis.report.text import cause_rows
+from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, which
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.selection.attribution import Attribution
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.refit import refit, refit_all
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.gap.made_up import effect_found, fast
 from tests.statistics.checks import seed_of
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ssmppl.diagnosis.model.basis import bases
+from ssmppl.diagnosis.screening.location import curve, group_score, localise, regions
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.bases import bases
-from ssmppl.gap.localise import curve, group_score, localise, regions
 from tests.statistics.checks import LEVEL, seed_of
 
 B, P = 200, 5

@@ -17,8 +17,9 @@ import pytest
 from PIL import Image
 
 import ssmppl.plots as plots
+from ssmppl.diagnosis.report.findings import COLUMNS, tabulate
+from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.report import COLUMNS, GapReport, tabulate
 from tests.gap.made_up import ALL, MODEL_TEXT, effect_found, fast, no_gap, several
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")

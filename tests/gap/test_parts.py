@@ -6,11 +6,11 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.data import bind
-from ssmppl.gap.parts import FOLDS, GAP, folds, long_enough, three_parts, without
-from ssmppl.gap.simulator import Simulator
+from ssmppl.diagnosis.heldout.parts import FOLDS, GAP, folds, long_enough, three_parts, without
+from ssmppl.diagnosis.model.smoothing import Simulator
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.trace import trace
 from tests.gap import models
 from tests.gap.small import level, levels

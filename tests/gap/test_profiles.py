@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.profiles import (
+from ssmppl.diagnosis.effects.candidate import (
     ALL_DATES,
     DATES,
     PHASES,
@@ -17,6 +16,7 @@ from ssmppl.gap.profiles import (
     periods,
     sharpened,
 )
+from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.language.trace import trace
 from tests.gap.harness import scales
 from tests.gap.small import level

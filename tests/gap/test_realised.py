@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssmppl.gap.efficient import Null, efficient
-from ssmppl.gap.familywise import tail_p
-from ssmppl.gap.realised import FREE, excess, typical
+from ssmppl.diagnosis.screening.efficient_score import Null, efficient
+from ssmppl.diagnosis.screening.familywise import tail_p
+from ssmppl.diagnosis.screening.statistics import FREE, excess, typical
 from tests.statistics.checks import seed_of
 
 ROWS = 200

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.gap import reference
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.fit import Fitter
-from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.workshop import Workshop
-from ssmppl.inference.particles.filtering import seed_sequence
+from ssmppl.diagnosis.heldout import reference
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.fit import Fitter
+from ssmppl.inference.run.seeds import seed_sequence
 from tests.gap.test_basis import THETA, asked, simulated
 
 FIXED = {n: np.asarray(v) for n, v in THETA.items() if n != "phi"}

@@ -10,12 +10,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmppl.diagnosis.report import report as module
+from ssmppl.diagnosis.report.findings import COLUMNS, MODES, VERDICTS, tabulate
+from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.diagnosis.report.words import (
+    alternatives,
+    class_letters,
+    headline,
+    how_far,
+    label,
+    leaders,
+    listed,
+    next_steps,
+    sentence,
+    untold,
+    where,
+    which,
+)
+from ssmppl.drawing.numerals import DASH, interval, number, p_text, percent, span, with_error
 from ssmppl.errors import ArgumentError
-from ssmppl.gap import report as module
-from ssmppl.gap.naming import alternatives, class_letters, label, leaders, listed, sentence
-from ssmppl.gap.numerals import DASH, interval, number, p_text, percent, span, with_error
-from ssmppl.gap.report import COLUMNS, MODES, VERDICTS, GapReport, tabulate
-from ssmppl.gap.words import headline, how_far, next_steps, untold, where, which
 from tests.gap.made_up import ALL, NAN, effect_found, fast, no_gap, none_of_these, several
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.effect import means, quantiles, sds, sizes
-from ssmppl.gap.scales import DIGITS, LEVELS, Scale, Scales, value_of
+from ssmppl.diagnosis.effects.effect import means, quantiles, sds, sizes
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.scales import DIGITS, LEVELS, Scale, Scales, value_of
 from ssmppl.language.trace import trace
 from tests.gap.small import level
 from tests.statistics.checks import seed_of

@@ -6,15 +6,14 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.data import bind, check_parameters
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.smoothing import Settings, Simulator
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.fit import Fitter
-from ssmppl.gap.scales import Scales
-from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.simulator import Simulator
-from ssmppl.gap.smoothing import Settings
-from ssmppl.inference.particles.filtering import seed_sequence
-from ssmppl.inference.problem import missing_of, pose
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import seed_sequence
 from tests.gap.small import BREAK, DATE, level, levels
 from tests.statistics.checks import LEVEL, seed_of
 

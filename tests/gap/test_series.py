@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ssmppl.diagnosis.screening import statistics
 from ssmppl.errors import ArgumentError
-from ssmppl.gap import series
 from tests.statistics.checks import seed_of
 
 STARTS = (0, 17, 40)
@@ -33,22 +33,22 @@ def test_quadratic_forms_against_their_kernels(scores, starts):
     def form(kernel):
         return 0.5 * np.einsum("btk,ts,bsk->bk", scores, kernel * same, scores)
 
-    walk = series.random_walk(scores, starts)
+    walk = statistics.random_walk(scores, starts)
     np.testing.assert_allclose(walk, form(np.minimum.outer(time, time)))
     rho = [0.0, 0.5, 0.95, -0.4]
-    found = series.autoregressive(scores, rho, starts)
+    found = statistics.autoregressive(scores, rho, starts)
     for i, r in enumerate(rho):
         np.testing.assert_allclose(found[..., i], form(np.power(r, apart.astype(float))))
 
 
 def test_one_set_at_a_time_gives_the_same(scores):
-    np.testing.assert_allclose(series.random_walk(scores[1], STARTS),
-                               series.random_walk(scores, STARTS)[1])  # fmt: skip
-    np.testing.assert_allclose(series.autoregressive(scores[1], [0.8], STARTS),
-                               series.autoregressive(scores, [0.8], STARTS)[1])  # fmt: skip
+    np.testing.assert_allclose(statistics.random_walk(scores[1], STARTS),
+                               statistics.random_walk(scores, STARTS)[1])  # fmt: skip
+    np.testing.assert_allclose(statistics.autoregressive(scores[1], [0.8], STARTS),
+                               statistics.autoregressive(scores, [0.8], STARTS)[1])  # fmt: skip
 
 
 @pytest.mark.parametrize("starts", [(1,), (0, 60), (0, 5, 5), ()])
 def test_starts_that_make_no_experiments(scores, starts):
     with pytest.raises(ArgumentError, match="experiments that start at rows"):
-        series.random_walk(scores, starts)
+        statistics.random_walk(scores, starts)

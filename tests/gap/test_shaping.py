@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.gap import shaping
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.refit import Refit
-from ssmppl.gap.shaping import PRICE, shape_bounds, shaped_all
-from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.workshop import Workshop, share_of
-from ssmppl.inference.particles.filtering import seed_sequence
-from ssmppl.inference.problem import missing_of, pose
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.selection import shapes
+from ssmppl.diagnosis.selection.augmented_models import Workshop, share_of
+from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.shapes import PRICE, shape_bounds, shaped_all
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import seed_sequence
 from tests.gap import models
 from tests.gap.harness import scales, traced
 
@@ -162,7 +162,7 @@ def test_an_estimate_that_runs_to_its_bound_is_none(forced, monkeypatch):
     own = bounds(c)
     for low, kept in ((34.5, True), (31.0, False)):
         limits = own | {"period": (low, 37.5)}
-        monkeypatch.setattr(shaping, "shape_bounds", lambda *_, limits=limits: limits)
+        monkeypatch.setattr(shapes, "shape_bounds", lambda *_, limits=limits: limits)
         (new,) = shapes_of(forced)
         assert (new is found) == kept
 

@@ -8,23 +8,23 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.data import bind, check_parameters
-from ssmppl.errors import NotApplicable
-from ssmppl.gap.columns import score_columns
-from ssmppl.gap.confirm import stretches
-from ssmppl.gap.fit import Fitter
-from ssmppl.gap.simulator import Simulator
-from ssmppl.gap.smoothing import (
+from ssmppl.diagnosis.heldout.predictions import stretches
+from ssmppl.diagnosis.model.score_columns import score_columns
+from ssmppl.diagnosis.model.smoothing import (
     PREDICTIVE,
     Settings,
+    Simulator,
     Smoother,
     probability_transforms,
 )
-from ssmppl.gap.workshop import proposal_of
+from ssmppl.diagnosis.selection.augmented_models import proposal_of
+from ssmppl.diagnosis.selection.fit import Fitter
+from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import KalmanModel
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.trace import trace
 from tests.gap.models import THETA, build, simulated
 from tests.statistics.checks import LEVEL, seed_of, some

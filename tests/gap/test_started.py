@@ -8,19 +8,19 @@ import pytest
 from scipy.stats import norm
 
 import ssmppl as ssm
-from ssmppl.gap.answer import _written
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.checkpoint import Checkpoint
-from ssmppl.gap.confirm import predict
-from ssmppl.gap.refit import refit_all
-from ssmppl.gap.scales import Scales
-from ssmppl.gap.screen import Question, ask
-from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.started import FirstStates, Start, needs_start, start_of
-from ssmppl.gap.workshop import Workshop
+from ssmppl.diagnosis.heldout.predictions import predict
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.initial_law import FirstStates, Start, needs_start, start_of
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.report.answer import _written
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.refit import refit_all
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.statistics.checks import seed_of
 
 VALUES = {"q": 0.2, "r": 0.1, "a": 0.9, "b": 0.5}

@@ -5,16 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ssmppl.gap.candidate import Candidate
-from ssmppl.gap.catalogue_motion import (
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.effects.catalogue_motion import (
     level_break,
     periodic_forcing,
     quadratic_drag,
     random_walk_load,
 )
-from ssmppl.gap.localise import localise
-from ssmppl.gap.numerals import label, span
-from ssmppl.gap.tables import _experiments, _when, causes_table, shared, where_table
+from ssmppl.diagnosis.report.tables import _experiments, _when, causes_table, shared, where_table
+from ssmppl.diagnosis.screening.location import localise
+from ssmppl.drawing.numerals import label, span
 from tests.statistics.checks import seed_of
 
 DRAG = Candidate(quadratic_drag, "v", strength="drag")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ssmppl.diagnosis.screening.location import bin_edges, binned, group_score, when
 from ssmppl.errors import ArgumentError
-from ssmppl.gap.localise import group_score
-from ssmppl.gap.when import bin_edges, binned, when
 from tests.statistics.checks import LEVEL, seed_of
 
 B, P, J, D = 200, 4, 20, 4

@@ -14,9 +14,12 @@ import pandas as pd
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.heldout import crossfit, predictions
+from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.diagnosis.screening import screen
+from ssmppl.diagnosis.selection import attribution, fit, refit_test
 from ssmppl.errors import SSMError
-from ssmppl.gap import attribute, byrefit, confirm, crossfit, diagnose, fit, screen
-from ssmppl.gap.report import GapReport
 from ssmppl.language.distributions import Flat, HalfFlat
 from ssmppl.modelfile import load_model, read_csv
 from tests.analysis import corpus
@@ -43,13 +46,13 @@ def few(patch, where, name):
     patch.setattr(diagnose, "SETS", {"fast": sets, "full": sets})
     patch.setattr(screen, "OWN_RUNS", 2)
     patch.setattr(screen, "FEWEST", sets // 2)
-    patch.setattr(attribute, "AGAIN", sets)
-    patch.setattr(byrefit, "SETS", 3)
+    patch.setattr(attribution, "AGAIN", sets)
+    patch.setattr(refit_test, "SETS", 3)
     patch.setattr(fit, "INFORMATION_SETS", 6)
     patch.setattr(fit, "PILOT_PARTICLES", PARTICLES)
     patch.setattr(crossfit, "SETS", sets)
     patch.setattr(crossfit, "SINGLES", 1)
-    patch.setattr(confirm, "FREE_RUNS", 10)
+    patch.setattr(predictions, "FREE_RUNS", 10)
     for module in (diagnose, crossfit):
         patch.setattr(module, "FOLDS", BLOCKS)
 

@@ -3,10 +3,10 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-from ssmppl.gap.candidates import offers
-from ssmppl.gap.smoothing import Settings
-from ssmppl.gap.workshop import Workshop
-from ssmppl.inference.problem import missing_of, pose
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.inference.run.problem import missing_of, pose
 from tests.gap import models
 from tests.gap.harness import scales
 

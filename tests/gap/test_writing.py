@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.changed_laws import substituted
+from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.expr import symbol
-from ssmppl.gap.augment import augment
-from ssmppl.gap.laws import substituted
-from ssmppl.gap.writing import model_text, to_model
 from ssmppl.language.trace import trace
 from ssmppl.modelfile import load_model
 from tests.gap.harness import EVERY, differences, offered, traced
@@ -229,8 +229,8 @@ def test_a_primitive_of_a_loose_file_is_found_by_its_folder(tmp_path, name):
     assert ("import rub" in model_text(t)) == (name == "loose_friction")
     assert f"sys.path.append({str(tmp_path)!r})" in model_text(t)
     assert model_text(trace(to_model(t))) == model_text(t)
-    (tmp_path / "written.py").write_text(model_text(t))
-    again = trace(load_model(str(tmp_path / "written.py")))
+    (tmp_path / "language/distributions/from_density.py").write_text(model_text(t))
+    again = trace(load_model(str(tmp_path / "language/distributions/from_density.py")))
     assert model_text(again) == model_text(t)
 
 
@@ -249,7 +249,7 @@ def test_a_file_that_cannot_be_imported_is_refused(tmp_path):
 def test_a_script_does_not_run_again(tmp_path):
     """Its import ran the whole of it, a diagnosis at its end included."""
     (tmp_path / "script.py").write_text(
-        "import ssmppl as ssm\nfrom ssmppl.gap.writing import to_model\n"
+        "import ssmppl as ssm\nfrom ssmppl.diagnosis.report.model_file import to_model\n"
         "from ssmppl.language.trace import trace\n\n"
         "print('begun')\n\n@ssm.primitive\ndef rub(v):\n    return -0.5 * v\n\n"
         'model = ssm.Model("loose")\n'

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 import ssmppl as ssm
-from ssmppl.inference import runner
 from ssmppl.inference.checkpoints import archive
 from ssmppl.inference.checkpoints import chains as checkpoints
+from ssmppl.inference.run import chain_runner
 
 pair = ssm.Model("pair", inputs=("u",))
 
@@ -100,7 +100,7 @@ def main() -> None:
         time.sleep(0.01)
 
     checkpoints.SECONDS, checkpoints.SHARE, checkpoints.write = -1.0, 1e9, write_slowly
-    runner.BLOCK_SECONDS, runner.TIMES_SENDING = 1e-9, 0
+    chain_runner.BLOCK_SECONDS, chain_runner.TIMES_SENDING = 1e-9, 0
     folder = Path(sys.argv[1])
     for name in sys.argv[2:]:
         found = bits(call(name, folder / f"{name}.npz"))

@@ -13,14 +13,14 @@ import sys
 
 import numpy as np
 
-from ssmppl.codegen.kernels.random import fill_normal, fill_uniform
-from ssmppl.codegen.kernels.tiles import STREAM_BITS
-from ssmppl.codegen.kits import filter_kit
-from ssmppl.codegen.module import Layout
+from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
+from ssmppl.codegen.kernels.particle.cuda_filter import STREAM_BITS
+from ssmppl.codegen.text.kernel_functions import filter_kit
+from ssmppl.codegen.text.module import Layout
 from ssmppl.data import unpack_observations
-from ssmppl.inference.particles.filtering import random_state
 from ssmppl.inference.particles.on_device import random_numbers, run_on_device
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
 from tests.codegen.models import build

@@ -10,7 +10,7 @@ import numpy as np
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 from ssmppl.language.trace import trace
 
 # --- AR(2) in companion form: noisy laws with parameters, a deterministic state without ----------

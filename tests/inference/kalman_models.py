@@ -7,7 +7,7 @@ import ssmppl.language.distributions as D
 from ssmppl.data import bind, check_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import numbers
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 
 

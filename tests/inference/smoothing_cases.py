@@ -9,7 +9,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 from tests.statistics import models
 from tests.statistics.checks import seed_of
 from tests.statistics.exact import DenseGaussian

@@ -17,13 +17,9 @@ from ssmppl.inference.particles.backward import (
     genealogy,
     particle_system,
 )
-from ssmppl.inference.particles.filtering import (
-    SCHEMES,
-    FilterSettings,
-    log_likelihood_estimate,
-    random_state,
-)
-from ssmppl.inference.problem import pose
+from ssmppl.inference.particles.filtering import SCHEMES, FilterSettings, log_likelihood_estimate
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from tests.statistics import models
 from tests.statistics.checks import seed_of, some
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.gap.scales import Scale
+from ssmppl.diagnosis.model.scales import Scale
 from ssmppl.inference.chains.bridge import Student
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
+from ssmppl.inference.maximum.direct_optimization import SmoothLikelihood
 from ssmppl.inference.particles import backward
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

@@ -5,12 +5,12 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.blocks import BLOCK, ancestors_of
-from ssmppl.codegen.kernels.resampling import PADDING, systematic
+from ssmppl.codegen.kernels.particle.particle_filter import BLOCK, ancestors_of
+from ssmppl.codegen.kernels.particle.resampling import PADDING, systematic
 from ssmppl.inference.particles import blocks, filtering
 from ssmppl.inference.particles.blocks import run_in_blocks
-from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 
 AT = {"a": [0.9, 0.5], "q": 0.4}

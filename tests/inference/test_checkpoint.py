@@ -30,8 +30,8 @@ from ssmppl.inference.checkpoints import archive, chains
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec, Store
 from ssmppl.inference.checkpoints.origin import Origin
-from ssmppl.inference.draws import Block, stack
-from ssmppl.inference.runner import run_chains
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import Block, stack
 
 ROOT = Path(__file__).parents[2]
 N, WARMUP, CHAINS, WIDTH = 60, 20, 3, 4

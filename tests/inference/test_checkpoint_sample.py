@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference import runner
 from ssmppl.inference.checkpoints import archive, chains, origin
 from ssmppl.inference.checkpoints.chains import ChainFile
-from ssmppl.inference.sample import PREPARE
+from ssmppl.inference.run import chain_runner
+from ssmppl.inference.verbs.sample import PREPARE
 from tests.inference import checkpoint_models as models
 from tests.inference.checkpoint_models import CALLS, bits, call
 
@@ -33,8 +33,8 @@ def killed(monkeypatch):
     """The call, ended at its n-th write."""
     monkeypatch.setattr(chains, "SECONDS", -1.0)
     monkeypatch.setattr(chains, "SHARE", 1e9)
-    monkeypatch.setattr(runner, "BLOCK_SECONDS", 1e-9)
-    monkeypatch.setattr(runner, "TIMES_SENDING", 0)
+    monkeypatch.setattr(chain_runner, "BLOCK_SECONDS", 1e-9)
+    monkeypatch.setattr(chain_runner, "TIMES_SENDING", 0)
 
     def until(n, name, path, **changes):
         left = [n]

@@ -13,8 +13,8 @@ import pytest
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.checkpoints import chains, spool
-from ssmppl.inference.draws import stack
-from ssmppl.inference.runner import run_chains
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import stack
 from ssmppl.results import arviz, save
 from tests.inference.checkpoint_models import bits, call
 from tests.inference.test_checkpoint import (

@@ -11,14 +11,14 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.analysis.density import Missing
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.data import unpack_parameters
 from ssmppl.data.parameters import pack
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import NotDifferentiable
-from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import Problem, pose
+from ssmppl.inference.particles.scores import complete_scores
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.language.trace import trace
 from tests.codegen.models import build
 from tests.statistics import models

@@ -6,7 +6,7 @@ from scipy import optimize, stats
 from scipy.special import logsumexp
 
 import ssmppl as ssm
-from ssmppl.inference.exact.differences import jacobian, observed_information
+from ssmppl.inference.exact.derivatives import jacobian, observed_information
 from tests.statistics.checks import MCSE, assert_within, deviations, seed_of
 
 

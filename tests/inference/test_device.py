@@ -16,8 +16,8 @@ import pytest
 from numba import cuda, types
 
 import ssmppl as ssm
-from ssmppl.codegen import device
-from ssmppl.codegen.program import compile_trace
+from ssmppl.codegen.modules import device
+from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.language.trace import trace
 from tests.codegen.models import MODELS, build
 from tests.inference.test_blocks import AT, MODEL, data

@@ -8,14 +8,11 @@ from scipy.optimize import minimize
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.analysis.smooth import smooth_filter_applies
-from ssmppl.inference.maximum.smooth_likelihood import SmoothLikelihood
-from ssmppl.inference.particles.filtering import (
-    FilterSettings,
-    log_likelihood_estimate,
-    random_state,
-)
-from ssmppl.inference.problem import pose
+from ssmppl.analysis.proposals.smooth import smooth_filter_applies
+from ssmppl.inference.maximum.direct_optimization import SmoothLikelihood
+from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.trace import trace
 from tests.statistics import models
 from tests.statistics.checks import mean_one_p, seed_of

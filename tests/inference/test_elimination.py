@@ -11,20 +11,20 @@ import pytest
 from scipy import integrate, stats
 
 import ssmppl as ssm
-from ssmppl.analysis.eliminable import eliminable
-from ssmppl.analysis.elimination import eliminate
-from ssmppl.analysis.families import Beta, Dirichlet, Gamma, Normal, NormalGamma
-from ssmppl.analysis.normalisers import draw_of, log_normaliser
+from ssmppl.analysis.conjugacy.families import Beta, Dirichlet, Gamma, Normal, NormalGamma
+from ssmppl.analysis.elimination.eliminable import eliminable
+from ssmppl.analysis.elimination.elimination import eliminate
+from ssmppl.analysis.elimination.normalisers import draw_of, log_normaliser
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, symbol, symbols_of, topological
 from ssmppl.inference.chains.elimination import Eliminating, Learned, asked, describe
 from ssmppl.inference.chains.parameter_steps import log_joint
-from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Draws
-from ssmppl.language.traced import previous, seen
+from ssmppl.language.model.traced import previous, seen
 from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some
 from tests.statistics.checks import deviations as deviations_of
 

@@ -11,8 +11,8 @@ from ssmppl.inference.maximum.ascent import Setup
 from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.em import climb as climb_em
 from ssmppl.inference.maximum.m_step import maximiser
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
 from tests.inference import em_models
 from tests.inference.em_models import simulated
 from tests.statistics import models

@@ -9,10 +9,10 @@ from scipy import stats
 from scipy.special import logsumexp
 
 import ssmppl as ssm
-from ssmppl.inference.exact import finite_passes as passes
+from ssmppl.inference.exact import hidden_markov as passes
 from ssmppl.inference.exact.hidden_markov import hidden_markov
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.inference.finite_models import MODELS, data_of
 from tests.statistics.checks import seed_of
 

@@ -8,7 +8,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.forecast import after
+from ssmppl.inference.verbs.forecast import after
 from ssmppl.results import save, to_inference_data
 from tests.statistics.checks import LEVEL, seed_of
 

@@ -8,10 +8,10 @@ from scipy.special import logsumexp
 import ssmppl as ssm
 from ssmppl.data import bind
 from ssmppl.errors import SamplingError
-from ssmppl.inference.exact import finite_laws as tables
+from ssmppl.inference.exact import hidden_markov as tables
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.exact.histories import histories
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.trace import trace
 from tests.inference.finite_models import MODELS, data_of, enumerated, weather
 from tests.statistics.checks import LEVEL, seed_of

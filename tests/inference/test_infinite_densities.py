@@ -16,20 +16,20 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.analysis.conjugacy import draw
+from ssmppl.analysis.conjugacy.conjugacy import draw
 from ssmppl.analysis.density import terms
-from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN
+from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.inference.chains.noise_moves import Collapsed
+from ssmppl.inference.chains.interweaving import Collapsed
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, draw_parameters, plan_updates
 from ssmppl.inference.exact.hidden_markov import hidden_markov
-from ssmppl.inference.exact.vanishing import without_maximum
 from ssmppl.inference.particles.backward import pair_failure
 from ssmppl.inference.particles.filtering import failure
-from ssmppl.inference.problem import pose
+from ssmppl.inference.preparation.vanishing import without_maximum
+from ssmppl.inference.run.problem import pose
+from ssmppl.language.model.traced import seen
 from ssmppl.language.trace import trace
-from ssmppl.language.traced import seen
 from tests.statistics.checks import seed_of
 
 UNDERFLOWN = 1e-170  # whose square is 0

@@ -13,14 +13,13 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.analysis.noises import noises
+from ssmppl.analysis.proposals.noises import noises
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.interweaving import Interweaving, Tuning
-from ssmppl.inference.chains.noise_moves import NoiseMove
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
-from ssmppl.language.transforms import constant_bounds
+from ssmppl.inference.chains.interweaving import Interweaving, NoiseMove, Tuning
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.language.model.transforms import constant_bounds
 from tests.statistics.checks import LEVEL, some
 
 from . import noise_models as models

@@ -12,14 +12,20 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.analysis.perturbed import perturbed
+from ssmppl.analysis.proposals.perturbed import perturbed
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.maximum.hilltop import Hilltop, hilltop
-from ssmppl.inference.maximum.iterated_filtering import climb, step_scales
-from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swarm_block
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.maximum.iterated_filtering import (
+    State,
+    Swarms,
+    climb,
+    perturbed_model,
+    step_scales,
+    swarm_block,
+)
+from ssmppl.inference.maximum.noisy_maximum import Hilltop, hilltop
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.statistics import models
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 

@@ -12,11 +12,11 @@ import ssmppl as ssm
 import ssmppl.language.distributions as D
 from ssmppl import datasets
 from ssmppl.analysis.structure import linear_gaussian
-from ssmppl.codegen.kernels import kalman as kernel
+from ssmppl.codegen.kernels.kalman.square_root import square_root as kernel
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.kalman import kalman_filter, kalman_log_likelihood, kalman_model
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.inference.kalman_models import MODELS, posed
 
@@ -198,7 +198,7 @@ def test_refuses_other_models():
 def test_compiled_once_for_all_processes(tmp_path):
     code = (
         "import numpy as np\n"
-        "from ssmppl.codegen.exact import exact_entry\n"
+        "from ssmppl.codegen.modules.exact import exact_entry\n"
         "f = exact_entry('kalman_filter')\n"
         "one, e = np.eye(1), np.eye(1)[None]\n"
         "v, inc, y = np.zeros((1, 1)), np.empty(3), np.zeros((3, 1))\n"

@@ -5,10 +5,10 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
-from ssmppl.inference.exact.differences import jacobian
+from ssmppl.inference.exact.derivatives import jacobian
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.language.trace import trace
 from tests.statistics.checks import seed_of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.errors import SamplingError
 from ssmppl.inference.exact.kalman import kalman_model
 from tests.inference.kalman_models import MODELS, posed, scalar

@@ -9,9 +9,9 @@ import ssmppl.language.distributions as D
 from ssmppl import datasets
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.inference.exact.differences import jacobian
+from ssmppl.inference.exact.derivatives import jacobian
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.inference.kalman_models import MODELS, posed, scalar, time_varying
 from tests.inference.test_kalman import lgss

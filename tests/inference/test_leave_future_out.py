@@ -7,8 +7,8 @@ from scipy.special import logsumexp
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.leave_future_out import _smoothed
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.verbs.leave_future_out import _smoothed
 from tests.statistics.checks import MCSE, seed_of
 
 STEPS, MISSING = 30, 19

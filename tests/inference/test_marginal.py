@@ -8,20 +8,15 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.analysis.conditional import ConditionallyLinear, conditionally_linear
-from ssmppl.codegen.marginal import compile_marginal
+from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
+from ssmppl.codegen.modules.marginal import compile_marginal
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.particles.backward import particle_system
-from ssmppl.inference.particles.filtering import (
-    FilterSettings,
-    random_state,
-    repeated_estimates,
-    seed_sequence,
-)
-from ssmppl.inference.particles.marginal import draw_given
-from ssmppl.inference.particles.marginal_backward import _Step, backward_pass, marginal_paths
-from ssmppl.inference.problem import pose
+from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
+from ssmppl.inference.particles.marginal import _Step, backward_pass, draw_given, marginal_paths
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.trace import trace
 from tests.inference.conditional_models import THETA, enumerated, four_states, regimes
 from tests.statistics.checks import LEVEL, MCSE, deviations, mean_one_p, seed_of

@@ -10,13 +10,12 @@ import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
-from ssmppl.inference import maximize as verb
-from ssmppl.inference.exact.exact_score import ExactScore
 from ssmppl.inference.exact.kalman import KalmanModel
-from ssmppl.inference.maximum.ascent import Ascent
-from ssmppl.inference.maximum.chart import Chart
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.maximum.ascent import Ascent, Chart
+from ssmppl.inference.preparation.exact_score import ExactScore
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.verbs import maximize as verb
 from tests.statistics import models
 from tests.statistics.checks import seed_of
 

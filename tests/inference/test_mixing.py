@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.mixing import bulk_ess, rank_r_hat, told
+from ssmppl.inference.chains.mixing import bulk_ess, mixing_attributes, rank_r_hat
 
 
 def chains(rho: float, n: int, apart: float = 0.0, seed: int = 1, m: int = 4) -> np.ndarray:
@@ -45,7 +45,7 @@ def warned(draws: np.ndarray, interrupted: bool = False, method=None) -> str:
     method = ssm.PGAS() if method is None else method
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        attrs = told(labels, draws, interrupted, method, 500)
+        attrs = mixing_attributes(labels, draws, interrupted, method, 500)
     text = str(found[0].message) if found else ""
     assert attrs.get("mixing_warning", "") == text
     return text

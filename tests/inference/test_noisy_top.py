@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.inference.maximum.noisy_top import Fit, count, fitted, monomials, slopes_of_monomials
+from ssmppl.inference.maximum.noisy_maximum import (
+    Fit,
+    count,
+    fitted,
+    monomials,
+    slopes_of_monomials,
+)
 from tests.statistics.checks import LEVEL, seed_of
 
 TOP = np.array([0.3, -0.2])

@@ -22,7 +22,8 @@ from ssmppl.inference.maximum.psaem import (
     saem_block,
     step_size,
 )
-from ssmppl.inference.particles.filtering import FilterSettings, random_state
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.run.seeds import random_state
 from tests.inference import em_models
 from tests.inference.em_models import simulated
 from tests.inference.test_em import setup_of

@@ -5,8 +5,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.inference.maximum.m_step import maximiser
-from ssmppl.inference.maximum.path_climb import climbed
+from ssmppl.inference.maximum.m_step import climbed, maximiser
 from tests.inference import em_models
 from tests.inference.test_em import setup_of
 from tests.statistics.checks import seed_of

@@ -6,7 +6,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError, ModelError
-from ssmppl.inference.posterior_draws import group
+from ssmppl.inference.verbs.predict import group
 from ssmppl.results import save, to_inference_data
 from tests.statistics.checks import LEVEL, seed_of
 

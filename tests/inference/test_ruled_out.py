@@ -9,13 +9,12 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.averages import weighted_statistics
-from ssmppl.codegen.kernels.conditional_smc import JOINING
-from ssmppl.codegen.kernels.flags import interpreted
-from ssmppl.codegen.kernels.weights import NAN
+from ssmppl.codegen.kernels.math.flags import interpreted
+from ssmppl.codegen.kernels.particle.conditional_smc import JOINING
+from ssmppl.codegen.kernels.particle.weights import NAN, weighted_statistics
 from ssmppl.inference.particles.backward import sweep_failure
-from ssmppl.inference.particles.filtering import random_state, seed_sequence
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.statistics.checks import seed_of
 
 REMOVED = np.array([3.0, 1.0, 1.0, 0.0, 1.0])

@@ -14,10 +14,11 @@ import scipy.stats as st
 
 import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import chart, coordinates
-from ssmppl.inference.chains.curvature import fitted_covariance
+from ssmppl.inference.chains.pmmh import fitted_covariance
 from ssmppl.inference.chains.smc2 import _factor
-from ssmppl.inference.particles.pilot import find_mode, scale_of, space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.preparation.pilot import find_mode, scale_of
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
 from tests.statistics.checks import some
 
 SHORT = {"draws": 12, "warmup": 8, "chains": 2, "progress": False, "seed": 1}

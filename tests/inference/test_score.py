@@ -8,7 +8,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.particles.particle_score import Run, combine, run_weights
+from ssmppl.inference.particles.scores import Run, combine, run_weights
 from tests.statistics import models
 from tests.statistics.checks import seed_of, some
 from tests.statistics.exact import DenseGaussian

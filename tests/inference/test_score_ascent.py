@@ -8,12 +8,12 @@ import pytest
 import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
-from ssmppl.inference.maximize import choose_method
 from ssmppl.inference.maximum import score_ascent
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.particles.particle_score import Run
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.particles.scores import Run
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.verbs.maximize import choose_method
 from tests.statistics import models
 from tests.statistics.checks import seed_of
 from tests.statistics.exact import varve_log_likelihood

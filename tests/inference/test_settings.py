@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference import methods, smoothing_methods
-from ssmppl.inference.settings import RULES
+from ssmppl.inference.methods import methods
+from ssmppl.inference.preparation.settings import RULES
 
 model = ssm.Model("level")
 
@@ -127,7 +127,7 @@ def test_odd_settings_are_refused_by_their_names(method, name, value):
 def test_every_setting_has_a_rule():
     known = {
         kind
-        for module in (methods, smoothing_methods)
+        for module in (methods, methods)
         for kind in vars(module).values()
         if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__")
     }

@@ -10,8 +10,8 @@ import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.inference.chains.sampling import Setup
 from ssmppl.inference.chains.smc2 import Filters, begin, exchange, one_row
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
 from tests.statistics import models
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 

@@ -12,8 +12,9 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.particles.backward import genealogy, particle_system
-from ssmppl.inference.particles.filtering import FilterSettings, random_state
+from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.particles.fixed_lag import lag_moments
+from ssmppl.inference.run.seeds import random_state
 from tests.statistics import models
 from tests.statistics.checks import assert_moments as assert_chain_moments
 from tests.statistics.checks import seed_of

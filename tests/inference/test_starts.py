@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.particles.ordinary import ordinary_values
+from ssmppl.inference.preparation.initial_values import ordinary_values
 from ssmppl.language.trace import trace
 
 SHORT = {"draws": 6, "warmup": 4, "chains": 1, "seed": 1, "progress": False}

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.random import new_state
-from ssmppl.codegen.kernels.tempered_filter import accept
-from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.problem import pose
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.kernels.particle.tempered_filter import accept
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.run.problem import pose
 
 COVARIANCE = np.array([[1.0, 0.6], [0.6, 1.0]])
 

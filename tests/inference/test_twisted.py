@@ -10,18 +10,19 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.analysis import twisted as analysis
-from ssmppl.analysis.twisted import DEFENSIVE
-from ssmppl.codegen import program
-from ssmppl.codegen.kernels.particle_filter import GUIDED_SHARE
+from ssmppl.analysis.proposals import twisted as analysis
+from ssmppl.analysis.proposals.twisted import DEFENSIVE
+from ssmppl.codegen.kernels.particle.particle_filter import GUIDED_SHARE
+from ssmppl.codegen.modules import program
 from ssmppl.datasets import ice_varves
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.chains.pmmh import run_filters
-from ssmppl.inference.particles import proposal_choice
-from ssmppl.inference.particles.filtering import FilterSettings, random_state, repeated_estimates
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.particles.proposal_choice import ENOUGH, choose
-from ssmppl.inference.problem import pose
+from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
+from ssmppl.inference.preparation import proposal_choice
+from ssmppl.inference.preparation.proposal_choice import ENOUGH, choose
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 from tests.statistics import models
 from tests.statistics.checks import (
     LEVEL,

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.chains import update_rates
-from ssmppl.inference.chains.pgas import PGASState
-from ssmppl.inference.chains.update_rates import (
+from ssmppl.inference.chains import mixing
+from ssmppl.inference.chains.mixing import (
     Watch,
     movement,
     random_components,
-    told,
+    update_rate_attributes,
     watched_movement,
 )
-from ssmppl.inference.draws import ChainDraws
-from ssmppl.inference.problem import pose
-from ssmppl.inference.sample import _chosen
+from ssmppl.inference.chains.pgas import PGASState
+from ssmppl.inference.run.draws import ChainDraws
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.verbs.sample import _chosen
 
 
 def town():
@@ -141,10 +141,10 @@ def test_rows_that_stand_still_are_told_without_draws_of_them():
     problem = pose(integrated(), {"y": np.zeros(9)})
     paths = stuck_draws(9, 3, 2, np.random.default_rng(1))
     with pytest.warns(UserWarning, match="3 rows from 1 to 3 "):
-        expected = told(problem, made_up(paths))
+        expected = update_rate_attributes(problem, made_up(paths))
     with pytest.warns(UserWarning, match="3 rows from 1 to 3 "):
-        assert told(problem, made_up_without_paths(paths)) == expected
-    assert told(problem, made_up_without_paths(paths[:, :1])) == {}
+        assert update_rate_attributes(problem, made_up_without_paths(paths)) == expected
+    assert update_rate_attributes(problem, made_up_without_paths(paths[:, :1])) == {}
 
 
 def test_rows_that_stand_still_are_told_with_a_warning():
@@ -152,12 +152,14 @@ def test_rows_that_stand_still_are_told_with_a_warning():
     paths = stuck_draws(9, 3, 2, np.random.default_rng(1))
     paths[:, 0:1, 2, 0] += 1.0  # the third row moves once in 99 times
     with pytest.warns(UserWarning, match="3 rows from 1 to 3 "):
-        attrs = told(problem, made_up(paths))
+        attrs = update_rate_attributes(problem, made_up(paths))
     assert attrs["trajectory_update_rate"] == 0.0
     assert "ssm.PMMH" in attrs["trajectory_warning"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        free = told(problem, made_up(stuck_draws(9, 0, 2, np.random.default_rng(1))))
+        free = update_rate_attributes(
+            problem, made_up(stuck_draws(9, 0, 2, np.random.default_rng(1)))
+        )
         assert free == {"trajectory_update_rate": 1.0}
 
 
@@ -174,10 +176,10 @@ def test_discrete_states_count_where_chains_differ():
     paths[:, :, 1] = 2.0  # the data determine it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert 0.5 < told(problem, made_up(paths))["trajectory_update_rate"] < 1.0
+        assert 0.5 < update_rate_attributes(problem, made_up(paths))["trajectory_update_rate"] < 1.0
     paths[2:, :, 1] = 3.0
     with pytest.warns(UserWarning, match="1 rows from 2 to 2 "):
-        told(problem, made_up(paths))
+        update_rate_attributes(problem, made_up(paths))
 
 
 def test_r_hat_of_still_and_of_moving_chains():
@@ -207,7 +209,7 @@ def test_draws_that_are_read_in_pieces_count_as_whole_ones(monkeypatch, size):
     rng = np.random.default_rng(4)
     paths = np.floor(rng.normal(size=(3, 101, 4, 2)) * 2.0)
     paths[:, :, 1], paths[1:, :60, 2] = 3.1, 7.0
-    monkeypatch.setattr(update_rates, "PIECE", size)
+    monkeypatch.setattr(mixing, "PIECE", size)
     rate, ever, apart = movement(paths)
     np.testing.assert_array_equal(rate, np.mean(paths[:, 1:] != paths[:, :-1], axis=(0, 1)))
     np.testing.assert_array_equal(ever, (paths != paths[:1, :1]).any(axis=(0, 1)))

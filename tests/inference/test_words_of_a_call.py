@@ -86,7 +86,7 @@ def test_a_name_that_a_model_does_not_have(name, told):
 
 
 def test_verbs_of_models_exist():
-    from ssmppl.language.model import VERBS
+    from ssmppl.language.model.model import VERBS
 
     assert all(hasattr(ssm, verb) for verb in VERBS)
 

@@ -1,4 +1,4 @@
-"""The polynomials of `ssmppl.codegen.kernels.elementary`, computed anew with mpmath.
+"""The polynomials of `ssmppl.codegen.kernels.math.elementary`, computed anew with mpmath.
 
 Each is the interpolant of a smooth function at the Chebyshev nodes of its interval,
 which is within a small factor of the best approximation.  `python -m tests.kernels.coefficients`

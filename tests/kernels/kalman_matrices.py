@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ssmppl.codegen.kernels.kalman_steps import Matrices
+from ssmppl.codegen.kernels.kalman.steps import Matrices
 from tests.statistics.exact import DenseGaussian
 
 

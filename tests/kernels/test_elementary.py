@@ -9,8 +9,8 @@ import numba
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels import elementary
-from ssmppl.codegen.kernels.flags import kernel
+from ssmppl.codegen.kernels.math import elementary
+from ssmppl.codegen.kernels.math.flags import kernel
 
 from .coefficients import table
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.flags import exact
-from ssmppl.codegen.kernels.genealogy import FREE, open_genealogy, recall, remember
+from ssmppl.codegen.kernels.math.flags import exact
+from ssmppl.codegen.kernels.particle.conditional_smc import FREE, open_genealogy, recall, remember
 from tests.statistics.checks import seed_of
 
 STEPS, STATES = 300, 2

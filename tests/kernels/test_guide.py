@@ -12,12 +12,12 @@ import pytest
 from scipy import optimize
 
 import ssmppl as ssm
-from ssmppl.codegen import twisted
-from ssmppl.codegen.kernels.guide import lift, update
-from ssmppl.codegen.twisted import TwistedFilter
+from ssmppl.codegen.kernels.twisted.lookahead import lift, update
+from ssmppl.codegen.modules import twisted
+from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_filter
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 from tests.codegen.harness import plain_module
 from tests.inference import twisted_models
 from tests.statistics import models

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman_adjoint import zeros_like
-from ssmppl.codegen.kernels.kalman_steps import Matrices
+from ssmppl.codegen.kernels.kalman.adjoint import zeros_like
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.modules.exact import exact_entry
 from tests.kernels.kalman_matrices import random_data, random_model
 from tests.statistics.checks import seed_of
 

@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman_adjoint import zeros_like
-from ssmppl.codegen.kernels.kalman_steps import Matrices
+from ssmppl.codegen.kernels.kalman.adjoint import zeros_like
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.modules.exact import exact_entry
 from ssmppl.data import Experiment
-from ssmppl.inference.exact.kalman_diffuse import diffuse_filter, start_of
-from ssmppl.inference.exact.kalman_moments import drawn, smoothed
+from ssmppl.inference.exact.kalman import diffuse_filter, start_of
+from ssmppl.inference.exact.kalman_matrices import drawn, smoothed
 from tests.kernels.kalman_matrices import DenseFlat, random_data, random_model, with_flat
 from tests.statistics.checks import seed_of
 

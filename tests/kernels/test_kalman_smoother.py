@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman_steps import Matrices
-from ssmppl.codegen.kernels.random import new_state
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.modules.exact import exact_entry
 from tests.kernels.kalman_matrices import dense, random_data, random_model
 from tests.statistics.checks import seed_of
 

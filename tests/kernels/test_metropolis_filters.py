@@ -9,13 +9,17 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.correlated import hilbert_index, order_of, ordered_systematic
-from ssmppl.codegen.kernels.filter_with_score import carry_back
-from ssmppl.codegen.kernels.random import new_state
-from ssmppl.inference.chains.particle_likelihood import CorrelatedLikelihood, ScoredLikelihood
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.kernels.particle.continuous_filters import (
+    hilbert_index,
+    order_of,
+    ordered_systematic,
+)
+from ssmppl.codegen.kernels.particle.scored_filters import carry_back
+from ssmppl.inference.chains.pmmh import CorrelatedLikelihood, ScoredLikelihood
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.particles.filtering import FilterSettings
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 
 from ..statistics import models
 from ..statistics.checks import LEVEL, mean_one_p, seed_of

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.codegen.kernels import random
-from ssmppl.codegen.kernels.flags import kernel
+from ssmppl.codegen.kernels.math import random
+from ssmppl.codegen.kernels.math.flags import kernel
 
 TESTS = 150  # at least as many as p-values are computed below
 LEVEL = 1e-3 / TESTS

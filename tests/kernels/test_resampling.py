@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.codegen.kernels.flags import kernel
-from ssmppl.codegen.kernels.random import new_state
-from ssmppl.codegen.kernels.resampling import (
+from ssmppl.codegen.kernels.math.flags import kernel
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.codegen.kernels.particle.resampling import (
     MULTINOMIAL,
     PADDING,
     RESIDUAL,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.smooth_filter import invert, sort_order
+from ssmppl.codegen.kernels.particle.continuous_filters import invert, sort_order
 from tests.statistics.checks import seed_of
 
 

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis import twisted
-from ssmppl.codegen.kernels import steering
+from ssmppl.analysis.proposals import twisted
+from ssmppl.codegen.kernels.twisted import twisting
 
 D, R, N = 4, 3, 5
 SIZE = D * (D + 1) // 2
 
 
 def plain(name):
-    return getattr(steering, name).py_func
+    return getattr(twisting, name).py_func
 
 
 class Setting:
@@ -101,7 +101,7 @@ def test_draws_and_their_density(setting):
     """Noise by its normals, and log f + log g - log q at that noise."""
     fits, draws = setting.fit(), {}
     normals = setting.rng.normal(size=R * N)
-    uniforms = np.array([0.5, 0.999, 0.5 * steering.DEFENSIVE, 0.1, 0.0])
+    uniforms = np.array([0.5, 0.999, 0.5 * twisting.DEFENSIVE, 0.1, 0.0])
     x = np.empty((D, N))
 
     def follow(theta, c, s, x_prev, e, states):
@@ -116,7 +116,7 @@ def test_draws_and_their_density(setting):
     z, e = normals.reshape(R, N), draws["e"]
     for i in range(N):
         mean, covariance = setting.conditional(i)
-        if uniforms[i] < steering.DEFENSIVE:
+        if uniforms[i] < twisting.DEFENSIVE:
             np.testing.assert_array_equal(e[:, i], z[:, i])
             continue
         # of this covariance: the normals are those that the factor C takes it back to
@@ -137,7 +137,7 @@ def test_draws_and_their_density(setting):
     for i in range(N):
         q = stats.multivariate_normal.pdf(e[:, i], *setting.conditional(i))
         f = stats.norm.pdf(e[:, i]).prod()
-        share = steering.DEFENSIVE
+        share = twisting.DEFENSIVE
         assert log_w[i] == pytest.approx(0.25 - np.log(share + (1 - share) * q / f), rel=1e-10)
 
 
@@ -163,7 +163,7 @@ def test_the_first_state(setting):
     covariance = np.linalg.inv(factor @ factor.T)
     q = stats.multivariate_normal.pdf(e.T, setting.start, covariance)
     f = stats.norm.pdf(e).prod(axis=0)
-    share = steering.DEFENSIVE
+    share = twisting.DEFENSIVE
     np.testing.assert_allclose(log_w, -1.0 - np.log(share + (1 - share) * q / f), rtol=1e-10)
 
 
@@ -174,11 +174,11 @@ def test_weights_of_noise_a_thousand_spreads_away(setting):
     log_w = np.zeros(N)
     root = np.zeros((R * (R + 1) // 2, 1))
     root[[0, 2, 5]] = 3.0  # a third of the transition's spread
-    steering.steered_ratio(e, np.zeros((R, 1)), root, log_w)
-    far = -np.log(steering.DEFENSIVE)
-    near = -np.log(steering.DEFENSIVE + (1 - steering.DEFENSIVE) * 27)
+    twisting.steered_ratio(e, np.zeros((R, 1)), root, log_w)
+    far = -np.log(twisting.DEFENSIVE)
+    near = -np.log(twisting.DEFENSIVE + (1 - twisting.DEFENSIVE) * 27)
     np.testing.assert_allclose(log_w, [far] * 4 + [near], rtol=1e-12)
 
 
 def test_the_share_of_the_transition_is_that_of_the_analysis():
-    assert steering.DEFENSIVE == twisted.DEFENSIVE
+    assert twisting.DEFENSIVE == twisted.DEFENSIVE

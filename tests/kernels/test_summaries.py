@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.flags import interpreted
-from ssmppl.codegen.kernels.particle_filter import add
-from ssmppl.codegen.kernels.prediction import mix_channels
-from ssmppl.codegen.kernels.summaries import weighted_mean, weighted_product
+from ssmppl.codegen.kernels.math.flags import interpreted
+from ssmppl.codegen.kernels.particle.particle_filter import add
+from ssmppl.codegen.kernels.particle.simulation import mix_channels
+from ssmppl.codegen.kernels.particle.weights import weighted_mean, weighted_product
 from tests.statistics.checks import seed_of
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels import weights
-from ssmppl.codegen.kernels.weights import (
+from ssmppl.codegen.kernels.particle import weights
+from ssmppl.codegen.kernels.particle.weights import (
     ALL_ZERO,
     INFINITE,
     NAN,
@@ -128,9 +128,9 @@ def test_the_last_digit_does_not_depend_on_where_arrays_lie(n):
 
 
 def test_loops_that_add_up_store_nothing():
-    """In kernels whose sums may be reordered: see the head of `kernels/weights.py`."""
-    folder = Path(weights.__file__).parent
-    for file in sorted(folder.glob("*.py")):
+    """In kernels whose sums may be reordered: see the head of `kernels/particle/weights.py`."""
+    folder = Path(weights.__file__).parents[1]
+    for file in sorted(folder.rglob("*.py")):
         for function in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not isinstance(function, ast.FunctionDef):
                 continue

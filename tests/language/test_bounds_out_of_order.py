@@ -5,13 +5,13 @@ import pytest
 
 import ssmppl as ssm
 import ssmppl.language.distributions as D
-from ssmppl.analysis.moves import drawn
+from ssmppl.analysis.proposals.proposals import drawn
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.inference.prior import draw_prior
+from ssmppl.inference.run.prior import draw_prior
+from ssmppl.language.model.traced import Site
 from ssmppl.language.trace import trace
-from ssmppl.language.traced import Site
 
 A = symbol("parameter", "a")
 LAWS = {

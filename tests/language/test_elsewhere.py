@@ -8,7 +8,7 @@ import scipy.stats as st
 
 import ssmppl as ssm
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.elsewhere import WRITTEN, advice
+from ssmppl.language.model.calling import WRITTEN, advice
 
 NAMES = {
     "Weibul": "write ssm.Weibull",

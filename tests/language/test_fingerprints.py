@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.language.fingerprints import fingerprint
+from ssmppl.language.model.closure_digest import fingerprint
 
 
 def globally(text, **outside):

@@ -5,7 +5,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.errors import ModelError
-from ssmppl.language.packing import packed, unpacked
+from ssmppl.language.model.pickling import packed, unpacked
 from ssmppl.language.trace import trace
 
 

@@ -13,8 +13,8 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import differentiate, hessian
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.draws import Draws
-from ssmppl.language.shares import log_sum
+from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.nested import log_sum
 
 X, P, A, B = (symbol("state", n) for n in "xpab")
 LEVEL = 1e-6  # of each distribution test

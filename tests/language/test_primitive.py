@@ -11,7 +11,7 @@ import ssmppl as ssm
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.fingerprints import fingerprint
+from ssmppl.language.model.closure_digest import fingerprint
 from ssmppl.language.trace import trace
 
 LEVEL = 0.25

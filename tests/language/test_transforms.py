@@ -8,8 +8,8 @@ import ssmppl as ssm
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
+from ssmppl.language.model.transforms import transforms, unconstrain
 from ssmppl.language.trace import trace
-from ssmppl.language.transforms import transforms, unconstrain
 
 
 def bounded():

@@ -8,13 +8,13 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.analysis.smooth import smooth_filter_applies
+from ssmppl.analysis.proposals.smooth import smooth_filter_applies
 from ssmppl.errors import DataError, ModelError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.checkpoints.origin import model_digest
-from ssmppl.language.draws import Draws
+from ssmppl.language.distributions.base import Draws
 from ssmppl.language.trace import trace
 from tests.language.written_laws import (
     NAMES,

@@ -34,9 +34,11 @@ def test_the_wheel_takes_all_that_is_in_the_folder():
     assert {"ssmppl/py.typed", "ssmppl/datasets/nile.csv"} <= shipped()
 
 
-@pytest.mark.parametrize("stray", ["gap/table.json", "datasets/more/x.csv", "extra/module.py"])
+@pytest.mark.parametrize(
+    "stray", ["diagnosis/table.json", "datasets/more/x.csv", "extra/module.py"]
+)
 def test_a_file_that_no_pattern_takes_is_seen(tmp_path, stray):
-    for name in ("__init__.py", "py.typed", "gap/__init__.py", "datasets/__init__.py", stray):
+    for name in ("__init__.py", "py.typed", "diagnosis/__init__.py", "datasets/__init__.py", stray):
         file = tmp_path / "ssmppl" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()

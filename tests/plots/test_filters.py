@@ -8,10 +8,10 @@ from matplotlib.colors import to_rgba
 from scipy.stats import binom, norm
 
 import ssmppl as ssm
+from ssmppl.drawing.style import MAIN, OTHER
 from ssmppl.errors import ArgumentError
 from ssmppl.plots.filters import resampled, survivors
 from ssmppl.plots.predictions import pit_band
-from ssmppl.plots.style import MAIN, OTHER
 from tests.plots.results import (
     TRUTH,
     data,

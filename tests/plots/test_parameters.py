@@ -10,12 +10,12 @@ from matplotlib.contour import QuadContourSet
 from scipy import stats
 
 import ssmppl as ssm
+from ssmppl.drawing.style import MAIN, OTHER
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.particles.filtering import FilterSettings
-from ssmppl.inference.problem import pose
+from ssmppl.inference.run.problem import pose
 from ssmppl.plots.density import estimated, priors_of
 from ssmppl.plots.likelihood import surface
-from ssmppl.plots.style import MAIN, OTHER
 from tests.plots.results import TRUTH, counts, data, level, maximised, sampled, smoothed
 
 mpl.use("Agg")

@@ -10,12 +10,12 @@ from matplotlib import pyplot
 from matplotlib.dates import date2num
 
 import ssmppl as ssm
+from ssmppl.drawing.style import DATA, MAIN, OTHER
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.labels import observes
-from ssmppl.inference.posterior_draws import group
+from ssmppl.inference.run.labels import observes
+from ssmppl.inference.verbs.predict import group
 from ssmppl.language.trace import trace
 from ssmppl.plots.drawing import styled
-from ssmppl.plots.style import DATA, MAIN, OTHER
 from ssmppl.results import to_dataset, to_inference_data
 from ssmppl.tables import quantiles_of
 from tests.plots.results import DATES, TRUTH, data, filtered, level, sampled, smoothed

@@ -44,8 +44,8 @@ import numpy as np
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.inference.prior import draw_prior
-from ssmppl.inference.simulation import feeds_back
+from ssmppl.inference.run.prior import draw_prior
+from ssmppl.inference.verbs.simulate import feeds_back
 
 from . import geweke_kernels as kernels
 from . import models, wider_models

@@ -25,18 +25,18 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.data import unpack_parameters
+from ssmppl.inference.chains.coordinates import Metropolis, Point, WalkState
 from ssmppl.inference.chains.gibbs import GibbsState
-from ssmppl.inference.chains.noise_moves import NoiseMove
+from ssmppl.inference.chains.interweaving import NoiseMove
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, log_joint
 from ssmppl.inference.chains.pgas import PGASState
 from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.chains.walk import Metropolis, Point, WalkState
 from ssmppl.inference.exact import histories
-from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import Problem, pose
-from ssmppl.inference.sample import PREPARE
-from ssmppl.language.transforms import transforms, unconstrain
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import Problem, pose
+from ssmppl.inference.run.seeds import random_state
+from ssmppl.inference.verbs.sample import PREPARE
+from ssmppl.language.model.transforms import transforms, unconstrain
 
 RUNS = 20  # independence steps that draw a run of the particle filter given (theta, y)
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.inference.chains import elimination, gibbs, parameter_steps, pgas, walk
-from ssmppl.inference.chains.noise_moves import NoiseMove
-from ssmppl.inference.particles.pilot import Space
+from ssmppl.inference.chains import coordinates, elimination, gibbs, parameter_steps, pgas
+from ssmppl.inference.chains.interweaving import NoiseMove
+from ssmppl.inference.preparation.space import Space
 
 from .checks import LEVEL
 from .geweke import STUDIES, compare, least
@@ -235,8 +235,9 @@ MUTANTS = {
                ((Space, "parameters", no_jacobian),)),
         Mutant("no Jacobian of the noises", "growth PGAS interweaved",
                ((NoiseMove, "stand", stand_without), (NoiseMove, "at", at_without))),
-        Mutant("states of before", "counts PMMH", ((walk, "_iterate", states_kept),)),
-        Mutant("no prior in the ratio", "counts PMMH", ((walk, "_iterate", ratio_without_prior),)),
+        Mutant("states of before", "counts PMMH", ((coordinates, "_iterate", states_kept),)),
+        Mutant("no prior in the ratio", "counts PMMH",
+               ((coordinates, "_iterate", ratio_without_prior),)),
         Mutant("prior counted twice", "two_states PGAS eliminated",
                ((elimination.Eliminating, "_draw", prior_twice),)),
     )

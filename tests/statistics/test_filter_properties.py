@@ -15,13 +15,9 @@ import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_filter, kalman_model
 from ssmppl.inference.particles.backward import backward_draws, genealogy, particle_system
-from ssmppl.inference.particles.filtering import (
-    FilterSettings,
-    full_run,
-    log_likelihood_estimate,
-    random_state,
-)
-from ssmppl.inference.problem import pose
+from ssmppl.inference.particles.filtering import FilterSettings, full_run, log_likelihood_estimate
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 
 from . import models
 from .checks import seed_of

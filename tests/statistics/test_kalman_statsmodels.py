@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ssmppl.inference.exact.kalman_diffuse import start_of
-from ssmppl.inference.exact.kalman_moments import smoothed
+from ssmppl.inference.exact.kalman import start_of
+from ssmppl.inference.exact.kalman_matrices import smoothed
 from tests.kernels.kalman_matrices import random_data, random_model, with_flat
 from tests.kernels.test_kalman_diffuse import experiment
 from tests.statistics.checks import seed_of

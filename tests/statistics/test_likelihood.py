@@ -18,9 +18,10 @@ import pytest
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
 from ssmppl.inference.chains.pmmh import run_filters
-from ssmppl.inference.particles.filtering import FilterSettings, random_state
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.problem import pose
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import random_state
 
 from . import models
 from .checks import LEVEL, mean_one_p, seed_of, some

@@ -16,7 +16,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves
-from ssmppl.inference import runner
+from ssmppl.inference.run import chain_runner
 
 from . import models
 
@@ -86,8 +86,8 @@ def test_processes(processes, verb, kind):
 @pytest.mark.parametrize("seconds", [1e-9, 60.0], ids=["small", "large"])
 def test_size_of_blocks(monkeypatch, method, seconds):
     first = VERBS[method](None)
-    monkeypatch.setattr(runner, "BLOCK_SECONDS", seconds)
-    monkeypatch.setattr(runner, "TIMES_SENDING", 0)
+    monkeypatch.setattr(chain_runner, "BLOCK_SECONDS", seconds)
+    monkeypatch.setattr(chain_runner, "TIMES_SENDING", 0)
     np.testing.assert_array_equal(VERBS[method](None), first)
 
 

@@ -21,7 +21,7 @@ import pandas as pd
 from scipy.io import loadmat
 
 import ssmppl as ssm
-from ssmppl.gap.report import GapReport
+from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.modelfile import load_model
 
 HERE = Path(__file__).parent

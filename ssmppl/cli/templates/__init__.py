@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.cli.templates import counts, inputs, scalar, vector
-from ssmppl.language.model import Model
+from ssmppl.language.model.model import Model
 
 __all__ = ["TEMPLATES", "Template", "skeleton"]
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-from ssmppl.codegen import folder
 from ssmppl.codegen.native.library import function_ir
 from ssmppl.codegen.native.translate import Untranslatable, translate
+from ssmppl.codegen.store import folder
 from ssmppl.compiling import once, one_at_a_time
 
 OLDEST = 16  # LLVM from which pointers have no type, as in the text that is written here

@@ -12,9 +12,9 @@ from typing import Any
 
 from numba import float64, types
 
-from ssmppl.codegen import folder
 from ssmppl.codegen.native.translate import Untranslatable
-from ssmppl.codegen.text import MODULES
+from ssmppl.codegen.store import folder
+from ssmppl.codegen.text.module import MODULES
 from ssmppl.compiling import once
 
 HOMES = {n: file for file, names in MODULES.items() for n in names.split() if file != "flags"}
@@ -43,7 +43,7 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
 
 
 def _made(name: str, arity: int, draws: bool) -> str:
-    module = importlib.import_module(f"ssmppl.codegen.kernels.{HOMES[name]}")
+    module = importlib.import_module(f"ssmppl.codegen.kernels.math.{HOMES[name]}")
     dispatcher: Any = getattr(getattr(module, name), "bare", None)
     if dispatcher is None:  # Numba is switched off
         raise Untranslatable(f"{name} is not compiled", fix="")

@@ -16,7 +16,7 @@ import ast
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from ssmppl.codegen.kernels.flags import FAST
+from ssmppl.codegen.kernels.math.flags import FAST
 from ssmppl.codegen.native.arithmetic import (
     INTEGER,
     PLANE,

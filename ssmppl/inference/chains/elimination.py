@@ -4,7 +4,7 @@ Wigren, Risuleo, Murray and Lindsten (2019), "Parameter elimination in particle 
 With B the eliminated parameters and R the others, one sweep is
 
 1. for each experiment j, x_j by conditional SMC for p(x_j | x of the others, y, R), B integrated
-   out (`analysis/elimination.py`): a step that leaves this law invariant;
+   out (`analysis/elimination/elimination.py`): a step that leaves this law invariant;
 2. B from p(B | x, y, R), its conjugate family, whatever it was before;
 3. the other updates as ever.
 
@@ -25,19 +25,19 @@ from functools import cached_property
 
 import numpy as np
 
-from ssmppl.analysis.eliminable import Eliminable, eliminable
-from ssmppl.analysis.elimination import Elimination
+from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable
+from ssmppl.analysis.elimination.elimination import Elimination
 from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.elimination import compile_elimination
-from ssmppl.codegen.kernels.weights import OK
-from ssmppl.codegen.loading import Loaded
+from ssmppl.codegen.kernels.particle.weights import OK
+from ssmppl.codegen.modules.elimination import compile_elimination
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, ThetaValues
 from ssmppl.inference.particles.backward import sweep_failure
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.run.problem import Problem
 
 WORTH = 20.0  # rows of what the warmup found, in the base of the first row
 FORGETTING = 0.6  # the warmup's mean takes in sweep k with weight k^-FORGETTING

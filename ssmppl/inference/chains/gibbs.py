@@ -23,12 +23,12 @@ from ssmppl.inference.chains.parameter_steps import (
     plan_updates,
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.draws import Block
-from ssmppl.inference.exact.models import ExactModel, filter_of
-from ssmppl.inference.exact.vanishing import check_mode
-from ssmppl.inference.methods import Gibbs
-from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
-from ssmppl.inference.singular import need_density
+from ssmppl.inference.methods.methods import Gibbs
+from ssmppl.inference.methods.requirements import need_density
+from ssmppl.inference.preparation.exact_models import ExactModel, filter_of
+from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.preparation.vanishing import check_mode
+from ssmppl.inference.run.draws import Block
 
 
 @dataclass(frozen=True)

@@ -14,27 +14,38 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.coordinates import coordinates
-from ssmppl.inference.chains.langevin import Langevin
-from ssmppl.inference.chains.pmmh import STRETCH, adapts, given_factor, settings_of, walk_factor
-from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.chains.walk import (
+from ssmppl.inference.chains.coordinates import (
     Metropolis,
     Point,
     Proposal,
     RandomWalk,
     Run,
+    coordinates,
     metropolis_block,
     start_chain,
 )
-from ssmppl.inference.estimate import free_components
-from ssmppl.inference.exact.deterministic import Deterministic
-from ssmppl.inference.exact.exact_score import exact_score
-from ssmppl.inference.exact.models import ExactModel, exact_model, filter_name, filter_of
-from ssmppl.inference.exact.vanishing import check_mode
-from ssmppl.inference.methods import MetropolisHastings
-from ssmppl.inference.particles.pilot import dispersed, find_mode
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.chains.pmmh import (
+    STRETCH,
+    Langevin,
+    adapts,
+    given_factor,
+    settings_of,
+    walk_factor,
+)
+from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.methods.methods import MetropolisHastings
+from ssmppl.inference.particles.deterministic import Deterministic
+from ssmppl.inference.preparation.exact_models import (
+    ExactModel,
+    exact_model,
+    filter_name,
+    filter_of,
+)
+from ssmppl.inference.preparation.exact_score import exact_score
+from ssmppl.inference.preparation.pilot import dispersed, find_mode
+from ssmppl.inference.preparation.vanishing import check_mode
+from ssmppl.inference.run.estimate import free_components
+from ssmppl.inference.run.problem import Problem
 
 
 def needed_model(problem: Problem, method: str) -> ExactModel:

@@ -13,14 +13,14 @@ from types import ModuleType
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy import Update, derive_updates, draw
-from ssmppl.codegen.gibbs import compile_updates, statistics_name
+from ssmppl.analysis.conjugacy.conjugacy import Update, derive_updates, draw
+from ssmppl.codegen.modules.trajectories import compile_updates, statistics_name
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
-from ssmppl.inference.problem import Problem
-from ssmppl.inference.ranges import without_density
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.ranges import without_density
 
 
 @dataclass(frozen=True)

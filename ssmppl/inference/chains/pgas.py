@@ -13,11 +13,12 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.weights import OK
+from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.chains.elimination import Eliminating, Learned, describe
 from ssmppl.inference.chains.elimination import asked as asked_to_eliminate
 from ssmppl.inference.chains.interweaving import Interweaving, Tuning, asked, interweaving
+from ssmppl.inference.chains.mixing import Watch
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
@@ -25,14 +26,13 @@ from ssmppl.inference.chains.parameter_steps import (
     plan_updates,
 )
 from ssmppl.inference.chains.sampling import Sampler, Setup
-from ssmppl.inference.chains.update_rates import Watch
-from ssmppl.inference.draws import Block
-from ssmppl.inference.methods import PGAS
+from ssmppl.inference.methods.methods import PGAS
+from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.particles.filtering import FilterSettings, failure
-from ssmppl.inference.particles.pilot import Pilot, dispersed, find_mode
-from ssmppl.inference.problem import Problem
-from ssmppl.inference.singular import need_density
+from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.problem import Problem
 
 PARTICLES = 25
 PARTICLES_WITHOUT_ANCESTORS = 200

@@ -13,10 +13,10 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from ssmppl.data import unpack_parameters
-from ssmppl.inference.draws import Block, Keep
-from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.particles.pilot import Space
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.preparation.space import Space
+from ssmppl.inference.run.draws import Block, Keep
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.seeds import random_state
 
 Result = TypeVar("Result")
 

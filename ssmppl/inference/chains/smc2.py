@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import terms
-from ssmppl.codegen.kernels.resampling import PADDING, systematic
-from ssmppl.codegen.kernels.weights import NO_POINT, OK
-from ssmppl.codegen.rowwise import compile_filter_rows
+from ssmppl.codegen.kernels.particle.resampling import PADDING, systematic
+from ssmppl.codegen.kernels.particle.weights import NO_POINT, OK
+from ssmppl.codegen.modules.filter_variants import compile_filter_rows
 from ssmppl.compiling import once_property
 from ssmppl.counts import check_count
 from ssmppl.data import unpack_parameters
@@ -34,15 +34,15 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains.sampling import Setup
-from ssmppl.inference.draws import Block, ChainDraws
-from ssmppl.inference.methods import SMC2
+from ssmppl.inference.methods.methods import SMC2
 from ssmppl.inference.particles.filtering import failure, log_of_mean
-from ssmppl.inference.particles.pilot import Space
-from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.prior import draw_prior
-from ssmppl.inference.problem import Problem
-from ssmppl.inference.runner import run_chains
-from ssmppl.language.transforms import transforms, unconstrain
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.space import Space
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import Block, ChainDraws
+from ssmppl.inference.run.prior import draw_prior
+from ssmppl.inference.run.problem import Problem
+from ssmppl.language.model.transforms import transforms, unconstrain
 
 STEP = 2.38  # of the random walk, over sqrt(F), in standard deviations (Roberts et al. 1997)
 MOST_PARTICLES = 100_000

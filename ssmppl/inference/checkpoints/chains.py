@@ -31,7 +31,7 @@ from ssmppl.inference.checkpoints.archive import clear, no_checkpoint, read, unw
 from ssmppl.inference.checkpoints.codec import Codec, Store
 from ssmppl.inference.checkpoints.origin import Origin, origin_of
 from ssmppl.inference.checkpoints.spool import Spool
-from ssmppl.inference.draws import Block, ChainDraws, Standing, stack
+from ssmppl.inference.run.draws import Block, ChainDraws, Standing, stack
 
 SECONDS = 30.0  # between two writings, at least
 SHARE = 0.03  # of the time that may go into writing

@@ -18,9 +18,9 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.distributions import Distribution
-from ssmppl.language.primitive import Primitive
-from ssmppl.language.traced import Site, Trace
-from ssmppl.language.written import Written
+from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.user_defined.primitive import Primitive
 
 # What the digits of draws depend on besides this package: compilers, random number generators,
 # special functions, factorisations.

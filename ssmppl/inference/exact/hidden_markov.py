@@ -1,31 +1,228 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
-The laws (`finite_laws.py`) of data sets of one shape (`histories.py`) are handed all at once to the
-compiled passes (`finite_passes.py`).
+The laws of data sets of one shape (`histories.py`) are handed all at once to the compiled passes.
+
+The laws of a model of finitely many values, as tables over these.
+
+They may depend on parameters, inputs, time and observations before. The densities are evaluated by
+the interpreter, over all values, rows and data sets of one shape at once.
+
+The passes over finitely many values: in ordinary numbers, or by logarithms where these will not
+do.
+
+A value that the data have made 1e-300 times as likely as another is no number any more, and yet it
+may be the only one that later rows leave: before a change from which no way leads back. The pass in
+ordinary numbers tells where that may have happened, and then everything is done by logarithms, at
+several times the cost.
+
+Quantiles of mixtures by their distribution functions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 
-from ssmppl.analysis.channels import Channel, channels
+from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.finite import FiniteStates, finite_states
-from ssmppl.codegen.kernels.random import fill_uniform
-from ssmppl.codegen.kits import predictive
+from ssmppl.analysis.proposals.channels import Channel, channels
+from ssmppl.codegen.kernels.hmm.passes import UNSURE
+from ssmppl.codegen.kernels.math.random import fill_uniform
+from ssmppl.codegen.modules.exact import exact_entry
+from ssmppl.codegen.text.kernel_functions import predictive
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.expressions.expr import Expr
-from ssmppl.inference.exact.finite_laws import FiniteLaws
-from ssmppl.inference.exact.finite_passes import Filtered, forward
-from ssmppl.inference.exact.histories import Histories
-from ssmppl.inference.exact.kalman_moments import SmoothedMoments
-from ssmppl.inference.exact.mixtures import inverted
-from ssmppl.inference.ranges import without_density
-from ssmppl.language.traced import Trace, once_per_trace
+from ssmppl.expressions.calculus import differentiate
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, constant
+from ssmppl.inference.exact.derivatives import Scored
+from ssmppl.inference.exact.histories import Histories, histories
+from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
+from ssmppl.inference.run.ranges import without_density
+from ssmppl.language.model.traced import Trace, once_per_trace, previous
+
+ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
+
+
+@dataclass(frozen=True)
+class FiniteLaws(Scored):
+    """A traced model as one of finitely many values (K, D)."""
+
+    form: FiniteStates
+    _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
+
+    @property
+    def values(self) -> np.ndarray:
+        return self.form.values
+
+    def histories_of(self, experiments: Iterable[Experiment]) -> tuple[Histories, ...]:
+        entries = max(1, ENTRIES // len(self.values) ** 2)
+        return histories(self.trace, tuple(experiments), entries)
+
+    def density(self, role: str, h: Histories, by: Expr | None = None) -> Expr:
+        """The log density of a role, or its derivative by a parameter."""
+        missing = Missing(partial=h.partial)
+        key = f"{role} {sorted(h.partial)}"
+        if key not in self._densities:
+            total = constant(0.0)
+            for t in terms(self.trace, role, missing):
+                total = total + t.guarded()
+            self._densities[key] = total
+        if by is None:
+            return self._densities[key]
+        slope = f"{key} by {by!r}"
+        if slope not in self._densities:
+            self._densities[slope] = differentiate([self._densities[key]], by)[0]
+        return self._densities[slope]
+
+    def expected(
+        self, h: Histories, theta: np.ndarray, role: str, expressions: Sequence[Expr],
+        law: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
+        """Sums over data sets, rows and values of each expression, weighed by a law of `laws`: of
+        pairs for "transition". What has no weight does not count, be it infinite."""
+        out = np.zeros(len(expressions))
+        law = law * h.weights.reshape(-1, *(1,) * (law.ndim - 1))
+        for rows, found in self._by_rows(expressions, h, theta, role):
+            own = law[:, rows]
+            out += [np.sum(own * np.where(own > 0.0, values, 0.0)) for values in found]
+        return out
+
+    def over_values(
+        self, expression: Expr, h: Histories, theta: np.ndarray, role: str
+    ) -> np.ndarray:
+        """(Q, R, K), or (Q, R, K, K) over x_{t-1} and x_t for "transition"; Q is S, or 1 where it
+        is the same for all histories, and R is T, or 1 where it is the same in all rows (and for
+        "initial")."""
+        parts = []
+        for _, (found,) in self._by_rows([expression], h, theta, role):
+            parts.append(found)
+            if found.shape[1] == 1:
+                break
+        return np.ascontiguousarray(np.concatenate(parts, axis=1) if parts[1:] else parts[0])
+
+    def _by_rows(
+        self, expressions: Sequence[Expr], h: Histories, theta: np.ndarray, role: str
+    ) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """The rows of a role, and each expression over them as of `over_values`, as many rows at a
+        time as memory allows."""
+        size, pair = len(self.values), role == "transition"
+        given: dict[Expr, np.ndarray] = dict(zip(self.trace.parameter_symbols, theta, strict=True))
+        for s, column in zip(self.trace.state_symbols, self.values.T, strict=True):
+            given[s] = column
+            if pair:
+                given[previous(s)] = column[:, None]
+        shape = (size, size) if pair else (size,)
+        last = 1 if role == "initial" else h.steps
+        step = max(2, ENTRIES // (h.size * int(np.prod(shape)) * max(1, len(expressions))))
+        for a in range(0, last, step):
+            rows = slice(a, min(a + step, last))
+            own = {s: v[:, rows].reshape(len(v), -1, *(1,) * len(shape))
+                   for s, v in h.rows.items()}  # fmt: skip
+            found = []
+            for values in evaluate(expressions, {**given, **own}):
+                values = np.asarray(values, dtype=float)
+                values = values.reshape((1,) * (2 + len(shape) - values.ndim) + values.shape)
+                found.append(np.broadcast_to(values, (*values.shape[:2], *shape)))
+            yield rows, found
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What the forward pass tells of one experiment (T rows, K values).
+
+    log_increments : (T,) log p(y_t | y_{1:t-1}). predicted, filtered : (T, K) laws of x_t given
+    y_{1:t-1} and y_{1:t}, or their logarithms if `logs`. move : (T or 1, K, K), as of the kernels,
+    likewise.
+
+    Of S histories at once every array has one axis more, the first.
+    """
+
+    log_increments: np.ndarray
+    _predicted: np.ndarray
+    _filtered: np.ndarray
+    _move: np.ndarray
+    logs: bool
+
+    @property
+    def predicted(self) -> np.ndarray:
+        return np.exp(self._predicted) if self.logs else self._predicted
+
+    @property
+    def filtered(self) -> np.ndarray:
+        return np.exp(self._filtered) if self.logs else self._filtered
+
+    def of(self, s: int) -> Filtered:
+        """What it tells of history s."""
+        move = self._move[s if len(self._move) > 1 else 0]
+        own = self.log_increments[s], self._predicted[s], self._filtered[s]
+        return Filtered(*own, move, self.logs)
+
+    def smoothed(self, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Laws (S, T, K) of x_t given all data, and (S, T, K, K) of (x_{t-1}, x_t), row 0 zero;
+        without pairs the latter is empty."""
+        shape = self._filtered.shape
+        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
+        entry = exact_entry("finite_backward_logs" if self.logs else "finite_backward")
+        entry(self._move, self._predicted, self._filtered, law, both)
+        return law, both
+
+    def paths(self, which: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
+        """(M, T) indices of values drawn given all data, path m of history which[m], by uniforms
+        (M, T)."""
+        found = np.empty(uniforms.shape, dtype=np.int64)
+        entry = exact_entry("finite_draw_logs" if self.logs else "finite_draw")
+        entry(self._move, self._filtered, which, uniforms, found)
+        return found
+
+
+def forward(
+    log_start: np.ndarray, log_move: np.ndarray, log_g: np.ndarray
+) -> tuple[Filtered, np.ndarray]:
+    """The forward pass, and (S,) the row at which it came to an end, -1 if at none; arguments as of
+    the kernels."""
+    shape = log_g.shape
+    found = np.empty(shape[:2]), np.empty(shape), np.empty(shape)
+    stopped = np.empty(len(log_g), dtype=np.int64)
+    move = np.exp(log_move)
+    exact_entry("finite_forward")(move, log_start, log_move, log_g, *found, stopped)
+    if not np.any(stopped == UNSURE):
+        return Filtered(*found, move, logs=False), stopped
+    exact_entry("finite_forward_logs")(log_start, log_move, log_g, *found, stopped)
+    return Filtered(*found, log_move, logs=True), stopped
+
+
+MOST = 200  # halvings: of an interval between any two floats that differ in size by less than 1e40
+ROUNDING = 1e-12  # by which sums of probabilities may miss a level
+
+
+def inverted(
+    below: Callable[[np.ndarray], np.ndarray], level: float, low: np.ndarray, high: np.ndarray,
+    whole: bool,
+) -> np.ndarray:  # fmt: skip
+    """The smallest values at which distribution functions reach a level, by bisection.
+
+    below : values -> P(Y <= value), in the shape of low and high, between which they lie: of a
+        mixture the least and the largest quantile of its parts. whole : whether values are whole
+        numbers.
+    """
+    low, high = low.copy(), high.copy()
+    for _ in range(MOST):
+        middle = 0.5 * low + 0.5 * high
+        if whole:
+            middle = np.floor(middle)
+            open_ = low < high
+        else:
+            open_ = high - low > 2.0**-52 * np.maximum(np.abs(low), np.abs(high))
+        if not open_.any():
+            break
+        reached = below(middle) >= level - ROUNDING * whole
+        high = np.where(open_ & reached, middle, high)
+        low = np.where(open_ & ~reached, middle + 1.0 if whole else middle, low)
+    return high
 
 
 @dataclass(frozen=True)

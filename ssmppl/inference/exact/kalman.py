@@ -1,48 +1,261 @@
 """The exact filter of linear Gaussian models (Kalman 1960), and what follows from it.
 
 Applies where `structure.linear_gaussian` does. The matrices are evaluated by the interpreter, all
-time steps at once, and handed to the compiled filter of `codegen/kernels/kalman.py`; the smoother
-and the sampler are in `kalman_moments.py`.
+time steps at once, and handed to the compiled filter of `codegen/kernels/kalman/square_root.py`;
+the smoother and the sampler are in `kalman_matrices.py`.
+
+Flat components of x_1 in a linear Gaussian model: the start that smoother and score go from.
+
+See `codegen/kernels/kalman/diffuse.py`. Given the flat part the model is an ordinary one, and given
+the data the flat part is Gaussian; so everything but the filter runs on the ordinary model from the
+mean of that Gaussian, with its root in further columns.
+
+The exact score of a linear Gaussian model: derivatives of its matrices times their adjoints.
+
+The matrices are differentiated as expressions, once for each model; their derivatives are evaluated
+as the matrices themselves are, and meet what one backward pass of the filter says about every entry
+(`codegen/kernels/kalman/adjoint.py`). No parameter costs another pass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from ssmppl.analysis.structure import LinearGaussian, linear_gaussian
-from ssmppl.codegen.exact import exact_entry
-from ssmppl.codegen.kernels.kalman import OK
-from ssmppl.codegen.kernels.kalman_steps import Matrices
-from ssmppl.codegen.program import Program
+from ssmppl.codegen.kernels.kalman.adjoint import zeros_like
+from ssmppl.codegen.kernels.kalman.square_root import LOG_2PI, OK
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.modules.exact import exact_entry
+from ssmppl.codegen.modules.program import Program
 from ssmppl.data import Experiment
-from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.errors import ArgumentError, Location, NotApplicable, SamplingError
+from ssmppl.expressions.calculus import NotDifferentiable, differentiate
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact import kalman_matrices
-from ssmppl.inference.exact.kalman_diffuse import check_agreement, diffuse_filter, start_of
-from ssmppl.inference.exact.kalman_moments import (
+from ssmppl.inference.exact.derivatives import Scored
+from ssmppl.inference.exact.kalman_matrices import (
     Disturbances,
     SmoothedMoments,
     Stopped,
     drawn,
     smoothed,
+    values_of,
 )
-from ssmppl.inference.exact.kalman_score import Slopes, check_free, score, slopes
-from ssmppl.inference.exact.scored import Scored
-from ssmppl.inference.totals import total_of
-from ssmppl.language.traced import Trace, once_per_trace
+from ssmppl.inference.run.ranges import total_of
+from ssmppl.language.model.traced import Trace, once_per_trace
 
-__all__ = [
-    "Disturbances",
-    "KalmanModel",
-    "KalmanMoments",
-    "Matrices",
-    "SmoothedMoments",
-    "kalman_filter",
-    "kalman_log_likelihood",
-    "kalman_model",
-]
+__all__ = ["Disturbances", "Matrices", "SmoothedMoments"]
+
+AGREEMENT = 1e-6  # of log p(y) by two roads; what is worse was lost to rounding
+
+
+@dataclass(frozen=True)
+class Start:
+    """x_1 = columns[:, 0] + columns[:, 1:] n + N(0, P), n ~ N(0, I) given the data.
+
+    columns (D, F). log_likelihood : log p(y), and log_given : log p(y | n = 0) that it entails;
+    None where no component is flat.
+    """
+
+    columns: np.ndarray
+    log_likelihood: float | None = None
+    log_given: float | None = None
+
+    def log_density(self, log_given: float) -> float:
+        """log p(y) from what the ordinary filter says of column 0."""
+        return log_given if self.log_likelihood is None else self.log_likelihood
+
+
+def diffuse_filter(
+    model: Matrices, flat: tuple[int, ...], experiment: Experiment, *outputs: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """factor (G, G) and right (G,) of the law of the flat part; outputs as of the kernel.
+
+    Raises
+    ------
+    Stopped : the laws have no density at theta.
+    """
+    g = len(flat)
+    factor, right = np.empty((g, g)), np.empty(g)
+    outputs = outputs if len(outputs) > 1 else (*outputs, *[None] * 6)
+    status, t = exact_entry("diffuse_filter")(
+        model, np.array(flat), experiment.y, experiment.seen, factor, right, *outputs
+    )
+    if status != OK:
+        raise Stopped(status, t)
+    return factor, right
+
+
+def start_of(trace: Trace, flat: tuple[int, ...], model: Matrices, experiment: Experiment) -> Start:
+    """The start of the ordinary model that stands for this one, given the data.
+
+    Raises
+    ------
+    Stopped : the laws have no density at theta.
+    SamplingError : the data do not tell some flat component.
+    """
+    mean = model.m[:, None]
+    if not flat:
+        return Start(mean.copy())
+    increments = np.empty(experiment.steps)
+    factor, right = diffuse_filter(model, flat, experiment, increments)
+    for j, i in enumerate(flat):
+        if factor[j, j] == 0.0:
+            site = trace.initial[trace.state_symbols[i].data[1]]
+            raise SamplingError(
+                f"the start of {trace.state_symbols[i]!r} is Flat, and the data do not tell it "
+                "(together with the components that are Flat before it)",
+                fix="give it a proper law in @initial, or data that depend on it",
+                where=site.distribution.location,
+            )
+    total = total_of(increments)
+    root = scipy.linalg.solve_triangular(factor, np.eye(len(flat)))
+    columns = np.zeros((len(mean), 1 + len(flat)))
+    columns[:, :1] = mean
+    columns[list(flat), 0] += root @ right
+    columns[list(flat), 1:] = root
+    spread = float(np.log(abs(np.diag(factor))).sum()) - 0.5 * len(flat) * LOG_2PI
+    return Start(columns, total, total + spread)
+
+
+def check_agreement(trace: Trace, start: Start, log_given: float) -> None:
+    """Refuse results of a filter that disagrees with the one that found the start.
+
+    Raises
+    ------
+    SamplingError : rounding errors have grown until nothing was left.
+    """
+    expected = start.log_given
+    if expected is None or abs(log_given - expected) <= AGREEMENT * (1.0 + abs(expected)):
+        return
+    site = next(s for s in trace.initial.values() if not s.distribution.proper)
+    raise SamplingError(
+        f"the start of {site.name!r} is Flat, and its effect grows over time until rounding errors "
+        f"hide it: log p(y) is {expected:.8g} or {log_given:.8g}, by where it is computed",
+        fix="give it a proper law in @initial, or its transition some noise",
+        where=site.distribution.location,
+    )
+
+
+LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",
+        "C": "observation", "d": "observation", "R": "observation"}  # fmt: skip
+
+
+class Slope(NamedTuple):
+    """The derivative of one entry of one matrix in one parameter, where it is not zero."""
+
+    parameter: int
+    field: str
+    entry: int
+    expression: Expr
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives of a model's matrices in its parameters.
+
+    refused : for each parameter in which some matrix has no derivative, the reason and the place.
+    """
+
+    known: tuple[Slope, ...]
+    refused: dict[int, tuple[str, Location]]
+
+
+def slopes(trace: Trace, form: LinearGaussian) -> Slopes:
+    """All derivatives of the matrices that are not zero."""
+    known: list[Slope] = []
+    refused: dict[int, tuple[str, Location]] = {}
+    for p, parameter in enumerate(trace.parameter_symbols):
+        for field in Matrices._fields:
+            entries = list(getattr(form, field).ravel())
+            try:
+                found = differentiate(entries, parameter)
+            except NotDifferentiable as error:
+                place = _culprit(trace, LAWS[field], parameter)
+                refused.setdefault(p, (f"the {LAWS[field]} law: {error.found}", place))
+                continue
+            known += [
+                Slope(p, field, i, e)
+                for i, e in enumerate(found)
+                if not (e.op == "const" and e.data == 0.0)
+            ]
+    return Slopes(tuple(known), refused)
+
+
+def _culprit(trace: Trace, law: str, parameter: Expr) -> Location:
+    """Where the law is written that has no derivative in the parameter."""
+    sites = {
+        "initial": trace.initial, "transition": trace.transition,
+        "observation": trace.observations,
+    }[law]  # fmt: skip
+    places = [site.distribution.location for site in sites.values()]
+    for site, place in zip(sites.values(), places, strict=True):
+        for values in site.distribution.parameters.values():
+            try:
+                differentiate(list(values.ravel()), parameter)
+            except NotDifferentiable:
+                return place
+    return places[0]
+
+
+def check_free(trace: Trace, found: Slopes, free: np.ndarray) -> None:
+    """Refuse free parameters in which the likelihood has no derivative in closed form.
+
+    Raises
+    ------
+    ArgumentError : naming the parameter, the law and the reason.
+    """
+    for p, (reason, where) in found.refused.items():
+        if free[p]:
+            raise ArgumentError(
+                f"the score in {trace.parameter_symbols[p]!r} has no closed form: {reason}",
+                fix="fix the parameter by fixed={...}, or use a method without gradients",
+                where=where,
+            )
+
+
+def score(
+    trace: Trace, found: Slopes, model: Matrices, start: np.ndarray, experiment: Experiment,
+    theta: np.ndarray,
+) -> tuple[float, np.ndarray]:  # fmt: skip
+    """Log density of column 0 of the start, and the gradient (P,) of log p(y), of one experiment.
+
+    Raises
+    ------
+    Stopped : the laws have no density at theta.
+    """
+    adjoint, increments = zeros_like(model), np.empty(experiment.steps)
+    status, t = exact_entry("adjoints")(
+        model, start, experiment.y, experiment.seen, increments, adjoint
+    )
+    if status != OK:
+        raise Stopped(status, t)
+    gradient = np.zeros(len(theta))
+    values = evaluate([s.expression for s in found.known], values_of(trace, experiment, theta))
+    for slope, value in zip(found.known, values, strict=True):
+        gradient[slope.parameter] += _product(slope, np.asarray(value), adjoint, experiment.steps)
+    return total_of(increments), gradient
+
+
+def _product(slope: Slope, value: np.ndarray, adjoint: Matrices, steps: int) -> float:
+    """Derivative of an entry times its adjoint, summed over the steps at which it acts."""
+    weights: np.ndarray = getattr(adjoint, slope.field)
+    if LAWS[slope.field] == "initial":
+        return float(weights.ravel()[slope.entry] * value.ravel()[0])
+    weight = weights.reshape(len(weights), -1)[:, slope.entry]
+    if LAWS[slope.field] == "transition":  # row 0 has no transition
+        if steps == 1:
+            return 0.0
+        if len(weight) > 1:
+            weight = weight[1:]
+            value = value[1:] if value.ndim else value
+    return float(np.sum(weight * value))
 
 
 @dataclass(frozen=True)

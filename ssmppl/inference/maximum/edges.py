@@ -21,8 +21,8 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.language.traced import Site
-from ssmppl.language.transforms import Transform, transforms, unconstrain
+from ssmppl.language.model.traced import Site
+from ssmppl.language.model.transforms import Transform, transforms, unconstrain
 
 OUTWARDS = (1.0, 4.0)  # steps on the unconstrained scale
 FARTHEST = (

@@ -1,9 +1,10 @@
 """Expectation maximisation where the smoother is exact, and so every step.
 
 Dempster, Laird and Rubin (1977); Shumway and Stoffer (1982); Schön et al. (2015), section on EM.
-The E-step takes the smoother's moments (`analysis/expectation.py`; for finite states see
-`baum_welch.py`), the M-step is derived (`analysis/mstep.py`). Where the densities do not separate,
-Q is climbed as it stands, by BFGS with its symbolic gradient, evaluated over all rows at once.
+The E-step takes the smoother's moments (`analysis/conjugacy/m_step.py`; for finite states sums over
+their values), the M-step is derived (`analysis/conjugacy/m_step.py`). Where the densities do not
+separate, Q is climbed as it stands, by BFGS with its symbolic gradient, evaluated over all rows at
+once.
 
 EM nears its limit by a constant factor at each step, close to one where the states tell much more
 of the parameters than the data do. So its steps are extrapolated by SQUAREM (Varadhan and Roland
@@ -12,37 +13,133 @@ algorithm", scheme S3) on the unconstrained scale, followed by an EM step, and w
 is kept only where the exact log-likelihood is at least that of two plain steps: it never falls. The
 same extrapolation tells how far the limit still is, which, and not the length of a step, decides
 when to stop.
+
+EM where the states take few values.
+
+L. Baum, T. Petrie, G. Soules and N. Weiss, *Annals of Mathematical Statistics* 41 (1970). The
+expectations are sums over the values of x_t and over the pairs of x_{t-1} and x_t; the M-step is
+derived (`analysis/conjugacy/m_step.py`), or the expected density is climbed.
+
+The M-step of a complete-data density that does not separate: the expected density climbed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import scipy
 
 from ssmppl.analysis.climber import Unconstrained
-from ssmppl.analysis.expectation import (
+from ssmppl.analysis.conjugacy.m_step import (
     IN_TIME,
     ExpectedDensity,
+    MStep,
     expected_density,
     expected_statistics,
     moments_of,
 )
-from ssmppl.analysis.mstep import MStep
+from ssmppl.analysis.density import terms
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.expressions.calculus import gradient as gradient_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.inference.exact.deterministic import Deterministic
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
+from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman import KalmanModel
-from ssmppl.inference.exact.models import filter_name
-from ssmppl.inference.exact.vanishing import without_maximum
-from ssmppl.inference.maximum.ascent import Ascent, Setup
-from ssmppl.inference.maximum.baum_welch import FiniteSteps
-from ssmppl.inference.maximum.expected_climb import climbed
+from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Setup
 from ssmppl.inference.maximum.m_step import maximiser
-from ssmppl.inference.methods import EM
-from ssmppl.inference.singular import need_density
-from ssmppl.language.traced import Trace, previous, seen
+from ssmppl.inference.methods.methods import EM
+from ssmppl.inference.methods.requirements import need_density
+from ssmppl.inference.particles.deterministic import Deterministic
+from ssmppl.inference.preparation.exact_models import filter_name
+from ssmppl.inference.preparation.vanishing import without_maximum
+from ssmppl.language.model.traced import Trace, previous, seen
+
+
+def climbed(
+    setup: Setup, theta: np.ndarray, expected: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    with_slope: bool,
+) -> np.ndarray:  # fmt: skip
+    """Where theta' -> (Q, its derivatives (P,)) has its top near theta, by BFGS on the
+    unconstrained scale; Nelder and Mead's simplex where the derivatives are not there.
+
+    Raises
+    ------
+    SamplingError : Q has a value and no slope at theta itself.
+    """
+    chart = setup.chart
+
+    def at(z: np.ndarray) -> tuple[float, np.ndarray]:
+        """-Q and its derivatives in z."""
+        point = chart.at(z)
+        if not np.all(np.isfinite(point.theta)):
+            return np.inf, np.zeros(len(z))
+        total, gradient = expected(point.theta)
+        if not np.isfinite(total) or not np.all(np.isfinite(gradient)):
+            return np.inf, np.zeros(len(z))
+        return -total, -point.pull(gradient)
+
+    z = setup.space_at(theta)
+    value, gradient = expected(theta)
+    if with_slope and (reason := chart.without_slope(value, theta, gradient)):
+        raise SamplingError(f"the expected log density cannot be climbed: {reason}", fix=ELSEWHERE)
+    before = at(z)[0]
+    found = scipy.optimize.minimize(
+        at if with_slope else (lambda v: at(v)[0]), z, jac=with_slope or None,
+        method="BFGS" if with_slope else "Nelder-Mead",
+        options={"gtol": 1e-7} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},
+    )  # fmt: skip
+    return chart.at(found.x).theta if found.fun <= before else theta
+
+
+class FiniteSteps:
+    """theta -> theta after one E-step and one M-step."""
+
+    def __init__(self, setup: Setup, model: HiddenMarkov):
+        self.setup, self.model = setup, model
+        self.step: MStep | NotApplicable = maximiser(setup, "EM").step
+        self.free = [
+            s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held
+        ]
+
+    def __call__(self, theta: np.ndarray) -> np.ndarray:
+        laws = self.model.laws(self.setup.problem.experiments, theta)
+        if not isinstance(self.step, MStep):
+            return climbed(self.setup, theta, lambda at: self._density(laws, at), True)
+        total = np.array(self.step.prior(theta.tolist()), dtype=float)
+        for role, summands in self.step.update.coefficients.items():
+            if role in IN_TIME:
+                for h, law, pairs in laws:
+                    own = pairs if role == "transition" else law
+                    total += self.model.expected(h, theta, role, summands, own)
+        return self.step.maximise(total, theta)
+
+    def _density(
+        self, laws: list[tuple[Histories, np.ndarray, np.ndarray]], at: np.ndarray
+    ) -> tuple[float, np.ndarray]:
+        """(Q, its derivatives) at theta' of the laws of the states at another theta."""
+        trace = self.setup.problem.trace
+        place = {s: i for i, s in enumerate(trace.parameter_symbols)}
+        total, gradient = 0.0, np.zeros(len(place))
+        for h, law, pairs in laws:
+            for role in IN_TIME:
+                own = pairs if role == "transition" else law
+                both = [self.model.density(role, h),
+                        *(self.model.density(role, h, s) for s in self.free)]  # fmt: skip
+                found = self.model.expected(h, at, role, both, own)
+                total += found[0]
+                gradient[[place[s] for s in self.free]] += found[1:]
+        if self.setup.with_prior:
+            here = dict(zip(trace.parameter_symbols, at, strict=True))
+            for term in terms(trace, "prior"):
+                both = [term.log_density, *gradient_of(term.log_density, self.free)]
+                found = np.array([float(v) for v in evaluate(both, here)])
+                total += found[0]
+                gradient[[place[s] for s in self.free]] += found[1:]
+        return total, gradient
+
 
 SHORTENINGS = 2  # of an extrapolation that lost, before plain steps are taken
 ROUNDING = 1e-13  # of the log-likelihood, relative

@@ -10,8 +10,8 @@ on the unconstrained scale; parameters and states are resampled together, and th
 are left begin the next pass. As the steps vanish the swarm settles where the likelihood is highest.
 
 Numbers that act in the initial law alone step at the first row only, which the model itself tells
-(`analysis/perturbed.py`); those that act nowhere stay. Several experiments are passed over one
-after another with one swarm, whose parameters all of them share.
+(`analysis/proposals/perturbed.py`); those that act nowhere stay. Several experiments are passed
+over one after another with one swarm, whose parameters all of them share.
 
 At the end of a pass the swarm leans to the last rows. Averaged over all rows of a pass it does not,
 to first order: the filtered mean of a random walk is a weighted mean of what the rows say whose
@@ -20,31 +20,220 @@ of the initial law's numbers are the swarm's means at the end.
 
 What is left, all swarms may share: steps that have not vanished, a ridge not yet climbed. How the
 ends differ does not tell it. So from the ends the top itself is looked for, by estimates of the
-likelihood round it (`hilltop.py`); their noise is the error of the estimate.
+likelihood round it (`noisy_maximum.py`); their noise is the error of the estimate.
+
+Swarms of iterated filtering: how a pass over the data moves them; see iterated_filtering.py.
+
+The ends of several noisy climbs: which is the highest, and which agree with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.perturbed import Perturbed
+from ssmppl.analysis.proposals.perturbed import Perturbed, perturbed
+from ssmppl.codegen.kernels.particle.weights import OK
+from ssmppl.codegen.modules.filter_variants import compile_iterated_filter
+from ssmppl.compiling import once_property
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference.draws import stack
 from ssmppl.inference.maximum.ascent import Ascent, Setup
-from ssmppl.inference.maximum.hilltop import Hilltop, check_points, hilltop
 from ssmppl.inference.maximum.m_step import starts
-from ssmppl.inference.maximum.summit import HALF_INTERVAL, Summit, evaluate, summit
-from ssmppl.inference.maximum.swarms import State, Swarms, perturbed_model, swarm_block
-from ssmppl.inference.methods import IF2
-from ssmppl.inference.particles.filtering import random_state
-from ssmppl.inference.particles.pilot import space_of
-from ssmppl.inference.progress import announced
-from ssmppl.inference.runner import run_chains
+from ssmppl.inference.maximum.noisy_maximum import Hilltop, check_points, hilltop
+from ssmppl.inference.methods.methods import IF2
+from ssmppl.inference.particles.filtering import (
+    FilterSettings,
+    failure,
+    log_of_mean,
+    repeated_estimates,
+)
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.space import Space, space_of
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import Block, stack
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.progress import announced
+from ssmppl.inference.run.ranges import total_of
+from ssmppl.inference.run.seeds import random_state
+from ssmppl.inference.run.tasks import run_tasks
+
+
+@dataclass(frozen=True)
+class Swarms:
+    """What all swarms of a call share; other processes generate the filter again.
+
+    perturbation : (F,) standard deviation of the first step. moving : (F,) see `Perturbed`.
+    cooling : factor of the standard deviation over 50 passes.
+    """
+
+    space: Space
+    with_prior: bool
+    perturbation: np.ndarray
+    moving: np.ndarray
+    cooling: float
+
+    @property
+    def problem(self) -> Problem:
+        return self.space.problem
+
+    @once_property
+    def run(self) -> Callable[..., Any]:
+        return compile_iterated_filter(perturbed_model(self.space, self.with_prior))
+
+    def __getstate__(self) -> dict:
+        return {k: v for k, v in self.__dict__.items() if k != "run"}
+
+    def steps(self, iteration: int) -> list[np.ndarray]:
+        """Standard deviations of the steps in a pass (from 1), (T, F) for each experiment."""
+        rows = [e.steps for e in self.problem.experiments]
+        part = iteration - 1.0 + np.arange(sum(rows)) / sum(rows)
+        scale = (self.cooling ** (part / 50.0))[:, None] * self.perturbation
+        out = np.split(scale, np.cumsum(rows)[:-1])
+        for own in out:
+            own[1:, ~self.moving] = 0.0
+        return out
+
+    def one_pass(
+        self, swarm: np.ndarray, iteration: int, stream: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Move the swarm (F, N) over all experiments; (iterate (F,), log_increment of all rows).
+
+        Raises
+        ------
+        SamplingError : a weight is infinite.
+        """
+        every, sums = [], np.zeros(len(swarm))
+        for k, (e, steps) in enumerate(
+            zip(self.problem.experiments, self.steps(iteration), strict=True)
+        ):
+            parts = [e.u, steps]
+            if self.with_prior:
+                counts = np.zeros((e.steps, 1))
+                counts[0] = k == 0
+                parts.append(counts)
+            increment, means = np.empty(e.steps), np.empty(steps.shape)
+            status, t = self.run(
+                self.space.theta, e.y, e.seen, np.hstack(parts), stream, swarm, increment, means
+            )
+            if status != OK:
+                theta, _ = self.space.parameters(swarm.mean(axis=1))
+                raise failure(self.problem, theta, status, t, e)
+            every.append(increment)
+            sums += means.sum(axis=0)
+        log_increment = np.concatenate(every)
+        mean = np.where(self.moving, sums / len(log_increment), swarm.mean(axis=1))
+        return mean, log_increment
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a swarm stands: (F, N), the kernels' random state, passes made."""
+
+    swarm: np.ndarray
+    stream: np.ndarray
+    done: int
+
+
+def swarm_block(swarms: Swarms, state: State, n: int) -> tuple[State, Block]:
+    """n passes of one swarm."""
+    swarm, stream = state.swarm.copy(), state.stream.copy()
+    z, totals, impossible = [], [], []
+    for k in range(state.done + 1, state.done + n + 1):
+        mean, log_increment = swarms.one_pass(swarm, k, stream)
+        z.append(mean)
+        totals.append(total_of(log_increment))
+        impossible.append(np.sum(log_increment == -np.inf))
+    stats = {"perturbed_log_likelihood": np.array(totals), "impossible": np.array(impossible)}
+    return State(swarm, stream, state.done + n), Block({"z": np.array(z)}, stats)
+
+
+def perturbed_model(space: Space, with_prior: bool) -> Perturbed:
+    """The perturbed form of a problem's model."""
+    problem = space.problem
+    return perturbed(problem.trace, problem.program.missing, space.free.tolist(), with_prior)
+
+
+HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
+
+
+@dataclass(frozen=True)
+class Summit:
+    """The best of S ends, or the mean of those that agree with it.
+
+    z : (F,) the estimate. value, noise : log-likelihood there and its standard error. values,
+    errors : (S,) those of the ends. near : (S,) which ends agree. pooled : whether z is their mean.
+    """
+
+    z: np.ndarray
+    value: float
+    noise: float
+    values: np.ndarray
+    errors: np.ndarray
+    best: int
+    near: np.ndarray
+    pooled: bool
+
+
+def summit(setup: Setup, method: IF2, ends: np.ndarray) -> Summit:
+    """Where the likelihood is highest out of the ends (S, F) of the swarms and their mean.
+
+    Ends agree where their log-likelihoods differ by less than half the width of a 0.95 interval of
+    a profile, and two standard errors.
+    """
+
+    def prior(z: np.ndarray) -> float:
+        return setup.chart.at(z).log_prior if setup.with_prior else 0.0
+
+    values, errors = evaluate(setup, method, ends, 0)
+    heights = values + np.array([prior(z) for z in ends])
+    best = int(np.argmax(heights))
+    with np.errstate(invalid="ignore"):  # none is near where all likelihoods are zero
+        near = heights[best] - heights <= HALF_INTERVAL + 2.0 * np.hypot(errors, errors[best])
+    z, value, noise, pooled = ends[best], values[best], errors[best], False
+    if near.sum() > 1:
+        middle = ends[near].mean(axis=0)
+        (own,), (own_noise,) = evaluate(setup, method, middle[None], len(ends))
+        if own + prior(middle) >= heights[best]:
+            z, value, noise, pooled = middle, own, own_noise, True
+    return Summit(z, float(value), float(noise), values, errors, best, near, pooled)
+
+
+def evaluate(
+    setup: Setup, method: IF2, ends: np.ndarray, first: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(log-likelihood, its standard error) at each end (S, F), numbered from `first`; exact where
+    that can be. An end at which the filter fails has -inf.
+    """
+    problem, thetas = setup.problem, [setup.space.parameters(z)[0].copy() for z in ends]
+    if not isinstance(setup.exact, NotApplicable):
+        exact = [setup.exact.log_likelihood(problem.experiments, theta) for theta in thetas]
+        return np.array(exact), np.zeros(len(ends))
+    task = partial(_estimates, problem, method.particles, method.evaluations)
+    pieces = [(theta, setup.seed(7, first + k)) for k, theta in enumerate(thetas)]
+    found = run_tasks(task, pieces, executor=setup.executor)
+    failed = [e for e in found if isinstance(e, SamplingError)]
+    if len(failed) == len(found):
+        raise failed[0]
+    pairs = [(-np.inf, np.nan) if isinstance(e, SamplingError) else log_of_mean(e) for e in found]
+    values, errors = np.array(pairs).T
+    return values, np.nan_to_num(errors)
+
+
+def _estimates(
+    problem: Problem, particles: int, repeats: int, piece: tuple[np.ndarray, np.random.SeedSequence]
+) -> np.ndarray | SamplingError:
+    theta, seed = piece
+    try:
+        settings = FilterSettings(particles, choose(problem, theta, exact=False).name)
+        return repeated_estimates(problem, theta, settings, seed, range(repeats))
+    except SamplingError as error:
+        return error
+
 
 USUAL = 0.02  # standard deviation of a step
 MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row

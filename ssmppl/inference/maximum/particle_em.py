@@ -4,7 +4,7 @@ Wei and Tanner (1990); Schön, Wills and Ninness (2011), "System identification 
 state-space models"; Schön et al. (2015), section on EM for nonlinear models. Each iteration runs R
 filters at theta_k, draws M trajectories from them backwards, and maximises the mean of log p(x, y |
 theta) over them: through its statistics where it separates, else by Newton's method
-(`path_climb.py`). Deterministic states that depend on a parameter then follow from the noisy ones,
+(`m_step.py`). Deterministic states that depend on a parameter then follow from the noisy ones,
 which alone are the missing data.
 
 EM magnifies what is wrong with its expectations as much as it is slow, so that the smoother's bias
@@ -28,15 +28,16 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.draws import Block
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
-from ssmppl.inference.methods import ParticleEM
+from ssmppl.inference.methods.methods import ParticleEM
+from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
-from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.filtering import FilterSettings, random_state
-from ssmppl.inference.particles.proposal_choice import choose
-from ssmppl.inference.singular import need_density
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.particles.scores import complete_scores
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.seeds import random_state
 
 
 def climb(setup: Setup, method: ParticleEM) -> Ascent:

@@ -24,7 +24,7 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.weights import OK
+from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
     PARTICLES,
@@ -33,13 +33,14 @@ from ssmppl.inference.chains.pgas import (
     pgas_proposal,
     start_chain,
 )
-from ssmppl.inference.draws import Block
 from ssmppl.inference.maximum.ascent import Ascent, Setup
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
-from ssmppl.inference.methods import PSAEM
+from ssmppl.inference.methods.methods import PSAEM
+from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import sweep_failure
-from ssmppl.inference.particles.filtering import FilterSettings, random_state
-from ssmppl.inference.singular import need_density
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.seeds import random_state
 
 
 def climb(setup: Setup, method: PSAEM) -> Ascent:

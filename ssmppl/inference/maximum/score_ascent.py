@@ -10,9 +10,9 @@ at iterates z_k that are near it
     z* = mean z_k + I^-1 mean g_k,   its Monte Carlo covariance I^-1 Cov(mean g_k) I^-1,
 
 whatever steps led there. The runs are weighted by their estimates of the likelihood, over those of
-the quadratic at z_k, which takes away the bias of order 1 / N (see `particle_score.py`). The steps
-are z_{k+1} = z_k + k^-0.6 B^-1 g_k, B an estimate of I, after D.
-Ruppert (1988), and B. T. Polyak and A. B. Juditsky, *SIAM J. Control Optim.* 30 (1992).
+the quadratic at z_k, which takes away the bias of order 1 / N (see
+`inference/particles/scores.py`). The steps are z_{k+1} = z_k + k^-0.6 B^-1 g_k, B an estimate of I,
+after D. Ruppert (1988), and B. T. Polyak and A. B. Juditsky, *SIAM J. Control Optim.* 30 (1992).
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ import scipy
 from ssmppl.data import spelled
 from ssmppl.errors import SamplingError
 from ssmppl.inference.maximum.ascent import Ascent, Setup
-from ssmppl.inference.methods import ScoreAscent
+from ssmppl.inference.methods.methods import ScoreAscent
+from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import choose_kernel
-from ssmppl.inference.particles.complete_score import complete_scores
-from ssmppl.inference.particles.particle_score import (
+from ssmppl.inference.particles.scores import (
     Run,
     Smoothing,
     combine,
+    complete_scores,
     run_weights,
     several_runs,
 )
-from ssmppl.inference.particles.proposal_choice import choose, resolve_settings
-from ssmppl.inference.progress import Progress
-from ssmppl.inference.singular import need_density
-from ssmppl.language.transforms import transforms
+from ssmppl.inference.preparation.proposal_choice import choose, resolve_settings
+from ssmppl.inference.run.progress import Progress
+from ssmppl.language.model.transforms import transforms
 
 NEWTON = {"particles": 500, "trajectories": 200, "runs": 8, "iterations": 200}
 PAPER = {"particles": 500, "trajectories": 100, "runs": 1, "iterations": 250}

@@ -19,20 +19,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.analysis.heights import transition_height
+from ssmppl.analysis.proposals.upper_bounds import transition_height
 from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.backward_pairs import ABOVE_BOUND
-from ssmppl.codegen.kernels.conditional_smc import JOINING
-from ssmppl.codegen.kernels.random import fill_uniform
-from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, OK
+from ssmppl.codegen.kernels.math.random import fill_uniform
+from ssmppl.codegen.kernels.particle.backward import ABOVE_BOUND
+from ssmppl.codegen.kernels.particle.conditional_smc import JOINING
+from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, OK
 from ssmppl.counts import check_count
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
-from ssmppl.inference.problem import Problem
-from ssmppl.inference.ranges import without_density
-from ssmppl.inference.totals import total_of
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.ranges import total_of, without_density
 
 __all__ = [
     "KERNELS",

@@ -1,7 +1,7 @@
 """One particle filter of very many particles, in blocks that the cores of a machine share out.
 
-See `codegen/kernels/blocks.py`. The numbers depend on the size of a block and on the seed, not on
-how many threads there are.
+See `codegen/kernels/particle/particle_filter.py`. The numbers depend on the size of a block and on
+the seed, not on how many threads there are.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.blocks import BLOCK
-from ssmppl.codegen.kernels.random import new_state, uniform
-from ssmppl.codegen.kernels.resampling import PADDING
-from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
+from ssmppl.codegen.kernels.math.random import new_state, uniform
+from ssmppl.codegen.kernels.particle.particle_filter import BLOCK
+from ssmppl.codegen.kernels.particle.resampling import PADDING
+from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN, OK
 from ssmppl.data import Experiment
-from ssmppl.inference.executors import cpu_count
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.run.executors import cpu_count
+from ssmppl.inference.run.problem import Problem
 
 LEAST = 1 << 19
 """Particles from which a filter runs in blocks, whatever the number of cores."""

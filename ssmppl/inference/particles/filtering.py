@@ -1,6 +1,6 @@
 """Runs of the particle filter: the likelihood, and everything else that a filter tells.
 
-Algorithm 2 of Schön et al. (2015); see `codegen/kernels/particle_filter.py`.
+Algorithm 2 of Schön et al. (2015); see `codegen/kernels/particle/particle_filter.py`.
 """
 
 from __future__ import annotations
@@ -11,18 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.random import new_state
-from ssmppl.codegen.kernels.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
-from ssmppl.codegen.kernels.weights import ALL_ZERO, INFINITE, NAN, OK
+from ssmppl.codegen.kernels.particle.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
+from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN, OK
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
-from ssmppl.inference.problem import Problem
-from ssmppl.inference.ranges import DOMAIN, out_of_range, without_density
-from ssmppl.inference.totals import total_of
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.ranges import DOMAIN, out_of_range, total_of, without_density
+from ssmppl.inference.run.seeds import random_state
 
 SCHEMES = {
     "systematic": SYSTEMATIC,
@@ -97,21 +96,6 @@ def check_rescue(rescue: Any) -> None:
             "rescue=1 allows a row the N particles that it has anyway",
             fix="give how many times N particles a row may take, as rescue=100; 0: no rescue",
         )
-
-
-def seed_sequence(seed: Any) -> np.random.SeedSequence:
-    """The root of a call's random numbers."""
-    whole = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
-    if seed is not None and (not whole or seed < 0):
-        raise ArgumentError(
-            f"seed={seed!r}", fix="give a whole number of at least 0, or None for a random one"
-        )
-    return np.random.SeedSequence(seed)
-
-
-def random_state(root: np.random.SeedSequence, *path: int) -> np.ndarray:
-    """State of the kernels' generator at a place in the work (chain, repeat, experiment, ...)."""
-    return new_state(np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *path)))
 
 
 Arrays = tuple[np.ndarray, ...]

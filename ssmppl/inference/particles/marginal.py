@@ -1,31 +1,48 @@
 """Runs of the Rao-Blackwellised particle filter, told in the model's own states.
 
 The filter carries the states x that are sampled and the moments of the linear ones, z
-(`analysis/marginal.py`). What is known of z_t is a mixture of Gaussians, one of each particle: its
-mean and covariance are exact given the particles, its quantiles come from one draw of each. Given
-a path of x, z is drawn by the backward sampler of the Kalman filter.
+(`analysis/elimination/marginal.py`). What is known of z_t is a mixture of Gaussians, one of each
+particle: its mean and covariance are exact given the particles, its quantiles come from one draw of
+each. Given a path of x, z is drawn by the backward sampler of the Kalman filter.
+
+Backward simulation over a Rao-Blackwellised particle filter.
+
+Paths of x and z together are drawn backwards (F. Lindsten and T. Schön, "Backward simulation
+methods for Monte Carlo statistical inference", *Foundations and Trends in Machine Learning* 6,
+2013, section 5): given x_{t+1} and z_{t+1}, the index of x_t has the probabilities
+
+    w_t^i p(x_{t+1}, z_{t+1} | x_t^i, m_t^i, P_t^i),
+
+in which z_t is integrated out, and z_t is drawn given all of these. x alone would not do: without
+z its future depends on its whole past. Of the joint path only that of x is kept; z is drawn anew
+given it by the Kalman filter's backward sampler, and so owes nothing to the particles but x.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.kalman_steps import Matrices
-from ssmppl.codegen.kernels.random import fill_normal
-from ssmppl.codegen.kernels.summaries import summarise
-from ssmppl.codegen.kernels.weights import OK
-from ssmppl.codegen.marginal import NAMES, MarginalFilter
+from ssmppl.analysis.density import Term, terms
+from ssmppl.codegen.kernels.kalman.steps import Matrices
+from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
+from ssmppl.codegen.kernels.particle.weights import NAN, OK, summarise
+from ssmppl.codegen.modules.marginal import NAMES, MarginalFilter
 from ssmppl.data import Experiment
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.inference.exact import kalman_matrices
-from ssmppl.inference.exact.kalman_moments import Stopped, drawn
+from ssmppl.inference.exact.kalman_matrices import Stopped, drawn
+from ssmppl.inference.methods.methods import FFBSi
+from ssmppl.inference.particles.backward import ParticleSystem, draw_particles, pair_failure
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, failure, run_filter
-from ssmppl.inference.problem import Problem
-from ssmppl.language.traced import previous, seen
+from ssmppl.inference.run.problem import Problem
+from ssmppl.language.distributions import Dirac
+from ssmppl.language.model.traced import previous, seen
 
 MOST_VALUES = 100_000  # particles times steps whose moments are computed at a time
 
@@ -220,3 +237,248 @@ def _draw_part(
         out[i][:, list(columns.linear)] = z[0][:, len(exact) :]
     for own, theirs in columns.sampled:
         out[:, :, own] = paths[:, :, theirs]
+
+
+MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time
+WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}
+"""Particles without weight may lie where the laws are infinite or undefined, and others so far from
+what follows them that their density is zero."""
+NEGLIGIBLE = 1e-12  # of a variance, what rounding leaves of it
+ROUNDING, TINY = 1e-13, 1e-300  # of a value, likewise; a variance, so that none is zero
+
+
+def may_integrate(problem: Problem, method: FFBSi) -> bool:
+    """Whether FFBSi is to draw its paths so: where it was asked for, or left to the model.
+
+    Raises
+    ------
+    ArgumentError : it was asked for and does not apply; gives the reason.
+    """
+    asked = is_marginal(method.proposal)
+    none = isinstance(problem.program.marginal, NotApplicable)
+    if none or not (asked or method.proposal == "auto"):
+        return asked  # what does not exist is refused where the proposal is looked up
+    reason: NotApplicable | None = _refusal(problem)
+    if method.kernel not in ("auto", "exact"):
+        reason = NotApplicable(f'kernel="{method.kernel}" is of filters of all states')
+    if asked and reason is not None:
+        raise ArgumentError(
+            f'FFBSi(proposal="{method.proposal}") does not apply: {reason}',
+            fix='use kernel="auto" with a proposal of all states, "bootstrap" or "guided"',
+        )
+    return reason is None
+
+
+def _refusal(problem: Problem) -> NotApplicable | None:
+    """Why paths cannot be drawn so; None where they can."""
+    found = marginal_of(problem).found
+    moments = {*found.mean, *found.covariance.ravel()}
+    before = set(found.trace.state_prev_symbols)
+    for site in found.trace.transition.values():
+        if isinstance(site.distribution, Dirac) and not moments & set(site.components):
+            if before & symbols_of(array(site.distribution.mean()).ravel()):
+                return NotApplicable(
+                    f"{site.name} follows from the state before without noise, so that no "
+                    "particle but its own ancestor can have come before it",
+                    site.distribution.location,
+                )
+    return None
+
+
+def marginal_paths(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, system: ParticleSystem,
+    trajectories: int, stream: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Trajectories (M, T, D) of all states; `system` holds the particles of the marginal model."""
+    paths, _ = backward_pass(problem, theta, experiment, system, trajectories, stream)
+    return draw_given(problem, experiment, theta, paths, stream)
+
+
+def backward_pass(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, system: ParticleSystem,
+    trajectories: int, stream: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Paths of the particles (M, T, D') and of z (M, T, n), drawn backwards together."""
+    steps, d, n = system.particles.shape
+    law = _Law(problem, experiment, theta, system)
+    index = draw_particles(system.weights[-1], trajectories, stream)
+    paths = np.empty((trajectories, steps, d))
+    paths[:, -1] = system.particles[-1][:, index].T
+    mean, covariance = law.filtered(steps - 1)
+    z = _gaussian(mean[:, index], covariance[:, :, index], stream)
+    linear = np.empty((trajectories, steps, len(z)))
+    linear[:, -1] = z.T
+    for t in range(steps - 2, -1, -1):
+        x = paths[:, t + 1].T
+        uniforms, chosen = np.empty(trajectories), np.empty(trajectories, dtype=np.int64)
+        fill_uniform(stream, uniforms)
+        with np.errstate(**WITHOUT_WEIGHT):
+            step = law.step(t)
+        width = max(1, MOST_PAIRS // n)
+        for first in range(0, trajectories, width):
+            part = slice(first, min(first + width, trajectories))
+            with np.errstate(**WITHOUT_WEIGHT):
+                log_w = step.log_weights(x[:, part], z[:, part])
+            if not np.all(np.isfinite(log_w.max(axis=0))):
+                raise pair_failure(problem, theta, NAN, t, experiment)
+            chosen[part] = _drawn_indices(log_w, uniforms[part])
+        z = step.draw(x, z, chosen, stream)
+        paths[:, t], linear[:, t] = system.particles[t][:, chosen].T, z.T
+    return paths, linear
+
+
+def _drawn_indices(log_w: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
+    """An index by each column of unnormalised log weights (N, M)."""
+    w = np.exp(log_w - log_w.max(axis=0))
+    cumulative = np.cumsum(w, axis=0)
+    below = cumulative <= uniforms * cumulative[-1]
+    return np.minimum(below.sum(axis=0), len(w) - 1)
+
+
+class _Law:
+    """What the particles know, row by row; moments are computed for many rows at a time."""
+
+    def __init__(
+        self, problem: Problem, experiment: Experiment, theta: np.ndarray, system: ParticleSystem
+    ):
+        self.problem, self.experiment, self.theta, self.system = problem, experiment, theta, system
+        self.values = values_of(problem, experiment, theta)
+        found = marginal_of(problem).found
+        self.found, self.columns = found, columns_of(problem)
+        moments = {*found.mean, *found.covariance.ravel(), *found.split.coupled}
+        self.free: list[Term] = [
+            t for t in terms(found.trace, "transition")
+            if not moments & set(t.site.components) and not isinstance(t.site.distribution, Dirac)
+        ]  # fmt: skip
+        self._rows, self._moments = range(0), (np.empty(0), np.empty(0))
+
+    def filtered(self, t: int) -> tuple[np.ndarray, np.ndarray]:
+        """Means (n, N) and covariances (n, n, N) of z_t given y_t."""
+        if t not in self._rows:
+            chunk = max(1, MOST_VALUES // self.system.particles.shape[2])
+            rows = slice(max(0, t + 1 - chunk), t + 1)
+            self._rows = range(rows.start, rows.stop)
+            self._moments = filtered_moments(
+                self.problem, self.experiment, self.theta, rows, self.system.particles
+            )
+        at = t - self._rows.start
+        return self._moments[0][at], self._moments[1][at]
+
+    def step(self, t: int) -> _Step:
+        """The law of row t + 1 given the particles of row t."""
+        given, n = self.found.given, self.system.particles.shape[2]
+        row = slice(t + 1, t + 2)
+        values = {s: at_rows(v, row) for s, v in self.values.items()}
+        for i, s in enumerate(self.found.trace.state_symbols):
+            values[previous(s)] = self.system.particles[t, i][:, None]
+        k = len(self.found.split.coupled)
+        a_form = given.A[:, k:]
+        flat = [*a_form.ravel(), *given.b, *given.Q.ravel()]
+        found = [np.broadcast_to(v, (n, 1))[:, 0] for v in evaluate(flat, values)]
+        size = len(given.b)
+        a = np.reshape(found[: a_form.size], (*a_form.shape, n))
+        b = np.reshape(found[a_form.size : a_form.size + size], (size, n))
+        q = np.reshape(found[a_form.size + size :], (size, size, n))
+        mean, covariance = self.filtered(t)
+        cross = np.einsum("ijn,kjn->ikn", covariance, a)  # of z_t with (coupled x, z)_{t+1}
+        spread = np.einsum("ijn,jkn->ikn", a, cross) + q
+        predicted = np.einsum("ijn,jn->in", a, mean) + b
+        log_w = np.log(self.system.weights[t])
+        return _Step(self, values, log_w, mean, covariance, cross, predicted, spread)
+
+
+class _Step:
+    """One step back; N particles, M trajectories."""
+
+    def __init__(
+        self, law: _Law, values: dict, log_w: np.ndarray, mean: np.ndarray,
+        covariance: np.ndarray, cross: np.ndarray, predicted: np.ndarray, spread: np.ndarray,
+    ):  # fmt: skip
+        self.law, self.values, self.log_w = law, values, log_w
+        self.mean, self.covariance, self.cross = mean, covariance, cross
+        self.predicted = predicted
+        self.factor, self.pivots = _factorised(spread)
+        self.variances = np.einsum("jjn->jn", spread)
+
+    def _following(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[list(self.law.columns.coupled)], z])
+
+    def log_weights(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """log w p(x_{t+1}, z_{t+1} | particle), (N, M), of the particles given."""
+        v = self._following(x, z)
+        total = np.repeat(self.log_w[:, None], v.shape[1], axis=1)
+        residuals: list[np.ndarray] = []
+        for j in range(len(v)):
+            e = v[j] - self.predicted[j][:, None]
+            for i, earlier in enumerate(residuals):
+                e = e - self.factor[j, i][:, None] * earlier
+            residuals.append(e)
+            own = self.pivots[j][:, None]
+            known = own == 0.0
+            if known.any():
+                # Where a particle tells the component exactly the width is that of rounding, not
+                # none: one that tells another value did not lead here.
+                size = np.abs(v[j]) + np.abs(self.predicted[j])[:, None]
+                rounding = NEGLIGIBLE * self.variances[j][:, None] + (ROUNDING * size) ** 2 + TINY
+                height = np.where(known, rounding, 0.0).max(axis=0)  # of point masses all alike
+                total += -0.5 * np.log(np.where(known, height, own))
+                own = np.where(known, rounding, own)
+            else:
+                total += -0.5 * np.log(own)
+            total += -0.5 * e**2 / own
+        if self.law.free:
+            values = dict(self.values)
+            for i, s in enumerate(self.law.found.trace.state_symbols):
+                values[s] = x[i]
+            for found in evaluate([t.log_density for t in self.law.free], values):
+                total += found
+        return np.where(self.log_w[:, None] == -np.inf, -np.inf, total)
+
+    def draw(
+        self, x: np.ndarray, z: np.ndarray, chosen: np.ndarray, stream: np.ndarray
+    ) -> np.ndarray:
+        """z_t (n, M) given x_{t+1}, z_{t+1} and the particle that was chosen for each."""
+        v = self._following(x, z)
+        mean, covariance = self.mean[:, chosen], self.covariance[:, :, chosen]
+        factor, pivots = self.factor[:, :, chosen], self.pivots[:, chosen]
+        residuals: list[np.ndarray] = []
+        crosses: list[np.ndarray] = []
+        for j in range(len(v)):
+            e = v[j] - self.predicted[j, chosen]
+            c = self.cross[:, j, chosen]
+            for i, (earlier, before) in enumerate(zip(residuals, crosses, strict=True)):
+                e, c = e - factor[j, i] * earlier, c - factor[j, i] * before
+            residuals.append(e)
+            crosses.append(c)
+            known = pivots[j] > 0.0
+            weight = np.where(known, 1.0 / np.where(known, pivots[j], 1.0), 0.0)
+            mean = mean + c * weight * e
+            covariance = covariance - np.einsum("im,jm->ijm", c, c) * weight
+        return _gaussian(mean, covariance, stream)
+
+
+def _factorised(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L (k, k, N), unit lower triangular, and D (k, N) of covariances (k, k, N) = L D L'.
+
+    A pivot that rounding alone has left is 0, with nothing below it.
+    """
+    k, n = covariance.shape[0], covariance.shape[2]
+    factor, pivots = np.zeros((k, k, n)), np.zeros((k, n))
+    for j in range(k):
+        for i in range(j, k):
+            left = covariance[i, j] - np.sum(factor[i, :j] * factor[j, :j] * pivots[:j], axis=0)
+            if i == j:
+                pivots[j] = np.where(left > NEGLIGIBLE * covariance[j, j], left, 0.0)
+                factor[j, j] = 1.0
+            else:
+                safe = np.where(pivots[j] > 0.0, pivots[j], 1.0)
+                factor[i, j] = np.where(pivots[j] > 0.0, left / safe, 0.0)
+    return factor, pivots
+
+
+def _gaussian(mean: np.ndarray, covariance: np.ndarray, stream: np.ndarray) -> np.ndarray:
+    """A draw (n, M) from each of M Gaussians; singular ones too."""
+    factor, pivots = _factorised(covariance)
+    normals = np.empty(mean.size)
+    fill_normal(stream, normals)
+    return mean + np.einsum("ijm,jm->im", factor, np.sqrt(pivots) * normals.reshape(mean.shape))

@@ -1,16 +1,16 @@
-"""Runs of the particle filter on a CUDA device; see `codegen/kernels/tiles.py`."""
+"""Runs of the particle filter on a CUDA device; see `codegen/kernels/particle/cuda_filter.py`."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba.core.errors import NumbaError
 
-from ssmppl.codegen.device import TILE, cuda_module
-from ssmppl.codegen.kernels.random import fill_uniform, new_state, uniform
-from ssmppl.codegen.kernels.weights import OK
+from ssmppl.codegen.kernels.math.random import fill_uniform, new_state, uniform
+from ssmppl.codegen.kernels.particle.weights import OK
+from ssmppl.codegen.modules.device import TILE, cuda_module
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.problem import Problem
+from ssmppl.inference.run.problem import Problem
 
 
 def check_device(problem: Problem, proposal: str, **others: tuple[object, object]) -> None:

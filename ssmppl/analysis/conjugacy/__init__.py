@@ -1,0 +1,1 @@
+"""Closed-form conditionals of parameters, found by separating the log density, and checked."""

@@ -1,0 +1,225 @@
+"""Gibbs updates of the parameters given states and data, derived from the log density alone.
+
+`derive_updates` looks for the largest blocks with a closed-form conditional (`search.py`), by the
+table of families (`families.py`). What lies outside a family's span, if it comes from the prior or
+the initial law only (a bounded number of terms, however long the series), becomes a correction of
+the draw; if it grows with the series, the block is sampled by slices on its exact conditional.
+Every update is compared with the model's own density when it is derived (`check.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+from ssmppl.analysis.conjugacy import describe
+from ssmppl.analysis.conjugacy.check import verify
+from ssmppl.analysis.conjugacy.describe import (
+    Explanation,
+    joined,
+    matrix_statistics,
+    named,
+    shown_as_matrices,
+)
+from ssmppl.analysis.conjugacy.families import Gamma, Normal, NormalGamma
+from ssmppl.analysis.conjugacy.search import Found, Search, kind_of
+from ssmppl.analysis.conjugacy.sufficient import (
+    NOTHING_MISSING,
+    ROLES,
+    BlockForm,
+    complete_data,
+    degenerate,
+    separate_block,
+)
+from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.sampler import draw, natural_bounds, sampler_of
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr, to_text
+from ssmppl.language.model.traced import Trace
+
+__all__ = ["Update", "conjugate_update", "derive_updates", "draw"]
+
+
+def derive_updates(
+    trace: Trace,
+    fixed: Iterable[str] = (),
+    missing: Missing = NOTHING_MISSING,
+    check: bool = True,
+) -> list[Update]:
+    """The updates that together move every parameter that is not fixed, in the order declared.
+
+    check=False leaves out the comparison with the model's own density.
+    """
+    data = complete_data(trace, missing)
+    search = Search(data, frozenset(fixed))
+    updates: list[Update] = []
+    waiting = [(unit, found, False) for unit, found in search.found()]
+    while waiting:
+        unit, found, refused = waiting.pop(0)
+        update = _update(search, unit, found, refused)
+        failure = verify(data, update) if check and update.functions else None
+        if failure is None:
+            updates.append(update)
+        elif unit in search.single:
+            waiting.append((unit, failure, True))
+        else:  # a joint block is taken apart
+            waiting += [
+                (u, f, False) for u, f in search.single.items() if not set(u).isdisjoint(unit)
+            ]
+    order = {s: i for i, s in enumerate(trace.parameter_symbols)}
+    return sorted(updates, key=lambda u: min(order[c] for c in u.components))
+
+
+def _update(
+    search: Search, unit: tuple[Expr, ...], found: Found | NotApplicable, refused: bool
+) -> Update:
+    if isinstance(found, Found):
+        return conjugate_update(search, found)
+    return _slice(search, unit, found, use_statistics=not refused)
+
+
+def conjugate_update(search: Search, found: Found) -> Update:
+    """A finding as an update, explained."""
+    form, family = found.form, found.family
+    site = search.site(found.components[0])
+    where, reason = site.distribution.location, ""
+    if found.correction:
+        sources = [f for j in found.correction for f in form.origins[form.monomials[j]]]
+        laws = " and the ".join(sorted({f"{f.role} law of {f.site}" for f in sources}))
+        left = ", ".join(to_text(form.functions[j]) for j in found.correction)
+        where = sources[0].where
+        reason = f"the {laws} leaves {left} outside the {family.name} family"
+    if form.left:
+        where, reason = form.left[0][1].where or where, form.left[0][1].reason
+    update = Update(
+        block=tuple(dict.fromkeys(c.data[1] for c in found.components)),
+        components=found.components,
+        family=family.name,
+        functions=form.functions,
+        coefficients=form.coefficients,
+        correction=found.correction,
+        bounds=tuple(search.bound[c] for c in found.components),
+        explanation=Explanation(joined(found.components), ""),
+        reason=reason,
+        where=where,
+        kind=kind_of(site),
+        conditional=family,
+        left=tuple(factor for factor, _ in form.left),
+    )
+    hyperparameters = search.unread(found.components)
+    if hyperparameters is not None and not found.correction and not form.left:
+        told = describe.prior_alone(found.components, hyperparameters, "from which it is drawn")
+        return replace(update, explanation=told)
+    title = name = joined(found.components)
+    lines = None
+    if shown_as_matrices(family):
+        title = name = named(found.components, search.data.trace)
+        lines = matrix_statistics(family, form, search.data.trace)
+    if len(update.block) > 1:
+        title += " jointly"
+    explanation = Explanation(
+        title,
+        describe.conditional(family, form, name),
+        describe.statistics(form) if lines is None else lines,
+        tuple(_notes(update, form)),
+    )
+    return replace(update, explanation=explanation)
+
+
+def _notes(update: Update, form: BlockForm) -> list[str]:
+    notes = []
+    cut = [
+        f"{to_text(c)} to ({to_text(low)}, {to_text(high)})"
+        for c, (low, high), natural in zip(
+            update.components, update.bounds, natural_bounds(update), strict=True
+        )
+        if update.kind == "real"
+        and not (low.op == high.op == "const" and low.data <= natural[0] <= natural[1] <= high.data)
+    ]
+    if cut:
+        notes.append(f"truncated: {', '.join(cut)}")
+    if isinstance(update.conditional, Gamma) and _may_be_improper(update, update.conditional):
+        notes.append("slice steps where the shape or the rate is not positive")
+    if update.left:
+        laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
+        notes.append(
+            f"corrected for the {laws} by a Metropolis step on the log joint density and a slice "
+            f"sweep: {update.reason}"
+        )
+        if update.where is not None:
+            notes.append(update.where.short)
+    elif update.correction:
+        text = describe.correction_text(form, update.correction)
+        if _may_be_bounded(update):
+            notes.append(f"accepted with probability proportional to {text}: {update.reason}")
+        else:
+            notes.append(
+                f"corrected for {text} by a Metropolis step, as it has no known upper bound, and "
+                f"a slice sweep: {update.reason}"
+            )
+        if update.where is not None:
+            notes.append(update.where.short)
+    if isinstance(update.conditional, NormalGamma):
+        notes.append("separate updates where the precision H or the rate is not positive")
+    elif isinstance(update.conditional, Normal):
+        notes.append("slice steps where the precision H is not positive definite")
+    return notes
+
+
+def _may_be_improper(update: Update, family: Gamma) -> bool:
+    """Whether prior and initial law alone do not give the Gamma a positive shape."""
+    parts = [update.coefficients[r][family.log] for r in ("prior", "initial")]
+    if any(e.op != "const" for e in parts):
+        return False
+    return (math.fsum(e.data for e in parts) + 1.0) / family.power <= 0.0
+
+
+def _may_be_bounded(update: Update) -> bool:
+    """Whether the correction has a known bound, for whatever sign its coefficients can have."""
+    for (low, high), j in zip(sampler_of(update).ranges, update.correction, strict=True):
+        parts = [update.coefficients[r][j] for r in ("prior", "initial")]
+        total = math.fsum(e.data for e in parts) if all(e.op == "const" for e in parts) else None
+        if (total is None or total > 0.0) and high == math.inf:
+            return False
+        if (total is None or total < 0.0) and low == -math.inf:
+            return False
+    return True
+
+
+def _slice(
+    search: Search, unit: tuple[Expr, ...], why: NotApplicable, use_statistics: bool
+) -> Update:
+    """Slice steps on the exact conditional; through the statistics where it separates."""
+    kind = kind_of(search.site(unit[0]))
+    separated = separate_block(search.data, unit) if use_statistics else why
+    form = separated if isinstance(separated, BlockForm) else None
+    how = {
+        "real": "a slice step on its exact conditional",
+        "simplex": "slice steps on its log ratios, on their exact conditional",
+        "matrix": "slice steps on its Cholesky factor (log diagonal), on the exact conditional",
+    }[kind]
+    cost = "through its statistics" if form else "each evaluation a pass over the data"
+    law = f"{how}, {cost}"
+    if degenerate(search.data, unit) is not None:
+        law = f"{how}, given the noisy states alone, from which the deterministic ones follow anew"
+    notes = (f"because {why.reason}", *([why.where.short] if why.where else []))
+    explanation = Explanation(joined(unit), law, describe.statistics(form) if form else (), notes)
+    hyperparameters = search.unread(unit)
+    if hyperparameters is not None:
+        explanation = describe.prior_alone(unit, hyperparameters, f"moved by {how}")
+    return Update(
+        block=(unit[0].data[1],),
+        components=unit,
+        family="slice",
+        functions=form.functions if form else (),
+        coefficients=form.coefficients if form else dict.fromkeys(ROLES, ()),
+        correction=(),
+        bounds=tuple(search.bound[c] for c in unit),
+        explanation=explanation,
+        reason=why.reason,
+        where=why.where,
+        needs_log_joint=form is None,
+        kind=kind,
+    )

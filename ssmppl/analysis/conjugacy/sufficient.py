@@ -1,0 +1,236 @@
+"""The complete-data log density as factors, and each factor separated in a block of parameters.
+
+    log p(theta, x_{1:T}, y_{1:T}) = prior + initial + sum_{t=2}^T transition_t
+                                   + sum_{t=1}^T observation_t
+
+With everything but a block fixed, every factor is sum_i c_i(rest) s_i(block), so that
+
+    log p(block | rest) = const + sum_i C_i s_i(block),
+    C_i = prior_i + initial_i + sum_t transition_i + sum_t observation_i.
+
+The functions s_i are common to all roles; the C_i are the statistics. Factors that do not hold
+the block are left out. Supports are kept apart: the densities here are unguarded, and what a
+support asks of the block is told by `CompleteData.restrictions`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing, terms
+from ssmppl.errors import Location, NotApplicable
+from ssmppl.expressions.algebra import ONE, Monomial, Separation, monomial_expr, separate
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
+from ssmppl.language.distributions import Dirac
+from ssmppl.language.model.traced import Site, Trace
+
+ROLES = ("prior", "initial", "transition", "observation")
+BOUNDED_ROLES = ("prior", "initial")  # as many terms, however long the series
+_BOUNDED = ("interval", "integers")
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One summand of the complete-data log density: of one site, or one component of it.
+
+    density : log density on the support; of an observation 0 where it is missing.
+    degenerate : a Dirac, whose density is 0 or infinite; `density` is then the value.
+    """
+
+    role: str
+    site: str
+    density: Expr
+    where: Location
+    symbols: frozenset[Expr]
+    degenerate: bool = False
+
+
+@dataclass(frozen=True)
+class Restriction:
+    """A bound that one component of a site must respect, where it is no number."""
+
+    role: str
+    site: str
+    value: Expr
+    bound: Expr
+    where: Location
+
+    @property
+    def symbols(self) -> frozenset[Expr]:
+        return symbols_of(self.bound)
+
+
+@dataclass(frozen=True)
+class CompleteData:
+    """The factors of a model and the bounds that its supports set."""
+
+    trace: Trace
+    factors: tuple[Factor, ...]
+    restrictions: tuple[Restriction, ...]
+
+    def holding(self, block: Iterable[Expr]) -> list[Factor]:
+        """The factors that hold a symbol of the block."""
+        wanted = frozenset(block)
+        return [f for f in self.factors if f.symbols & wanted]
+
+
+@dataclass(frozen=True)
+class BlockForm:
+    """log p(block | rest) = const + sum_i C_i s_i(block).
+
+    functions : the s_i; `monomials` holds them as products of powers.
+    coefficients : role -> the summands of C_i, aligned with `functions`.
+    origins : monomial -> the factors it comes from.
+    left : factors of the prior and the initial law that do not separate, and why; they are missing
+        in the sum. Empty unless it was asked for.
+    """
+
+    components: tuple[Expr, ...]
+    monomials: tuple[Monomial, ...]
+    functions: tuple[Expr, ...]
+    coefficients: dict[str, tuple[Expr, ...]]
+    origins: dict[Monomial, tuple[Factor, ...]] = field(repr=False)
+    left: tuple[tuple[Factor, NotApplicable], ...] = ()
+
+    def roles(self, monomial: Monomial) -> frozenset[str]:
+        """The roles of the factors that a function comes from."""
+        return frozenset(f.role for f in self.origins[monomial])
+
+
+NOTHING_MISSING = Missing()
+
+
+def complete_data(trace: Trace, missing: Missing = NOTHING_MISSING) -> CompleteData:
+    """All factors of a traced model, in the order prior, initial, transition, observation."""
+    factors: list[Factor] = []
+    restrictions: list[Restriction] = []
+    by_role = (trace.parameters, trace.initial, trace.transition, trace.observations)
+    for role, sites in zip(ROLES, by_role, strict=True):
+        for site in sites.values():
+            if role != "observation":
+                factors += _factors(role, site)
+            restrictions += _restrictions(role, site)
+    for term in terms(trace, "observation", missing, guard=False):
+        density = term.guarded()
+        factors.append(
+            Factor("observation", term.site.name, density, term.where, symbols_of(density))
+        )
+    return CompleteData(trace, tuple(factors), tuple(restrictions))
+
+
+def _factors(role: str, site: Site) -> list[Factor]:
+    law, out = site.distribution, []
+    degenerate = isinstance(law, Dirac)
+    if degenerate:
+        densities = list(law.value.ravel())
+    else:
+        densities = list(array(law.log_densities(site.value)).ravel())
+    for e in densities:
+        out.append(Factor(role, site.name, e, law.location, symbols_of(e), degenerate))
+    return out
+
+
+def _restrictions(role: str, site: Site) -> list[Restriction]:
+    support = site.distribution.support()
+    if support.kind not in _BOUNDED:
+        return []
+    out = []
+    shape = site.shape
+    for bounds in (support.lower, support.upper):
+        for bound, value in zip(
+            np.broadcast_to(bounds.view(np.ndarray), shape).ravel(),
+            site.value.ravel(),
+            strict=True,
+        ):
+            if bound.op != "const":
+                out.append(Restriction(role, site.name, value, bound, site.distribution.location))
+    return out
+
+
+def separate_block(
+    trace: Trace | CompleteData, block: Iterable[Expr], leave: bool = False
+) -> BlockForm | NotApplicable:
+    """The separated log density of a block of parameter components, given all else.
+
+    leave : go on where a factor that does not grow with the series does not separate, without it.
+
+    NotApplicable where a factor does not separate, where a Dirac's value depends on the block
+    (its density is degenerate), or where the support of another quantity does.
+    """
+    data = trace if isinstance(trace, CompleteData) else complete_data(trace)
+    components = tuple(block)
+    wanted = frozenset(components)
+    sums_by_role: dict[str, dict[Monomial, Expr]] = {role: {} for role in ROLES}
+    origins: dict[Monomial, list[Factor]] = {}
+    left: list[tuple[Factor, NotApplicable]] = []
+    for refusal in (degenerate(data, components), restricted(data, components)):
+        if refusal is not None:
+            return refusal
+    for factor in data.holding(components):
+        form = separate(factor.density, wanted)
+        if not isinstance(form, Separation):
+            why = NotApplicable(f"{_law(factor)}: {_shorten(form.reason)}", factor.where)
+            if not leave or factor.role not in BOUNDED_ROLES:
+                return why
+            left.append((factor, why))
+            continue
+        for monomial, coefficient in form.terms.items():
+            if monomial == ONE:
+                continue
+            sums = sums_by_role[factor.role]
+            sums[monomial] = sums.get(monomial, constant(0.0)) + coefficient
+            origins.setdefault(monomial, []).append(factor)
+    texts = {m: monomial_expr(m) for m in origins}
+    monomials = tuple(sorted(origins, key=lambda m: to_text(texts[m])))
+    zero = constant(0.0)
+    return BlockForm(
+        components,
+        monomials,
+        tuple(texts[m] for m in monomials),
+        {role: tuple(sums_by_role[role].get(m, zero) for m in monomials) for role in ROLES},
+        {m: tuple(o) for m, o in origins.items()},
+        tuple(left),
+    )
+
+
+def degenerate(data: CompleteData, block: Iterable[Expr]) -> NotApplicable | None:
+    """Why the block has no density given the states: a Dirac's value depends on it."""
+    for factor in data.holding(block):
+        if factor.degenerate:
+            names = _names(factor.symbols & frozenset(block))
+            return NotApplicable(
+                f"the {factor.role} of {factor.site} is Dirac and its value depends on {names}: "
+                "given the states the value determines the parameter, so that it cannot move",
+                factor.where,
+            )
+    return None
+
+
+def restricted(data: CompleteData, block: Iterable[Expr]) -> NotApplicable | None:
+    """Why the block is not free: the support of another quantity depends on it."""
+    wanted = frozenset(block)
+    for r in data.restrictions:
+        inside = r.symbols & wanted
+        if inside:
+            return NotApplicable(
+                f"{_names(inside)} bounds the support of {r.site} ({to_text(r.value)} and "
+                f"{_shorten(to_text(r.bound))}): the bound is in no separated factor",
+                r.where,
+            )
+    return None
+
+
+def _law(factor: Factor) -> str:
+    return f"{factor.role} of {factor.site}"
+
+
+def _names(symbols: Iterable[Expr]) -> str:
+    return ", ".join(sorted({to_text(s) for s in symbols}))
+
+
+def _shorten(text: str, length: int = 160) -> str:
+    return text if len(text) <= length else text[: length - 4] + " ..."

@@ -1,0 +1,45 @@
+"""One Gibbs update of a block of parameters, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ssmppl.analysis.conjugacy.describe import Explanation
+from ssmppl.analysis.conjugacy.families import Family
+from ssmppl.analysis.conjugacy.sufficient import Factor
+from ssmppl.errors import Location
+from ssmppl.expressions.expr import Expr
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """One Gibbs update: a block of parameter components and how it is drawn given all else.
+
+    block : names of the parameters; components : the symbols that are drawn, in this order.
+    family : "Normal-Gamma", "Gamma", ..., or "slice".
+    functions : the s_i of log p(block | rest) = const + sum_i C_i s_i.
+    coefficients : role -> summands of the C_i: C = prior + initial + sum_t transition
+        + sum_t observation. The initial ones are summed over experiments.
+    correction : positions of the functions outside the family's span.
+    bounds : (lower, upper) of each component, expressions of other parameters.
+    needs_log_joint : not separable, so each evaluation takes the whole log joint density; where a
+        deterministic state depends on the block, that of the noisy states and the observations.
+    left : factors of the prior or the initial law that the statistics do not hold; the log joint
+        density corrects for them.
+    reason, where : why nothing better applies, and the user's line.
+    """
+
+    block: tuple[str, ...]
+    components: tuple[Expr, ...]
+    family: str
+    functions: tuple[Expr, ...]
+    coefficients: dict[str, tuple[Expr, ...]]
+    correction: tuple[int, ...]
+    bounds: tuple[tuple[Expr, Expr], ...]
+    explanation: Explanation
+    reason: str = ""
+    where: Location | None = None
+    needs_log_joint: bool = False
+    left: tuple[Factor, ...] = ()
+    kind: str = "real"  # or "simplex", "matrix"
+    conditional: Family | None = field(default=None, repr=False)

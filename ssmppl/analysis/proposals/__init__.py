@@ -1,0 +1,1 @@
+"""How particles move: the proposals that are derived from a model."""

@@ -1,0 +1,116 @@
+"""The laws of single components of an observation, which predictions are made by."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssmppl.analysis.proposals.proposals import drawn
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import Expr, attributed
+from ssmppl.language.distributions import (
+    Beta,
+    Categorical,
+    Dirichlet,
+    Mixture,
+    MvNormal,
+    Normal,
+    ZeroInflated,
+)
+from ssmppl.language.distributions.base import Distribution
+from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.multivariate import SequentialNormal
+from ssmppl.language.model.traced import Site, Trace
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One component given x_t. below : P(Y <= y), of its own symbol y. ends : values, of a level,
+    between which its inverse lies; of most laws that itself. whole : whether its values are whole
+    numbers."""
+
+    below: Expr
+    ends: Callable[[float], list[Expr]]
+    whole: bool
+
+
+def channels(site: Site) -> list[Channel | None]:
+    """Of every component; None where its law has no distribution function, or no inverse of it."""
+    law, y = of_components(site.distribution), site.value
+    parts = _parts(law)
+    joint = law.joint and not isinstance(law, Categorical)
+    if joint or not all(map(_inverts, parts)):
+        return [None] * len(site.components)
+    first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}
+    places = [first[s] for s in site.components]
+
+    below = law.cdf(y)
+
+    def ends(place: int) -> Callable[[float], list[Expr]]:
+        return lambda level: [_at(p.quantile(array(level)), site, place) for p in parts]
+
+    return [Channel(_at(below, site, p), ends(p), law.discrete) for p in places]
+
+
+def _parts(law: Distribution) -> list[Distribution]:
+    """The laws that a law is a mixture of: its quantiles lie between theirs."""
+    if isinstance(law, Mixture):
+        return [part for component in law.components for part in _parts(component)]
+    if isinstance(law, ZeroInflated) and isinstance(law.base, Mixture):
+        return [ZeroInflated(part, law.p) for part in _parts(law.base)]
+    return [law]
+
+
+def _inverts(law: Distribution) -> bool:
+    """Whether the quantiles of a law, and of what it is made of, have a formula."""
+    base = getattr(law, "base", None)
+    if base is not None and not _inverts(base):
+        return False
+    return not isinstance(law, Mixture) and (not isinstance(law, Written) or law.inverts())
+
+
+def _at(values: ExprArray, site: Site, place: int) -> Expr:
+    wide = array(np.broadcast_to(array(values).view(np.ndarray), site.shape))
+    found: Expr = wide.ravel()[place]
+    return found
+
+
+def channel_draws(trace: Trace) -> list[Expr]:
+    """A draw of every component of y_t given x_t, in the trace's order, by its own law: those of
+    one that is jointly Gaussian are independent, which takes no factor of its covariance."""
+    sites = [replace(s, distribution=alone(s.distribution)) for s in trace.observations.values()]
+    return observation_draws(replace(trace, observations={s.name: s for s in sites}))
+
+
+def observation_draws(trace: Trace) -> list[Expr]:
+    """A draw of every component of y_t given x_t, in the trace's order."""
+    out: list[Expr] = []
+    for site in trace.observations.values():
+        with attributed(trace.locations, site.distribution.location):
+            sample = drawn(site).ravel()
+        by_symbol = dict(zip(site.value.ravel(), sample, strict=True))
+        out += [by_symbol[s] for s in site.components]
+    return out
+
+
+def alone(law: Distribution) -> Distribution:
+    """The laws of the components of one that is jointly Gaussian; any other as it is."""
+    if not isinstance(law, (MvNormal, SequentialNormal)):
+        return law
+    found = Normal(law.mean(), variance=law.variance())
+    found.location = law.location
+    return found
+
+
+def of_components(law: Distribution) -> Distribution:
+    """The law of each component alone, of a law that has them in closed form; any other as it
+    is."""
+    return _shares(law) if isinstance(law, Dirichlet) else alone(law)
+
+
+def _shares(law: Dirichlet) -> Beta:
+    """The laws of single shares."""
+    a = law.concentration
+    return Beta(a, array(np.sum(a.view(np.ndarray), axis=-1, keepdims=True) - a.view(np.ndarray)))

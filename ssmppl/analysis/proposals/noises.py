@@ -1,0 +1,167 @@
+"""The states of a model as what drives them: x_1 = F_1(e_1; theta), x_t = F(x_{t-1}, e_t; theta).
+
+With a law of location and scale, x = m + S e, the noise e has a law that is free of the parameters
+in m and S. A move of theta that holds the noises fixed takes the trajectory along (non-centred
+parametrisation: Papaspiliopoulos, Roberts and Sköld 2007, "A general framework for the
+parametrization of hierarchical models", *Statistical Science* 22). Nothing is asked of the law of e
+itself: the Jacobian of x in e is all that such a move needs, so a Student t may even have its
+degrees of freedom moved. States of other laws stay where they are, deterministic ones follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing, terms
+from ssmppl.analysis.proposals.twisted import Guided, given_draws, guided
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.calculus import differentiate
+from ssmppl.expressions.expr import Expr, apply, constant, symbol, symbols_of
+from ssmppl.language.distributions import (
+    Cauchy,
+    Dirac,
+    Distribution,
+    Exponential,
+    Gamma,
+    HalfCauchy,
+    HalfNormal,
+    InverseGamma,
+    Laplace,
+    LogNormal,
+    MvNormal,
+    Normal,
+    StudentT,
+    Uniform,
+    Weibull,
+)
+from ssmppl.language.model.traced import Site, Trace
+
+GAUSSIAN = (Normal, MvNormal, LogNormal)
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A law by the noise that drives it.
+
+    noise : symbols of e (R,). value : F by component, in the order of the trace's states, as a
+    function of x_{t-1} and e; a state that stays is its own symbol. recovered : (R,) e as a
+    function of x_{t-1} and x. log_volume : log |dx / de| over the states with noise. stays : names
+    of the states that are neither driven nor deterministic.
+    """
+
+    noise: tuple[Expr, ...]
+    value: ExprArray
+    recovered: ExprArray
+    log_volume: Expr
+    stays: tuple[str, ...]
+
+    @property
+    def parameters(self) -> frozenset[str]:
+        """Parameters that move the states when the noises are held fixed."""
+        return frozenset(
+            s.data[1] for s in symbols_of(list(self.value)) if s.data[0] == "parameter"
+        )
+
+
+@dataclass(frozen=True)
+class Noises:
+    """Both laws of a model by noise; parameters : names of those that move the states with them.
+
+    tied : names of all parameters that stand in a factor with a state. guide : what a Gaussian
+    guide of the states can be made from, or why there is none.
+    """
+
+    initial: Driven
+    transition: Driven
+    parameters: tuple[str, ...]
+    tied: tuple[str, ...]
+    guide: Guided | NotApplicable
+
+
+def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
+    """The model by its noises; NotApplicable where no state has noise of its own that can be told
+    from it."""
+    states = trace.state_symbols
+    initial = driven(list(trace.initial.values()), states)
+    transition = driven(list(trace.transition.values()), states)
+    if not transition.noise:
+        site = next(iter(trace.transition.values()))
+        kinds = sorted({type(s.distribution).__name__ for s in trace.transition.values()})
+        return NotApplicable(
+            f"no state has a law of location and scale ({', '.join(kinds)}): no noise to hold",
+            site.distribution.location,
+        )
+    held = initial.parameters | transition.parameters
+    tied = set(held)
+    for role in ("initial", "transition", "observation"):
+        for term in terms(trace, role, missing, guard=False):
+            inside = symbols_of(term.log_density)
+            if any(s.data[0] in ("state", "state_prev") for s in inside):
+                tied |= {s.data[1] for s in inside if s.data[0] == "parameter"}
+    guide = guided(trace, missing)
+    if not (tied if isinstance(guide, Guided) else held):
+        site = next(iter(trace.transition.values()))
+        return NotApplicable("no parameter is in the law of a state", site.distribution.location)
+    first, second = ([p for p in trace.parameters if p in names] for names in (held, tied))
+    return Noises(initial, transition, tuple(first), tuple(second), guide)
+
+
+def driven(sites: Sequence[Site], states: Sequence[Expr]) -> Driven:
+    """The laws of one role by their noises."""
+    value: dict[Expr, Expr] = {s: s for s in states}
+    noise: list[Expr] = []
+    recovered: list[Expr] = []
+    log_volume, stays = constant(0.0), []
+    for site in sites:
+        d, own = site.distribution, site.value.ravel()
+        if isinstance(d, Dirac):
+            value.update(zip(own, array(d.mean()).ravel(), strict=True))
+            continue
+        new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
+        pair = _by_noise(site, new)
+        if pair is None:
+            stays.append(site.name)
+            continue
+        noise += new
+        value.update(zip(own, pair[0].ravel(), strict=True))
+        recovered += list(pair[1].ravel())
+        for s, e in zip(own, pair[1].ravel(), strict=True):
+            # de / dx is triangular within a site
+            (slope,) = differentiate([e], s)
+            log_volume = log_volume - apply("log", apply("abs", slope))
+    ordered = array([value[s] for s in states])
+    return Driven(tuple(noise), ordered, array(recovered), log_volume, tuple(stays))
+
+
+def _by_noise(site: Site, noise: list[Expr]) -> tuple[ExprArray, ExprArray] | None:
+    """(x as a function of e, e as a function of x), None where the law is not of that kind."""
+    d, x = site.distribution, site.value
+    if isinstance(d, GAUSSIAN):
+        return array(d.sample(given_draws(site.name, noise))), array(d.standard(x))
+    found = _location_and_scale(d)
+    if found is None:
+        return None
+    location, scale = (array(np.broadcast_to(array(a).view(np.ndarray), d.shape)) for a in found)
+    e = array(np.array(noise, dtype=object).reshape(d.shape))
+    return array(location + scale * e), array((x - location) / scale)
+
+
+def _location_and_scale(d: Distribution) -> tuple[ExprArray, ExprArray] | None:
+    zero = array(np.zeros(d.shape))
+    if isinstance(d, (StudentT, Laplace, Cauchy)):
+        return d.loc, d.scale
+    if isinstance(d, (HalfCauchy, InverseGamma, Weibull)):
+        return zero, d.scale
+    if isinstance(d, HalfNormal):
+        return zero, d.sd
+    if isinstance(d, Exponential):
+        return zero, d.mean()
+    if isinstance(d, Gamma):
+        return zero, array(d.mean() / d.shape_)
+    if isinstance(d, Uniform):
+        return d.lower, array(d.upper - d.lower)
+    return None

@@ -1,0 +1,48 @@
+"""Whether a particle filter's likelihood can be made continuous in the parameters.
+
+Malik and Pitt (2011): one scalar state, which moves continuously with the parameters when its
+random numbers are held fixed.
+"""
+
+from __future__ import annotations
+
+from ssmppl.analysis.structure import deterministic
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import BOOLEAN, dependent, topological
+from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
+from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.model.traced import Trace
+
+JUMPING = BOOLEAN | {"floor", "ceil", "sign", "mod"}
+
+
+def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
+    """None where the continuous filter applies, else the reason why not."""
+    if len(trace.state_symbols) != 1:
+        return NotApplicable(
+            f"the state has {len(trace.state_symbols)} components, and only one can be sorted"
+        )
+    for sites in (trace.initial, trace.transition):
+        site = next(iter(sites.values()))
+        d = site.distribution
+        if d.discrete:
+            return NotApplicable(f"{site.name} is discrete", d.location)
+        if deterministic([site]):
+            continue
+        if isinstance(d, Mixture | ZeroInflated):
+            kind = type(d).__name__
+            return NotApplicable(f"draws of {kind} jump from one part to the other", d.location)
+        draw = list(array(d.sample(Draws(site.name))).ravel())
+        random = [n for n in topological(draw) if n.op == "random"]
+        jumps = dependent(draw, random) if isinstance(d, Written) else set()
+        if any(n.op in JUMPING for n in jumps):
+            return NotApplicable(f"the sampler of {type(d).__name__} may jump", d.location)
+        for node in random:
+            if node.data[0] not in ("normal", "uniform"):
+                return NotApplicable(
+                    f"draws of {type(d).__name__} come by rejection, and jump where the "
+                    "parameters change",
+                    d.location,
+                )
+    return None

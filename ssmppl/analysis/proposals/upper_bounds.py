@@ -1,0 +1,223 @@
+"""How high the transition density of a given x_t can get over all x_{t-1}.
+
+What rejection sampling of backward indices needs (Douc, Garivier, Moulines and Olsson 2011): for
+each law, the density with those parameters that depend on x_{t-1} at the values that maximise it.
+A location goes to the value itself, a rate or a mean to its maximum likelihood estimate from one
+value. The result is free of x_{t-1}, and no smaller than the density anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.bounds import interval
+from ssmppl.analysis.structure import deterministic, deterministic_memory
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.algebra import affine
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import Expr, apply, attributed, constant, depends_on
+from ssmppl.language import distributions as laws
+from ssmppl.language.distributions.base import Distribution
+from ssmppl.language.model.traced import Site, Trace
+
+Estimate = Callable[[Any, ExprArray], Any]
+
+
+TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
+
+
+# law -> parameter -> its maximising value, given the law and the value, the others fixed
+_MAXIMISERS: dict[type, dict[str, Estimate]] = {
+    laws.Normal: {"mean_": lambda d, v: v},
+    laws.MvNormal: {"mean_": lambda d, v: v},
+    laws.LogNormal: {"mean_": lambda d, v: ew("log", v)},
+    laws.StudentT: {"loc": lambda d, v: v},
+    laws.Laplace: {"loc": lambda d, v: v},
+    laws.Cauchy: {"loc": lambda d, v: v},
+    laws.HalfNormal: {"sd": lambda d, v: v},
+    laws.HalfCauchy: {"scale": lambda d, v: v},
+    laws.Exponential: {"rate": lambda d, v: 1.0 / v, "scale": lambda d, v: v},
+    laws.Gamma: {"rate": lambda d, v: d.shape_ / v, "scale": lambda d, v: v / d.shape_},
+    laws.InverseGamma: {"scale": lambda d, v: d.shape_ * v},
+    laws.Weibull: {"scale": lambda d, v: v},
+    laws.VonMises: {"mean_": lambda d, v: v},
+    laws.Poisson: {"rate": lambda d, v: ew("maximum", v, TINY)},
+    laws.NegativeBinomial: {"mean_": lambda d, v: ew("maximum", v, TINY)},
+    laws.Binomial: {
+        "p": lambda d, v: ew("minimum", ew("maximum", array(v / d.n), TINY), 1.0 - TINY)
+    },
+}
+# law -> its centre, and parameters of its spread: the density at a distance from the centre is
+# highest where the spread is that distance, and at the centre where it is smallest
+_SPREADS = {
+    laws.Normal: ("mean_", ("sd", "variance")), laws.StudentT: ("loc", ("scale",)),
+    laws.Laplace: ("loc", ("scale",)), laws.Cauchy: ("loc", ("scale",)),
+    laws.LogNormal: ("mean_", ("sd",)),
+}  # fmt: skip
+
+
+def transition_height(trace: Trace) -> Expr | NotApplicable:
+    """An upper bound over x_{t-1} of the log density of the noisy components of x_t.
+
+    An expression in x_t, theta, inputs and time; or the reason why there is none.
+    """
+    if deterministic_memory(trace) != 0:
+        (site, *_) = deterministic(list(trace.transition.values()))
+        return NotApplicable(
+            f"the deterministic component {site.name} changes later densities too",
+            site.distribution.location,
+        )
+    skipped = {s.name for s in deterministic(list(trace.transition.values()))}
+    total = constant(0.0)
+    for site in trace.transition.values():
+        if site.name in skipped:
+            continue
+        with attributed(trace.locations, site.distribution.location):
+            height = _height(site, trace.state_prev_symbols)
+        if isinstance(height, NotApplicable):
+            return height
+        total = total + height
+    return total
+
+
+def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    d, where = site.distribution, site.distribution.location
+    free = {n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())}
+    if not free:
+        return d.log_density(site.value, guard=False)
+    kind = type(d)
+    if isinstance(d, laws.Mixture):
+        return _mixture(site, d, prev)
+    if isinstance(d, laws.ZeroInflated):
+        return _zero_inflated(site, d, prev)
+    if isinstance(d, (laws.Bernoulli, laws.Categorical, laws.BetaBinomial)):
+        return constant(0.0)  # no probability is above 1
+    if isinstance(d, laws.Uniform):
+        return _uniform(site, prev)
+    known, changed = _MAXIMISERS.get(kind, {}), {}
+    for name in sorted(free, key=lambda n: n in known):  # spreads first
+        if name in known:
+            best = array(known[name](d, site.value))
+        elif (spread := _spread(site, name, prev)) is not None:
+            best = spread
+        else:
+            reason = f"{_plain(name)} of {site.name} ({kind.__name__}) depends on the state before"
+            return NotApplicable(reason, where)
+        changed[name] = best if d.joint else _replaced(d.parameters[name], best, prev)
+    return _with(d, changed).log_density(site.value, guard=False)
+
+
+def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
+    value = array(site.value[index])
+    return Site(site.name, site.role, law.element(index), value, site.where)
+
+
+def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    """The sum of the components' own heights; a weight that depends on the state is at most 1."""
+    whole, total = d.support(), constant(0.0)
+    for law in d.components:
+        own = law.support()
+        ends = [(own.lower, whole.lower), (own.upper, whole.upper)]
+        if any(
+            a is not b for pair in ends for a, b in zip(*(p.ravel() for p in pair), strict=True)
+        ):
+            return NotApplicable(
+                f"the components of {site.name} (Mixture) have different supports", d.location
+            )
+    for i in np.ndindex(site.shape):
+        height = None
+        for law, weight in zip(d.components, d.weights, strict=True):
+            part = _height(_element(site, law, i), prev)
+            if isinstance(part, NotApplicable):
+                return part
+            if not depends_on(weight[i], prev):
+                part = apply("log", weight[i]) + part
+            height = part if height is None else apply("logaddexp", height, part)
+        total = total + height
+    return total
+
+
+def _zero_inflated(site: Site, d: laws.ZeroInflated, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    """At most 1 at zero; elsewhere that of the law inside, times 1 - p where p is free of the
+    state."""
+    total = constant(0.0)
+    for i in np.ndindex(site.shape):
+        part = _height(_element(site, d.base, i), prev)
+        if isinstance(part, NotApplicable):
+            return part
+        if not depends_on(d.p[i], prev):
+            part = apply("log1p", -d.p[i]) + part
+        total = total + apply("where", apply("eq", site.value[i], 0.0), 0.0, part)
+    return total
+
+
+def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
+    """1 / the smallest width."""
+    d: Any = site.distribution
+    width = array(d.upper - d.lower)
+    form = affine(width.ravel(), prev)  # x + 1 - (x - 1) is 2
+    if not isinstance(form, NotApplicable) and all(e.op == "const" and e.data == 0.0
+                                                   for e in form[0].ravel()):  # fmt: skip
+        width = array(form[1].reshape(width.shape))
+    lowest = _lowest(width, prev)
+    if lowest is None:
+        return NotApplicable(f"the width of {site.name} depends on the state before", d.location)
+    return array(np.sum(-array(ew("log", lowest))))[()]
+
+
+def _spread(site: Site, name: str, prev: Sequence[Expr]) -> ExprArray | None:
+    """The value of a parameter of the spread that maximises the density, entry by entry.
+
+    None where the parameter is none of these, or has no positive number below it.
+    """
+    d = site.distribution
+    centre, spreads = _SPREADS.get(type(d), ("", ()))
+    lowest = _lowest(d.parameters[name], prev) if name in spreads else None
+    if lowest is None:
+        return None
+    value = array(ew("log", site.value)) if isinstance(d, laws.LogNormal) else site.value
+    best = np.empty(site.shape, dtype=object)
+    for i in np.ndindex(site.shape):
+        best[i], place = lowest[i], d.parameters[centre][i]
+        if not depends_on(place, prev):
+            away = apply("abs", value[i] - place)
+            best[i] = apply("maximum", best[i], away**2 if name == "variance" else away)
+    return array(best)
+
+
+def _lowest(spread: ExprArray, prev: Sequence[Expr]) -> ExprArray | None:
+    """`spread` with a positive number below it for each entry that depends on the state before.
+
+    None where there is no such number.
+    """
+    out = np.empty(spread.shape, dtype=object)
+    for i in np.ndindex(spread.shape):
+        out[i] = spread[i]
+        if depends_on(spread[i], prev):
+            low = interval(spread[i], {})[0]
+            if not 0.0 < low < np.inf:
+                return None
+            out[i] = constant(low)
+    return array(out)
+
+
+def _replaced(old: ExprArray, best: ExprArray, prev: Sequence[Expr]) -> ExprArray:
+    """`best` in place of the entries of `old` that depend on the state before."""
+    wide = np.broadcast_to(best.view(np.ndarray), old.shape)
+    out = np.empty(old.shape, dtype=object)
+    for i in np.ndindex(old.shape):
+        out[i] = wide[i] if depends_on(old[i], prev) else old[i]
+    return array(out)
+
+
+def _with(d: Distribution, changed: dict[str, ExprArray]) -> Distribution:
+    """The same law with other values for some parameters."""
+    return d.rebuilt(changed)
+
+
+def _plain(name: str) -> str:
+    return name.rstrip("_")

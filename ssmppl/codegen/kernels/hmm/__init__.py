@@ -1,0 +1,1 @@
+"""Exact passes over states of finitely many values."""

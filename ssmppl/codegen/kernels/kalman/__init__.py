@@ -1,0 +1,1 @@
+"""Exact filters and smoothers of linear Gaussian models, in square-root form."""

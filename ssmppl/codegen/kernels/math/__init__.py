@@ -1,0 +1,1 @@
+"""Elementary and special functions, random numbers, and the compiler flags of all kernels."""

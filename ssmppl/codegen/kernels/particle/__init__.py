@@ -1,0 +1,1 @@
+"""Particle filters, conditional SMC and backward simulation, over a model's functions."""

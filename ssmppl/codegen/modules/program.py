@@ -1,0 +1,287 @@
+"""Program: the generated module of a model, and its entry points.
+
+`compile_trace` writes one readable module per model (and per kind of missing data): for each
+proposal the functions of the particle filter, then those of simulation and prediction. Numba
+compiles a function when it is first called, so only what is used is compiled.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals.proposals import Proposal, bootstrap, derive
+from ssmppl.analysis.proposals.twisted import twisted
+from ssmppl.analysis.proposals.upper_bounds import transition_height
+from ssmppl.analysis.structure import check_start, deterministic_memory
+from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
+from ssmppl.codegen.kernels.particle.backward import (
+    backward_exact,
+    backward_mcmc,
+    backward_rejection,
+    backward_weights,
+    continuation,
+)
+from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, filtered_path
+from ssmppl.codegen.kernels.particle.particle_filter import move_blocks, particle_filter
+from ssmppl.codegen.kernels.particle.simulation import (
+    observe_states,
+    predict_step,
+    simulate,
+    simulate_on,
+)
+from ssmppl.codegen.modules.device import DeviceFilter, compile_device
+from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
+from ssmppl.codegen.modules.marginal import MarginalFilter, compile_marginal
+from ssmppl.codegen.modules.tempered import TemperedFilter, compile_tempered
+from ssmppl.codegen.modules.twisted import TwistedFilter, compile_twisted
+from ssmppl.codegen.native.loading import Loaded, load
+from ssmppl.codegen.text.kernel_functions import (
+    backward_kit,
+    conditional_passes,
+    filter_kit,
+    log_joint_function,
+    parameter_functions,
+    prediction_kit,
+    simulation_kit,
+)
+from ssmppl.codegen.text.module import Layout, ModuleText
+from ssmppl.codegen.text.render import identifier
+from ssmppl.compiling import LOCK, once_property
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.expr import Expr
+from ssmppl.language.model.traced import Trace
+
+
+@dataclass
+class Program:
+    """The generated module of a traced model.
+
+    Attributes
+    ----------
+    proposals : by name, what was derived, or the reason why not.
+    """
+
+    trace: Trace
+    missing: Missing
+    proposals: dict[str, Proposal | NotApplicable]
+    text: str
+    module: ModuleType = field(repr=False)
+    loaded: Loaded = field(repr=False)
+    _entries: dict[str, Callable[..., Any]] = field(default_factory=dict, repr=False)
+    _on_device: dict[tuple[str, int], DeviceFilter] = field(default_factory=dict, repr=False)
+
+    def __reduce__(self):  # another process generates the module again, or finds it in its cache
+        return compile_trace, (self.trace, self.missing)
+
+    @once_property
+    def twisted(self) -> TwistedFilter | NotApplicable:
+        """The twisted filter, in a module of its own; generated when it is first asked for."""
+        return compile_twisted(self.trace, self.missing)
+
+    @once_property
+    def marginal(self) -> MarginalFilter | NotApplicable:
+        """The Rao-Blackwellised filters, likewise."""
+        return compile_marginal(self.trace, self.missing)
+
+    @once_property
+    def tempered(self) -> TemperedFilter | NotApplicable:
+        """The tempered filter, likewise."""
+        return compile_tempered(self.trace, self.missing)
+
+    def apart(self, proposal: str) -> bool:
+        """Whether particles of this proposal move without looking ahead at each other, as in
+        blocks and on a device."""
+        return f"move_blocks_{proposal}" in self.loaded
+
+    def on_device(self, proposal: str, tile: int) -> DeviceFilter:
+        """The filter of one proposal for a CUDA device, with blocks of so many threads."""
+        key = proposal, tile
+        if key not in self._on_device:
+            found = self.proposals[proposal]
+            assert isinstance(found, Proposal), found
+            with LOCK:
+                if key not in self._on_device:
+                    self._on_device[key] = compile_device(self.trace, found, tile)
+        return self._on_device[key]
+
+    def proposal(self, name: str) -> Proposal | NotApplicable | None:
+        """What was derived under this name, or why nothing was; None where no proposal has it."""
+        if name in MARGINAL:
+            found = self.marginal
+            return found if isinstance(found, NotApplicable) else found.proposals[name]
+        if name == "tempered":
+            own = self.tempered
+            return own if isinstance(own, NotApplicable) else own.proposal
+        return self.proposals.get(name)
+
+    def carried(self, proposal: str) -> list[Expr]:
+        """The components that a particle has under this proposal."""
+        if proposal in MARGINAL and isinstance(self.marginal, MarginalFilter):
+            return self.marginal.found.trace.state_symbols
+        return self.trace.state_symbols
+
+    def source(self) -> str:
+        """The generated Python module, commented with the user's lines.
+
+        Returns
+        -------
+        str : its text; lines of a notebook go by the number of their cell.
+        """
+        text = self.text
+        places = (place for found in self.trace.functions.values() for place in found)
+        for file, where in {place.file: place for place in places}.items():
+            # the module itself keeps the name that cells go by, which is the same in every session
+            if where.cell:
+                text = text.replace(f"{os.path.basename(file)}:", f"{where.cell}:")
+        return text
+
+    @property
+    def path(self) -> Path:
+        """The file of the generated module."""
+        return Path(str(self.module.__file__))
+
+    def entry(self, name: str) -> Callable[..., Any]:
+        """A compiled entry point of the module.
+
+        Raises
+        ------
+        ArgumentError : it belongs to a proposal that could not be derived; gives the reason.
+        """
+        if name not in self._entries:
+            with LOCK:
+                if name not in self._entries:
+                    self._entries[name] = self._entry(name)
+        return self._entries[name]
+
+    def _entry(self, name: str) -> Callable[..., Any]:
+        if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
+            return self.twisted.entry(name.removesuffix("_twisted"))
+        if name.endswith("_tempered") and isinstance(self.tempered, TemperedFilter):
+            return self.tempered.entry(name.removesuffix("_tempered"))
+        if name.endswith(tuple(f"_{own}" for own in MARGINAL)):
+            if isinstance(self.marginal, MarginalFilter):
+                return self.marginal.entry(name)
+        if not hasattr(self.module, name):
+            for proposal, found in self.proposals.items():
+                if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
+                    raise ArgumentError(
+                        f"particles cannot move by the proposal {proposal!r}: {found}",
+                        fix="use an exact method, or another proposal",
+                    )
+        return getattr(self.loaded, name)
+
+
+# The last programs; each keeps its trace, and with it the trace's id, in use.
+_programs: OrderedDict[tuple[int, Missing], Program] = OrderedDict()
+_MOST_PROGRAMS = 64
+
+
+def compile_trace(trace: Trace, missing: Missing = Missing()) -> Program:
+    """Generate, write and import the module of a traced model, once per trace.
+
+    Raises
+    ------
+    ModelError : a state has a flat initial law, and the model is not linear and Gaussian.
+    """
+    key = id(trace), missing
+    program = _programs.get(key)  # without the lock: others may compile for long
+    if program is not None:
+        return program
+    with LOCK:
+        program = _programs.get(key)
+        if program is None:
+            program = _programs[key] = _compiled(trace, missing)
+            while len(_programs) > _MOST_PROGRAMS:
+                _programs.popitem(last=False)
+        return program
+
+
+def _compiled(trace: Trace, missing: Missing) -> Program:
+    check_start(trace)
+    proposals = {**derive(trace, missing), "twisted": twisted(trace, missing)}
+    out, lines = _write(trace, missing, proposals)
+    loaded = load(out, identifier(trace.name), lines)
+    return Program(trace, missing, proposals, out.finish(lines), loaded.module, loaded)
+
+
+def _write(
+    trace: Trace, missing: Missing, proposals: dict[str, Proposal | NotApplicable]
+) -> tuple[ModuleText, list[str]]:
+    layout = Layout(trace)
+    plain = bootstrap(trace, missing)
+    memory = deterministic_memory(trace)
+    out = ModuleText(layout)
+    if trace.observations:
+        prediction = prediction_kit(trace, layout, plain)
+        out.add("one-step predictions", prediction)
+        out.algorithm(predict_step, "predict", prediction, "exact")
+    simulation = simulation_kit(trace, layout, plain)
+    out.add("simulation", simulation)
+    out.algorithm(simulate, "simulate", simulation, "entry")
+    out.algorithm(simulate_on, "simulate_on", simulation, "entry")
+    out.algorithm(observe_states, "observe_states", simulation, "entry")
+    for name, proposal in proposals.items():
+        if isinstance(proposal, NotApplicable) or not trace.observations or name == "twisted":
+            continue
+        section = filter_kit(layout, proposal)
+        conditional_passes(trace, layout, section, plain)
+        out.add(f"particle filter, {name}: {proposal.explanation}", section)
+        ahead = "NO_LOOK_AHEAD"
+        if proposal.look_ahead is not None:
+            ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
+        own = {"ahead": ahead, "predict": "predict"}
+        out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
+        out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
+        if proposal.look_ahead is None:
+            out.algorithm(move_blocks, section.name("move_blocks"), section, "entry")
+        own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
+        own["eliminated"] = "0"
+        out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
+        out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
+    if trace.observations:
+        _backward(out, trace, layout, plain)
+    out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
+    if trace.parameters:
+        out.add_function("parameters", parameter_functions(trace, layout))
+    return out, _introduction(trace, proposals)
+
+
+def _backward(out: ModuleText, trace: Trace, layout: Layout, plain: Proposal) -> None:
+    """The entry points of backward simulation."""
+    height, memory = transition_height(trace), deterministic_memory(trace)
+    section = backward_kit(trace, layout, plain, height)
+    why = f"; no rejection: {height.reason}" if isinstance(height, NotApplicable) else ""
+    out.add(f"backward simulation{why}", section)
+    own = {"horizon": "-1" if memory is None else str(memory)}
+    for function in (backward_weights, continuation):
+        out.algorithm(function, function.__name__, section, "exact", own)
+        own[function.__name__] = function.__name__
+    out.algorithm(backward_exact, "backward_exact", section, "entry", own)
+    out.algorithm(backward_mcmc, "backward_mcmc", section, "entry", own)
+    if not isinstance(height, NotApplicable):
+        out.algorithm(backward_rejection, "backward_rejection", section, "entry", own)
+
+
+def _introduction(trace: Trace, proposals: dict[str, Proposal | NotApplicable]) -> list[str]:
+    lines = [f"Generated by ssmppl from the model {trace.name!r}; edits here have no effect.", ""]
+    for role, places in trace.functions.items():
+        for place in places:
+            lines.append(f"{role:<12} {os.path.basename(place.file)}:{place.line} {place.function}")
+    lines.append("")
+    for name, p in proposals.items():
+        what = p.explanation if not isinstance(p, NotApplicable) else f"not derived: {p.reason}"
+        lines.append(f"{name:<12} {what}")
+    rows = [("theta", trace.parameter_symbols), ("states", trace.state_symbols),
+            ("y, seen", trace.observation_symbols), ("u", trace.input_symbols)]  # fmt: skip
+    lines.append("")
+    for label, symbols in rows:
+        if symbols:
+            lines.append(f"{label:<12} {', '.join(map(repr, symbols))}")
+    return lines

@@ -1,0 +1,1 @@
+"""Expressions and algorithms as the text of Python functions."""

@@ -1,0 +1,362 @@
+"""The verb `diagnose`: where a model differs from data, which effect causes it, how far it closes.
+
+The stages are fit, screen, refit and confirm; each has a module of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ssmppl.counts import check_count, check_number
+from ssmppl.data import Experiment, check_values
+from ssmppl.diagnosis.effects.candidate import passing
+from ssmppl.diagnosis.heldout.crossfit import CrossFit
+from ssmppl.diagnosis.heldout.gain_ratio import HowFar, how_far
+from ssmppl.diagnosis.heldout.parts import FOLDS, Parts, long_enough, three_parts
+from ssmppl.diagnosis.heldout.predictions import Predictions, predict
+from ssmppl.diagnosis.model.candidates import Chosen
+from ssmppl.diagnosis.model.candidates import chosen as chosen_effects
+from ssmppl.diagnosis.model.differentiable import check_differentiable
+from ssmppl.diagnosis.model.initial_law import start_of
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.report.answer import Results, answer
+from ssmppl.diagnosis.report.findings import MODES
+from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers, digests
+from ssmppl.diagnosis.run.expected_time import Timed, in_words, timed
+from ssmppl.diagnosis.run.expected_time import seconds as expected
+from ssmppl.diagnosis.run.failures import Failures, reason_of
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.selection.attribution import MOST_WORK, Attribution, attribute, measure
+from ssmppl.diagnosis.selection.augmented_models import Workshop, proposal_of
+from ssmppl.diagnosis.selection.equivalence import separating
+from ssmppl.diagnosis.selection.fit import Fit, Fitter, note
+from ssmppl.errors import ArgumentError, SSMError, listing
+from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.progress import announced
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.verbs.simulate import check_samplers
+from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.model.model import Model
+
+SETS = {"fast": 100, "full": 200}  # simulated data sets
+PARTICLES = {"fast": 500, "full": 1000}
+TWISTED_PARTICLES = {"fast": 100, "full": 100}  # a few that know where to go do more
+
+
+def diagnose(
+    model: Model,
+    data: Any,
+    effects: Chosen = None,
+    *,
+    mode: str = "full",
+    alpha: float = 0.05,
+    fixed: Mapping[str, Any] | None = None,
+    particles: int | None = None,
+    executor: Executor | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    progress: bool = True,
+    seed: int | None = 1,
+    debug: bool = False,
+) -> GapReport:
+    """Find where a model differs from reality, and which effect that it lacks causes this.
+
+    Also how far the gap closes once that effect is added, on rows that took no part in choosing it.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    effects : names that restrict the catalogue (`ssm.effects.names()`), effects made by
+        `@ssm.effect` that join it, or a mapping that renames; None: the whole catalogue.
+    mode : "fast" stops after the screen; "full" refits, confirms on held-out rows and writes the
+        augmented model.
+    alpha : family-wise error rate of every verdict.
+    fixed : values of known parameters.
+    particles : of the particle filters; None: 500 in fast mode, 1000 in full mode, 100
+        where the twisted proposal applies.
+    executor : any `concurrent.futures.Executor`, over which simulated sets and refits are shared
+        out; None: threads.
+    checkpoint : a file, or a folder, that keeps what is done: the same call again goes on from
+        there and gives the same report. None: nothing is kept.
+    progress : whether to show the stages and the time that they will take, on stderr.
+    seed : the same seed gives the same report.
+    debug : the first fault of this package is raised, where else the part that it ended (a
+        candidate, a refit, a block, a table) is left out: see `GapReport.left_out`.
+
+    Returns
+    -------
+    GapReport : `print` it. After Ctrl-C it is of the stages that are done, with `interrupted` set,
+        if the screen is among them; else KeyboardInterrupt is raised.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
+    SSMError : the fit or the screen, without which there is no answer, ended in a fault.
+    """
+    if mode not in MODES:
+        raise ArgumentError(f"mode={mode!r}", fix=f"use one of: {listing(str(mode), MODES)}")
+    check_number("alpha", alpha, lambda v: 0.0 < v < 0.5, "give an error rate such as 0.05")
+    if particles is not None:
+        check_count("particles", particles, 10)
+    check_executor(executor)
+    return _Diagnosis(
+        model,
+        data,
+        effects,
+        mode,
+        alpha,
+        fixed,
+        particles,
+        executor,
+        checkpoint,
+        progress,
+        seed,
+        Failures(debug),
+    ).run()
+
+
+class _Diagnosis:
+    """One run, stage by stage."""
+
+    def __init__(
+        self, model: Model, data: Any, effects: Chosen, mode: str, alpha: float,
+        fixed: Mapping[str, Any] | None, particles: int | None, executor: Executor | None,
+        checkpoint: str | os.PathLike[str] | None, progress: bool, seed: int | None,
+        failures: Failures,
+    ):  # fmt: skip
+        self.failures = failures
+        self.began = time.perf_counter()
+        self.problem = pose(model, data)
+        self.trace = self.problem.trace
+        check_samplers(self.trace)
+        self.experiments = self.problem.experiments
+        self.fixed = check_values(self.trace, fixed, argument="fixed")
+        check_differentiable(self.trace, self.fixed)
+        self.effects, self.mode, self.alpha = effects, mode, alpha
+        self.root = seed_sequence(seed)
+        self.parts: Parts | None = None
+        if mode == "full" and long_enough(self.experiments):
+            self.parts = three_parts(self.experiments)
+        missing = self.problem.program.missing
+        if mode == "full" and self.parts is None:  # blocks of rows will be set missing
+            missing = replace(missing, none=False)
+        proposal = proposal_of(self.problem.program)
+        number = particles or (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)[mode]
+        self.settings = Settings(number, proposal)
+        self.workshop = Workshop(self.trace, missing, self.fixed, self.settings)
+        self.notes = [
+            f"The law of {n}, {type(s.distribution).__name__}, has no distribution function "
+            "(.cdf): its one-step predictions are not checked."
+            for n, s in self.trace.observations.items()
+            if isinstance(s.distribution, Written) and not s.distribution.has_cdf
+        ]
+        described = {
+            "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,
+            "sets": SETS[mode],
+        }  # fmt: skip
+        made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
+        self.kept = Checkpoint(checkpoint, made_from, executor, progress, failures)
+
+    def run(self) -> GapReport:
+        """All stages, and the report; after an interrupt, of those that are done."""
+        try:
+            results = self._screened()
+            if self.mode == "full":
+                try:
+                    self._explained(results)
+                except KeyboardInterrupt:
+                    results.interrupted = True
+                    self.kept.say("interrupted: the report is of the stages that are done")
+            return answer(results, time.perf_counter() - self.began)
+        except SSMError:
+            raise
+        except Exception as error:
+            if self.failures.raised:
+                raise
+            raise SSMError(
+                f"the diagnosis of {self.trace.name!r} could not be finished: {reason_of(error)}",
+                fix="please report it with the model and the data; debug=True shows where it is",
+            ) from error
+        finally:
+            self.kept.flush()
+
+    # -- stages
+    def _screened(self) -> Results:
+        """Fit, and screen."""
+        base = self.workshop.fitter(())
+        training = self.parts.train if self.parts else self.experiments
+        fit = self._fit("fitting", base, training, 1, {}, searched=False)
+        states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
+        self.workshop.start = start_of(self.trace, [x[0].mean(axis=0) for x in states], states)
+        question = Question(
+            self.trace, self._scales(states, training), self.workshop.missing,
+            (*self.fixed, *fit.bounds), self.settings, self.effects, failures=self.failures,
+        )  # fmt: skip
+        if not question.candidates:
+            raise ArgumentError(
+                "none of the effects applies to this model: "
+                + "; ".join(map(str, question.refused[:3])),
+                fix="name others in effects=; ssm.effects.names() lists them",
+            )
+        with self.failures.part("the time that is expected"):
+            self._tell_time(base, fit, question, training)
+        screen = ask(question, training, fit.theta, SETS[self.mode], self._seed(2), self.kept)
+        settings = {
+            "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
+            "particles": 0 if base.exact else self.settings.particles,
+        }  # fmt: skip
+        return Results(
+            self.trace, self.experiments, self.parts, self.mode, self.alpha, base, fit, screen,
+            settings, self.notes, failures=self.failures,
+        )  # fmt: skip
+
+    def _explained(self, r: Results) -> None:
+        """Refit and choose, tell apart, and measure how far the gap closes; into `r`."""
+        found = Attribution(r.fit)
+        with self.failures.part("the choice of an effect"):
+            attribute(
+                found, self.workshop, r.screen, r.screen.experiments, self._seed(4), self.alpha,
+                self.kept,
+            )  # fmt: skip
+        r.attribution, r.fit = found, found.base
+        if found.unfitted is not None:  # nothing to measure, then
+            return
+        with self.failures.part("whether several effects predict better than fewer"):
+            self._borne_out(r)
+        with self.failures.part("the input that would separate the class best"):
+            self._separated(r)
+        with self.failures.part("how far the gap closes"):
+            r.far = self._how_far(r)
+
+    def _borne_out(self, r: Results) -> None:
+        """Of several effects chosen together, fewer again while all of them predict the held-out
+        rows no better than the model itself: what they fitted was chance. It is a choice made on
+        these rows, and the report says so."""
+        found = r.attribution
+        if not self.parts or found is None or found.chosen is None or not found.fewer:
+            return
+        try:
+            plain = self._confirmed(r.base, r.fit)
+        except SSMError:  # as will be said where the share is measured
+            return
+        while found.fewer:
+            last = found.chosen
+            try:
+                seen = self._confirmed(last.fitter, last.fit)
+            except SSMError as error:
+                found.notes.append(
+                    f"{' and '.join(map(str, last.candidates))} fit better together, and whether "
+                    f"they predict held-out rows better is not known: {error.found}"
+                )
+                return
+            gain = seen.log_density.sum(axis=1).mean() - plain.log_density.sum(axis=1).mean()
+            if gain > 0.0:
+                return
+            found.chosen, found.left_out = found.fewer.pop(), True
+            measure(found, self._seed(4), self.kept)
+            found.notes.append(
+                f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
+                f"held-out rows worse than the model itself ({gain:.1f} nats); kept instead: "
+                + " and ".join(map(str, found.chosen.candidates))
+            )
+
+    def _confirmed(self, fitter: Fitter, fit: Fit) -> Predictions:
+        """One-step predictions of the held-out rows."""
+        assert self.parts is not None
+        return predict(fitter, fit, self.experiments, self.parts.confirm, self._seed(8))
+
+    def _how_far(self, r: Results) -> HowFar:
+        once = r.chosen is not None and any(passing(c) for c in r.chosen.candidates)
+        if self.parts and not once:
+            return how_far(
+                self.workshop, self.parts, self.experiments, (r.base, r.fit), r.screen, r.chosen,
+                r.refits[0] if r.refits else None, r.label, self._seed(8), self.kept,
+            )  # fmt: skip
+        r.blocks = FOLDS
+        workshop, question, base = self.workshop, r.screen.question, (r.base, r.fit)
+        if self.parts:  # the code so far knows no missing rows
+            missing = replace(self.workshop.missing, none=False)
+            workshop = Workshop(self.trace, missing, self.fixed, self.settings, self.workshop.start)
+            question = Question(
+                self.trace, question.scales, missing, (*self.fixed, *r.fit.bounds),
+                self.settings, self.effects, failures=self.failures,
+            )  # fmt: skip
+            fitter = workshop.fitter(())
+            base = fitter, fitter.restored(self.experiments, r.fit.numbers)
+        whole = None if self.parts or (r.attribution and r.attribution.rebased) else r.screen
+        return CrossFit(
+            workshop, question, base, self.experiments, self.alpha, r.chosen, whole
+        ).how_far(r.label, self._seed(8), self.kept)
+
+    def _separated(self, r: Results) -> None:
+        """The input that would separate the class of the best, where there is a class."""
+        order, found = r.classes()
+        members = [order[i] for i in found.members(1)] if len(order) else []
+        work = sum(e.steps for e in r.screen.experiments) * self.settings.particles
+        if r.chosen is None or len(members) < 2 or not self.trace.inputs:
+            return
+        if r.base.exact or work <= MOST_WORK:
+            r.separating[1] = separating(r.screen, members, self._seed(7), self.kept)
+
+    # -- small parts
+    def _fit(
+        self, stage: str, base: Fitter, experiments: Sequence[Experiment], seed: int,
+        start: Mapping[str, np.ndarray], *, searched: bool,
+    ) -> Fit:  # fmt: skip
+        if stage not in self.kept:
+            self.kept.say(f"{stage} {self.trace.name!r}")
+
+        def numbers() -> Numbers:
+            return base.fit(experiments, self._seed(seed), start, searched=searched).numbers
+
+        with announced("diagnose", stage, shown=self.kept.progress):
+            fit = base.restored(experiments, self.kept.of(stage, numbers))
+        if not fit.converged:
+            left = f": about {fit.distance:.1f} nats may be left" if fit.distance > 0.0 else ""
+            self.notes.append(f"the fit of the model did not settle ({stage}){left}")
+        if fit.bounds:
+            self.notes.append(note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}"))
+        return fit
+
+    def _tell_time(
+        self, base: Fitter, fit: Fit, question: Question, experiments: Sequence[Experiment]
+    ) -> None:
+        """What the mode will take, from passes over the data."""
+        done = sum(f"screening/{k}" in self.kept for k in range(SETS[self.mode]))
+        if not self.kept.progress or done > SETS[self.mode] // 2:
+            return
+        whole = question.theta(fit.theta)
+        # A refit's code is about as much to compile as the screen's.
+        for_screen, generating = timed(
+            lambda: question.smoother.run(experiments, whole, random_state(self._seed(12)))
+        )
+        for_fit, _ = timed(
+            lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
+        )
+        of_climbs, _ = timed(lambda: base.value(experiments, fit.theta))
+        blocks = 0 if self.parts else FOLDS
+        rest = expected(
+            Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
+            self.kept.executor,
+        )  # fmt: skip
+        self.kept.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
+
+    def _scales(self, states: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> Scales:
+        """From filtered states, observations and inputs."""
+        y = np.concatenate([np.where(e.seen == 1.0, e.y, np.nan) for e in experiments])
+        u = np.concatenate([e.u for e in experiments])
+        longest = max(e.steps for e in experiments)
+        return Scales.of(self.trace, np.concatenate(states), y, u, longest)
+
+    def _seed(self, stage: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence(self.root.entropy, spawn_key=(*self.root.spawn_key, stage))

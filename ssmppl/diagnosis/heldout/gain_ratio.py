@@ -1,0 +1,390 @@
+"""How far the gap closes on rows that took no part in fitting or choosing.
+
+How much of the gap an effect closes on data that did not choose it.
+
+F = sum_t (l_kt - l_0t) / sum_t (l_Ct - l_0t), l the one-step log predictive densities of the base
+model (0), the model with the effect (k) and the reference (C). Numerator and denominator are sums
+over the same dependent rows: their 2 x 2 covariance comes from a paired circular block bootstrap
+(Politis and Romano 1992), and the interval of the ratio from Fieller's theorem (E. Fieller 1954),
+which says so where the denominator could be zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from scipy.special import stdtrit
+
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.effects.candidate import WHOLE, segments
+from ssmppl.diagnosis.heldout.parts import Parts
+from ssmppl.diagnosis.heldout.predictions import FreeRun, free_run, gain_of_mean, predict, rmse
+from ssmppl.diagnosis.heldout.reference import fit_reference
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.screen import Screen
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.errors import ArgumentError, SSMError
+
+REPLICATES = 2000
+LEAST_CHOSEN = 10  # blocks that the choice of their length leaves
+FEWEST_BLOCKS = 5  # below which the bootstrap does not know a variance
+
+Kind = Literal["bounded", "complement", "unbounded"]
+
+
+@dataclass(frozen=True)
+class Fieller:
+    """Confidence set of a ratio: [low, high], all but (low, high), or every number."""
+
+    kind: Kind
+    low: float
+    high: float
+
+    def holds(self, value: float) -> bool:
+        """Whether the set holds this value."""
+        if self.kind == "unbounded":
+            return True
+        return (self.low <= value <= self.high) == (self.kind == "bounded")
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Log predictive density gained over the base model, in nats, with its standard error.
+
+    nats_per_sample : over the rows with data.
+    """
+
+    nats: float
+    error: float
+    nats_per_sample: float
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Share of the gap that is closed.
+
+    F, low, high : NaN where the gap is not measurable; `reason` then says why, else it is "".
+    gain, reference : numerator and denominator. covariance : (2, 2) of their two sums.
+    block : rows per block. blocks : how many of them. level : of the interval.
+    """
+
+    F: float
+    low: float
+    high: float
+    gain: Gain
+    reference: Gain
+    covariance: np.ndarray
+    block: int
+    blocks: float
+    level: float
+    reason: str = ""
+
+    @property
+    def measurable(self) -> bool:
+        """Whether the reference gains more than nothing, as far as these rows tell."""
+        return not self.reason
+
+
+def closed(
+    base: np.ndarray,
+    effect: np.ndarray,
+    reference: np.ndarray,
+    *,
+    block: int | None = None,
+    starts: Sequence[int] = WHOLE,
+    noise: Sequence[float] | None = None,
+    level: float = 0.95,
+    replicates: int = REPLICATES,
+    seed: int = 1,
+) -> Closed:
+    """F with its interval from one-step log predictive densities.
+
+    Parameters
+    ----------
+    base, effect, reference : (T,), or (R, T) from R independent runs of the particle filter, run r
+        of each with the same seed. Missing rows are 0 in all three. Rows may also be whole blocks
+        (the folds of a cross-fit): then give `block=1`.
+    block : rows per block; None: chosen by `block_length`.
+    starts : first row of each experiment; no block reaches across.
+    noise : Monte Carlo sd of the three totals, where there is one run only. With R >= 2 runs it
+        comes from their spread.
+
+    Raises
+    ------
+    ArgumentError : shapes that differ, a value that is not finite, fewer than `FEWEST_BLOCKS`
+        blocks.
+    """
+    l0, lk, lc = _runs(base, "base"), _runs(effect, "effect"), _runs(reference, "reference")
+    if not l0.shape == lk.shape == lc.shape:
+        raise ArgumentError(
+            f"log predictive densities of shapes {l0.shape}, {lk.shape} and {lc.shape}",
+            fix="give the three models the same rows and the same number of runs",
+        )
+    gains = np.stack([lk - l0, lc - l0])  # (2, R, T)
+    rows = gains.shape[-1]
+    mean = gains.mean(axis=1)
+    length = block_length(mean, starts) if block is None else int(block)
+    blocks = sum(max((s.stop - s.start) / length, 1.0) for s in segments(rows, starts))
+    if length < 1 or blocks < FEWEST_BLOCKS:
+        raise ArgumentError(
+            f"{rows} rows make {blocks:.1f} blocks of {length}",
+            fix=f"keep at least {FEWEST_BLOCKS} blocks of rows to confirm on, or state a shorter "
+            "block=",
+        )
+    rng = np.random.default_rng(seed)
+    covariance = _lengthened(mean, length, starts, replicates, rng)
+    covariance *= blocks / (blocks - 1.0)  # deviations are from the blocks' own mean
+    covariance += _run_covariance(gains, noise)
+    total = mean.sum(axis=1)
+    q = float(stdtrit(blocks - 1.0, 0.5 + 0.5 * level))
+    error = np.sqrt(np.diagonal(covariance))
+    with_data = np.any(np.concatenate([l0, lk, lc]) != 0.0, axis=0)
+    samples = max(int(with_data.sum()), 1)
+    gain = [Gain(float(v), float(e), float(v) / samples) for v, e in zip(total, error, strict=True)]
+    low = total[1] - q * error[1]
+    if not low > 0.0:
+        nan = float("nan")
+        reason = (
+            f"no measurable gap: the reference gains {total[1]:.1f} nats, {level:.0%} interval "
+            f"from {low:.1f}"
+        )
+        return Closed(nan, nan, nan, gain[0], gain[1], covariance, length, blocks, level,
+                      reason)  # fmt: skip
+    interval = fieller(float(total[0]), float(total[1]), covariance, q)
+    return Closed(float(total[0] / total[1]), interval.low, interval.high, gain[0], gain[1],
+                  covariance, length, blocks, level)  # fmt: skip
+
+
+def fieller(numerator: float, denominator: float, covariance: np.ndarray, q: float) -> Fieller:
+    """The ratios F with |N - F D| <= q sd(N - F D), q a two-sided critical value.
+
+    A quadratic inequality in F: its solutions are an interval where D differs from zero at this
+    level, else everything but an interval, or everything.
+    """
+    n, d = float(numerator), float(denominator)
+    (vn, c), (_, vd) = np.asarray(covariance, float) * q**2
+    a, half_b, constant = d * d - vd, n * d - c, n * n - vn
+    inside = half_b**2 - a * constant
+    if a == 0.0 or inside < 0.0:
+        # a > 0 always has the solution N / D: only rounding can say otherwise.
+        return (
+            Fieller("bounded", n / d, n / d) if a > 0.0 else Fieller("unbounded", -np.inf, np.inf)
+        )
+    # The root without cancellation, and the other by the product of the two.
+    far = half_b + np.copysign(np.sqrt(inside), half_b)
+    roots = sorted((far / a, constant / far) if far != 0.0 else (0.0, 0.0))
+    return Fieller("bounded" if a > 0.0 else "complement", roots[0], roots[1])
+
+
+def block_length(gains: np.ndarray, starts: Sequence[int] = WHOLE) -> int:
+    """Rows per block for gains (C, T): the longest that any of the C series asks for.
+
+    Politis and White (2004), *Econometric Reviews* 23, for the circular bootstrap, with the
+    correction of Patton, Politis and White (2009): flat-top lag window, whose width is where the
+    autocorrelation becomes negligible. Experiments are taken as one series less their means. At
+    least `LEAST_CHOSEN` blocks are left.
+    """
+    gains = np.atleast_2d(np.asarray(gains, float))
+    parts = list(segments(gains.shape[-1], starts))
+    centred = np.concatenate([gains[:, s] - gains[:, s].mean(1, keepdims=True) for s in parts], 1)
+    most = min(centred.shape[1] // LEAST_CHOSEN, min(s.stop - s.start for s in parts) // 2)
+    return max(1, min(max(_politis_white(x) for x in centred), most))
+
+
+def _politis_white(x: np.ndarray) -> int:
+    rows = len(x)
+    run = max(5, int(np.ceil(np.sqrt(np.log10(rows)))))
+    most = int(np.ceil(np.sqrt(rows))) + run
+    lags = np.arange(min(most, rows - 1) + 1)
+    r = np.array([np.dot(x[: rows - k], x[k:]) for k in lags]) / rows
+    if r[0] <= 0.0:
+        return 1
+    small = np.abs(r[1:] / r[0]) < 2.0 * np.sqrt(np.log10(rows) / rows)
+    quiet = [m for m in range(len(small) - run + 1) if small[m : m + run].all()]
+    last = quiet[0] if quiet else int(lags[-1])
+    width = min(2 * max(last, 1), int(lags[-1]))
+    k = lags[: width + 1]
+    window = np.clip(2.0 * (1.0 - k / width), 0.0, 1.0) * r[: width + 1]
+    spectrum = window[0] + 2.0 * window[1:].sum()
+    if spectrum <= 0.0:
+        return 1
+    g = 2.0 * np.sum(k * window)
+    best = (2.0 * g**2 / (4.0 / 3.0 * spectrum**2)) ** (1.0 / 3.0) * rows ** (1.0 / 3.0)
+    return int(np.clip(round(best), 1, np.ceil(min(3.0 * np.sqrt(rows), rows / 3.0))))
+
+
+def _lengthened(
+    gains: np.ndarray, length: int, starts: Sequence[int], replicates: int,
+    rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
+    """(2, 2) of the sums of gains (2, T), with what blocks of this length miss added.
+
+    They lack the correlations that reach beyond them, to first order as much as blocks of half the
+    length lack more (D. Vats and J. Flegal, *Biometrika* 109, 2022, with r = 2, c = 1/2); of that
+    difference the part that makes the covariance larger is added.
+    """
+    found = _block_covariance(gains, length, starts, replicates, rng)
+    if length == 1:
+        return found
+    missed = found - _block_covariance(gains, (length + 1) // 2, starts, replicates, rng)
+    values, vectors = np.linalg.eigh(missed)
+    return found + (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def _block_covariance(
+    gains: np.ndarray, length: int, starts: Sequence[int], replicates: int,
+    rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
+    """(2, 2) of the sums of gains (2, T), both resampled by the same blocks."""
+    totals = np.zeros((replicates, 2))
+    for s in segments(gains.shape[1], starts):
+        part = gains[:, s]
+        rows = part.shape[1]
+        size = min(length, rows)
+        count = rows / size
+        doubled = np.concatenate([np.zeros((2, 1)), np.cumsum(np.tile(part, 2), axis=1)], axis=1)
+        sums = doubled[:, size : size + rows] - doubled[:, :rows]  # (2, rows) circular blocks
+        centred = sums - sums.mean(axis=1, keepdims=True)
+        whole = max(round(count), 1)
+        drawn = centred[:, rng.integers(rows, size=(replicates, whole))].sum(axis=-1)
+        totals += drawn.T * np.sqrt(count / whole)
+    return totals.T @ totals / replicates
+
+
+def _run_covariance(gains: np.ndarray, noise: Sequence[float] | None) -> np.ndarray:
+    """(2, 2) Monte Carlo covariance of the two sums, gains (2, R, T)."""
+    runs = gains.shape[1]
+    if runs >= 2:
+        return np.cov(gains.sum(axis=2)) / runs
+    base, effect, reference = np.square([0.0, 0.0, 0.0] if noise is None else np.asarray(noise))
+    return np.array([[effect + base, base], [base, reference + base]])
+
+
+def _runs(values: np.ndarray, name: str) -> np.ndarray:
+    found = np.atleast_2d(np.asarray(values, float))
+    if found.ndim != 2 or not np.all(np.isfinite(found)):
+        raise ArgumentError(
+            f"the log predictive densities of the {name} model have shape {np.shape(values)}"
+            + ("" if found.ndim != 2 else " and hold values that are not finite"),
+            fix="give (T,) or (R, T) finite numbers, 0 for missing rows",
+        )
+    return found
+
+
+NOT_GIVEN = "the share of the gap that is closed is not given: {}"
+SAME = 1e-3  # relative difference of two gains up to which they are the same model's
+
+
+@dataclass
+class HowFar:
+    """Rows of the report's table, free runs of each experiment before and after, and notes.
+
+    beyond : what the reference gains over the best of the catalogue, chosen or not.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    beyond: Gain | None = None
+    before: list[FreeRun] = field(default_factory=list)
+    after: list[FreeRun] | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def runs(
+        self, base: tuple[Fitter, Fit], experiments: Sequence[Experiment], chosen: Refit | None,
+        seed: np.random.SeedSequence,
+    ) -> None:  # fmt: skip
+        """Simulate freely before and after."""
+        self.before = [free_run(*base, e, seed) for e in experiments]
+        if chosen is not None:
+            self.after = [free_run(chosen.fitter, chosen.fit, e, seed) for e in experiments]
+
+
+def how_far(
+    workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
+    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, leader: Refit | None,
+    label: str, seed: np.random.SeedSequence, kept: Checkpoint,
+) -> HowFar:  # fmt: skip
+    """The chosen model, or, where none was chosen, the reference itself, against the base model.
+
+    leader : the best refit, chosen or not.
+    """
+    out = HowFar()
+    out.runs(base, experiments, chosen, seed)
+    try:
+        _measure(out, workshop, parts, experiments, base, screen, chosen, leader, label, seed, kept)
+    except SSMError as error:  # a held-out row may be impossible under what was fitted to others
+        out.notes.append(NOT_GIVEN.format(error.found))
+    return out
+
+
+def _measure(
+    out: HowFar, workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
+    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, leader: Refit | None,
+    label: str, seed: np.random.SeedSequence, kept: Checkpoint,
+) -> None:  # fmt: skip
+    """The share, and what the reference gains beyond, into `out`.
+
+    Raises
+    ------
+    SSMError : a model cannot predict the held-out rows, or there are too few.
+    """
+    counts = parts.confirm
+    plain = predict(*base, experiments, counts, seed)
+    try:
+        reference = fit_reference(
+            workshop, chosen.candidates if chosen else (), chosen.fit if chosen else base[1],
+            screen, parts.train, seed, kept, parts,
+        )  # fmt: skip
+        best = predict(*reference, experiments, counts, seed)
+    except SSMError as error:
+        out.notes.append(f"no reference to measure the gap against: {error.found}")
+        return
+    model = (chosen.fitter, chosen.fit) if chosen else reference
+    same = reference[1] is model[1]  # nothing was found beyond the chosen effects
+    found = best if same else predict(*model, experiments, counts, seed)
+    share = closed(plain.log_density, found.log_density, best.log_density, starts=plain.starts)
+    rival = found
+    if chosen is None:
+        rival = predict(leader.fitter, leader.fit, experiments, counts, seed) if leader else plain
+    out.beyond = closed(
+        rival.log_density, best.log_density, best.log_density, starts=plain.starts
+    ).gain
+    runs = out.after or [free_run(*model, e, seed) for e in experiments]
+    mean = gain_of_mean(plain, found)
+    low, high = interval_of(share)
+    out.rows.append({
+        "effect": label, "F": share.F, "F_low": low, "F_high": high,
+        "nats_per_sample": share.gain.nats_per_sample, "gain_mean": mean,
+        "gain_noise": share.gain.nats - mean,
+        "rmse_before": rmse(out.before, experiments, counts),
+        "rmse_after": rmse(runs, experiments, counts),
+    })  # fmt: skip
+    out.notes += notes_of(share, chosen is not None)
+
+
+def own_reference(share: Closed) -> bool:
+    """Whether the reference is the chosen model itself, so that the share is no comparison."""
+    return abs(share.gain.nats - share.reference.nats) <= SAME * abs(share.reference.nats)
+
+
+def interval_of(share: Closed) -> tuple[float, float]:
+    """The interval of the share; NaN where it compares a model with itself."""
+    return (np.nan, np.nan) if own_reference(share) else (share.low, share.high)
+
+
+def notes_of(share: Closed, chosen: bool) -> list[str]:
+    """What has to be known beside the share."""
+    if share.reason:
+        return [share.reason]
+    if not own_reference(share):
+        return []
+    low, high = (share.gain.nats + s * 1.96 * share.gain.error for s in (-1.0, 1.0))
+    what = "nothing beyond the chosen effect was found" if chosen else "no effect was chosen"
+    return [
+        f"{what}, so that the share is of its own gain: {share.gain.nats:.1f} nats on held-out "
+        f"rows (95% interval {low:.1f} to {high:.1f})"
+    ]

@@ -1,0 +1,175 @@
+"""The reference that "how far" is measured against: a regularised superset of the model.
+
+The base model with the chosen effects and with smooth functions of the states and inputs wherever
+the screen says that there is something, shrunk by normal priors whose width is an empirical Bayes
+estimate: E z^2 = 1 + tau^2 V of a group of basis functions with strengths of variance tau^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.heldout.parts import Parts
+from ssmppl.diagnosis.heldout.predictions import predict
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.basis import Term
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.screening.efficient_score import Null, efficient
+from ssmppl.diagnosis.screening.familywise import familywise
+from ssmppl.diagnosis.screening.location import group_score
+from ssmppl.diagnosis.screening.screen import Screen, with_parameters
+from ssmppl.diagnosis.selection.augmented_models import Workshop, lift
+from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.errors import SSMError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import symbol
+from ssmppl.language.distributions import Normal
+
+GROUPS = 3  # of basis functions that are taken in, at most
+CHANCE = 0.1  # family-wise p up to which a group is taken in: others would only add noise
+ASTRAY = 1.0  # nats below the model without the groups, beyond Monte Carlo noise
+
+Values = dict[str, np.ndarray]
+
+
+def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term], float]]:
+    """(terms of one equation, moment and variable, tau) where the basis has signal beyond what was
+    chosen, best first; none where chance explains it."""
+    question = screen.question
+    if not question.terms:
+        return []
+    own, own_seen = screen.columns_of(chosen)
+    taken = np.concatenate([screen.stacked("nuisance"), own], axis=1)
+    seen = np.concatenate([screen.observed.nuisance, own_seen])
+    found = efficient(Null.of(screen.stacked("basis"), taken), screen.observed.basis, seen)
+    groups: dict[tuple[str, str, str], list[int]] = {}
+    for i, t in enumerate(question.terms):
+        if not found.status[i]:
+            groups.setdefault((t.equation, t.moment, t.variable), []).append(i)
+    out, residual = [], residual_groups(screen, chosen)
+    for key, places in groups.items():
+        size = float(np.mean(found.z[places] ** 2))
+        if residual[key].p <= CHANCE and size > 1.0:
+            variance = float(np.mean(found.variance[places]))
+            tau = float(np.sqrt((size - 1.0) / variance))
+            out.append((size, [question.terms[i] for i in places], tau))
+    out.sort(key=lambda g: -g[0])
+    return [(terms, tau) for _, terms, tau in out[:GROUPS]]
+
+
+def fit_reference(
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen,
+    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint,
+    parts: Parts | None = None,
+) -> tuple[Fitter, Fit]:  # fmt: skip
+    """The superset, fitted from the fit of the model with the chosen effects.
+
+    A fit that comes out below where it started has gone astray (a feedback of what is past that
+    makes the model unstable): then with the best group alone, and at last with none. Where there
+    are `parts`, the curves have to predict the rows of the choose part, fitted to the screen part,
+    better than the model without them does: what only bends through the noise is left out.
+
+    Raises
+    ------
+    SSMError : it cannot be fitted.
+    """
+    groups = signal(screen, chosen)
+    if groups and parts is not None:
+        gained = kept.of(
+            "reference on other rows",
+            lambda: {"nats": _gained(workshop, chosen, start, groups, parts, seed)},
+        )
+        groups = groups if float(gained["nats"]) > 0.0 else []
+    for count in dict.fromkeys((len(groups), min(1, len(groups)))):
+        fitter, begin = superset(workshop, chosen, start, groups[:count])
+
+        def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:
+            return fitter.fit(
+                train, seed, begin, searched=True, quick=True, rough=parts is None
+            ).numbers
+
+        stage = "reference" if count == len(groups) else "reference with one group"
+        fit = fitter.restored(train, kept.of(stage, numbers))
+        noise = 3.0 * np.hypot(fit.error, start.error)
+        if fit.log_likelihood >= start.log_likelihood - ASTRAY - noise:
+            return fitter, fit
+    return workshop.fitter(chosen), start
+
+
+def _gained(
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit,
+    groups: Sequence[tuple[list[Term], float]], parts: Parts, seed: np.random.SeedSequence,
+) -> np.ndarray:  # fmt: skip
+    """() nats by which the superset predicts the choose part better; -inf where it has no fit."""
+    told = []
+    for wanted in ([], groups):
+        fitter, begin = superset(workshop, chosen, start, wanted)
+        try:
+            fit = fitter.fit(parts.screen, seed, begin, searched=True, quick=True)
+            found = predict(fitter, fit, parts.train, parts.chosen, seed)
+        except SSMError:
+            return np.asarray(-np.inf)
+        told.append(found.log_density.sum(axis=1).mean())
+    return np.asarray(told[1] - told[0])
+
+
+def superset(
+    workshop: Workshop, chosen: Sequence[Candidate], start: Fit,
+    groups: Sequence[tuple[list[Term], float]],
+) -> tuple[Fitter, Values]:  # fmt: skip
+    """The fitter of the superset, and where it starts."""
+    candidates = [t.candidate for terms, _ in groups for t in terms]
+    made, shapes = lift([*chosen, *candidates])
+    widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}
+    trace = with_parameters(augment(workshop.trace, made), {**shapes, **widths})
+    parameters = dict(trace.parameters)
+    # A prior may depend on parameters declared before: the widths come first.
+    ordered = {n: parameters.pop(n) for n in widths}
+    for i, (terms, _) in enumerate(groups):
+        for t in terms:
+            site = parameters[t.candidate.strength]
+            law = Normal(0.0, sd=array(symbol("parameter", f"tau_{i}", ())))
+            law.location = site.distribution.location
+            parameters[t.candidate.strength] = replace(site, distribution=law)
+    trace = replace(trace, parameters={**ordered, **parameters})
+    given = {**shapes, **widths}
+    fitter = workshop.made(trace, given)
+    values = unpack_parameters(start.problem.trace, start.theta)
+    begin = {n: v for n, v in values.items() if n in trace.parameters and n not in given}
+    begin |= {t.candidate.strength: np.asarray(0.0) for terms, _ in groups for t in terms}
+    return fitter, begin
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How much a group of the basis stands out: z, and its family-wise p."""
+
+    z: float
+    p: float
+
+
+def residual_groups(
+    screen: Screen, others: Sequence[Candidate]
+) -> dict[tuple[str, str, str], Residual]:
+    """Each group of the basis with `others` projected out, by equation, moment and variable: the
+    functions of one variable, or of one pair, are a group."""
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, seen = screen.stacked("basis"), screen.observed.basis
+    rest = screen.columns_of(others)
+    keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
+    if not keys:
+        return {}
+    groups = []
+    for key in keys:
+        own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
+        groups.append(
+            group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        )
+    z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
+    p = familywise(z, null, sided=1).p
+    return {k: Residual(float(z[i]), float(p[i])) for i, k in enumerate(keys)}

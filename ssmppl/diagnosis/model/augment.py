@@ -1,0 +1,269 @@
+"""A traced model with effects added: their strengths are parameters, and 0 gives the model back.
+
+Inputs and parameters are replaced first, in transitions and observations; means, variances, tails
+and starts are changed after that. Several effects on one equation add up. Auxiliary states join the
+model's own; those with the same laws are shared. Each effect is bound to the model as it was, not
+to what others make of it: one after the other they are the same as all at once (`augmented`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.model.binding import bind
+from ssmppl.diagnosis.model.candidates import slug
+from ssmppl.diagnosis.model.changed_laws import (
+    has_scale,
+    has_tail,
+    heavier,
+    scale_of_mean,
+    scaled,
+    shifted,
+    substituted,
+)
+from ssmppl.diagnosis.model.equations import Anatomy, Augmented, Part, as_it_was
+from ssmppl.errors import ArgumentError, Location, NotApplicable
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import Expr, attributed
+from ssmppl.language.distributions import Distribution, Flat, HalfFlat, Uniform
+from ssmppl.language.model.traced import Site, Trace, symbols
+
+Sum = dict[tuple[str, tuple[int, ...]], Expr]  # (name, index) -> what is added
+_LAWS = {"transition": shifted, "observation": shifted, "initial": shifted, "noise": scaled,
+         "tail": heavier}  # fmt: skip
+
+
+def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True) -> Trace:
+    """The model with the effects added, as an `Augmented` one.
+
+    Parameters
+    ----------
+    trace : the model; where effects were added to it before, these join them.
+    candidates : their strengths become scalar parameters, in this order behind the model's own.
+    prior : whether they get a prior: Flat, HalfFlat where the strength is at least 0, Uniform
+        between two bounds. False leaves them as symbols that no site declares, for derivatives.
+
+    Raises
+    ------
+    ArgumentError : two candidates have a strength of the same name, or one does not fit the model.
+    ModelError : an effect's function does not do what its kind says.
+    """
+    origin = as_it_was(trace)
+    anatomy = Anatomy(origin)
+    _check(candidates, trace, anatomy)
+    before = trace if isinstance(trace, Augmented) else None
+    every = [*(before.added if before else ()), *candidates]
+    places = dict(trace.locations)
+    auxiliary = _Auxiliary(trace, origin, before.names if before else {})
+    early = [c for c in every if c.change in ("input", "parameter")]
+    late = [c for c in every if c.change not in ("input", "parameter")]
+    names: dict[str, dict[str, str]] = {}  # strength -> its auxiliary states
+    for c in early:
+        names[c.strength] = auxiliary.add(c, anatomy, places)
+    new = _replaced(origin, early, anatomy, names, places)
+    anatomy = Anatomy(new, anatomy)
+    for c in late:
+        names[c.strength] = auxiliary.add(c, anatomy, places)
+    new = _moved(new, late, anatomy, names, places)
+    parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
+    for c in candidates:
+        if prior:
+            with attributed(places, c.effect.where):
+                parameters[c.strength] = _prior_site(c)
+    return Augmented(
+        name=trace.name,
+        parameters=parameters,
+        initial=_in_order(trace.initial, {**new.initial, **auxiliary.initial}),
+        transition=_in_order(trace.transition, {**new.transition, **auxiliary.transition}),
+        observations=new.observations,
+        proposal={**new.proposal, **auxiliary.transition} if new.proposal else {},
+        inputs=trace.inputs,
+        locations=places,
+        functions=trace.functions,
+        choices=trace.choices,
+        origin=origin,
+        added=tuple(every),
+        names=names,
+    )
+
+
+def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Site]:
+    """The sites with those that there were before first, in their order."""
+    return {n: new[n] for n in [*before, *(n for n in new if n not in before)]}
+
+
+def _check(candidates: Sequence[Candidate], trace: Trace, anatomy: Anatomy) -> None:
+    """That their names are free, and that they fit the model. anatomy : of it as it was."""
+    taken = {p.name: f"the model's {p.role}" for p in Anatomy(trace, anatomy).parts.values()}
+    for c in candidates:
+        if c.strength in taken:
+            raise ArgumentError(
+                f"the strength of {c} is named {c.strength!r}, as is {taken[c.strength]}",
+                fix="give each candidate a name of its own: replace(candidate, strength=...)",
+            )
+        taken[c.strength] = f"the strength of {c}"
+        moved = [label for label, _ in (*c.reaction, *c.carried)]
+        for label in (c.equation, *dict(c.bound).values(), *moved):
+            if label not in anatomy.parts:
+                raise ArgumentError(
+                    f"{c}: the model {anatomy.trace.name!r} has no {label!r}",
+                    fix="make the candidates by offers() of the same model",
+                )
+        _check_law(c, anatomy)
+
+
+def _check_law(c: Candidate, anatomy: Anatomy) -> None:
+    """That the law can be changed so."""
+    found: Any = None
+    part = anatomy.parts[c.equation]
+    if c.change in ("transition", "observation", "initial"):
+        found = scale_of_mean(anatomy.law(part, c.change))
+    elif c.change in ("noise", "tail"):
+        found = {"noise": has_scale, "tail": has_tail}[c.change](anatomy.law(part))
+    if isinstance(found, NotApplicable):
+        raise ArgumentError(f"{c} cannot be added: {found}", fix="leave it out")
+
+
+def _prior_site(c: Candidate) -> Site:
+    e = c.effect
+    law: Distribution
+    if math.isfinite(e.lower) and math.isfinite(e.upper):
+        law = Uniform(e.lower, e.upper)
+    else:
+        law = HalfFlat() if e.lower == 0.0 else Flat()
+    law.location = e.where
+    return Site(c.strength, "parameter", law, symbols("parameter", c.strength, ()), e.where)
+
+
+# -- auxiliary states
+class _Auxiliary:
+    """The auxiliary states of all candidates, by name in the model.
+
+    earlier : the names of those that are in it already.
+    """
+
+    def __init__(self, trace: Trace, origin: Trace, earlier: Mapping[str, Mapping[str, str]]):
+        self.earlier = {strength: dict(names) for strength, names in earlier.items()}
+        self.kept = {n for names in self.earlier.values() for n in names.values()}
+        self.taken = {*trace.parameters, *origin.initial, *trace.observations, *trace.inputs}
+        self.initial: dict[str, Site] = {}
+        self.transition: dict[str, Site] = {}
+
+    def add(self, c: Candidate, anatomy: Anatomy, places: dict[Expr, Location]) -> dict[str, str]:
+        """The names of a candidate's states: those of an earlier one where their laws agree."""
+        if not c.effect.states or c.held:
+            return {}
+        for number in itertools.count(1):
+            suffix = "" if number == 1 else f"_{number}"
+            names = {n: slug(f"{n} {c.equation}") + suffix for n in c.effect.states}
+            names = self.earlier.get(c.strength, names)
+            # A name that an earlier candidate keeps is not given away before it is asked for.
+            kept = self.kept if c.strength not in self.earlier else set()
+            if (self.taken | kept - set(self.initial)) & set(names.values()):
+                continue
+            with attributed(places, c.effect.where):
+                first = bind(c, anatomy, "initial", names).initial
+                step = bind(c, anatomy, "transition", names).transition
+            if all(n not in self.initial for n in names.values()):
+                for n in names.values():
+                    self.initial[n] = _site(n, first[n], c)
+                    self.transition[n] = _site(n, step[n], c)
+                return names
+            if all(
+                n in self.initial
+                and _alike(self.initial[n].distribution, first[n])
+                and _alike(self.transition[n].distribution, step[n])
+                for n in names.values()
+            ):
+                return names
+        raise AssertionError("unreachable")
+
+
+def _site(name: str, law: Distribution, c: Candidate) -> Site:
+    law.location = c.effect.where
+    return Site(name, "state", law, symbols("state", name, law.shape), c.effect.where)
+
+
+def _alike(a: Distribution, b: Distribution) -> bool:
+    if type(a) is not type(b) or a.shape != b.shape or list(a.parameters) != list(b.parameters):
+        return False
+    nodes = [[e for p in d.parameters.values() for e in array(p).ravel()] for d in (a, b)]
+    return all(x is y for x, y in zip(*nodes, strict=True))
+
+
+# -- inputs and parameters
+def _replaced(
+    trace: Trace, candidates: Sequence[Candidate], anatomy: Anatomy,
+    names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
+) -> Trace:  # fmt: skip
+    """With what acts in place of inputs and parameters."""
+    out = {}
+    for role in ("transition", "observation"):
+        values: dict[Expr, list[Expr]] = defaultdict(list)
+        for c in candidates:
+            with attributed(places, c.effect.where):
+                changes = bind(c, anatomy, role, names[c.strength]).changes
+            values[anatomy.parts[c.equation].seen_from(role)] += changes.values()
+        replacement = {}
+        for s, new in values.items():
+            total = new[0]
+            for other in new[1:]:
+                total = total + (other - s)
+            replacement[s] = total
+        sites = trace.transition if role == "transition" else trace.observations
+        out[role] = {n: _with_law(site, substituted, replacement, places)
+                     for n, site in sites.items()}  # fmt: skip
+    return replace(trace, transition=out["transition"], observations=out["observation"])
+
+
+def _with_law(site: Site, change: Any, how: Any, places: dict[Expr, Location]) -> Site:
+    if not how:
+        return site
+    with attributed(places, site.distribution.location):
+        return replace(site, distribution=change(site.distribution, how))
+
+
+# -- means, variances, tails, starts
+def _moved(
+    trace: Trace, candidates: Sequence[Candidate], anatomy: Anatomy,
+    names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
+) -> Trace:  # fmt: skip
+    layers: dict[tuple[str, str], list[Sum]] = defaultdict(list)  # (which laws, change)
+    for c in candidates:
+        part = anatomy.parts[c.equation]
+        role = _role(c, part)
+        with attributed(places, c.effect.where):
+            for label, by in bind(c, anatomy, role, names[c.strength]).changes.items():
+                target = anatomy.parts[label]
+                at = (target.name, target.index)
+                free = [into for into in layers[role, c.change] if at not in into]
+                if not free:
+                    layers[role, c.change].append({})
+                    free = layers[role, c.change][-1:]
+                free[0][at] = by
+    groups = {"initial": trace.initial, "transition": trace.transition,
+              "observation": trace.observations}  # fmt: skip
+    for role, sites in groups.items():
+        new = dict(sites)
+        # Scales before tails: Student's t takes over the scale of the normal law.
+        for change in (role, "noise", "tail"):
+            for layer in layers.get((role, change), []):
+                for name in dict.fromkeys(n for n, _ in layer):
+                    how = {i: by for (n, i), by in layer.items() if n == name}
+                    new[name] = _with_law(new[name], _LAWS[change], how, places)
+        groups[role] = new
+    return replace(trace, initial=groups["initial"], transition=groups["transition"],
+                   observations=groups["observation"])  # fmt: skip
+
+
+def _role(c: Candidate, part: Part) -> str:
+    """Whose law a change belongs to."""
+    if c.change in ("noise", "tail"):
+        return "transition" if part.role == "state" else "observation"
+    return c.change

@@ -1,0 +1,353 @@
+"""What of a traced model effects can be bound to, and what its equations say of each other.
+
+A traced model with effects added, which remembers the model as it was.
+
+What an effect is bound to (the state that integrates a rate, how far that moves in a step, what
+moves along) is read off the model as it was: with the terms of another effect in its equations a
+position is no plain integral any more, and means, steps and inputs are others. So a further effect
+is added to the model as it was, beside those that are in already, and means the same as if all had
+been added at once.
+
+Flows: expressions that several equations share, so that what one lacks the others lack with it.
+
+The acceleration of a cart turns the pole on it; who is infected leaves the susceptible. A force or
+a loss that is missing there is missing in every equation that holds the flow: an increment g of x_i
+is then one of g (d f_j / d F) / (d f_i / d F) of x_j, f the transitions' means and F the flow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.model.changed_laws import Index, noise_free, scale_of_mean
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.calculus import NotDifferentiable, gradient
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_of, topological
+from ssmppl.language.distributions import Dirac, Distribution
+from ssmppl.language.model.traced import Trace, previous, symbols
+
+
+@dataclass(frozen=True)
+class Augmented(Trace):
+    """What `augment` makes.
+
+    origin : the model as it was. added : the effects, in the order in which they were added.
+    names : strength -> the names of its auxiliary states in the model.
+    """
+
+    origin: Trace | None = None
+    added: tuple[Candidate, ...] = ()
+    names: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+
+def as_it_was(trace: Trace) -> Trace:
+    """The model without what was added to it; itself where nothing was."""
+    if isinstance(trace, Augmented) and trace.origin is not None:
+        return trace.origin
+    return trace
+
+
+_POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
+
+
+def label_of(name: str, index: Index) -> str:
+    """`v`, `x[0]`, `A[0, 1]`."""
+    return f"{name}[{', '.join(map(str, index))}]" if index else name
+
+
+@dataclass(frozen=True)
+class Part:
+    """One scalar component of a state, channel, input or parameter.
+
+    symbol : its symbol where it is current (not that of the step before).
+    """
+
+    label: str
+    role: str
+    name: str
+    index: Index
+    symbol: Expr
+
+    def seen_from(self, role: str) -> Expr:
+        """Its symbol in a transition (of the step before) or in another law."""
+        lagging = role == "transition" and self.role != "parameter"
+        return previous(self.symbol) if lagging else self.symbol
+
+
+class Anatomy:
+    """The parts of a traced model by label, and which state is the integral of which.
+
+    integral_of : state -> the state that it integrates (a position's velocity).
+    copies : state -> the quantity that its transition only hands on.
+    """
+
+    def __init__(self, trace: Trace, base: Anatomy | None = None):
+        """base : of the same model before effects were added; of itself where it has none."""
+        if base is None and as_it_was(trace) is not trace:
+            base = Anatomy(as_it_was(trace))
+        self.trace = trace
+        self.parts: dict[str, Part] = {}
+        for role, sites in (("state", trace.initial), ("channel", trace.observations),
+                            ("parameter", trace.parameters)):  # fmt: skip
+            for site in sites.values():
+                for s in site.components:
+                    self._add(role, s)
+        for name, shape in trace.inputs.items():
+            for s in symbols("input", name, shape).ravel():
+                self._add("input", s)
+        self.copies: dict[str, str] = base.copies if base else self._copies()
+        self.integral_of: dict[str, str] = base.integral_of if base else self._integrals()
+
+    def _add(self, role: str, s: Expr) -> None:
+        _, name, index = s.data
+        label = label_of(name, index)
+        self.parts[label] = Part(label, role, name, index, s)
+
+    def of_role(self, role: str) -> list[Part]:
+        """The parts of one role, in the model's order."""
+        return [p for p in self.parts.values() if p.role == role]
+
+    def law(self, part: Part, role: str = "") -> Distribution:
+        """The law of a state (in the transition unless role is "initial") or of a channel."""
+        if part.role == "channel":
+            return self.trace.observations[part.name].distribution
+        sites = self.trace.initial if role == "initial" else self.trace.transition
+        return sites[part.name].distribution
+
+    def mean(self, part: Part, role: str = "") -> Expr | NotApplicable:
+        """The value without noise of a state's or channel's law; why there is none."""
+        d = self.law(part, role)
+        scale = scale_of_mean(d)
+        return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
+
+    def step(self, part: Part) -> Expr | NotApplicable:
+        """mean - x_prev: how far a state moves in a step, without noise."""
+        mean = self.mean(part)
+        if isinstance(mean, NotApplicable):
+            return mean
+        if scale_of_mean(self.law(part)) != "identity":
+            return NotApplicable("its transition is no step from where it was")
+        return mean - previous(part.symbol)
+
+    def position(self, part: Part) -> Part | None:
+        """The state that integrates this one."""
+        found = [p for p, v in self.integral_of.items() if v == part.label]
+        return self.parts[found[0]] if found else None
+
+    def fixed_by_others(self, part: Part) -> str:
+        """Why a state is no rate: what its transition does instead; "" where it is one."""
+        if part.label in self.integral_of:
+            return f"its transition is only the integral of {self.integral_of[part.label]}"
+        if part.label in self.copies:
+            return f"its transition only hands on {self.copies[part.label]}"
+        return ""
+
+    def deterministic(self, part: Part) -> bool:
+        """Whether a state's transition has no noise."""
+        return isinstance(self.law(part), Dirac)
+
+    def second_order(self, part: Part) -> Expr | NotApplicable:
+        """(F'F)_i / 2 of the step x_prev + F(x_prev): what an Euler step leaves out."""
+        step = self.step(part)
+        if isinstance(step, NotApplicable):
+            return step
+        total = constant(0.0)
+        try:
+            for other in self.of_role("state"):
+                slope = gradient(step, [previous(other.symbol)])[0]
+                if slope.op == "const" and slope.data == 0.0:
+                    continue
+                by = self.step(other)
+                if isinstance(by, NotApplicable):
+                    return NotApplicable(f"it depends on {other.label}: {by.reason}")
+                total = total + slope * by
+        except NotDifferentiable as error:
+            return NotApplicable(f"its transition has no derivative: {error.found}")
+        if total.op == "const":
+            return NotApplicable("its transition has no second-order term")
+        return 0.5 * total
+
+    # -- kinematics
+    def _copies(self) -> dict[str, str]:
+        out = {}
+        for part in self.of_role("state"):
+            mean = self.mean(part)
+            if isinstance(mean, Expr) and mean.op == "symbol":
+                if mean is not previous(part.symbol) and mean.data[0] != "parameter":
+                    out[part.label] = label_of(*mean.data[1:])
+        return out
+
+    def _integrals(self) -> dict[str, str]:
+        """x with mean - x_prev = a v_prev + b mean(v), a, b >= 0 the same whatever the parameters.
+
+        Which covers explicit, semi-implicit and trapezoidal steps. The parameters are varied, so
+        that -k x in the equation of v does not make v an integral of x.
+        """
+        states = [p for p in self.of_role("state") if isinstance(self.step(p), Expr)]
+        steps = {p.label: self.step(p) for p in states}
+        rng = np.random.default_rng(1)
+        samples = [_values(self.trace, steps, rng) for _ in range(3)]
+        out: dict[str, str] = {}
+        for p in states:
+            if p.label in self.copies:
+                continue
+            for v in states:
+                if v is not p and all(_is_integral(p.label, v.label, s) for s in samples):
+                    if out.get(v.label) != p.label:
+                        out[p.label] = v.label
+                    break
+        return out
+
+
+def _values(trace: Trace, steps: dict[str, Any], rng: Any) -> dict[str, tuple[Any, Any]]:
+    """Values and steps of the states at random points; inputs and time the same at all of them."""
+    roots = list(steps.values())
+    known = {}
+    for s in symbols_of(roots):
+        fixed = s.data[0] in ("input_prev", "time_prev")
+        known[s] = rng.uniform(0.3, 1.5, None if fixed else _POINTS)
+    for s in trace.state_prev_symbols:
+        known.setdefault(s, rng.uniform(0.3, 1.5, _POINTS))
+    moved = evaluate(roots, known)
+    own = {label_of(*s.data[1:]): known[s] for s in trace.state_prev_symbols}
+    wide = np.zeros(_POINTS)
+    return {k: (own[k], wide + m) for k, m in zip(steps, moved, strict=True)}
+
+
+def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]]) -> bool:
+    moved = values[x][1]
+    own, by = values[v]
+    if not (np.all(np.isfinite(moved)) and np.all(np.isfinite(by))):
+        return False
+    if not np.any(np.abs(moved) > _SMALL):
+        return False
+    basis = np.stack([own, own + by], axis=1)
+    coefficients, *_ = np.linalg.lstsq(basis, moved, rcond=1e-10)
+    rest = moved - basis @ coefficients
+    exact = np.max(np.abs(rest)) <= _SMALL * np.max(np.abs(moved))
+    return bool(exact and np.all(coefficients >= -_SMALL))
+
+
+def time_symbol(role: str) -> Expr:
+    """`t` in a transition, and in another law."""
+    return symbol("time_prev" if role == "transition" else "time", "t")
+
+
+def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> Any:
+    """The symbols of a named quantity seen from a law, a node for a scalar."""
+    site = {"state": trace.initial, "channel": trace.observations,
+            "parameter": trace.parameters}.get(role, {}).get(name)  # fmt: skip
+    value = symbols("input", name, shape) if site is None else site.value
+    return value[()] if array(value).shape == () else value
+
+
+Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
+
+FLOW = symbol("flow", "F")
+
+
+@dataclass(frozen=True)
+class Flows:
+    """What moves with the state of a label: `flows`, and what is `carried`."""
+
+    reactions: Mapping[str, list[Reaction]]
+    carried: Mapping[str, Reaction]
+
+    @classmethod
+    def of(cls, anatomy: Anatomy) -> Flows:
+        """Of a model."""
+        return cls(flows(anatomy), carried(anatomy))
+
+
+def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
+    """By the label of a state: how the others move with it, once for each set of others.
+
+    A flow is a shared expression of states or inputs, the largest of its kind, that enters the
+    state's own equation with a constant factor, and the others' linearly. What integrates the state
+    is not moved: see `carried`.
+    """
+    means = {}
+    for part in anatomy.of_role("state"):
+        mean = anatomy.mean(part)
+        if isinstance(mean, Expr) and scale_of_mean(anatomy.law(part)) == "identity":
+            means[part.label] = mean
+    out: dict[str, list[Reaction]] = {}
+    for label in means:
+        part = anatomy.parts[label]
+        if not anatomy.fixed_by_others(part):
+            found: dict[tuple[str, ...], Reaction] = {}
+            others = {k: m for k, m in means.items()
+                      if k != label and anatomy.integral_of.get(k) != label}  # fmt: skip
+            for flow in _shared(means[label], others):
+                reaction = _reaction(flow, means[label], others)
+                found.setdefault(tuple(other for other, _ in reaction), reaction)
+            out[label] = [r for r in found.values() if r]
+    return out
+
+
+def carried(anatomy: Anatomy) -> dict[str, Reaction]:
+    """By the label of a state: what integrates its new value, and so moves within the same step, as
+    in semi-implicit steps, x + h v_new."""
+    out: dict[str, Reaction] = {}
+    for x, v in anatomy.integral_of.items():
+        mean, whole = (anatomy.mean(anatomy.parts[label]) for label in (v, x))
+        if not (isinstance(mean, Expr) and isinstance(whole, Expr)):
+            continue
+        if mean in set(topological([whole])):
+            try:
+                (slope,) = gradient(substitute([whole], {mean: FLOW})[0], [FLOW])
+            except NotDifferentiable:
+                continue
+            if not _moving(slope) and FLOW not in symbols_of(slope):
+                out[v] = ((x, slope),)
+    return out
+
+
+def _moving(e: Expr) -> bool:
+    """Whether it depends on states or inputs."""
+    return any(s.data[0] in ("state_prev", "input_prev") for s in symbols_of(e))
+
+
+def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
+    """What a state's equation and some other one hold, the larger first. Without a parameter,
+    as h v, cos x or x_1 - x_2, it is geometry and no flow."""
+    elsewhere = set(topological(others.values()))
+    out: list[Expr] = []
+    seen: set[Expr] = set()
+    stack = [mean]
+    while stack:
+        node = stack.pop()
+        if node in seen or node.op in ("symbol", "const") or not _moving(node):
+            continue
+        seen.add(node)
+        law = any(s.data[0] == "parameter" for s in symbols_of(node))
+        if law and node in elsewhere and node is not mean:
+            out.append(node)
+        stack += node.args
+    return out
+
+
+def _reaction(flow: Expr, mean: Expr, others: Mapping[str, Expr]) -> Reaction:
+    """How the other equations move with one; () where the flow does not enter as it has to."""
+    out = []
+    try:
+        (own,) = gradient(substitute([mean], {flow: FLOW})[0], [FLOW])
+        if _moving(own) or FLOW in symbols_of(own):
+            return ()
+        for label, other in others.items():
+            (slope,) = gradient(substitute([other], {flow: FLOW})[0], [FLOW])
+            if slope.op == "const" and slope.data == 0.0:
+                continue
+            if FLOW in symbols_of(slope):
+                return ()
+            out.append((label, slope / own))
+    except NotDifferentiable:
+        return ()
+    return tuple(out)

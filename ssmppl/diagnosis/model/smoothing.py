@@ -1,0 +1,405 @@
+"""One pass over the data: log-likelihood, smoothed scores row by row, one-step predictions.
+
+Exact draws of the trajectories where the model is linear and Gaussian, else a particle filter,
+twisted where the model allows it, with fixed-lag smoothing over its genealogy; see
+`codegen/kernels/particle/scored_filters.py`.
+
+Data sets drawn from a fitted model, with the lengths, inputs and gaps of the data.
+
+A component of x_1 whose law is Flat cannot be drawn: it starts at its smoothed mean given the data,
+as does one whose law stands for a flat one (`initial_law.py`).
+What a linear Gaussian model with a flat start says of its disturbances does not depend on where it
+starts (P. de Jong, *Annals of Statistics* 19, 1991).
+
+How well observations are predicted several rows ahead: the CRPS of simulations from what the
+filter knows.
+
+A model can predict one row well and drift away from reality in ten, as one-step predictions are
+corrected by every observation. So the filtered states of some rows are simulated on, and the
+continuous ranked probability score of what they give at each horizon is a statistic like the
+others, whose law comes from simulated data sets (`detect`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.structure import flat_start
+from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
+from ssmppl.codegen.modules.filter_variants import compile_row_scores
+from ssmppl.codegen.modules.program import Program, compile_trace
+from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.codegen.native.loading import Loaded
+from ssmppl.compiling import once_property
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.model.score_columns import Columns
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
+from ssmppl.inference.particles.backward import ParticleSystem, particle_system
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.verbs.simulate import feeds_back
+from ssmppl.language.distributions import Dirac, Flat
+from ssmppl.language.model.traced import Site, Trace, symbols
+
+
+class Simulator:
+    """Draws from a model at given parameters.
+
+    program : of the model, which is used as it is where x_1 has a law. kalman : of the model where
+    it is linear and Gaussian. held : further states that start at a mean; found : of an experiment
+    and theta (P,), the means (D,) of x_1 that these take.
+    """
+
+    def __init__(
+        self, program: Program, missing: Missing, kalman: object, held: Sequence[str] = (),
+        found: Callable[[Experiment, np.ndarray], np.ndarray] | None = None,
+    ):  # fmt: skip
+        self.trace, self.feedback = program.trace, feeds_back(program.trace)
+        self.found = found
+        flat = [*flat_start(self.trace), *(self.trace.initial[n] for n in held)]
+        self.starts: list[Expr] = [s for site in flat for s in site.components]
+        self.kalman = kalman if isinstance(kalman, KalmanModel) else None
+        self.program = compile_trace(_started(self.trace, flat), missing) if flat else program
+
+    def sets(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
+    ) -> list[Experiment]:
+        """The experiments with observations drawn at theta (P,), missing where theirs are.
+
+        Where a transition reads observations, `y` has those that it read, seen or not.
+        """
+        out = []
+        for e in experiments:
+            drawn = self.observations(e, theta, stream, 1)[:, :, 0]
+            y = drawn if self.feedback else np.where(e.seen == 1.0, drawn, 0.0)
+            out.append(replace(e, y=y))
+        return out
+
+    def observations(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, n: int
+    ) -> np.ndarray:
+        """(T, K, n) drawn with the experiment's inputs, all rows measured."""
+        d, k = len(self.trace.state_symbols), len(self.trace.observation_symbols)
+        at = np.append(theta, self._start(e, theta))
+        run, width = self.program.entry("simulate"), 1 if self.feedback else n
+        drawn = []
+        for _ in range(n // width):
+            x, out = np.empty((e.steps, d, width)), np.empty((e.steps, k, width))
+            run(at, np.zeros_like(e.y), np.ones_like(e.seen), e.u, stream, x, out, self.feedback)
+            drawn.append(out)
+        return np.concatenate(drawn, axis=2)
+
+    def _start(self, e: Experiment, theta: np.ndarray) -> list[float]:
+        if not self.starts:
+            return []
+        place = {s: i for i, s in enumerate(self.trace.state_symbols)}
+        own = theta[: len(self.trace.parameter_symbols)]
+        if self.found is not None:
+            mean = self.found(e, own)
+        elif self.kalman is not None:
+            mean = self.kalman.smooth(e, own).mean[0]
+        else:
+            return []
+        return [float(mean[place[s]]) for s in self.starts]
+
+
+def _started(trace: Trace, flat: Sequence[Site]) -> Trace:
+    """The trace with flat starts replaced by further parameters."""
+    initial, parameters = dict(trace.initial), dict(trace.parameters)
+    for site in flat:
+        name = f"{site.name}_start"
+        while name in parameters or name in trace.transition:
+            name += "_"
+        at = symbols("parameter", name, site.shape)
+        law, start = Flat(shape=site.shape), Dirac(at)
+        law.location = start.location = site.distribution.location
+        parameters[name] = Site(name, "parameter", law, at, site.distribution.location)
+        initial[site.name] = replace(site, distribution=start)
+    return replace(trace, initial=initial, parameters=parameters)
+
+
+HORIZONS = (1, 10, 100)  # rows
+ORIGINS = 40  # rows that are simulated on from, spread evenly
+CRPS_DRAWS = 24  # from each
+FEWEST = 8  # of these rows, without which a horizon is left out (0 in every data set)
+
+
+def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """(T,) continuous ranked probability score of predictive samples (T, M), smaller is better.
+
+    mean |x_i - y| - sum_{i<j} |x_i - x_j| / (M (M - 1)): fair, i.e. unbiased for the score of the
+    law that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018, equation 6).
+    NaN where nothing was observed, or a sample is infinite.
+    """
+    x, y = np.sort(np.asarray(samples, float), axis=-1), np.asarray(observed, float)
+    m = x.shape[-1]
+    if m < 2 or x.shape[:-1] != y.shape:
+        raise ArgumentError(
+            f"predictive samples of shape {x.shape} for observations of shape {y.shape}",
+            fix="give (T, M) samples, M at least 2, and (T,) observations",
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = x @ (2.0 * np.arange(1, m + 1) - m - 1.0)  # sum over pairs, by the order statistics
+        score = np.mean(np.abs(x - y[..., None]), axis=-1) - apart / (m * (m - 1.0))
+    return np.where(np.isfinite(x).all(axis=-1), score, np.nan)
+
+
+def crps_ahead(
+    program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
+    stream: np.ndarray, feedback: bool, horizons: Sequence[int] = HORIZONS,
+) -> np.ndarray:  # fmt: skip
+    """(O, H, K) CRPS of each channel at each horizon, from O rows on; NaN where nothing was
+    observed, or the record ends before.
+
+    particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
+    observations; rows that lack one are then not simulated on from.
+    """
+    simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
+    origins = np.unique(np.linspace(0, max(steps - 2, 0), ORIGINS).astype(int))
+    if steps < 2:
+        return np.full((len(origins), len(horizons), channels), np.nan)
+    levels = np.empty(1)
+    samples = np.full((len(origins), len(horizons), channels, CRPS_DRAWS), np.nan)
+    known = np.isfinite(particles[origins]).all(axis=(1, 2))  # not a flat start before it is
+    for o, t in enumerate(origins.tolist()):
+        if not known[o] or (feedback and not np.all(e.seen[t] == 1.0)):
+            continue
+        fill_uniform(stream, levels)
+        chosen = _systematic(weights[t], float(levels[0]))
+        reach = min(max(horizons), steps - 1 - t)
+        states = np.empty((reach, particles.shape[1], CRPS_DRAWS))
+        drawn = np.empty((reach, channels, CRPS_DRAWS))
+        start = np.ascontiguousarray(particles[t][:, chosen])
+        y = e.y.copy() if feedback else e.y
+        simulate(theta, y, e.seen, e.u, t + 1, start, stream, states, drawn, feedback)
+        for h, horizon in enumerate(horizons):
+            if horizon <= reach:
+                samples[o, h] = drawn[horizon - 1]
+    rows = origins[:, None] + np.array(horizons)
+    inside = np.minimum(rows, steps - 1)
+    measured = (rows < steps)[..., None] & (e.seen[inside] == 1.0)
+    return crps(samples, np.where(measured, e.y[inside], np.nan))
+
+
+def _systematic(weights: np.ndarray, level: float) -> np.ndarray:
+    """Indices of `DRAWS` particles, drawn by their weights with one uniform."""
+    cumulative = np.cumsum(weights)
+    points = (np.arange(CRPS_DRAWS) + level) / CRPS_DRAWS * cumulative[-1]
+    return np.minimum(np.searchsorted(cumulative, points), len(weights) - 1)
+
+
+def mean_scores(
+    scores: Sequence[np.ndarray], channels: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Statistics by channel: the mean CRPS at each horizon over all rows and experiments; 0 where
+    there are too few."""
+    together = np.concatenate([np.empty((0, len(HORIZONS), len(channels))), *scores])
+    out: dict[str, dict[str, float]] = {}
+    for k, channel in enumerate(channels):
+        own = out[channel] = {}
+        for h, horizon in enumerate(HORIZONS):
+            known = together[:, h, k]
+            known = known[np.isfinite(known)]
+            rows = "row" if horizon == 1 else "rows"
+            own[f"CRPS {horizon} {rows} ahead"] = (
+                float(known.mean()) if len(known) >= FEWEST else 0.0
+            )
+    return out
+
+
+LAG = 40
+DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
+PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
+
+
+@dataclass(frozen=True)
+class Settings:
+    """particles : N of the filter. proposal : of the filter. lag : of the smoother, in rows."""
+
+    particles: int = 1000
+    proposal: str = "bootstrap"
+    lag: int = LAG
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What one pass tells of one experiment (T rows, F columns, K channels).
+
+    log_increments : (T,) log p(y_t | y_{1:t-1}). rows : (T, F) smoothed scores, row by row.
+    prediction : (T, 4, K) mean, variance, P(Y <= y), P(Y < y) given y_{1:t-1}.
+    ahead : (O, H, K) CRPS of predictions further ahead (`crps_ahead`), where it was asked for.
+    covariance : (T, K, K) of the prediction, where it is exact.
+    """
+
+    log_increments: np.ndarray
+    rows: np.ndarray
+    prediction: np.ndarray
+    ahead: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+
+
+class Smoother:
+    """Runs passes for a set of columns; the generated code is made when first asked for."""
+
+    def __init__(self, columns: Columns, missing: Missing, settings: Settings):
+        self.columns, self.missing, self.settings = columns, missing, settings
+
+    def __getstate__(self) -> dict:  # another process finds the generated modules in its cache
+        generated = ("program", "module", "problem")
+        return {k: v for k, v in self.__dict__.items() if k not in generated}
+
+    @once_property
+    def program(self) -> Program:
+        return compile_trace(self.columns.base, self.missing)
+
+    @once_property
+    def module(self) -> Loaded:
+        c = self.columns
+        return compile_row_scores(c.given, c.base, c.initial, c.later, self.missing, c.follows)
+
+    @once_property
+    def kalman(self) -> KalmanModel | NotApplicable:
+        return kalman_model(self.columns.base)
+
+    @once_property
+    def problem(self) -> Problem:
+        return Problem(self.columns.base, (), self.program)
+
+    def run(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray,
+        *, predicted: bool = True, ahead: bool = False,
+    ) -> list[Pass]:  # fmt: skip
+        """A pass over each experiment at theta, the values of `columns.given`'s parameters.
+
+        The stream is advanced in place. predicted : whether the predictions are wanted, which are
+        NaN where they are not and cost something; ahead : likewise those of more than one row.
+
+        Raises
+        ------
+        SamplingError : all weights vanish, or are NaN; names the step and the parameters.
+        """
+        return [self._one(e, theta, stream, predicted or ahead, ahead) for e in experiments]
+
+    def _one(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, predicted: bool, ahead: bool
+    ) -> Pass:
+        given, data = theta, (e.y, e.seen, e.u)
+        own = given[: len(self.columns.base.parameter_symbols)]
+        rows = np.empty((e.steps, len(self.columns.later)))
+        prediction = np.full((e.steps, 4, e.y.shape[1]), np.nan)
+        known: tuple[np.ndarray, np.ndarray] | None = None
+        together = None
+        if isinstance(self.kalman, KalmanModel):
+            moments = self.kalman.filter(e, own)
+            increments, together = _exact(moments, e, prediction), moments.observation_covariance
+            if ahead:
+                known = _drawn(moments.mean, moments.covariance, stream)
+            # Antithetic: scores that are linear in the states come out exact.
+            paths = self.kalman.draw(e, own, stream, DRAWS // 2)
+            paths = np.concatenate([paths, 2.0 * self.kalman.smooth(e, own).mean - paths])
+            found = np.moveaxis(paths, 0, 2)
+            weights = np.full((e.steps, DRAWS), 1.0 / DRAWS)
+            ancestors = np.broadcast_to(np.arange(DRAWS, dtype=np.int32), weights.shape).copy()
+        else:
+            system, weights = self.system(e, own, stream)
+            found, ancestors, increments = system.particles, system.ancestors, system.log_increments
+            if predicted:
+                known = self._before_prediction(system, weights, e, own, stream)
+                self.module.row_predictions(given, *data, *known, stream, prediction)
+        particles = np.zeros((e.steps, len(self.columns.carried.state_symbols), found.shape[2]))
+        particles[:, : found.shape[1]] = found
+        if self.columns.follows:
+            self.module.complete_rows(given, *data, particles, ancestors)
+        self.module.row_scores(given, *data, particles, weights, ancestors, self.settings.lag, rows)
+        scores = None
+        if ahead and known is not None:
+            feedback = feeds_back(self.columns.base)
+            scores = crps_ahead(self.program, e, own, *known, stream, feedback)
+        return Pass(increments, rows, prediction, scores, together)
+
+    def system(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray
+    ) -> tuple[ParticleSystem, np.ndarray]:
+        """All particles of one run at theta (P,), and weights (T, N) for smoothing.
+
+        Under the twisted proposal those by which the next generation was drawn, which know all the
+        data: the filter's own tell what was known at a row, and few particles matter to them.
+        """
+        settings = FilterSettings(self.settings.particles, self.settings.proposal)
+        system = particle_system(self.problem, theta, settings, e, stream)
+        if self.settings.proposal != "twisted":
+            return system, system.weights
+        n = settings.particles
+        offspring = [np.bincount(a, minlength=n) / n for a in system.ancestors[1:]]
+        return system, np.array([*offspring, system.weights[-1]])
+
+    def _before_prediction(
+        self, system: ParticleSystem, weights: np.ndarray, e: Experiment, theta: np.ndarray,
+        stream: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Particles (T, D, N) and weights (T, N) that tell what was known at each row.
+
+        Of the filter itself; under the twisted proposal, whose particles know what comes later,
+        draws from the extended Kalman filter, in pairs mirrored at its mean.
+        """
+        if self.settings.proposal != "twisted":
+            return system.particles, system.weights
+        moments = self._twisted.filtered(theta, e.y, e.seen, e.u)
+        if moments is None:
+            return system.particles, system.weights
+        return _drawn(*moments, stream)
+
+    @property
+    def _twisted(self) -> TwistedFilter:
+        found = self.program.twisted
+        assert isinstance(found, TwistedFilter)
+        return found
+
+
+def _drawn(
+    mean: np.ndarray, covariance: np.ndarray, stream: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Particles (T, D, N), in pairs mirrored at the mean, and weights (T, N) of normal laws with
+    these moments (T, D), (T, D, D)."""
+    # Rows before a flat start is known have none: what is drawn there is NaN, as their mean is.
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(covariance), covariance, 0.0))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    normals = np.empty(mean.size * (PREDICTIVE // 2))
+    fill_normal(stream, normals)
+    away = root @ normals.reshape(*mean.shape, -1)
+    drawn = mean[:, :, None] + np.concatenate([away, -away], axis=2)
+    return drawn, np.full((len(mean), PREDICTIVE), 1.0 / PREDICTIVE)
+
+
+def _exact(found: KalmanMoments, e: Experiment, prediction: np.ndarray) -> np.ndarray:
+    """Fill the predictions of a linear Gaussian model; returns the increments (T,)."""
+    variance = np.diagonal(found.observation_covariance, axis1=1, axis2=2)
+    prediction[:, 0], prediction[:, 1] = found.observation_mean, variance
+    with np.errstate(all="ignore"):
+        below = ndtr((e.y - found.observation_mean) / np.sqrt(variance))
+    prediction[:, 2] = prediction[:, 3] = below
+    return found.log_increments
+
+
+def probability_transforms(
+    passes: Sequence[Pass], experiments: Sequence[Experiment], stream: np.ndarray
+) -> list[np.ndarray]:
+    """PIT values (T, K) of one-step predictions, randomised where a channel is discrete.
+
+    NaN where a value is missing (Czado, Gneiting and Held 2009 for counts).
+    """
+    out = []
+    for p, e in zip(passes, experiments, strict=True):
+        upper, lower = p.prediction[:, 2], p.prediction[:, 3]
+        uniforms = np.empty(upper.size)
+        fill_uniform(stream, uniforms)
+        value = lower + uniforms.reshape(upper.shape) * (upper - lower)
+        out.append(np.where(e.seen == 1.0, value, np.nan))
+    return out

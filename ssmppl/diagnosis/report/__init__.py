@@ -1,0 +1,1 @@
+"""The report of a diagnosis: its tables, its words, its plots, its page and the model file."""

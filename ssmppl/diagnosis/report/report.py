@@ -1,0 +1,90 @@
+"""GapReport: what `diagnose` returns, and prints, draws and saves itself."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ssmppl.diagnosis.report.findings import Findings
+from ssmppl.diagnosis.report.folder import save
+from ssmppl.diagnosis.report.panels import plot
+from ssmppl.diagnosis.report.text import report_html, report_text
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GapReport(Findings):
+    """Where a model differs from its data, which effect is missing, and how far the gap closes.
+
+    `print` it for the answers in words; `plot()` draws them; `save(folder)` writes everything.
+
+    Parameters
+    ----------
+    verdict : "effect", "none of these" or "no measurable gap".
+    where : one row for each place that stands out, strongest first: the equation, the moment of
+        its law (mean, scale, tails, time dependence), when (t_from, t_to), the region of states and
+        inputs in words, z and its family-wise p.
+    causes : candidate effects, best first. `gain_screen` is the gain in nats that the score
+        predicts, `gain_refit` the one after refitting, NaN where it was not refitted; `sign` the
+        constraint on the strength or the sign found, `estimate` and `se` that strength.
+        Effects that these data cannot tell apart share a `class_id`.
+    classes : the members of each class, their correlation `rho` with the best one, and in words
+        the input that would separate them best ("" if none would).
+    closed : the chosen model first: share F of the closable gap that it closes on data that took
+        no part in choosing it, with a 95% interval (infinite ends where the data do not bound it;
+        F NaN where there is no measurable gap); the gain in nats per sample, and its parts in all
+        from the mean and from the noise law; the error of a free run before and after.
+    detection : tests of the one-step predictions by observation channel.
+    residual_map : standardised smoothed score by equation and window of time.
+    free_run : the data, and the models run without seeing them, before and after (NaN if there is
+        no after), with 95% bands.
+    not_applicable : parts that do not apply to this model, the equation ("" if all), and why.
+    missing : estimated curve of what is missing over a state, input or time, with a 95% band.
+    model, model_text : the model with the chosen effects added, and its file; None and "" if
+        nothing was chosen.
+    chosen : labels of the chosen effects: the effect's name, or "<effect> on <equation>" where
+        that effect was tried on several equations.
+    leading : for each effect that the verdict names, its `row` in `causes`, and form, sign,
+        estimate and se in the model with all of them; or `row` and `unfitted` for one that the
+        screen found and that could not be fitted.
+    estimates : {"before": {parameter: (value, standard error)}, "after": ...}; error 0 if fixed.
+    parts : {"screen": (first, last), "confirm": ...}, row labels of the rows that were used, or
+        {"cross-fitting": number of blocks}; any further entry is text, such as "choice".
+    notes : what has to be known before the figures are used.
+    settings : the arguments used; of these the words use `alpha`, `candidates` (number tried),
+        `model` (name), `samples`, `seed`, `experiment` (whose rows `parts` tells, of several).
+    seconds, mode, interrupted : run time; "full" or "fast" (which stops after the screen); whether
+        it was interrupted, and only the stages done before are here.
+    failures : the parts that an error ended, while the rest went on: see `left_out`.
+    """
+
+    def __str__(self) -> str:
+        return report_text(self)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return report_html(self)
+
+    def plot(self) -> Any:
+        """Draw the residual map, the ranked effects, the missing term and the free run.
+
+        Returns
+        -------
+        Figure : of Matplotlib.
+        """
+        return plot(self)
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write the tables (CSV), the plots (PNG), the model file and the page to a folder.
+
+        Parameters
+        ----------
+        folder : made where there is none.
+
+        Returns
+        -------
+        Path : of the page, `index.html`.
+        """
+        return save(self, folder)

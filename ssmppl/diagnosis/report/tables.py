@@ -1,0 +1,296 @@
+"""The tables of a report, from the results of the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.effects.candidate import Candidate, one_off, shape_text
+from ssmppl.diagnosis.heldout.predictions import FreeRun
+from ssmppl.diagnosis.heldout.reference import residual_groups
+from ssmppl.diagnosis.report.findings import tabulate
+from ssmppl.diagnosis.screening.location import (
+    Group,
+    bin_edges,
+    curve,
+    group_score,
+    localise,
+    regions,
+    when,
+)
+from ssmppl.diagnosis.screening.screen import Screen
+from ssmppl.diagnosis.selection.equivalence import Classes
+from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.drawing.numerals import label
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CURVE_POINTS = 41
+AT_BOUND = 1e-3  # standard errors of the screen, below which a one-sided strength is none
+STANDS_OUT = 3.0  # |z| of a region that is named
+# Of the error rate, for the places and for the checks of the predictions: with the whole of it for
+# the effects, at most 1.4 times as much in all.
+SHARED = 0.2
+
+
+def shared(p: Any) -> Any:
+    """p of the places, or of the checks, with what else is looked at counted (Bonferroni)."""
+    return np.minimum(1.0, np.asarray(p, dtype=float) / SHARED)
+
+
+def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, Group]]:
+    """Equation, moment, stretch of time and region of each group of the basis; by p (`shared`)."""
+    observed, nuisance = screen.observed, screen.stacked("nuisance")
+    columns, terms = screen.stacked("basis"), screen.question.terms
+    keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
+    if not keys:
+        return tabulate("where"), {}
+    places = {k: [i for i, t in enumerate(terms) if (t.equation, t.moment) == k] for k in keys}
+    groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
+    table, found = localise(groups, nuisance, observed.nuisance)
+    alone = {
+        k: group_score(columns[:, p], observed.basis[p], nuisance, observed.nuisance)
+        for k, p in places.items()
+    }
+    sizes = [e.steps for e in screen.experiments]
+    starts = np.cumsum([0, *sizes[:-1]]).tolist()
+    edges = bin_edges(sum(sizes), starts)
+    labels = _labels(screen.experiments)
+    bins, own = screen.stacked("basis_bins"), screen.stacked("nuisance_bins")
+    rows = []
+    for row in table.itertuples():
+        key, p = row.key, float(shared(row.p_either))
+        stretch = (0, sum(sizes))
+        if p <= alpha and len(edges) > 3:
+            at = when(
+                alone[key], bins[:, :, places[key]], observed.basis_bins[:, places[key]],
+                own, observed.nuisance_bins, edges, alpha=alpha,
+            )  # fmt: skip
+            stretch = (at.first, at.last)
+        rows.append({
+            "equation": key[0], "moment": key[1], "t_from": labels[stretch[0]],
+            "t_to": labels[stretch[1] - 1], "z": max(row.z, row.z_alone), "p": p,
+            "region": _region(screen, key, places[key]) if p <= alpha else "",
+            "experiment": _experiments(starts, *stretch),
+        })  # fmt: skip
+    rows.sort(key=lambda r: (r["p"], -r["z"]))
+    return tabulate("where", rows), found
+
+
+def _labels(experiments: Sequence[Experiment]) -> list[Any]:
+    """A label for each row: its time, else its number in its experiment."""
+    out: list[Any] = []
+    for e in experiments:
+        out += list(e.time) if e.time is not None else list(range(1, e.steps + 1))
+    return out
+
+
+def _experiments(starts: Sequence[int], first: int, last: int) -> str:
+    """Whose the rows first <= t < last are: "2", "1 to 3"; "" where there is one experiment."""
+    if len(starts) < 2:
+        return ""
+    a, b = (int(np.searchsorted(starts, row, side="right")) for row in (first, last - 1))
+    return str(a) if a == b else f"{a} to {b}"
+
+
+def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
+    """Where the strongest of the variables shows the gap most, in words."""
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, best = screen.stacked("basis"), None
+    for variable in dict.fromkeys(terms[i].variable for i in places):
+        own = [i for i in places if terms[i].variable == variable]
+        group = group_score(
+            columns[:, own], screen.observed.basis[own], nuisance, screen.observed.nuisance
+        )
+        if best is None or group.z > best[0].z:
+            best = group, variable, own
+    if best is None:
+        return ""
+    group, variable, own = best
+    if not terms[own[0]].is_curve:
+        return f"with {variable}"
+    values = screen.question.grid(variable)
+    table = regions(group, [terms[i].at for i in own], values, variable)
+    row = table.iloc[int(np.argmax(np.abs(table["z"].to_numpy())))]
+    return f"where {row['region']}" if abs(row["z"]) >= STANDS_OUT else f"over {variable}"
+
+
+def missing_table(
+    screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
+) -> pd.DataFrame:
+    """The estimated missing curve of the mean over each variable of an equation.
+
+    others : candidates that are projected out.
+    """
+    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
+    columns, seen = screen.stacked("basis"), screen.observed.basis
+    rest = screen.columns_of(others)
+    rows = []
+    places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key and t.is_curve]
+    for variable in dict.fromkeys(terms[i].variable for i in places):
+        own = [i for i in places if terms[i].variable == variable]
+        group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        values = screen.question.grid(variable)
+        low_end, high_end = np.quantile(values, (0.02, 0.98))
+        grid = np.linspace(float(low_end), float(high_end), CURVE_POINTS)
+        design = np.stack([np.asarray(terms[i].at(grid)) for i in own], axis=1)
+        found = curve(group, design)
+        for x, e, low, high in zip(grid, found.estimate, found.low, found.high, strict=True):
+            rows.append({"equation": key[0], "variable": variable, "value": x, "estimate": e,
+                         "low": low, "high": high})  # fmt: skip
+    return tabulate("missing", rows)
+
+
+def catalogue(screen: Screen) -> list[Candidate]:
+    """The candidates that the screen could tell anything about."""
+    candidates = screen.question.candidates
+    return [c for c, s in zip(candidates, screen.found.status, strict=True) if not s]
+
+
+def residual_group(
+    screen: Screen, others: Sequence[Candidate]
+) -> tuple[float, tuple[str, str] | None]:
+    """(family-wise p, equation and moment) of what of the basis stands out most with `others`
+    projected out."""
+    groups = residual_groups(screen, others)
+    if not groups:
+        return 1.0, None
+    best = max(groups, key=lambda key: groups[key].z)
+    return groups[best].p, best[:2]
+
+
+def causes_table(
+    screen: Screen, refits: Sequence[Refit], found: Classes, order: Sequence[int],
+    tested: Mapping[int, float] | None, screened: bool = True,
+) -> pd.DataFrame:  # fmt: skip
+    """One row for each group of candidates, the refitted ones first; pairs are not listed.
+
+    tested : p of refits whose own gain was tested, by column; None where no refit was to be tested.
+    With two tests p is twice the smaller one (Bonferroni). screened : whether the screen's own p
+    holds; else what was not tested has none.
+    """
+    tests, tested = (1, {}) if tested is None else (2, tested)
+    by_head = {r.index[0]: r for r in refits if len(r.index) == 1}
+    significant = screen.significant
+    rows = []
+    for i, k in enumerate(order):
+        c, s = screen.question.candidates[k], screen.found
+        own = by_head.get(k)
+        sided = screen.question.sided[k]
+        strength = float(s.strength[k])
+        error = 1.0 / np.sqrt(s.variance[k]) if s.variance[k] > 0.0 else np.nan
+        if screen.question.quadratic[k]:  # told of is the square
+            strength = float(np.sqrt(max(strength, 0.0)))
+            error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
+        if own is not None:
+            told = estimated(screen, own, own.candidates[0], error)
+        elif sided * strength < 0.0:  # the screen knows no bounds
+            told = _told(screen, c, 0.0, np.nan)
+        else:
+            told = _told(screen, c, strength, error)
+        p = tested.get(k, np.nan)
+        if screened:
+            p = min(float(significant[k]), tested.get(k, 1.0))
+        rows.append({
+            "effect": c.effect.name, "equation": c.equation, "z": float(s.z[k]),
+            "p": float(np.minimum(1.0, tests * p)),
+            "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
+            "class_id": int(found.class_id[i]), **told,
+        })  # fmt: skip
+    return tabulate("causes", rows)
+
+
+def estimated(screen: Screen, refit: Refit, c: Candidate, error: float = np.nan) -> dict[str, Any]:
+    """Form, sign, estimate and se of one of a refit's effects, whose shape need not be among those
+    that the screen tried. error : of the strength by the screen, about, where it is known."""
+    strengths = {own.strength: v for own, v in zip(refit.candidates, refit.strengths, strict=True)}
+    strength = strengths[c.strength]
+    if c.sided and (abs(strength) < AT_BOUND * error or c.strength in refit.bounds):
+        return _told(screen, c, 0.0, np.nan)  # the search runs towards the bound for ever
+    return _told(screen, c, strength, refit.errors[c.strength])
+
+
+def _told(screen: Screen, c: Candidate, strength: float, error: float) -> dict[str, Any]:
+    times = [e.time for e in screen.experiments]
+    shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in c.shape)
+    return {
+        "form": ", ".join(filter(None, [c.form, shape])),
+        "sign": "one-sided" if c.sided else ("+" if strength > 0 else "-"),
+        "estimate": float(strength), "se": float(error),
+    }  # fmt: skip
+
+
+def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:
+    """The label of the row that a date is, if it is the same in all experiments that reach there;
+    times : of each, None where its rows have none."""
+    if shape != "date" or not one_off(c) or any(t is None for t in times):
+        return ""
+    found = {label(t[int(value) - 1]) for t in times if 1 <= value <= len(t)}
+    return f" ({found.pop()})" if len(found) == 1 else ""
+
+
+def classes_table(
+    screen: Screen, found: Classes, order: Sequence[int], separating: dict[int, str]
+) -> pd.DataFrame:
+    """The members of each class of two or more."""
+    rows = []
+    for number in dict.fromkeys(found.class_id.tolist()):
+        members = found.members(number)
+        for m in members:
+            c = screen.question.candidates[order[m]]
+            rows.append({
+                "class_id": int(number), "effect": c.effect.name, "equation": c.equation,
+                "rho": float(found.rho[m]),
+                "separating_input": separating.get(int(number), "") if len(members) > 1 else "",
+            })  # fmt: skip
+    return tabulate("classes", rows)
+
+
+def map_table(screen: Screen) -> pd.DataFrame:
+    """Standardised smoothed scores of each equation's linear term by window of time."""
+    terms = screen.question.terms
+    sizes = [e.steps for e in screen.experiments]
+    starts = np.cumsum([0, *sizes[:-1]]).tolist()
+    edges = bin_edges(sum(sizes), starts)
+    labels, rows = _labels(screen.experiments), []
+    null, seen = screen.stacked("basis_bins"), screen.observed.basis_bins
+    for equation in dict.fromkeys(t.equation for t in terms if t.moment == "mean"):
+        own = [i for i, t in enumerate(terms) if t.equation == equation and t.moment == "mean"]
+        spread = null[:, :, own].std(axis=0)
+        z = np.divide(seen[:, own], spread, out=np.zeros_like(spread), where=spread > 0.0)
+        strongest = np.argmax(np.abs(z).sum(axis=0))
+        for j in range(len(edges) - 1):
+            rows.append({
+                "equation": equation, "t_from": labels[edges[j]],
+                "t_to": labels[edges[j + 1] - 1], "z": float(z[j, strongest]),
+                "experiment": _experiments(starts, edges[j], edges[j + 1]),
+            })  # fmt: skip
+    return tabulate("residual_map", rows)
+
+
+def run_table(
+    experiments: Sequence[Experiment], channels: Sequence[str], before: Sequence[FreeRun],
+    after: Sequence[FreeRun] | None,
+) -> pd.DataFrame:  # fmt: skip
+    """The data beside free runs of the model before and after."""
+    import pandas as pd
+
+    frames = []
+    for n, e in enumerate(experiments):
+        labels = e.time if e.time is not None else np.arange(1, e.steps + 1)
+        for k, channel in enumerate(channels):
+            nothing = np.full(e.steps, np.nan)
+            b, a = before[n], after[n] if after is not None else None
+            frames.append(pd.DataFrame({
+                "experiment": n + 1, "t": labels, "channel": channel,
+                "observed": np.where(e.seen[:, k] == 1.0, e.y[:, k], np.nan),
+                "before": b.mean[:, k], "before_low": b.low[:, k], "before_high": b.high[:, k],
+                "after": a.mean[:, k] if a else nothing,
+                "after_low": a.low[:, k] if a else nothing,
+                "after_high": a.high[:, k] if a else nothing,
+            }))  # fmt: skip
+    return pd.concat(frames, ignore_index=True)

@@ -1,0 +1,139 @@
+"""`print(report)`: the verdict, the three answers, one table, and what could not be told."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from typing import TYPE_CHECKING
+
+from ssmppl import markup
+from ssmppl.diagnosis.report.words import (
+    GLOSSARY,
+    class_letters,
+    headline,
+    how_far,
+    how_sure,
+    left_out,
+    marked,
+    next_steps,
+    row_label,
+    rows,
+    sentence,
+    untold,
+    where,
+    which,
+)
+from ssmppl.drawing.numerals import DASH, is_number, number, p_text, with_error
+
+if TYPE_CHECKING:
+    from ssmppl.diagnosis.report.findings import Findings
+
+__all__ = ["cause_rows", "report_html", "report_text"]
+
+PAGE = 100  # columns
+SHOWN_CAUSES = 8
+
+
+def cause_rows(report: Findings, shown: int = SHOWN_CAUSES) -> list[tuple[str, ...]]:
+    """Header and the best causes: name, form, strength, gain, p, class letter."""
+    letters, chosen = class_letters(report), marked(report)
+    out: list[tuple[str, ...]] = [("effect", "form", "strength", "gain (nats)", "p", "alike")]
+    for i, r in enumerate(rows(report.causes)[:shown]):
+        refit = is_number(r["gain_refit"])
+        gain = number(r["gain_refit"] if refit else r["gain_screen"], 2)
+        gain += "" if refit or gain == DASH else " *"
+        name = ("→ " if i in chosen else "  ") + row_label(r)
+        form = r["form"] if isinstance(r["form"], str) else ""
+        out.append((name, form, with_error(r["estimate"], r["se"]), gain,
+                    p_text(r["p"]).removeprefix("p ").removeprefix("= "),
+                    letters.get(r["class_id"], "")))  # fmt: skip
+    return out
+
+
+def _table(cells: list[tuple[str, ...]]) -> list[str]:
+    """Columns side by side: the first two to the left, numbers to the right; forms cut to fit."""
+    keep = [i for i in range(len(cells[0])) if any(row[i] for row in cells[1:])]
+    widths = {i: max(len(row[i]) for row in cells) for i in keep}
+    if 1 in widths:
+        others = sum(w + 2 for i, w in widths.items() if i != 1)
+        widths[1] = max(min(widths[1], PAGE - others - 2), 8)
+    lines = []
+    for row in cells:
+        parts = []
+        for i in keep:
+            text = row[i] if len(row[i]) <= widths[i] else row[i][: widths[i] - 1] + "…"
+            parts.append(text.ljust(widths[i]) if i < 2 else text.rjust(widths[i]))
+        lines.append("  ".join(parts).rstrip())
+    return lines
+
+
+def report_text(report: Findings) -> str:
+    """The verdict, the three answers, one table, what could not be told and what would tell."""
+    lines = [*wrapped(headline(report)), ""]
+    for name, sentences in (
+        ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
+        ("How sure", how_sure(report)),
+    ):  # fmt: skip
+        lines += wrapped(" ".join(sentences), f"{name:<10}", " " * 10)
+    cells = cause_rows(report)
+    if len(cells) > 1:
+        lines += ["", *_table(cells)]
+        if any("*" in row[3] for row in cells[1:]):
+            lines.append("* predicted by the screen, not refitted")
+        if class_letters(report):
+            lines.append("Effects with the same letter cannot be told apart by these data.")
+        for term in ("gain", "closable gap", "p")[:: 1 if len(report.closed) else 2]:
+            lines += wrapped(f"{term}: {GLOSSARY[term]}.")
+    for name, found in _rest(report):
+        lines += ["", name]
+        for item in found:
+            lines += wrapped(item, "- ", "  ")
+    return "\n".join(lines)
+
+
+def report_html(report: Findings) -> str:
+    """What `report_text` says, for a notebook."""
+    parts = [markup.heading(report.title or "Diagnosis"), markup.paragraph(headline(report))]
+    answers = [
+        (markup.text(name), markup.text(" ".join(sentences)))
+        for name, sentences in (
+            ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
+            ("How sure", how_sure(report)),
+        )
+        if sentences
+    ]  # fmt: skip
+    parts.append(markup.table(answers, left=(0, 1)))
+    head, *causes = cause_rows(report)
+    if causes:
+        keep = [i for i in range(len(head)) if any(row[i] for row in causes)]
+        cells = [[markup.text(row[i].strip()) for i in keep] for row in causes]
+        left = [k for k, i in enumerate(keep) if i < 2]
+        parts.append(markup.table(cells, [head[i] for i in keep], left))
+        if any("*" in row[3] for row in causes):
+            parts.append(markup.paragraph("* predicted by the screen, not refitted"))
+        if class_letters(report):
+            told = "Effects with the same letter cannot be told apart by these data."
+            parts.append(markup.paragraph(told))
+    for name, found in _rest(report):
+        items = "".join(f"<li>{markup.text(item)}</li>" for item in found)
+        parts.append(markup.folded(f"{name} ({len(found)})", f"<ul>{items}</ul>"))
+    return "".join(parts)
+
+
+def _rest(report: Findings) -> list[tuple[str, list[str]]]:
+    """What could not be told, what would tell, and what has to be known."""
+    found = [
+        ("Could not be told", untold(report)), ("What next", next_steps(report)),
+        ("Notes", [sentence(n) for n in report.notes]),
+        ("Left out", left_out(report)),
+    ]  # fmt: skip
+    return [(name, items) for name, items in found if items]
+
+
+def wrapped(text: str, first: str = "", rest: str = "") -> list[str]:
+    """Lines of the page's width; "t = 411" and "p < 0.001" are not broken."""
+    whole = re.sub(r"\b([a-z]) ([=<]) ", "\\1\N{NO-BREAK SPACE}\\2\N{NO-BREAK SPACE}", text)
+    lines = textwrap.wrap(
+        whole, PAGE, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False
+    )
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]

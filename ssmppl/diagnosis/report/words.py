@@ -1,0 +1,479 @@
+"""The answers of a report in words, for readers who never heard of a score test.
+
+Every function takes the report and gives plain sentences: what is missing, where, how far adding it
+closes the gap, how sure that is, and what would tell what these data cannot.
+
+What things are called in a report's sentences: effects, their rivals and their classes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
+
+if TYPE_CHECKING:
+    from ssmppl.diagnosis.report.findings import Findings
+
+NAMED_RIVALS = 3
+
+# Effects that are something *of* an input, a sensor or a parameter; others act *in* an equation.
+OF = ("input", "sensor", "actuator", "parameter", "wrong initial", "backlash", "dead zone")
+
+
+def rows(table: Any) -> list[dict[str, Any]]:
+    """The rows of a table as mappings."""
+    return [] if table is None else list(table.to_dict("records"))
+
+
+def label(effect: str, equation: Any = "") -> str:
+    """Quadratic drag on v is "quadratic drag in v", sensor bias on y "sensor bias of y"."""
+    if not equation or not isinstance(equation, str):
+        return str(effect)
+    return f"{effect} {'of' if str(effect).lower().startswith(OF) else 'in'} {equation}"
+
+
+def row_label(row: dict[str, Any]) -> str:
+    """`label` of a row of a table."""
+    return label(row["effect"], row.get("equation"))
+
+
+def sentence(text: str) -> str:
+    """The first letter large, a full stop at the end; the names in it as they are."""
+    text = text.strip()
+    text = text[:1].upper() + text[1:]
+    return text if not text or text[-1] in ".!?:" else text + "."
+
+
+def listed(items: list[str], word: str = "and") -> str:
+    """a, b and c."""
+    if len(items) < 2:
+        return "".join(items)
+    return f"{', '.join(items[:-1])} {word} {items[-1]}"
+
+
+def named(report: Findings) -> str:
+    """The model, as the subject of a sentence."""
+    return f"the model “{report.title}”" if report.title else "the model"
+
+
+def tried(report: Findings) -> str:
+    """How many effects were tried, as "87 effects tried"."""
+    count = report.settings.get("candidates") or len(report.causes)
+    return f"{count:,} effect{'s' * (count > 1)} tried" if count else "effects tried"
+
+
+def leaders(report: Findings) -> list[dict[str, Any]]:
+    """The rows of `causes` that the verdict is about: the chosen ones, as they are in the model
+    with all of them, else a significant best."""
+    found = rows(report.causes)
+    if report.leading:
+        return [{**found[d["row"]], **{k: v for k, v in d.items() if k != "row"}}
+                for d in report.leading]  # fmt: skip
+    labels = report.chosen or [""]
+    return [{"effect": labels[n], "equation": ""} if i is None else found[i]
+            for n, i in enumerate(_places(report))]  # fmt: skip
+
+
+def marked(report: Findings) -> set[int]:
+    """Which rows of `causes` the verdict is about."""
+    places = [d["row"] for d in report.leading] or _places(report)
+    return {i for i in places if i is not None}
+
+
+def _places(report: Findings) -> list[int | None]:
+    """The same by the labels of what was chosen, None where there is no such row; the first where
+    nothing was chosen."""
+    found = rows(report.causes)
+    out: list[int | None] = []
+    for name in report.chosen:
+        wanted = [f"{r['effect']} on {r['equation']}" == name for r in found]
+        if not any(wanted):
+            wanted = [r["effect"] == name for r in found]
+        fresh = [i for i, same in enumerate(wanted) if same and i not in out]
+        out.append(fresh[0] if fresh else None)
+    if report.chosen or report.verdict != "effect":
+        return out
+    return [0] if found else []
+
+
+def rivals(report: Findings, row: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of `classes` that these data cannot tell from this cause."""
+    mine = (row["effect"], row.get("equation"))
+    return [
+        r
+        for r in rows(report.classes)
+        if r["class_id"] == row.get("class_id") and (r["effect"], r["equation"]) != mine
+    ]
+
+
+def class_letters(report: Findings) -> dict[Any, str]:
+    """A, B, ... for the classes with several members, in the order of `causes`."""
+    members: dict[Any, int] = {}
+    for r in rows(report.classes):
+        members[r["class_id"]] = members.get(r["class_id"], 0) + 1
+    order = [*(r["class_id"] for r in rows(report.causes)), *members]
+    several = [c for c in dict.fromkeys(order) if members.get(c, 0) > 1]
+    return {c: chr(ord("A") + i % 26) * (i // 26 + 1) for i, c in enumerate(several)}
+
+
+def alternatives(report: Findings, row: dict[str, Any]) -> list[str]:
+    """The cause and its rivals, by name; many are counted."""
+    others = [row_label(r) for r in rivals(report, row)]
+    if len(others) > NAMED_RIVALS:
+        others = [*others[: NAMED_RIVALS - 1], f"{len(others) - NAMED_RIVALS + 1} more"]
+    return [row_label(row), *others]
+
+
+CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
+MOMENTS = {
+    "mean": "the mean of",
+    "scale": "the noise level of",
+    "tails": "the tails of the noise of",
+    "time dependence": "how the noise of one step depends on the last, of",
+}
+
+USE = {
+    "screen": "effects were looked for on",
+    "confirm": "the gap was measured on",
+}
+
+GLOSSARY = {
+    "gain": "how much more probable the effect makes the data, on a log scale: 1 nat is 2.7 times "
+    "as probable, 3 nats 20 times, 10 nats 22,000 times",
+    "closable gap": "what the best reference at hand gains over the model as it was, on the same "
+    "data; 100% closed means as good as that reference",
+    "p": "how often the best of everything tried would stand out this much if the model were "
+    "right; everything tried is counted, so one p does not mislead because many were computed",
+    "z": "a distance from what the model expects, in standard deviations",
+    "±": "one standard error; twice that, either way, is about a 95% interval",
+}
+
+
+def share(report: Findings) -> str:
+    """How much of the gap the chosen model closes, with its interval; "" if not measured."""
+    closed = rows(report.closed)
+    if not closed or not is_number(closed[0]["F"]):
+        return ""
+    first = closed[0]
+    return f"closes {percent(first['F'])} of the closable gap " \
+           f"({interval(first['F_low'], first['F_high'])})"  # fmt: skip
+
+
+def kept_back(report: Findings) -> str:
+    """Which data took no part in choosing."""
+    if "cross-fitting" in report.parts:
+        blocks = report.parts["cross-fitting"]
+        return f"on {blocks} blocks of the data, each left out in turn"
+    part = report.parts.get("confirm")
+    when = _when(report, part) if isinstance(part, tuple | list) else str(part or "")
+    if when and _experiment(report):
+        when += ", and likewise of the others"
+    own = "on data that took no part in the choice"
+    if "choice" in report.parts:
+        own = "on data that took part in the choice only in that an effect was left out again"
+    return own + (f" ({when})" if when else "")
+
+
+def _experiment(report: Findings) -> str:
+    """Whose rows stand for those of all experiments; "" where there is one."""
+    return str(report.settings.get("experiment", ""))
+
+
+def _when(report: Findings, part: Sequence[Any]) -> str:
+    first, last = part
+    return span(first, last, _experiment(report))
+
+
+def outstanding(report: Findings, table: Any) -> list[dict[str, Any]]:
+    """The rows of `where` or `detection` that are more than chance."""
+    alpha = report.settings.get("alpha", 0.05)
+    return [r for r in rows(table) if is_number(r["p"]) and r["p"] <= alpha]
+
+
+# -- the three answers
+def headline(report: Findings) -> str:
+    """The verdict in a sentence or two, with its number and its uncertainty."""
+    if report.verdict == "no measurable gap":
+        return _no_gap(report)
+    if report.verdict == "none of these":
+        return _none_of_these(report)
+    found = leaders(report) or [{"effect": "something", "equation": "", "p": None}]
+    groups = [alternatives(report, row) for row in found]
+    sure = p_text(found[0].get("p"))
+    unfitted = bool(found[0].get("unfitted"))
+    if report.mode == "fast" or unfitted:
+        text = f"the screen says that {named(report)} lacks {listed(groups[0], 'or')} ({sure} " \
+               f"with {tried(report)})."  # fmt: skip
+        text += " These data cannot tell which." * (len(groups[0]) > 1)
+        if unfitted:
+            return sentence(f"{text} The model with {row_label(found[0])} could not be fitted (see "
+                            "the notes), so that how far the gap closes is not known")  # fmt: skip
+        return sentence(f"{text} How much of the gap that closes has not been measured yet")
+    lacks, adding = _lacks(groups)
+    text, measured = f"{named(report)} lacks {lacks}", share(report)
+    if measured:
+        return sentence(f"{text}. {adding} {measured}")
+    if not rows(report.closed):
+        return sentence(f"{text} ({sure}). How far the gap closes has not been measured")
+    return sentence(
+        f"{text} ({sure}), but {kept_back(report)} its gain is too uncertain to say how far the "
+        "gap closes"
+    )
+
+
+def _lacks(groups: list[list[str]]) -> tuple[str, str]:
+    """What is lacking, one group of names for each effect, and what adding it is called."""
+    many = len(groups) > 1
+    if all(len(g) == 1 for g in groups):
+        return listed([g[0] for g in groups]), "Adding them" if many else "Adding it"
+    if not many:
+        names = listed(groups[0], "or")
+        return f"one of these, and these data cannot tell which: {names}", "Adding the first"
+    numbered = "; ".join(f"({i}) {listed(g, 'or')}" for i, g in enumerate(groups, start=1))
+    text = f"{len(groups)} effects: {numbered} (“or” joins those that these data cannot tell apart)"
+    return text, "Adding the first of each"
+
+
+def _none_of_these(report: Findings) -> str:
+    measured = share(report)
+    found, failed = outstanding(report, report.where), outstanding(report, report.detection)
+    spot = ""
+    if found:
+        when = span(found[0]["t_from"], found[0]["t_to"], found[0]["experiment"])
+        spot = f" in {place(found[0])}{f', strongest at {when}' if when else ''}" \
+               f" ({p_text(found[0]['p'])})"  # fmt: skip
+    text = f"{named(report)} lacks something{spot}, and none of the {tried(report)} explains it."
+    if failed and not found:
+        check = f"{failed[0]['statistic']} of {failed[0]['channel']}, {p_text(failed[0]['p'])}"
+        text += f" What shows it is a check of the one-step predictions ({check})."
+    if measured and _best_tried(report):
+        text += f" The best of them, {_best_tried(report)}, {measured}: curves estimated from " \
+                "the data do clearly better."  # fmt: skip
+    elif measured:
+        text += f" A curve estimated from the data {measured}."
+    return sentence(text)
+
+
+def _best_tried(report: Findings) -> str:
+    """What of the catalogue was chosen, where that is not enough; "" for nothing."""
+    closed = rows(report.closed)
+    return str(closed[0]["effect"]) if closed and closed[0]["effect"] != CURVES else ""
+
+
+def _no_gap(report: Findings) -> str:
+    best = min(rows(report.causes), key=_by_p, default=None)
+    where = f"No measurable gap between {named(report)} and its data"
+    if best is None:
+        return where + "."
+    if is_number(best["p"]) and best["p"] <= report.settings.get("alpha", 0.05):
+        text = f"{where}: {row_label(best)} stood out at first ({p_text(best['p'])}), but"
+        if not rows(report.closed):
+            return f"{text} what it gains has not been measured."
+        return f"{text} {kept_back(report)} nothing could be gained."
+    return f"{where}: none of the {tried(report)} stands out from chance (the best, " \
+           f"{row_label(best)}, has {p_text(best['p'])})."  # fmt: skip
+
+
+def _by_p(row: dict[str, Any]) -> float:
+    return float(row["p"]) if is_number(row["p"]) else 2.0
+
+
+def place(row: dict[str, Any]) -> str:
+    """Equation and moment: "the noise level of y"."""
+    moment = str(row["moment"])
+    return f"{MOMENTS.get(moment, f'the {moment} of')} {row['equation']}"
+
+
+def where(report: Findings) -> list[str]:
+    """Which equation, which moment, when and in which region: the three strongest places."""
+    found = outstanding(report, report.where)
+    if not found:
+        return ["No equation stands out from chance."]
+    out = []
+    for i, r in enumerate(found[:3]):
+        region = r["region"] if isinstance(r["region"], str) else ""
+        when = span(r["t_from"], r["t_to"], r["experiment"])
+        spots = [s for s in (f"at {when}" if when else "", region) if s]
+        strongest = f", strongest {' and '.join(spots)}" if spots else ""
+        text = f"{'also ' if i else ''}in {place(r)}{strongest} (z = {number(r['z'], 2)}, " \
+               f"{p_text(r['p'])})"  # fmt: skip
+        out.append(sentence(text))
+    return out
+
+
+def which(report: Findings) -> list[str]:
+    """The effects that explain it, with their strength, and what they cannot be told from."""
+    if report.verdict == "none of these":
+        text = f"None of the {tried(report)}. What is left over is more than chance"
+        curve = _curve_peak(report)
+        return [sentence(text), *([curve] if curve else [])]
+    found = leaders(report)
+    if not found:
+        return [f"None of the {tried(report)} stands out."]
+    out = []
+    for row in found:
+        form = f", {row['form']}" if isinstance(row.get("form"), str) and row["form"] else ""
+        text = f"{row_label(row)}{form}"
+        if is_number(row.get("estimate")):
+            text += f": strength {with_error(row['estimate'], row.get('se'))}"
+        gains = [row.get("gain_refit"), row.get("gain_screen")]
+        gain = next((g for g in gains if is_number(g)), None)
+        if gain is not None:
+            by = "" if is_number(gains[0]) else "predicted "
+            alone = " by itself" * (len(found) > 1)
+            text += f"; {by}gain {number(gain, 2)} nats{alone}, {p_text(row.get('p'))}"
+        out.append(sentence(text))
+        others = rivals(report, row)
+        if others:
+            names = listed([row_label(r) for r in others], "or")
+            rhos = [abs(float(r["rho"])) for r in others if is_number(r["rho"])]
+            close = f" (they leave traces that correlate up to {max(rhos):.2f})" if rhos else ""
+            out.append(sentence(f"these data cannot tell it from {names}{close}"))
+        elif row.get("class_id") in [r["class_id"] for r in rows(report.classes)]:
+            out.append("These data tell it from every other effect tried.")
+    return out
+
+
+def _curve_peak(report: Findings) -> str:
+    curve = [r for r in rows(report.missing) if is_number(r["estimate"])]
+    sure = [r for r in curve if r["low"] > 0 or r["high"] < 0]
+    if not sure:
+        return ""
+    top = max(sure, key=lambda r: abs(r["estimate"]))
+    text = f"The estimated curve of what is missing in {top['equation']} is largest at " \
+           f"{top['variable']} = {number(top['value'])}: {number(top['estimate'])}"  # fmt: skip
+    return f"{text} (95% band {number(top['low'])} to {number(top['high'])})."
+
+
+def how_far(report: Findings) -> list[str]:
+    """Share of the gap closed, its gain per sample, and the error of a free run."""
+    if report.mode == "fast":
+        return ["Not measured: fast mode stops after the screen."]
+    closed = rows(report.closed)
+    if not closed and any(r.get("unfitted") for r in leaders(report)):
+        return ["Not measured: the effect could not be fitted."]
+    if not closed:
+        return ["Not measured."]
+    first, out = closed[0], []
+    if is_number(first["F"]):
+        out.append(sentence(f"{kept_back(report)}, {first['effect']} {share(report)}"))
+        if first["F"] < 0:
+            out.append("A share below zero means that it made the predictions worse.")
+    elif report.verdict == "no measurable gap":
+        out.append(sentence(f"{kept_back(report)}, no gap could be measured"))
+    else:
+        out.append(sentence(
+            f"{kept_back(report)} the gain is too uncertain for a share of the gap: its interval "
+            "reaches zero (see the notes)"
+        ))  # fmt: skip
+    if report.verdict == "no measurable gap":  # what no effect gained is no finding
+        return out
+    if is_number(first["nats_per_sample"]):
+        nats = float(first["nats_per_sample"])
+        text = f"each sample becomes {number(math.exp(nats))} times as probable on average " \
+               f"({number(nats, 2)} nats per sample"  # fmt: skip
+        if is_number(first["gain_mean"]) and is_number(first["gain_noise"]):
+            text += f"; in all {number(first['gain_mean'], 2)} from better predictions and " \
+                    f"{number(first['gain_noise'], 2)} from a better noise law"  # fmt: skip
+        out.append(sentence(text + ")"))
+    before, after = first["rmse_before"], first["rmse_after"]
+    if is_number(before) and is_number(after):
+        way = "falls" if after < before else "does not fall: it goes"
+        out.append(f"The error of a simulation left to itself {way} from {number(before)} to "
+                   f"{number(after)} (root mean square, units of the data).")  # fmt: skip
+    return out
+
+
+# -- how sure, and what next
+def how_sure(report: Findings) -> list[str]:
+    """What the numbers rest on: the data used for what, the tests, what stands out at all."""
+    out = []
+    if "cross-fitting" in report.parts:
+        out.append(f"The data were used in turn: {report.parts['cross-fitting']} blocks, each "
+                   "predicted by models that were fitted, and whose effects were chosen among the "
+                   "leading ones, without it.")  # fmt: skip
+    else:
+        used = [(name, _when(report, report.parts[name])) for name in USE
+                if isinstance(report.parts.get(name), tuple | list)]  # fmt: skip
+        if used:
+            text = listed([f"{USE[name]} {when}" for name, when in used])
+            text = sentence(text)
+            text += " Likewise of the other experiments." * bool(_experiment(report))
+            once = len(used) > 1 and "choice" not in report.parts
+            out.append(text + " No row served twice." * once)
+    out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
+    tests = [r for r in rows(report.detection) if is_number(r["p"])]
+    bad = outstanding(report, report.detection)
+    if bad:
+        names = [f"{r['statistic']} of {r['channel']} ({p_text(r['p'])})" for r in bad[:4]]
+        out.append(f"Before any effect was tried, the one-step predictions failed {len(bad)} of "
+                   f"{len(tests)} checks: {listed(names)}.")  # fmt: skip
+    elif tests:
+        out.append(f"The one-step predictions of the model as it was passed all {len(tests)} "
+                   "checks.")  # fmt: skip
+    if report.verdict == "no measurable gap":
+        out.append("That does not prove the model right: an effect that these data hardly excite "
+                   "leaves no trace in them.")  # fmt: skip
+    return out
+
+
+def untold(report: Findings) -> list[str]:
+    """What these data could not tell, and the parts that do not apply, with their reasons."""
+    out = []
+    for row in leaders(report):
+        if rivals(report, row):
+            out.append(sentence(f"which it is: {listed(alternatives(report, row), 'or')}"))
+    parts: dict[tuple[str, str], list[str]] = {}
+    for r in rows(report.not_applicable):
+        equation = r["equation"] if isinstance(r["equation"], str) else ""
+        parts.setdefault((equation, r["reason"]), []).append(r["part"])
+    for (equation, reason), own in parts.items():
+        about = f" for {equation}" if equation else ""
+        out.append(sentence(f"{listed(list(dict.fromkeys(own)))}{about}: {reason}"))
+    return out
+
+
+def left_out(report: Findings) -> list[str]:
+    """The parts that failed, each with its reason."""
+    return [sentence(f"{r['part']}: {r['reason']}") for r in rows(report.left_out)]
+
+
+def next_steps(report: Findings) -> list[str]:
+    """What to do now: what to measure, and what to do with the model."""
+    out = []
+    if report.interrupted:
+        out.append("The run was interrupted: run it again, and it goes on from the stages done.")
+    elif len(report.left_out):
+        out.append("Parts of this answer are missing (left out, below). Another run tries them "
+                   "again; with debug=True (--debug) it stops at the first fault.")  # fmt: skip
+    if report.mode == "fast" and report.verdict != "no measurable gap":
+        out.append("Run it again in full mode: it refits the leading effects and measures how far "
+                   "the gap closes.")  # fmt: skip
+    for row in leaders(report):
+        others = rivals(report, row)
+        if not others:
+            continue
+        inputs = [r["separating_input"] for r in others]
+        inputs = list(dict.fromkeys(i for i in inputs if isinstance(i, str) and i))
+        if inputs:
+            out.append(f"To tell {listed(alternatives(report, row), 'from')}, record data with "
+                       f"{listed(inputs, 'or')}.")  # fmt: skip
+        else:
+            out.append(f"None of the simple inputs considered would tell "
+                       f"{listed(alternatives(report, row), 'from')}; measure another quantity, "
+                       "or look at the machine.")  # fmt: skip
+    if report.verdict == "none of these" and report.missing is not None:
+        out.append("Look at the estimated curve, think what could have its shape, write it as an "
+                   "@ssm.effect and run again with it.")  # fmt: skip
+    elif report.verdict == "none of these":
+        out.append("Think what could change the noise so, or what acts in that stretch only; write "
+                   "it as an @ssm.effect and run again with it.")  # fmt: skip
+    elif report.verdict == "no measurable gap":
+        out.append("To look closer, record more data, or drive the system over more of its range.")
+    if report.model_text:
+        out.append("The model with what was found is ready to use: augmented_model.py, an ordinary "
+                   "model file (report.model in Python).")  # fmt: skip
+    return out

@@ -1,0 +1,420 @@
+"""The screen: all candidates, the basis and the detection statistics from one set of simulations.
+
+B data sets are simulated at the fitted parameters and go through the same smoother as the data;
+every statistic of the report that is not a refit takes its null law from them
+(`efficient_score.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.effects.candidate import Candidate, Profiles, dated
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.basis import Term, basis, lifted
+from ssmppl.diagnosis.model.candidates import Chosen, Refused, offers
+from ssmppl.diagnosis.model.scales import Scales
+from ssmppl.diagnosis.model.score_columns import Columns, score_columns
+from ssmppl.diagnosis.model.smoothing import (
+    Pass,
+    Settings,
+    Simulator,
+    Smoother,
+    mean_scores,
+    probability_transforms,
+)
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.run.failures import FAULT, Failures
+from ssmppl.diagnosis.screening import detection, statistics
+from ssmppl.diagnosis.screening.efficient_score import Efficient, Null, efficient
+from ssmppl.diagnosis.screening.familywise import FamilyWise, familywise
+from ssmppl.diagnosis.screening.location import bin_edges, binned
+from ssmppl.diagnosis.screening.statistics import excess, typical
+from ssmppl.errors import ArgumentError, ModelError, SamplingError
+from ssmppl.inference.run.seeds import random_state
+from ssmppl.language.distributions import Distribution, Flat
+from ssmppl.language.model.traced import Site, Trace, symbols
+
+OWN_RUNS = 6  # passes over the data themselves, which tell the smoother's own noise
+FEWEST = 60  # simulated sets that must have gone through
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
+
+    squares (K,) : of the columns' rows, summed; NaN where a column is no sum of scores.
+    nuisance_bins (J, P), basis_bins (J, D) : sums over J bins of time.
+    """
+
+    nuisance: np.ndarray
+    columns: np.ndarray
+    squares: np.ndarray
+    basis: np.ndarray
+    detection: np.ndarray
+    nuisance_bins: np.ndarray
+    basis_bins: np.ndarray
+
+
+class Question:
+    """What is asked of a model: candidates, basis, and the code that answers."""
+
+    def __init__(
+        self, trace: Trace, scales: Scales, missing: Missing, held: Sequence[str],
+        settings: Settings, effects: Chosen = None, *,
+        candidates: Sequence[Candidate] | None = None, simulator: Simulator | None = None,
+        failures: Failures | None = None,
+    ):  # fmt: skip
+        """candidates : these instead of what the catalogue offers, and no basis. simulator : of the
+        model, where it is not the plain one. failures : takes the candidates that a fault ends."""
+        failures = Failures() if failures is None else failures
+        self._simulator = simulator
+        self.trace, self.settings, self.scales = trace, settings, scales
+        self.refused: list[Refused] = []
+        self.terms: list[Term] = []
+        if candidates is None:
+            offered, self.refused = offers(trace, scales, effects, failures)
+            offered = dated(offered, scales.rows)
+            with failures.part("the basis of smooth functions"):
+                self.terms = basis(trace, scales)
+        else:
+            offered = list(candidates)
+        unique: dict[str, Candidate] = {}
+        for c in offered:
+            unique.setdefault(c.increment.key, c.increment)
+        plain = [*unique.values(), *(t.candidate for t in self.terms)]
+        try:
+            self.columns, self.shapes = _columns(trace, plain, held, missing)
+        except ModelError:  # of the user's own effect
+            raise
+        except Exception:
+            if failures.raised:
+                raise
+            plain = _sound(trace, plain, held, missing, failures)
+            self.columns, self.shapes = _columns(trace, plain, held, missing)
+        self.smoother = Smoother(self.columns, missing, settings)
+        for name, reason in self.columns.refused.items():
+            at = next((c for c in plain if c.strength == name), None)
+            label = (at.effect.name, at.equation) if at else (name, "")
+            self.refused.append(Refused(*label, reason.reason))
+        place = {n: len(self.columns.nuisance) + i for i, n in enumerate(self.columns.names)}
+        by_key = {key: place.get(c.strength) for key, c in unique.items()}
+        self.candidates: list[Candidate] = []
+        self.place: list[int] = []
+        for c in offered:
+            found = by_key[c.increment.key]
+            if found is not None:
+                self.candidates.append(c)
+                self.place.append(found)
+        self.terms = [t for t in self.terms if t.candidate.strength in place]
+        self.basis_place = [place[t.candidate.strength] for t in self.terms]
+        self._timed = [k for k, c in enumerate(self.candidates)
+                       if c.effect.profile and not c.process]  # fmt: skip
+        self._profiles = Profiles(
+            tuple(self.candidates[k] for k in self._timed),
+            tuple(self.place[k] for k in self._timed),
+        )
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Draws data sets from the model."""
+        s = self.smoother
+        if self._simulator is not None:
+            return self._simulator
+        return Simulator(s.program, s.missing, s.kalman)
+
+    def grid(self, variable: str) -> np.ndarray:
+        """Values of a state or input at its quantiles, as the data have them."""
+        return np.array(self.scales.scale[variable].quantiles)
+
+    def theta(self, values: np.ndarray) -> np.ndarray:
+        """The parameters of the columns: the model's own (P,), then the shapes."""
+        symbols_ = self.columns.given.parameter_symbols[len(values) :]
+        return np.append(values, [self.shapes[s.data[1]] for s in symbols_])
+
+    @cached_property
+    def sided(self) -> np.ndarray:
+        """(K,) the sign that each strength must have."""
+        return np.array([c.sided for c in self.candidates], dtype=int)
+
+    @cached_property
+    def _sums(self) -> np.ndarray:
+        """(K,) which statistics are sums of one column's rows, all with the same weight."""
+        return np.array([not (c.process or c.effect.profile) for c in self.candidates])
+
+    @cached_property
+    def quadratic(self) -> np.ndarray:
+        """(K,) which statistics are quadratic forms."""
+        return np.array([not c.first_order for c in self.candidates])
+
+    def statistics(
+        self, experiments: Sequence[Experiment], passes: Sequence[Pass], stream: np.ndarray,
+        checks: bool = True,
+    ) -> Statistics:  # fmt: skip
+        """Everything that is asked of one data set; without `checks` nothing of its predictions."""
+        rows = np.concatenate([p.rows for p in passes])
+        starts = np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()
+        edges = bin_edges(len(rows), starts)
+        p = len(self.columns.nuisance)
+        bins = binned(rows, edges)
+        found = np.empty(0)
+        if checks:
+            pits = np.concatenate(probability_transforms(passes, experiments, stream))
+            ahead = [p.ahead for p in passes if p.ahead is not None]
+            found = self._detection(pits, experiments, starts, ahead).values
+        return Statistics(
+            rows[:, :p].sum(axis=0),
+            self._of_candidates(rows, starts),
+            np.where(self._sums, np.sum(rows**2, axis=0)[self.place], np.nan),
+            rows[:, self.basis_place].sum(axis=0),
+            found,
+            bins[:, :p],
+            bins[:, self.basis_place],
+        )
+
+    def _of_candidates(self, rows: np.ndarray, starts: list[int]) -> np.ndarray:
+        out = np.empty(len(self.candidates))
+        for k, (c, at) in enumerate(zip(self.candidates, self.place, strict=True)):
+            own = rows[:, at, None]
+            if c.process == "random walk":
+                out[k] = statistics.random_walk(own, starts)[0]
+            elif c.process == "ar1":
+                out[k] = statistics.autoregressive(own, [dict(c.shape)["memory"]], starts)[0, 0]
+            elif not c.effect.profile:
+                out[k] = own.sum()
+        out[np.array(self._timed, dtype=int)] = self._profiles.statistics(rows, starts)
+        return out
+
+    def _detection(
+        self, pits: np.ndarray, experiments: Sequence[Experiment], starts: list[int],
+        ahead: Sequence[np.ndarray],
+    ) -> detection.Statistics:  # fmt: skip
+        channels = [repr(s) for s in self.trace.observation_symbols]
+        inputs = np.concatenate([e.u for e in experiments])
+        names = [repr(s) for s in self.trace.input_symbols]
+        found = detection.statistics(pits, channels, inputs, names, starts=starts)
+        for channel, values in mean_scores(ahead, channels).items():
+            found = found.with_values(channel, values)
+        return found
+
+    def detection_names(self, experiments: Sequence[Experiment]) -> detection.Statistics:
+        """The detection statistics' names, with values of nothing."""
+        rows = sum(e.steps for e in experiments)
+        starts = np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()
+        nothing = np.full((rows, len(self.trace.observation_symbols)), 0.5)
+        return self._detection(nothing, experiments, starts, ())
+
+
+@dataclass(frozen=True)
+class Screen:
+    """The data's statistics beside those of B simulated sets.
+
+    observed : means over passes. null : (B, ...) of the simulated ones, by name. found, family : of
+    the candidates. law : what they were compared with. usual : (K,) sums of squares.
+    """
+
+    question: Question
+    theta: np.ndarray
+    observed: Statistics
+    null: Statistics
+    found: Efficient
+    family: FamilyWise
+    law: Null
+    usual: np.ndarray
+    experiments: tuple[Experiment, ...]
+
+    def stacked(self, name: str) -> np.ndarray:
+        """(B, ...) one statistic of all simulated sets."""
+        values: np.ndarray = getattr(self.null, name)
+        return values
+
+    def columns_of(self, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
+        """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
+        whose statistic is a sum of scores. A shape that the screen has not (a period that was
+        sharpened) stands for the best one of its group."""
+        known = {c.key: k for k, c in enumerate(self.question.candidates)}
+        best = {self.question.candidates[k].group: int(k) for k in self.family.best}
+        found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)
+        own = sorted({k for k in found if k is not None})
+        return self.stacked("columns")[:, own], self.observed.columns[own]
+
+    @property
+    def sets(self) -> int:
+        """B, the simulated sets that went through."""
+        return len(self.null.nuisance)
+
+    @property
+    def significant(self) -> np.ndarray:
+        """(K,) family-wise p of the group of each candidate."""
+        return self.family.of_columns(self.groups)
+
+    @cached_property
+    def groups(self) -> np.ndarray:
+        """(K,) labels of the candidates' groups."""
+        return groups_of(self.question.candidates)
+
+
+def _columns(
+    trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing
+) -> tuple[Columns, dict[str, float]]:
+    """The score columns of the model with all candidates, and the values of their shapes."""
+    made, shapes = lifted(list(candidates))
+    superset = with_parameters(augment(trace, made), shapes)
+    names = [c.strength for c in made]
+    return score_columns(trace, superset, names, held, missing), dict(shapes)
+
+
+def _sound(
+    trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing,
+    failures: Failures,
+) -> list[Candidate]:  # fmt: skip
+    """The candidates that have columns by themselves; the others are said to have failed."""
+    out = []
+    for c in candidates:
+        with failures.part(f"the candidate {c}"):
+            _columns(trace, [c], held, missing)
+            out.append(c)
+    return out
+
+
+def groups_of(candidates: Sequence[Candidate]) -> np.ndarray:
+    """(K,) a number for each group: candidates that differ in their shape only."""
+    labels = {g: i for i, g in enumerate(dict.fromkeys(c.group for c in candidates))}
+    return np.array([labels[c.group] for c in candidates], dtype=int)
+
+
+def ask(
+    question: Question, experiments: Sequence[Experiment], theta: np.ndarray, sets: int,
+    seed: np.random.SeedSequence, kept: Checkpoint, stage: str = "screening", *,
+    checks: bool = True,
+) -> Screen:  # fmt: skip
+    """Simulate, smooth, and put the data's statistics beside the simulated ones.
+
+    theta : (P,) the fitted parameters. kept : takes every set as soon as it is done, as `stage`.
+    checks : whether those of the predictions are wanted, which cost something.
+
+    Raises
+    ------
+    ArgumentError : too few simulated sets went through the filter.
+    """
+    smoother, whole = question.smoother, question.theta(theta)
+    _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
+    one = partial(_one_set, question, tuple(experiments), whole, seed, checks)
+    results = kept.each(stage, OWN_RUNS + sets, one)
+    faults = [r for r in results if kept.failures.of_task(f"a data set of {stage}", r)]
+    own = [r for r in results[:OWN_RUNS] if r and FAULT not in r]
+    null = [r for r in results[OWN_RUNS:] if r and FAULT not in r]
+    if not own or len(null) < min(FEWEST, sets):
+        why = f": {faults[0][FAULT]}" if faults else ""
+        raise ArgumentError(
+            f"{len(null)} of {sets} data sets simulated at the fit went through the smoother{why}",
+            fix="use more particles, or check the fit: the model may leave its domain",
+        )
+    names = Statistics.__dataclass_fields__
+    each = {n: np.stack([s[n] for s in own]) for n in names}
+    observed = Statistics(**{n: v.mean(axis=0) for n, v in each.items()})
+    simulated = Statistics(**{n: np.stack([s[n] for s in null]) for n in names})
+    usual = typical(simulated.squares)
+    noise = (each["columns"] / excess(each["squares"], usual)).var(
+        axis=0, ddof=min(1, len(own) - 1)
+    )
+    law = Null.of(
+        simulated.columns / excess(simulated.squares, usual), simulated.nuisance,
+        quadratic=question.quadratic, sided=question.sided, noise=noise,
+    )  # fmt: skip
+    found = compared(law, usual, observed)
+    family = familywise(
+        found.statistic, found.null, sided=found.sided, groups=groups_of(question.candidates)
+    )
+    return Screen(
+        question, theta, observed, simulated, found, family, law, usual, tuple(experiments)
+    )
+
+
+def held_against(
+    whole: Screen, experiments: Sequence[Experiment], theta: np.ndarray,
+    seed: np.random.SeedSequence,
+) -> Screen:  # fmt: skip
+    """The screen of a part of the data by the law of the sets that were simulated for all of them.
+
+    theta : (P,) fitted to the part. The scale is that of the information which the part holds
+    (`compared`), so that little changes where a tenth is missing, and nothing is simulated.
+    """
+    question, at = whole.question, whole.question.theta(theta)
+    one = partial(_one_set, question, tuple(experiments), at, seed, False)
+    own = [r for r in map(one, range(OWN_RUNS)) if r]
+    if not own:
+        raise SamplingError(
+            "the rows without the block did not go through the smoother", fix="use more particles"
+        )
+    empty = np.empty(0)
+    observed = Statistics(**{
+        n: np.mean([s[n] for s in own], axis=0) if n != "detection" else empty
+        for n in Statistics.__dataclass_fields__
+    })  # fmt: skip
+    found = compared(whole.law, whole.usual, observed)
+    family = familywise(found.statistic, found.null, sided=found.sided, groups=whole.groups)
+    return replace(
+        whole, theta=theta, observed=observed, found=found, family=family,
+        experiments=tuple(experiments),
+    )  # fmt: skip
+
+
+def _one_set(
+    question: Question, experiments: Sequence[Experiment], theta: np.ndarray,
+    seed: np.random.SeedSequence, checks: bool, number: int,
+) -> Numbers:  # fmt: skip
+    """The statistics of the data (the first `OWN_RUNS`) or of a simulated set; empty where it did
+    not go through. theta : of the columns."""
+    smoother, stream = question.smoother, random_state(seed, number)
+    data = list(experiments)
+    try:
+        if number >= OWN_RUNS:
+            own = theta[: len(question.columns.base.parameter_symbols)]
+            data = question.simulator.sets(experiments, own, stream)
+        passes = smoother.run(data, theta, stream, predicted=checks, ahead=checks)
+    except SamplingError:
+        if number < OWN_RUNS:
+            raise
+        return {}
+    if not all(np.all(np.isfinite(p.rows)) for p in passes):
+        return {}
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = question.statistics(data, passes, stream, checks)
+    if not np.all(np.isfinite(found.columns)) or np.any(np.isinf(found.squares)):
+        return {}  # rows whose squares are beyond what a number can be
+    return dict(vars(found))
+
+
+def compared(law: Null, usual: np.ndarray, seen: Statistics) -> Efficient:
+    """Efficient statistics of the candidates in one data set, each on the scale of the information
+    that these data hold."""
+    by = excess(seen.squares, usual)
+    found = efficient(law, seen.columns / by, seen.nuisance)
+    return replace(
+        found, score=found.score * by, variance=found.variance * by**2,
+        strength=found.strength / by,
+    )  # fmt: skip
+
+
+def with_parameters(
+    trace: Trace, names: Iterable[str], prior: Callable[[], Distribution] = Flat
+) -> Trace:
+    """The trace with further parameters: by default such as are given."""
+    location = next(iter(trace.transition.values())).distribution.location
+    parameters = dict(trace.parameters)
+    for name in names:
+        law = prior()
+        law.location = location
+        own = symbols("parameter", name, ())
+        parameters[name] = Site(name, "parameter", law, own, location)
+    return replace(trace, parameters=parameters)
+
+
+__all__ = ["Question", "Screen", "Statistics", "ask", "compared", "groups_of", "with_parameters"]

@@ -1,0 +1,1 @@
+"""Fits and refits, and the choice among candidates."""

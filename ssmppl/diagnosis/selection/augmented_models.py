@@ -1,0 +1,139 @@
+"""Augmented models, made once and fitted often: their code, their shapes, their proposal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.modules.program import Program, compile_trace
+from ssmppl.compiling import LOCK
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.basis import lifted
+from ssmppl.diagnosis.model.initial_law import Start, needs_start
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.screening.screen import with_parameters
+from ssmppl.diagnosis.selection.fit import Fitter
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.run.problem import Problem
+from ssmppl.language.distributions import LogNormal, Uniform
+from ssmppl.language.model.traced import Trace
+
+
+class Workshop:
+    """Makes and fits augmented models of one base model.
+
+    start : of those that cannot have the model's flat one.
+    """
+
+    def __init__(
+        self, trace: Trace, missing: Missing, fixed: Mapping[str, np.ndarray], settings: Settings,
+        start: Start | None = None,
+    ):  # fmt: skip
+        self.trace, self.missing, self.fixed, self.settings = trace, missing, dict(fixed), settings
+        self.start = start
+        self._made: dict[tuple[tuple[str, str], ...], Fitter] = {}
+
+    def __getstate__(self) -> dict:  # another process makes what it needs
+        return {**self.__dict__, "_made": {}}
+
+    def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
+        """The fitter of the model with these effects; shapes are fixed parameters, so that the
+        generated code is the same for all data."""
+        made, shapes = lift(candidates)
+        key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
+        if key not in self._made:
+            with LOCK:  # refits in threads ask for the same models
+                if key not in self._made:
+                    trace = self.trace
+                    if made:
+                        trace = with_parameters(augment(trace, made), shapes)
+                    self._made[key] = self.made(trace, shapes)
+        return self._made[key].with_fixed(shapes)
+
+    def with_free_shapes(
+        self, candidates: Sequence[Candidate], free: Mapping[str, tuple[float, float]]
+    ) -> Fitter:
+        """The fitter of the model with these effects, some of their shapes between bounds.
+
+        The last parameters are then the shapes' shares of the way between (`share_of`); the bounds
+        are fixed parameters, so that the generated code is the same for all data.
+        """
+        made, shapes = lift(candidates)
+        given = {n: v for n, v in shapes.items() if n not in free}
+        inside: dict[Expr, Expr] = {}
+        for name, (low, high) in free.items():
+            ends = (f"{name}_from", f"{name}_range")
+            given |= dict(zip(ends, (low, high - low), strict=True))
+            a, b, u = (symbol("parameter", n, ()) for n in (*ends, share_of(name)))
+            inside[symbol("parameter", name, ())] = a + b * u
+        key = (*((c.key, c.strength) for c in made), *((n, "free") for n in free))
+        if key not in self._made:
+            with LOCK:
+                if key not in self._made:
+                    made = [
+                        replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape))
+                        for c in made
+                    ]
+                    trace = with_parameters(augment(self.trace, made), given)
+                    trace = with_parameters(trace, map(share_of, free), lambda: Uniform(0, 1))
+                    self._made[key] = self.made(trace, given)
+        return self._made[key].with_fixed(given)
+
+    def made(self, trace: Trace, given: Mapping[str, float]) -> Fitter:
+        """The fitter of an augmented trace, with the values of what it was given besides."""
+        start = self.start if needs_start(trace) else None
+        trace = start.given(trace) if start else trace
+        program = compile_trace(trace, self.missing)
+        fixed = self.fixed | {n: np.asarray(v) for n, v in given.items()}
+        settings = Settings(self.settings.particles, proposal_of(program), self.settings.lag)
+        return Fitter(Problem(trace, (), program), fixed, settings, start)
+
+
+def share_of(shape: str) -> str:
+    """The parameter that says how far a shape is from its lower bound to its upper one."""
+    return f"{shape}_share"
+
+
+def lift(candidates: Sequence[Candidate]) -> tuple[list[Candidate], dict[str, float]]:
+    """Candidates whose shapes are symbols, dates among them, and the values of these."""
+    made, values = lifted(list(candidates))
+    out = []
+    for c in made:
+        lengths = {n for n in c.effect.states.values() if n is not None}
+        shape = []
+        for name, value in c.shape:
+            if c.effect.profile and not c.held and name not in lengths:
+                own = f"{c.strength}_{name}"
+                values = {**values, own: float(value)}
+                shape.append((name, symbol("parameter", own, ())))
+            else:
+                shape.append((name, value))
+        out.append(replace(c, shape=tuple(shape)))
+    return out, dict(values)
+
+
+def proposal_of(program: Program) -> str:
+    """The proposal of a program's filters: the user's, the twisted one, or the best there is."""
+    if "user" in program.proposals:
+        return "user"
+    if _steerable(program):
+        return "twisted"
+    found = program.proposals.get("auxiliary")
+    if found is not None and not isinstance(found, NotApplicable) and found.exact_look_ahead:
+        return "auxiliary"
+    return "bootstrap"
+
+
+def _steerable(program: Program) -> bool:
+    """Whether the twisted proposal applies, and its extended Kalman filter can be trusted: it may
+    step out of the support of a LogNormal state, where its guide and its predictions are lost."""
+    laws = [s.distribution for s in program.trace.transition.values()]
+    twisted = program.proposals.get("twisted", NotApplicable("there is none"))
+    return not isinstance(twisted, NotApplicable) and not any(
+        isinstance(d, LogNormal) for d in laws
+    )

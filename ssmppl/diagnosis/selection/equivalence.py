@@ -1,0 +1,341 @@
+"""What these data cannot tell apart among the leading candidates, and what input would.
+
+The class of the best is its confidence set: the refits that lie no further behind than the truth
+would by chance, and candidates whose scores are so like the best one's that its gain does not
+separate them.
+
+Which candidates these data cannot tell apart, and what input would.
+
+Near the base model the log-likelihood gains are quadratic: under truth k of strength lambda the
+efficient scores are S~ ~ N(lambda V[:, k], V), so that z ~ N(delta rho[:, k], rho) with delta^2 / 2
+the expected gain of the truth. The gain of candidate j is z_j^2 / 2. A rival whose correlation with
+the truth is rho overtakes it with probability Phi(-sqrt(g (1 - |rho|))): 5% where
+g = 1.645^2 / (1 - |rho|) = 2.7 / (1 - |rho|).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.screening.efficient_score import Null, efficient
+from ssmppl.diagnosis.screening.screen import Question, Screen
+from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.inference.run.seeds import random_state
+
+NATS_APART = 2.7  # 1.645^2: times 1 / (1 - |rho|), the gain that tells two effects apart at 5%
+LEAST_CUT = 2.0  # nats
+DRAWS = 4000
+
+
+def likeness(rho: np.ndarray, sided: np.ndarray | None = None) -> np.ndarray:
+    """(K, K) how far each candidate can stand in for another: |rho|.
+
+    Between two one-sided candidates the sign counts: one that would have to work backwards to
+    mimic the other has likeness 0.
+    """
+    rho = np.asarray(rho, float)
+    if sided is None:
+        return np.abs(rho)
+    sign = np.multiply.outer(np.sign(sided), np.sign(sided))
+    return np.where(sign == 0, np.abs(rho), np.maximum(sign * rho, 0.0))
+
+
+def needed_gain(rho: np.ndarray | float) -> np.ndarray:
+    """Nats that tell two effects of this correlation apart at 5%; infinite at 1."""
+    distance = 1.0 - np.abs(np.asarray(rho, float))
+    return np.divide(NATS_APART, distance, out=np.full(distance.shape, np.inf),
+                     where=distance > 1e-12)  # fmt: skip
+
+
+def told_apart(gain: np.ndarray | float, rho: np.ndarray | float) -> np.ndarray:
+    """Whether a gain (nats) tells effects of this correlation apart at 5%."""
+    return np.asarray(gain) >= needed_gain(rho)
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Equivalence classes. class_id : (K,), from 1, in order of their leaders' gains.
+
+    leader : (K,) of each candidate's class. rho : (K,) with its leader.
+    """
+
+    class_id: np.ndarray
+    leader: np.ndarray
+    rho: np.ndarray
+
+    def members(self, class_id: int) -> np.ndarray:
+        """Columns of a class, the leader first."""
+        found = np.flatnonzero(self.class_id == class_id)
+        return found[np.argsort(-np.abs(self.rho[found]) - (self.leader[found] == found))]
+
+
+def classes(rho: np.ndarray, gains: np.ndarray, sided: np.ndarray | None = None) -> Classes:
+    """The candidate with the largest gain takes all that it is not told apart from; and so on.
+
+    rho : (K, K). gains : (K,) nats, of the screen or of the refits.
+    """
+    rho, gains = np.asarray(rho, float), np.asarray(gains, float)
+    alike = likeness(rho, sided)
+    class_id, leader = np.zeros(len(gains), int), np.full(len(gains), -1)
+    for k in np.argsort(-gains, kind="stable"):
+        if class_id[k]:
+            continue
+        same = (class_id == 0) & ~told_apart(gains[k], alike[k])
+        same[k] = True
+        class_id[same], leader[same] = class_id.max() + 1, k
+    return Classes(class_id, leader, rho[leader, np.arange(len(gains))])
+
+
+# --- the confidence set --------------------------------------------------------------------------
+
+
+def cuts(
+    rho: np.ndarray,
+    gains: np.ndarray,
+    leading: Sequence[int],
+    *,
+    sided: np.ndarray | None = None,
+    groups: np.ndarray | None = None,
+    level: float = 0.95,
+    draws: int = DRAWS,
+    seed: int = 1,
+) -> np.ndarray:
+    """Quantile of (best gain - gain of the truth), each leading candidate taken as the truth.
+
+    (len(leading),) nats, at least `LEAST_CUT`. delta^2 = 2 gain - 1, as E z^2 = delta^2 + 1: a gain
+    is flattered by what it was fitted to, and a weaker truth is overtaken by more.
+
+    Parameters
+    ----------
+    rho : (K, K) of all candidates that are compared. gains : (K,) nats.
+    leading : columns that are taken as the truth in turn. sided : (K,) as in `Null`.
+    groups : (K,) families of shapes; a family's gain is its largest.
+    """
+    rho, gains = np.asarray(rho, float), np.asarray(gains, float)
+    width = len(gains)
+    signs = np.zeros(width, int) if sided is None else np.sign(sided).astype(int)
+    marks = np.arange(width) if groups is None else np.asarray(groups)
+    values, vectors = np.linalg.eigh(rho)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    noise = np.random.default_rng(seed).standard_normal((draws, width)) @ root.T
+    found = []
+    for k in leading:
+        delta = np.sqrt(max(2.0 * gains[k] - 1.0, 0.0)) * (signs[k] or 1)
+        gained = _gain(noise + delta * rho[k], signs)
+        excess = gained.max(axis=1) - gained[:, marks == marks[k]].max(axis=1)
+        found.append(max(float(np.quantile(excess, level)), LEAST_CUT))
+    return np.array(found)
+
+
+def confidence_set(gains: np.ndarray, cut: np.ndarray | float) -> np.ndarray:
+    """(K,) bool: candidates whose refit is no more than their own cut behind the best one."""
+    gains = np.asarray(gains, float)
+    return np.nanmax(gains) - gains <= cut
+
+
+def _gain(z: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    reached = np.where(signs == 0, np.abs(z), np.maximum(signs * z, 0.0))
+    return 0.5 * reached**2
+
+
+# --- the input that would separate ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Separation:
+    """input : which one separates a class best. told_apart : whether it would, at 5%.
+
+    nats : by input, the least gain (1 - |rho|) over pairs of the class, of which 2.7 is enough.
+    """
+
+    input: str
+    told_apart: bool
+    nats: dict[str, float]
+
+
+def separating_input(
+    members: Sequence[int],
+    strengths: np.ndarray,
+    covariances: Mapping[str, np.ndarray],
+    sided: np.ndarray | None = None,
+) -> Separation:
+    """The input under which the members of a class come apart best, the hardest pair counting.
+
+    Parameters
+    ----------
+    members : columns of the class, at least two.
+    strengths : (K,) estimated strength of each, which gains strength^2 V_kk / 2 if it is the truth.
+    covariances : by input, V (K, K) of the efficient scores under that input.
+
+    Raises
+    ------
+    ArgumentError : fewer than two members, or no input.
+    """
+    which = np.asarray(members, int)
+    if len(which) < 2 or not covariances:
+        raise ArgumentError(
+            f"{len(which)} members and {len(covariances)} inputs to separate them",
+            fix="give the columns of a class of two or more, and V under each input",
+        )
+    signs = None if sided is None else np.asarray(sided)[which]
+    nats = {}
+    for name, covariance in covariances.items():
+        v = np.asarray(covariance, float)[np.ix_(which, which)]
+        size = np.sqrt(np.maximum(np.diagonal(v), 0.0))
+        rho = np.divide(
+            v, np.outer(size, size), out=np.ones_like(v), where=np.outer(size, size) > 0
+        )
+        gain = 0.5 * np.asarray(strengths, float)[which] ** 2 * np.diagonal(v)
+        apart = gain[:, None] * (1.0 - np.minimum(likeness(rho, signs), 1.0))
+        nats[name] = float(np.min(apart[~np.eye(len(which), dtype=bool)]))
+    best = max(nats, key=lambda name: nats[name])
+    return Separation(best, nats[best] >= NATS_APART, nats)
+
+
+SETS = 25  # simulated under each input
+MOST_VARIED = 4  # inputs that are replaced in turn
+SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
+
+
+def heads(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """Best shape of each group: the refitted by their merit, then the others by their height."""
+    done = [r.index[0] for r in refits if len(r.index) == 1]
+    family, groups = screen.family, screen.groups
+    known = {int(groups[k]) for k in done}
+    return done + [
+        k for k in family.leaders if not screen.found.status[k] and int(groups[k]) not in known
+    ]
+
+
+def told(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
+    """Classes of the candidates in `order` (of `heads`); one of its own for whatever is weak."""
+    refitted = {r.index[0]: max(r.merit, 0.0) for r in refits if len(r.index) == 1}
+    at = np.array(order, dtype=int)
+    rho, sided = screen.found.rho[np.ix_(at, at)], screen.found.sided[at]
+    gains = np.array([refitted.get(int(k), screen.found.gain[k]) for k in at])
+    strong = np.array([int(k) in refitted or screen.found.gain[k] >= NATS_APART for k in at], bool)
+    class_id, leader = np.zeros(len(at), int), np.arange(len(at))
+    if refitted:
+        first = _of_the_best(rho, gains, sided, len(refitted), strong)
+        class_id[first], leader[first] = 1, 0
+    rest = np.flatnonzero(strong & (class_id == 0))
+    if len(rest):
+        found = classes(rho[np.ix_(rest, rest)], gains[rest], sided[rest])
+        class_id[rest] = found.class_id + class_id.max()
+        leader[rest] = rest[found.leader]
+    weak = np.flatnonzero(class_id == 0)
+    class_id[weak] = class_id.max(initial=0) + 1 + np.arange(len(weak))
+    return Classes(class_id, leader, rho[leader, np.arange(len(at))])
+
+
+def _of_the_best(
+    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray, refitted: int, strong: np.ndarray
+) -> np.ndarray:
+    """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
+    among those that were not."""
+    own = slice(0, refitted)
+    cut = cuts(rho[own, own], gains[own], range(refitted), sided=sided[own])
+    out = np.zeros(len(gains), bool)
+    out[own] = confidence_set(gains[own], cut)
+    alike = ~told_apart(gains[0], likeness(rho, sided)[0]) & strong
+    out[refitted:] = alike[refitted:]
+    return out
+
+
+# -- another input
+def separating(
+    screen: Screen, members: Sequence[int], seed: np.random.SeedSequence, kept: Checkpoint
+) -> str:
+    """The simple input that would separate these candidates best; "" if none would.
+
+    The base model is simulated under each, and its scores say how alike the candidates would be.
+    """
+    question, columns = screen.question, np.array(members, dtype=int)
+    inputs = simple_inputs(screen.experiments, list(map(repr, question.trace.input_symbols)))
+    if not inputs:
+        return ""
+    whole = question.theta(screen.theta)
+    names = list(inputs)
+    one = partial(_tried, question, list(inputs.values()), whole, columns, seed)
+    results = kept.each("trying inputs", SETS * len(names), one)
+    covariances = {}
+    for which, name in enumerate(names):
+        own = results[which :: len(names)]
+        done = [r for r in own if not kept.failures.of_task(f"a set under {name}", r) and r]
+        if not done:
+            continue
+        law = Null.of(
+            np.stack([r["columns"] for r in done]), np.stack([r["nuisance"] for r in done]),
+            quadratic=question.quadratic[columns], sided=question.sided[columns],
+        )  # fmt: skip
+        try:
+            nothing = np.zeros(len(columns)), np.zeros(law.nuisance.shape[1])
+            covariances[name] = efficient(law, *nothing).covariance
+        except ArgumentError:  # too few sets for so many parameters
+            continue
+    if not covariances:
+        return ""
+    best = separating_input(
+        range(len(columns)), screen.found.strength[columns], covariances,
+        screen.found.sided[columns],
+    )  # fmt: skip
+    return best.input if best.told_apart else ""
+
+
+def _tried(
+    question: Question, inputs: Sequence[Sequence[Experiment]], theta: np.ndarray,
+    columns: np.ndarray, seed: np.random.SeedSequence, k: int,
+) -> Numbers:  # fmt: skip
+    """The scores of a set that is simulated under one of the inputs; empty where there are none."""
+    number, which = divmod(k, len(inputs))
+    stream = random_state(seed, which, number)
+    own = theta[: len(question.columns.base.parameter_symbols)]
+    try:
+        data = question.simulator.sets(inputs[which], own, stream)
+        passes = question.smoother.run(data, theta, stream, predicted=False)
+    except SamplingError:
+        return {}
+    if not all(np.all(np.isfinite(p.rows)) for p in passes):
+        return {}
+    found = question.statistics(data, passes, stream, checks=False)
+    return {"columns": found.columns[columns], "nuisance": found.nuisance}
+
+
+def simple_inputs(
+    experiments: Sequence[Experiment], names: Sequence[str]
+) -> dict[str, list[Experiment]]:
+    """The experiments with one of the inputs (L,) replaced at a time, in the units of its own.
+
+    What does not vary in an experiment is no drive (the length of a step, a setting), and stays.
+    """
+    ends = [(e.u.min(axis=0), e.u.max(axis=0)) for e in experiments]
+    varies = np.array([low < high for low, high in ends])
+    out: dict[str, list[Experiment]] = {}
+    for k in np.flatnonzero(varies.any(axis=0))[:MOST_VARIED].tolist():
+        for e, varied in zip(experiments, varies[:, k], strict=True):
+            for name, column in _others(e.u[:, k], names[k]).items():
+                u = e.u.copy()
+                u[:, k] = column if varied else e.u[:, k]
+                out.setdefault(name, []).append(replace(e, u=u))
+    return out
+
+
+def _others(u: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    """Other courses of an input u (T,), by what they are called."""
+    t = np.arange(len(u))
+    low, high, mean, size = u.min(), u.max(), u.mean(), np.sqrt(2.0) * u.std()
+    stair = np.minimum(t * LEVELS // len(u), LEVELS - 1) / (LEVELS - 1.0)
+    return {
+        f"the same {name} at twice the size": 2.0 * u,
+        f"the same {name} at half the size": 0.5 * u,
+        f"a slow sine of {name}": mean + size * np.sin(2.0 * np.pi * t / (SLOW * len(u))),
+        f"a fast sine of {name}": mean + size * np.sin(2.0 * np.pi * t / FAST),
+        f"a staircase of {name} over the same range": low + (high - low) * stair,
+    }

@@ -1,0 +1,675 @@
+"""Fits of a model and of its augmentations: the mode of the posterior.
+
+Linear Gaussian models are climbed with their exact score. Others are climbed by the extended Kalman
+filter's log-likelihood where there is one, which is smooth and takes a millisecond, from several
+starts, and from there by the particle smoother's score (`noisy_climb`). How far the top still is is
+told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
+
+Scales and shares that a fit has driven to a bound of their support: a process noise of nothing.
+
+There the likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or
+1e-13, as it happened), and a curvature there is no information. Such a number is held at the value
+nearest to where it is of consequence, the farthest inside that costs next to nothing, which keeps
+the other numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their law).
+
+Quasi-Newton ascent by noisy gradients.
+
+z <- z + H^-1 g on the unconstrained scale, with H an estimate of the information, kept up by damped
+BFGS updates (Nocedal and Wright 2006, procedure 18.2); near the top the steps shrink as 1 / k,
+which averages the noise out (Robbins and Monro 1951).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import takewhile
+
+import numpy as np
+
+from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.diagnosis.model.initial_law import FirstStates, Start
+from ssmppl.diagnosis.model.score_columns import Columns, score_columns
+from ssmppl.diagnosis.model.smoothing import Settings, Simulator, Smoother
+from ssmppl.errors import SamplingError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.expr import symbols_of
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.maximum.ascent import Chart, Setup
+from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
+from ssmppl.inference.maximum.direct_optimization import observed_information
+from ssmppl.inference.maximum.newton import Top, climb, information_at
+from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.particles.backward import particle_system
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.preparation.pilot import climb_to_mode
+from ssmppl.inference.preparation.space import Space, at, space_of
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.ranges import total_of
+from ssmppl.inference.run.seeds import random_state
+from ssmppl.inference.run.tasks import run_tasks
+from ssmppl.language.model.transforms import transforms
+
+OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
+FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
+COST = 0.05  # nats that the value which is held may cost
+GRID = np.linspace(0.5, 40.0, 80).tolist()  # inwards, where the value that is held is looked for
+STEPS = 40  # of halving
+FALL = 0.5  # nats by which the function has to fall inside: else the number is not identified
+
+
+def bounded(
+    function: Callable[[np.ndarray], float], z: np.ndarray, candidates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(z, mask), each (F,): where a bound is the place of the maximum, and z moved inside there.
+
+    function : what was maximised. candidates : (F,) bool, those that have a bound to run to.
+    """
+    z, mask = np.array(z, dtype=float), np.zeros(len(z), dtype=bool)
+    for i in np.flatnonzero(candidates):
+        here = function(z)
+
+        def at(step: float, i: int = int(i)) -> float:
+            there = z.copy()
+            there[i] += step
+            return function(there)
+
+        for sign in (-1.0, 1.0):
+            # As far as there are values: nothing is resolved any more where a noise is tiny.
+            out = list(takewhile(lambda v: v > -np.inf, (at(sign * s) for s in OUTWARDS)))
+            if not out or min(out) < here - FREE:
+                continue
+            top = max(here, *out)
+            inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
+            if inside is None:  # flat either way: nothing tells of this number
+                continue
+            good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
+            for _ in range(STEPS):
+                middle = 0.5 * (good + bad)
+                good, bad = (middle, bad) if at(-sign * middle) >= top - COST else (good, middle)
+            z[i] -= sign * good
+            mask[i] = True
+            break
+    return z, mask
+
+
+def names_of(space: Space, mask: np.ndarray) -> list[str]:
+    """The components of the free numbers in `mask` (F,), by their text: `q`, `s[0]`."""
+    every: list[str] = []
+    for t in transforms(space.problem.trace):
+        single = len(t.free) == len(t.components)
+        every += (repr(t.components[k]) if single else t.site.name for k in range(len(t.free)))
+    free = [every[i] for i in space.where]
+    return list(dict.fromkeys(n for n, m in zip(free, mask, strict=True) if m))
+
+
+def note(names: Sequence[str], values: dict[str, float], what: str) -> str:
+    """What a report says of parameters at a bound."""
+    if not names:
+        return ""
+    told = ", ".join(f"{n} at {values[n]:.3g}" if n in values else n for n in names)
+    return (
+        f"in {what} the best value of {' and '.join(names)} is a bound: held where it begins to "
+        f"count ({told}, which costs {COST:g} nats), and left out of the information"
+    )
+
+
+MOST_STEPS = 20  # of the first phase
+NEAR = 1.0  # nats from the top where the first phase ends
+AVERAGED = 6  # steps of the second phase
+CLIFF = 30.0  # nats that a step of it may lose: Monte Carlo noise seldom explains more
+FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
+
+Point = tuple[float, np.ndarray]  # value and gradient
+
+
+def noisy_climb(
+    gradient: Callable[[np.ndarray], Point | None], z: np.ndarray, found: Point, h: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """(z, H, distance from the top in nats) where the climb from z (F,) ends.
+
+    gradient : value and gradient at a point, with noise; None where there are none. found : these
+    at z. h : (F, F) minus the second derivatives there, about.
+    """
+    value, g = found
+    size = 1.0
+    for _ in range(MOST_STEPS):
+        step = _step(h, g)
+        if 0.5 * g @ step < NEAR:
+            break
+        step *= size * _shortened(step)
+        new = gradient(z + step)
+        if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
+            size *= 0.4
+            if size < 0.01:
+                break
+            continue
+        h = _update(h, step, g - new[1])
+        z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
+    distance, size = np.inf, 1.0
+    for k in range(AVERAGED):
+        step = _step(h, g)
+        distance = 0.5 * float(g @ step)
+        step *= size * _shortened(step) / (k + 1.0)
+        new = gradient(z + step)
+        if new is None or new[0] < value - CLIFF:
+            size *= 0.4
+            continue
+        z, (value, g) = z + step, new
+    return z, h, distance
+
+
+def _shortened(step: np.ndarray) -> float:
+    """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
+    coordinate at all."""
+    return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
+
+
+def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """H^-1 g, with the small eigenvalues of the scaled H lifted."""
+    scale = np.sqrt(np.maximum(np.diagonal(h), 1e-12))
+    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
+    values = np.maximum(values, 1e-3)
+    return (vectors @ ((vectors.T @ (g / scale)) / values)) / scale
+
+
+def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Damped BFGS: H such that H s is about y, positive definite still (procedure 18.2)."""
+    hs = h @ s
+    curvature, along = float(s @ hs), float(s @ y)
+    if along < 0.2 * curvature:
+        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
+        along = float(s @ y)
+    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along
+
+
+LARGEST = 1e100  # of a score: what is beyond is an overflow
+INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
+PILOT_PARTICLES = 300
+PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
+NUMBERS = (
+    "theta", "z", "log_likelihood", "error", "information", "distance", "converged", "at_bound",
+)  # fmt: skip
+QUIETER = (1.0, 0.3, 0.1)  # times the noise of the transition, from which climbs start
+ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
+SPREAD = 0.1  # least information of a logarithm that steps are made with
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted to experiments (P parameters, F free numbers on the unconstrained scale).
+
+    theta : (P,). z : (F,). log_likelihood : at theta; error : its Monte Carlo standard deviation,
+    0 where exact. information : (F, F), minus the second derivatives of log p(y) in z, about.
+    distance : nats from the top by the last score. converged : whether that is a small number.
+    at_bound : (F,) bool, which numbers ran to a bound of their support, where they are held: they
+    are left out of the information (`bounds`).
+    """
+
+    space: Space
+    theta: np.ndarray
+    z: np.ndarray
+    log_likelihood: float
+    error: float
+    information: np.ndarray
+    distance: float
+    converged: bool
+    at_bound: np.ndarray
+
+    @property
+    def bounds(self) -> list[str]:
+        """Components that ran to a bound of their support, by their text."""
+        return names_of(self.space, self.at_bound)
+
+    @property
+    def problem(self) -> Problem:
+        return self.space.problem
+
+    def values(self) -> dict[str, float]:
+        """Values by the text of each component, `k`, `beta[0]`."""
+        symbols = self.problem.trace.parameter_symbols
+        return {repr(s): float(v) for s, v in zip(symbols, self.theta, strict=True)}
+
+    @property
+    def start(self) -> dict[str, np.ndarray]:
+        """The values by name, for another fit to start at."""
+        return dict(unpack_parameters(self.problem.trace, self.theta))
+
+    @property
+    def numbers(self) -> dict[str, np.ndarray]:
+        """All that a checkpoint has to keep; see `Fitter.restored`."""
+        return {n: np.asarray(getattr(self, n)) for n in NUMBERS}
+
+
+class Fitter:
+    """Fits one model to any of its data sets."""
+
+    def __init__(
+        self, problem: Problem, fixed: Mapping[str, np.ndarray], settings: Settings,
+        start: Start | None = None,
+    ):  # fmt: skip
+        """start : the law of x_1 is that one, in place of a flat one."""
+        self.problem, self.fixed, self.settings = problem, dict(fixed), settings
+        self.start = start
+        self.kalman = kalman_model(problem.trace)
+        trace = problem.trace
+        self.columns: Columns = score_columns(trace, trace, (), self.fixed, problem.program.missing)
+        self.smoother = Smoother(self.columns, problem.program.missing, settings)
+        place = {s: i for i, s in enumerate(trace.parameter_symbols)}
+        self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
+
+    def with_fixed(self, values: Mapping[str, float]) -> Fitter:
+        """The same with other values of parameters that are fixed."""
+        if not values:
+            return self
+        out = copy(self)
+        out.fixed = self.fixed | {n: np.asarray(v, dtype=float) for n, v in values.items()}
+        return out
+
+    @property
+    def few(self) -> int:
+        """Particles where a rough answer will do."""
+        return min(PILOT_PARTICLES, self.settings.particles)
+
+    @property
+    def exact(self) -> bool:
+        return isinstance(self.kalman, KalmanModel)
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Draws data sets from the model."""
+        program, held = self.problem.program, self.start.laws if self.start else ()
+        first = FirstStates(self.smoother) if self.start else None
+        return Simulator(program, program.missing, self.kalman, tuple(held), first)
+
+    @property
+    def height(self) -> float:
+        """Nats for each experiment that a law in place of a flat one takes."""
+        return self.start.height if self.start else 0.0
+
+    def restored(self, experiments: Sequence[Experiment], numbers: Mapping[str, np.ndarray]) -> Fit:
+        """The fit to `experiments` that had these `Fit.numbers`."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        theta = np.array(numbers["theta"])
+        start = unpack_parameters(problem.trace, theta)
+        space = at(space_of(problem, self.fixed, start), theta)
+        value, error, distance = (
+            float(numbers[n]) for n in ("log_likelihood", "error", "distance")
+        )
+        return Fit(space, theta, np.array(numbers["z"]), value, error,
+                   np.array(numbers["information"]), distance, bool(numbers["converged"]),
+                   np.array(numbers["at_bound"], dtype=bool))  # fmt: skip
+
+    def fit(
+        self, experiments: Sequence[Experiment], seed: np.random.SeedSequence,
+        start: Mapping[str, np.ndarray], *, searched: bool = False,
+        information: np.ndarray | None = None, quick: bool = False, rough: bool = False,
+    ) -> Fit:  # fmt: skip
+        """The mode from `start`, or, unless that was `searched`, from a pilot's mode near it.
+
+        information : (P, P) of the parameters where it starts, about; None: by simulation.
+        quick : no information is needed at the end. rough : nor more than the extended Kalman
+        filter's top near the start, where there is one: for what is fitted many times.
+
+        Raises
+        ------
+        ArgumentError : the likelihood is zero at every point that was tried.
+        SamplingError : the weights of the filter vanish where it starts.
+        """
+        problem = replace(self.problem, experiments=tuple(experiments))
+        space = space_of(problem, self.fixed, dict(start))
+        if isinstance(self.kalman, KalmanModel):
+            climbs = 0 if searched else 1  # from another start too
+            return self._exactly(self.kalman, space, dict(start), seed, quick or rough, climbs)
+        if information is not None:
+            information = self._unconstrained(space, space.theta, information, seed)
+        smooth = self._extended(problem)
+        if not searched:
+
+            def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
+                if smooth is not None:
+                    return smooth(theta)
+                return self._estimate(problem, theta, self.few, random_state(seed))
+
+            z, _ = climb_to_mode(space, seed, estimate)
+            space = at(space, space.parameters(z)[0].copy())
+        if smooth is None:
+            return self._climb(space, seed, information)
+        space, top = self._by_extended(space, smooth, seed, QUIETER[: 1 if rough else None])
+        if top is not None:
+            information = steady(top.information, ~space.on_the_line)
+        fit = None if rough and top is not None else self._climb(space, seed, information)
+        if top is not None:
+            fit = self._settled(fit, space, top, seed)
+        assert fit is not None
+        if rough:
+            return fit
+        z, mask = bounded(density_of(space, smooth), fit.z, ~space.on_the_line)
+        if not mask.any():
+            return fit
+        theta = space.parameters(z)[0].copy()
+        value, error = self.log_likelihood(problem.experiments, theta, seed)
+        return replace(fit, space=at(space, theta), theta=theta, z=z, log_likelihood=value,
+                       error=error, at_bound=mask)  # fmt: skip
+
+    def value(self, experiments: Sequence[Experiment], theta: np.ndarray) -> float:
+        """log p(y | theta) as climbs see it: exact, by the extended filter, or by particles."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        smooth = self._extended(problem)
+        if smooth is None and isinstance(self.kalman, KalmanModel):
+            return self.kalman.log_likelihood(experiments, theta)
+        return smooth(theta) if smooth else self.estimate(experiments, theta, random_state(
+            np.random.SeedSequence(0)))  # fmt: skip
+
+    # -- by the extended Kalman filter
+    def _extended(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
+        """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no
+        number; None where the model has no such filter."""
+        twisted = problem.program.twisted if self.settings.proposal == "twisted" else None
+        if not isinstance(twisted, TwistedFilter):
+            return None
+
+        def value(theta: np.ndarray) -> float:
+            total = 0.0
+            for e in problem.experiments:
+                total += twisted.extended_log_likelihood(theta, e.y, e.seen, e.u) + self.height
+            return total if np.isfinite(total) else -np.inf
+
+        return value
+
+    def _by_extended(
+        self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence,
+        shares: Sequence[float],
+    ) -> tuple[Space, Top | None]:  # fmt: skip
+        """The space at the top of that, from where it stands; as it is, and None, where the
+        particle filter knows better."""
+        function = density_of(space, smooth)
+        tops = []
+        for share in shares:
+            begin = self._quieter(space, share)
+            top = climb(function, begin.z[begin.where])
+            if top is not None:
+                tops.append(top)
+
+        def estimate(s: Space) -> float:
+            n = self.settings.particles
+            return self._estimate(s.problem, s.theta, n, random_state(seed, 8))
+
+        was = estimate(space)
+        for top in sorted(tops, key=lambda top: -top.value):
+            there = at(space, space.parameters(top.z)[0].copy())
+            if estimate(there) >= was - ASTRAY:
+                return there, top
+        return space, None
+
+    def _settled(
+        self, fit: Fit | None, space: Space, top: Top, seed: np.random.SeedSequence
+    ) -> Fit:
+        """The fit, or the top of the approximation where the particles' score led to nothing
+        higher: with next to no noise in a law that score is mostly Monte Carlo error."""
+        value, error = self.log_likelihood(space.problem.experiments, space.theta, seed)
+        if fit is not None:
+            prior = density_of(space, lambda theta: 0.0)
+            gained = fit.log_likelihood + prior(fit.z) - value - prior(top.z)
+            if gained > 2.0 * np.hypot(error, fit.error):
+                distance = min(fit.distance, top.distance)
+                return replace(fit, distance=distance, converged=distance < 3.0 * NEAR)
+        # As it is: a matrix made positive definite for steps would give standard errors of nothing.
+        nowhere = np.zeros(len(top.z), dtype=bool)
+        return Fit(space, space.theta, top.z, value, error, top.information, top.distance,
+                   top.distance < 3.0 * NEAR, nowhere)  # fmt: skip
+
+    def _quieter(self, space: Space, share: float) -> Space:
+        """The space with the scales of the transition's noise at a share of what they are."""
+        names = [n for n in self._noises if n not in self.fixed]
+        if share == 1.0 or not names:
+            return space
+        trace = space.problem.trace
+        theta = np.array([
+            v * share if s.data[1] in names else v
+            for s, v in zip(trace.parameter_symbols, space.theta, strict=True)
+        ])  # fmt: skip
+        return at(space, theta)
+
+    @cached_property
+    def _noises(self) -> set[str]:
+        """Positive parameters that the noise of the transition is made of."""
+        twisted, trace = self.problem.program.twisted, self.problem.trace
+        if not isinstance(twisted, TwistedFilter):
+            return set()
+        inside = {s.data[1] for s in symbols_of(list(twisted.found.transition.spread().ravel()))
+                  if s.data[0] == "parameter"}  # fmt: skip
+        out = set()
+        for name in inside:
+            support = trace.parameters[name].distribution.support()
+            ends = [e for end in (support.lower, support.upper) for e in array(end).ravel()]
+            if support.kind == "interval" and all(e.op == "const" for e in ends):
+                if {e.data for e in ends} == {0.0, np.inf}:
+                    out.add(name)
+        return out
+
+    def _exactly(
+        self, kalman: KalmanModel, space: Space, start: dict[str, np.ndarray],
+        seed: np.random.SeedSequence, quick: bool, climbs: int,
+    ) -> Fit:  # fmt: skip
+        problem = space.problem
+        setup = Setup(problem, space, "posterior", self.fixed, start, seed)
+        # The extended filter's is the same here, and needs no matrices to be put together.
+        smooth = self._extended(problem) or partial(kalman.log_likelihood, problem.experiments)
+        function = density_of(space, smooth)
+        top = None
+        if not climbs:  # from near the top, and to within what a decision needs
+            top = climb(function, space.z[space.where])
+        if top is not None and top.distance < NEAR:
+            theta, converged = space.parameters(top.z)[0].copy(), True
+        elif len(space.where):
+            ascent = climb_exactly(setup, DirectOptimization(restarts=climbs))
+            theta, converged = ascent.theta, bool(ascent.report["converged"])
+        else:
+            theta, converged = space.theta, True
+        z, mask = bounded(function, setup.space_at(theta), ~space.on_the_line)
+        theta = space.parameters(z)[0].copy() if mask.any() else theta
+        value = kalman.log_likelihood(problem.experiments, theta)
+        size = len(space.where)
+        information = np.full((size, size), np.nan)
+        fit = Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged, mask)
+        return fit if quick else self.measured(fit, seed)
+
+    def states(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 16
+    ) -> np.ndarray:
+        """(T, draws, D) draws of each x_t: of trajectories where exact, else filtered."""
+        if isinstance(self.kalman, KalmanModel):
+            return np.swapaxes(self.kalman.draw(e, theta, stream, draws), 0, 1)
+        system, weights = self.smoother.system(e, theta, stream)
+        cumulative = np.cumsum(weights, axis=1)
+        levels = (np.arange(draws) + 0.5) / draws
+        index = np.stack([np.searchsorted(c, levels * c[-1]) for c in cumulative])
+        return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
+
+    def gradient(
+        self, space: Space, z: np.ndarray, stream: np.ndarray, chart: Chart | None = None
+    ) -> tuple[float, np.ndarray] | None:
+        """(log p(y) + log prior, its derivatives (F,) in z), estimated; None where none is."""
+        point = (chart or Chart(space)).at(z)
+        if point.log_prior == -np.inf:
+            return None
+        try:
+            passes = self.smoother.run(
+                space.problem.experiments, point.theta, stream, predicted=False
+            )
+        except SamplingError:
+            return None
+        score = np.zeros(len(point.theta))
+        score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
+        slope = point.pull(score) + point.d_log_prior
+        if not np.all(np.isfinite(slope)):
+            return None
+        value = sum(total_of(p.log_increments) for p in passes)
+        return value + point.log_prior, slope
+
+    def _climb(
+        self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
+    ) -> Fit:
+        stream = random_state(seed, 1)
+        z = space.z[space.where]
+        if information is None:
+            information = self._simulated_information(space, space.theta, seed)
+        chart = Chart(space)
+        found = self.gradient(space, z, stream, chart)
+        if found is None:
+            raise SamplingError(
+                f"the model {space.problem.trace.name!r} cannot have produced the data where its "
+                "fit starts",
+                fix="check the data for outliers, or give the parameters priors round plausible "
+                "values",
+            )
+        z, h, distance = noisy_climb(
+            lambda z: self.gradient(space, z, stream, chart), z, found, information
+        )
+        theta = space.parameters(z)[0].copy()
+        value, error = self.log_likelihood(space.problem.experiments, theta, seed)
+        nowhere = np.zeros(len(z), dtype=bool)
+        return Fit(at(space, theta), theta, z, value, error, h, distance, distance < 3.0 * NEAR,
+                   nowhere)  # fmt: skip
+
+    def log_likelihood(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, seed: np.random.SeedSequence,
+        repeats: int = 8,
+    ) -> tuple[float, float]:  # fmt: skip
+        """log p(y | theta) from the mean of independent estimates, and its standard deviation."""
+        if isinstance(self.kalman, KalmanModel):
+            return self.kalman.log_likelihood(experiments, theta), 0.0
+        problem = replace(self.problem, experiments=tuple(experiments))
+        value, error = -np.inf, 0.0
+        for doubling in range(DOUBLINGS + 1):
+            n = self.settings.particles * 2**doubling
+
+            def one(r: int, n: int = n, doubling: int = doubling) -> float:
+                return self._estimate(problem, theta, n, random_state(seed, 2, r, doubling))
+
+            log_z = np.array(run_tasks(one, range(repeats)))
+            if not np.any(log_z > -np.inf):
+                return -np.inf, 0.0
+            share = np.exp(log_z - log_z.max())
+            error = float(share.std(ddof=1) / share.mean() / np.sqrt(repeats))
+            value = float(log_z.max() + np.log(share.mean()))
+            if error <= PRECISE:
+                break
+        return value, error
+
+    def estimate(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
+    ) -> float:
+        """One estimate of log p(y | theta), -inf where there is none."""
+        problem = replace(self.problem, experiments=tuple(experiments))
+        return self._estimate(problem, theta, self.settings.particles, stream)
+
+    def _estimate(
+        self, problem: Problem, theta: np.ndarray, particles: int, stream: np.ndarray
+    ) -> float:
+        """One estimate of log p(y | theta); -inf where there is none.
+
+        By the variant of the filter that the smoother has compiled already.
+        """
+        settings = FilterSettings(particles, self.settings.proposal)
+        try:
+            return sum(
+                particle_system(problem, theta, settings, e, stream).log_Z + self.height
+                for e in problem.experiments
+            )
+        except SamplingError:
+            return -np.inf
+
+    def measured(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
+        """The fit with an information matrix worth its name: minus the second derivatives where
+        they are exact, else that of scores simulated at it; its own was built up on the way."""
+        if isinstance(self.kalman, KalmanModel):
+            if np.all(np.isfinite(fit.information)):  # known already, or nothing is free
+                return fit
+            smooth = self._extended(fit.problem)
+            if smooth is not None:
+                found = information_at(density_of(fit.space, smooth), fit.z)
+            else:
+                setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
+                found = observed_information(setup, self.kalman, fit.z)
+            inside = found[np.ix_(~fit.at_bound, ~fit.at_bound)]  # at a bound it says nothing
+            if np.all(np.isfinite(found)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
+                return replace(fit, information=found)
+        return replace(fit, information=self._simulated_information(fit.space, fit.theta, seed))
+
+    def _unconstrained(
+        self, space: Space, theta: np.ndarray, information: np.ndarray,
+        seed: np.random.SeedSequence,
+    ) -> np.ndarray:  # fmt: skip
+        """(F, F) in z of a matrix (P, P) in theta, the prior's curvature included."""
+        setup = Setup(space.problem, at(space, theta), "posterior", self.fixed, {}, seed)
+        z = setup.space_at(theta)
+        jacobian = setup.chart.at(z).jacobian
+        curvature = setup.chart.curvature(z, np.zeros(len(theta)))
+        prior = -curvature.log_prior
+        values, vectors = np.linalg.eigh(0.5 * (prior + prior.T))
+        return jacobian.T @ information @ jacobian + (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+    def _simulated_information(
+        self, space: Space, theta: np.ndarray, seed: np.random.SeedSequence
+    ) -> np.ndarray:
+        """(F, F) in z: mean square of the scores of data simulated at theta, prior included."""
+        problem = space.problem
+        smoother = Smoother(
+            self.columns, problem.program.missing, replace(self.settings, particles=self.few)
+        )
+        smoother.__dict__.update(
+            {k: getattr(self.smoother, k) for k in ("program", "module", "problem")}
+        )
+        simulator = self.simulator
+
+        def one(r: int) -> np.ndarray | None:
+            stream = random_state(seed, 3, r)
+            sets = simulator.sets(problem.experiments, theta, stream)
+            try:
+                passes = smoother.run(sets, theta, stream, predicted=False)
+            except SamplingError:
+                return None
+            score = np.zeros(len(theta))
+            score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
+            return score
+
+        scores = [s for s in run_tasks(one, range(INFORMATION_SETS)) if s is not None]
+        scores = [s for s in scores if np.all(np.abs(s) < LARGEST)]
+        if not scores:
+            raise SamplingError(
+                f"no data set simulated from {problem.trace.name!r} at its fit went through the "
+                "filter",
+                fix="give the parameters priors round plausible values, or fix known ones",
+            )
+        square = np.mean([np.outer(s, s) for s in scores], axis=0)
+        return self._unconstrained(space, theta, square, seed)
+
+
+def density_of(
+    space: Space, log_likelihood: Callable[[np.ndarray], float]
+) -> Callable[[np.ndarray], float]:
+    """z (F,) -> log likelihood + log prior density of theta, -inf off the support."""
+
+    def value(z: np.ndarray) -> float:
+        theta, log_prior, log_jacobian = space.point(z)
+        if not log_prior + log_jacobian > -np.inf:
+            return -np.inf
+        found = log_likelihood(theta) + log_prior
+        return found if np.isfinite(found) else -np.inf
+
+    return value
+
+
+def steady(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
+    """(F, F) positive definite and near to `information`, for the steps of a climb; `logarithms`
+    (F,) are known to have moderate units, and steps of them are kept moderate."""
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), np.where(logarithms, SPREAD, 0.0)))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    lifted = (vectors * np.maximum(np.abs(values), 0.05)) @ vectors.T
+    return lifted * np.outer(scale, scale)

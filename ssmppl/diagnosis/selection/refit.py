@@ -1,0 +1,372 @@
+"""Attribution: the leading candidates and pairs of them, refitted with all parameters.
+
+The score is a screen only: noise that has grown shrinks it, and near equivalents swap places. What
+ranks is the log-likelihood after refitting, each fit starting where the screen's quadratic
+expects its top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.effects.candidate import Candidate, sharpened
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.screening.efficient_score import Efficient
+from ssmppl.diagnosis.screening.screen import Question, Screen
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.errors import NotApplicable, SSMError
+from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.seeds import random_state
+
+SINGLES, MATES, PAIRS = 5, 4, 3  # candidates refitted, further ones like the best of them, pairs
+ALIKE = 0.8  # correlation from which a candidate is refitted as a class mate
+SAME = 0.95  # beyond which two candidates are one to begin with
+SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
+NEAR = 25.0  # nats behind the best, up to which other delays are tried
+ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
+OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
+AGAIN = 2  # times that a fit which left more is taken up where it ended
+LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
+LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
+LEAST_GAIN = 1.0  # nats that the score must promise for a refit
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A model with effects, fitted.
+
+    index : their places among the screen's candidates. gain : nats over the model without them.
+    cost : of these, what the choice of their shapes is worth.
+    """
+
+    index: tuple[int, ...]
+    candidates: tuple[Candidate, ...]
+    fitter: Fitter
+    fit: Fit
+    gain: float
+    cost: float = 0.0
+
+    @property
+    def merit(self) -> float:
+        """By which refits are ranked: a date chosen among hundreds gains nats by that alone."""
+        return self.gain - self.cost
+
+    @property
+    def strengths(self) -> list[float]:
+        """Estimated strengths of the effects."""
+        values = self.fit.values()
+        return [values[c.strength] for c in self.candidates]
+
+    @property
+    def bounds(self) -> list[str]:
+        """Components that ran to a bound of their support."""
+        return self.fit.bounds
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Standard errors of all free parameters, from the information at the fit."""
+        return standard_errors(self.fit, self.fitter.fixed)
+
+
+def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """By the text of each component; 0 for what is fixed, NaN where there is no information: for
+    what ran to a bound of its support, and for all where the information about the others is not
+    positive definite."""
+    symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
+    nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
+    information = fit.information[np.ix_(free, free)]
+    if not np.all(np.isfinite(information)):
+        return nothing
+    scale = np.sqrt(np.abs(np.diagonal(information)))
+    if not np.all(scale > 0.0):
+        return nothing
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if len(values) and values[0] <= LEAST_INFORMATION:
+        return nothing
+    setup = Setup(fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0))
+    jacobian = setup.chart.at(fit.z).jacobian
+    root = (jacobian[:, free] / scale) @ (vectors / np.sqrt(values))
+    spread = np.sqrt(np.sum(root**2, axis=1))
+    held = np.any(jacobian[:, fit.at_bound] != 0.0, axis=1)
+    spread = np.where(held, np.nan, spread)
+    return {repr(s): float(v) for s, v in zip(symbols, spread, strict=True)}
+
+
+def refit(
+    workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
+    afresh: bool = False, rough: bool = False,
+) -> Refit | NotApplicable:  # fmt: skip
+    """Fit the model with the effects of `candidates`, of which the last are the screen's at
+    `index`, and the others are in `base`. Several have no standard errors: `Fitter.measured`.
+
+    afresh : from the model's own start, with the strengths that the effects declare for that.
+    rough : as of `Fitter.fit`.
+    """
+    candidates = tuple(candidates)
+    try:
+        fitter = workshop.fitter(candidates)
+        if afresh:
+            strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
+            fit = fitter.fit(train, seed, strengths)
+        else:
+            start = start_at(base, screen.question, screen.found, index)
+            new = [c.strength for c in candidates[-len(index) :]]
+            start = _shortened(fitter, start, new, train, seed)
+            information = None if fitter.exact else _information(fitter, screen, index, train)
+            fit = fitter.fit(train, seed, start, searched=True, information=information,
+                             quick=len(candidates) > 1, rough=rough)  # fmt: skip
+        for _ in range(AGAIN):
+            if not open_ended(fit, base):
+                break
+            more = fitter.fit(train, seed, fit.start, searched=True, quick=len(candidates) > 1,
+                              rough=rough)  # fmt: skip
+            fit = max(fit, more, key=lambda f: f.log_likelihood)
+    except SSMError as error:
+        return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
+    name = " and ".join(map(str, candidates))
+    if not np.isfinite(fit.log_likelihood):
+        return NotApplicable(f"{name}: the likelihood is zero")
+    gain = fit.log_likelihood - base.log_likelihood
+    if open_ended(fit, base):  # what it happened to reach is no rank
+        return NotApplicable(
+            f"{name}: its fit did not settle: it gains {gain:.0f} nats at least, and about "
+            f"{fit.distance:.0f} may be left"
+        )
+    return Refit(tuple(index), candidates, fitter, fit, gain)
+
+
+def open_ended(fit: Fit, base: Fit) -> bool:
+    """Whether a fit is so far from its top that what it gains says little."""
+    gain = fit.log_likelihood - base.log_likelihood
+    return not fit.converged and fit.distance > max(OPEN, OPEN_SHARE * abs(gain))
+
+
+def _shortened(
+    fitter: Fitter, start: dict[str, np.ndarray], strengths: Sequence[str],
+    train: Sequence[Experiment], seed: np.random.SeedSequence,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """The start, or one with smaller strengths of the last effects where that is more likely: the
+    quadratic may promise a top beyond the data's cliff."""
+    if fitter.exact:
+        return start
+    problem, stream = fitter.problem, random_state(seed, 4)
+    best, out = -np.inf, start
+    for share in SHARES:
+        tried = start | {n: share * start[n] for n in strengths}
+        theta = space_of(problem, fitter.fixed, tried).theta
+        value = fitter.estimate(train, theta, stream.copy())
+        if value > best:
+            best, out = value, tried
+    return out
+
+
+def _information(
+    fitter: Fitter, screen: Screen, index: Sequence[int], train: Sequence[Experiment]
+) -> np.ndarray | None:
+    """(P, P) of the fitter's parameters, from the simulated sets of the screen; None where a
+    strength scales a process, whose score at zero tells nothing."""
+    at, question = list(index), screen.question
+    if np.any(question.quadratic[at]):
+        return None
+    names = [repr(s) for s in question.columns.nuisance]
+    names += [question.candidates[k].strength for k in at]
+    scores = np.concatenate([screen.stacked("nuisance"), screen.stacked("columns")[:, at]], axis=1)
+    rows = [sum(e.steps for e in es) for es in (train, screen.experiments)]
+    found = scores.T @ scores / len(scores) * rows[0] / rows[1]
+    place = {repr(s): i for i, s in enumerate(fitter.problem.trace.parameter_symbols)}
+    own = np.array([place[n] for n in names])
+    out = np.zeros((len(place), len(place)))
+    out[np.ix_(own, own)] = found
+    return out
+
+
+def start_at(
+    base: Fit, question: Question, found: Efficient, index: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Where the quadratic expects the top: the strengths jointly, the parameters as they are."""
+    at = list(index)
+    v = found.covariance[np.ix_(at, at)]
+    strengths = np.linalg.lstsq(v, found.score[at], rcond=1e-6)[0]
+    out = base.start
+    for k, value in zip(at, strengths, strict=True):
+        c = question.candidates[k]
+        if question.quadratic[k]:
+            value = np.sqrt(max(float(value), 1e-12))
+        e = c.effect
+        if e.profile == "wave":  # its phase has been chosen so
+            value = abs(float(value))
+        if np.isfinite(e.upper):  # between two bounds: well inside
+            width = e.upper - e.lower
+            value = np.clip(value, e.lower + 0.02 * width, e.upper - 0.02 * width)
+        elif e.lower == 0.0:
+            least = 0.2 / np.sqrt(max(float(found.variance[k]), 1e-12))
+            value = max(float(value), least)
+        out[c.strength] = np.asarray(float(value))
+    return out
+
+
+def leading(screen: Screen) -> list[int]:
+    """The best shape of each of the best groups, the highest first; of those that are almost the
+    same as one above them none."""
+    out: list[int] = []
+    for k in _by_height(screen):
+        if len(out) < SINGLES and all(abs(screen.found.rho[k, j]) < SAME for j in out):
+            out.append(k)
+    return out
+
+
+def mates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """Candidates that are like the best of the refits, to be refitted beside it."""
+    if not refits:
+        return []
+    best, done = refits[0].index[0], {int(screen.groups[r.index[0]]) for r in refits}
+    like = np.abs(screen.found.rho[best])
+    found = [k for k in _by_height(screen)
+             if like[k] >= ALIKE and int(screen.groups[k]) not in done]  # fmt: skip
+    return sorted(found, key=lambda k: -like[k])[:MATES]
+
+
+def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """The other numbers of states, as delays are, of those near the best that have one: nothing
+    between two of them can be estimated."""
+    near = [r.index[0] for r in refits if refits[0].merit - r.merit <= NEAR]
+    out: list[int] = []
+    for best in near:
+        c = screen.question.candidates[best]
+        if any(c.effect.states.values()) and len(out) < MATES:
+            group = np.flatnonzero(screen.groups == screen.groups[best])
+            out += [int(k) for k in group if k != best and not screen.found.status[k]]
+    return out
+
+
+def asleep(screen: Screen) -> list[int]:
+    """Candidates that the fitted model cannot show, as their variable keeps one sign in the data:
+    a model of the speed whose sensor gives |speed| fits best where speeds never change theirs."""
+    out = []
+    for k in screen.family.leaders:
+        c = screen.question.candidates[k]
+        if c.effect.afresh is None:
+            continue
+        scale = screen.question.scales.scale.get(c.equation)  # a parameter has none
+        if scale is None or scale.quantile(ONE_SIGN) >= -BELOW * scale.quantile(1.0 - ONE_SIGN):
+            out.append(k)
+    return out[:MATES]
+
+
+def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
+    """Of refits that differ in their shapes only, the best; best first."""
+    out: dict[int, Refit] = {}
+    for r in sorted(refits, key=lambda r: -r.merit):
+        out.setdefault(int(screen.groups[r.index[0]]), r)
+    return list(out.values())
+
+
+def _by_height(screen: Screen) -> list[int]:
+    """The best shapes of the groups that promise anything."""
+    found = screen.found
+    return [k for k in screen.family.leaders if found.gain[k] >= LEAST_GAIN and not found.status[k]]
+
+
+def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
+    """Pairs of which the quadratic expects more than of the best single one."""
+    found, family = screen.found, screen.family
+    heads = [k for k in family.leaders
+             if not found.status[k] and not screen.question.quadratic[k]][:12]  # fmt: skip
+    refitted = [r.index[0] for r in refits[:3] if not found.status[r.index[0]]]
+    heads = list(dict.fromkeys([*refitted, *heads]))
+    best, out = float(np.max(found.gain, initial=0.0)), []
+    for i, a in enumerate(heads):
+        for b in heads[i + 1 :]:
+            if abs(found.rho[a, b]) > 0.98:
+                continue
+            v = found.covariance[np.ix_([a, b], [a, b])]
+            s = found.score[[a, b]]
+            strength = np.linalg.solve(v, s)
+            signs = found.sided[[a, b]]
+            if np.any(signs * strength < 0.0):
+                continue
+            out.append((0.5 * float(s @ strength), (a, b)))
+    out.sort(reverse=True)
+    return [pair for gain, pair in out if gain > best + 2.0][:PAIRS]
+
+
+def refit_all(
+    workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
+    given: Sequence[Candidate] = (), *, afresh: bool = False, rough: bool = False,
+) -> tuple[list[Refit], list[str]]:  # fmt: skip
+    """The refits that came to an end, best first, and why the others did not. afresh, rough :
+    `refit`."""
+    shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
+    added = [(*given, *(shaped[k] for k in index)) for index in sets]
+
+    one = partial(_one, workshop, base, screen, list(sets), tuple(train), seed, added, afresh,
+                  rough)  # fmt: skip
+    done, reasons = [], []
+    results = kept.each(stage, len(sets), one)
+    for index, candidates, numbers in zip(sets, added, results, strict=True):
+        name = " and ".join(map(str, candidates))
+        if kept.failures.of_task(f"the refit with {name}", numbers):
+            continue
+        if "reason" in numbers:
+            reasons.append(str(numbers["reason"]))
+            continue
+        fitter = workshop.fitter(candidates)
+        fit = fitter.restored(train, numbers)
+        gain = fit.log_likelihood - base.log_likelihood
+        if gain < -LOST - 3.0 * np.hypot(fit.error, base.error):
+            reasons.append(
+                f"{name}: its fit lost its way, and ended {-gain:.0f} nats below the model's own"
+            )
+            continue
+        cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
+        done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))
+    done.sort(key=lambda r: -r.merit)
+    return done, reasons
+
+
+def _one(
+    workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+    train: Sequence[Experiment], seed: np.random.SeedSequence,
+    added: Sequence[tuple[Candidate, ...]], afresh: bool, rough: bool, k: int,
+) -> Numbers:  # fmt: skip
+    """The numbers of one refit, or the reason why there are none."""
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
+    found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh, rough)
+    if isinstance(found, NotApplicable):
+        return {"reason": np.array(found.reason)}
+    return found.fit.numbers
+
+
+def _shaped(
+    base: Fit, screen: Screen, index: Sequence[int], train: Sequence[Experiment],
+    seed: np.random.SeedSequence,
+) -> dict[int, Candidate]:  # fmt: skip
+    """The candidates at `index`; waves among them with their period and phase by all rows that the
+    refits see, where a frequency that was near enough in the screen would lose its step."""
+    question = screen.question
+    out = {k: question.candidates[k] for k in index}
+    waves = [k for k, c in out.items() if c.effect.profile == "wave" and "period" in dict(c.shape)]
+    if not waves:
+        return out
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 9))
+    try:
+        passes = question.smoother.run(
+            train, question.theta(base.theta), random_state(own), predicted=False
+        )
+    except SSMError:
+        return out
+    rows = np.concatenate([p.rows for p in passes])
+    starts = np.cumsum([0, *(e.steps for e in train[:-1])]).tolist()
+    longest = max(e.steps for e in screen.experiments)
+    for k in waves:
+        out[k] = sharpened(out[k], rows[:, question.place[k]], starts, longest)
+    return out

@@ -1,0 +1,137 @@
+"""Whether the best refit gains more than chance would.
+
+Where noise has grown to swallow what is missing, the score at the fit is far smaller than what a
+refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). So
+the gain itself is tested: by the law of the scores, which is the same to first order (likelihood
+ratio and score tests); in short records, where a fit is quick and first order a poor guide, by its
+own: data sets simulated at theta-hat are fitted, screened and refitted as the data were. That test
+stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991), and as
+soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.screening.familywise import tail_p
+from ssmppl.diagnosis.screening.screen import Screen, compared
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.fit import Fit
+from ssmppl.diagnosis.selection.refit import Refit, start_at
+from ssmppl.errors import SSMError
+from ssmppl.inference.run.seeds import random_state
+
+LAX = 4.0  # times alpha, up to which a closer look is worth it
+TRIED = 2  # candidates refitted in each set, the best by the score
+SETS, CHUNK = 99, 10
+ENOUGH, CLEAR = 30, 0.1  # sets from which their tail is believed, where p is such a share of alpha
+MOST_WORK = 1.5e5  # rows times particles, beyond which the fits would take too long
+MOST_ROWS = 300  # from which on the law of the scores is taken
+
+
+def gain_p(screen: Screen, refit: Refit) -> float:
+    """Family-wise p of what one effect's refit gains, had its score been as large.
+
+    Twice the gain and the square of the score agree to first order where there is no effect; where
+    there is one the gain is the larger of the two, as the refit lets the noise shrink again.
+    """
+    label = int(screen.groups[refit.index[0]])
+    height = screen.family.put(label, float(np.sqrt(2.0 * max(refit.gain, 0.0))))
+    return tail_p(height, screen.family.maxima)
+
+
+def refit_p(
+    workshop: Workshop, base: Fit, screen: Screen, alpha: float, seed: np.random.SeedSequence,
+    kept: Checkpoint,
+) -> float:  # fmt: skip
+    """p of the largest gain among the `TRIED` best, of the data fitted in the way in which the
+    simulated sets are; by their count 1 / (sets + 1) at least, smaller by their tail.
+
+    base : the model's fit to the screen's experiments.
+    """
+    beyond, done = 0, 0
+    seen = kept.of(
+        "the gain that is tested",
+        lambda: {"gain": np.asarray(_gain(workshop, base, screen, screen.experiments, seed, 0))},
+    )
+    gain = float(seen["gain"])
+    if not np.isfinite(gain):
+        return 1.0
+    one = partial(_one, workshop, base, screen, seed)
+    for last in range(CHUNK, SETS + CHUNK, CHUNK):
+        found = kept.each("refitting simulated data", min(last, SETS), one)
+        for f in found:
+            kept.failures.of_task("a refit of simulated data", f)
+        gains = np.array([float(f.get("gain", np.nan)) for f in found])
+        done = int(np.sum(np.isfinite(gains)))
+        beyond = int(np.sum(gains >= gain))
+        if (beyond + 1.0) / (SETS + 1.0) > alpha:
+            break
+        if beyond == 0 and done >= ENOUGH:
+            heights = np.sqrt(2.0 * np.maximum(gains[np.isfinite(gains)], 0.0))
+            p = tail_p(float(np.sqrt(2.0 * max(gain, 0.0))), heights)
+            if p <= CLEAR * alpha:
+                return p
+    return (beyond + 1.0) / (done + 1.0)
+
+
+def _one(
+    workshop: Workshop, base: Fit, screen: Screen, seed: np.random.SeedSequence, k: int
+) -> Numbers:
+    """Of one simulated data set."""
+    question, stream = screen.question, random_state(seed, k)
+    given = question.theta(screen.theta)[: len(question.columns.base.parameter_symbols)]
+    try:
+        data = question.simulator.sets(screen.experiments, given, stream)
+    except SSMError:
+        return {"gain": np.asarray(np.nan)}
+    return {"gain": np.asarray(_gain(workshop, base, screen, data, seed, k + 1))}
+
+
+def _gain(
+    workshop: Workshop, base: Fit, screen: Screen, data: Sequence[Experiment],
+    seed: np.random.SeedSequence, k: int,
+) -> float:  # fmt: skip
+    """Of one data set; NaN where a fit failed."""
+    question, plain = screen.question, workshop.fitter(())
+    stream = random_state(seed, 200, k)
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 100, k))
+    try:
+        fit = plain.fit(data, own, base.start, searched=True, rough=True)
+        at = question.theta(fit.theta)
+        passes = question.smoother.run(data, at, stream, predicted=False)
+        seen = question.statistics(data, passes, stream, checks=False)
+        found = compared(screen.law, screen.usual, seen)
+        out = []
+        for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
+            fitter = workshop.fitter((question.candidates[j],))
+            start = start_at(fit, screen.question, found, [j])
+            again = fitter.fit(data, own, start, searched=True, rough=True)
+            out.append(again.log_likelihood - fit.log_likelihood)
+    except SSMError:
+        return float("nan")
+    return float(np.max(out, initial=0.0))
+
+
+def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
+    """Columns: the best shape of each of the best groups."""
+    groups, out, seen = screen.groups, [], set()
+    for k in np.argsort(-np.where(silent, -1.0, gain), kind="stable"):
+        if groups[k] not in seen:
+            seen.add(groups[k])
+            out.append(int(k))
+        if len(out) == TRIED:
+            break
+    return out
+
+
+def quick_enough(workshop: Workshop, experiments: Sequence[Experiment]) -> bool:
+    """Whether the fits of the test can be afforded."""
+    rows = sum(e.steps for e in experiments)
+    quick = workshop.fitter(()).exact or rows * workshop.settings.particles <= MOST_WORK
+    return quick and rows < MOST_ROWS

@@ -1,0 +1,143 @@
+"""Shapes estimated: the threshold of a stop, the period of a forcing, the memory of a disturbance.
+
+The screen tries a few values of each shape, which is enough to see an effect, and too few to
+predict with it: a period that is off by a quarter of a turn over the record is out of step
+afterwards. So the leading refits are fitted once more with their shapes as parameters, each between
+bounds that the effect declares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from ssmppl.data import Experiment
+from ssmppl.diagnosis.effects.candidate import SHORTEST, Candidate
+from ssmppl.diagnosis.model.scales import Scales, value_of
+from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.selection.augmented_models import Workshop, share_of
+from ssmppl.diagnosis.selection.fit import Fit
+from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.errors import SSMError
+
+SHAPED = 4  # refits at most
+WITHIN, SHARE = 15.0, 0.4  # so many nats behind the best, or with so much of what it gains
+PRICE = 1.0  # nats that a shape has to gain: one for a parameter (Akaike 1974)
+INSIDE = 0.02  # share of the range from either bound where a fit starts
+
+
+def shape_bounds(c: Candidate, scales: Scales) -> dict[str, tuple[float, float]]:
+    """Bounds of each shape parameter that can be estimated."""
+    values, out = dict(c.shape), {}
+    if c.effect.profile == "wave" and {"period", "phase"} <= set(values):
+        frequency, near = 1.0 / values["period"], 1.0 / scales.rows
+        low = max(frequency - near, 0.5 * near)
+        out["period"] = (1.0 / min(frequency + near, 1.0 / SHORTEST), 1.0 / low)
+        out["phase"] = (values["phase"] - np.pi, values["phase"] + np.pi)
+    for name, grid in c.effect.shapes.items():
+        if grid.between is None or name in out:
+            continue
+        scale = scales.scale.get(c.variable(grid.of))
+        low, high = (value_of(grid, v, scale, scales.rows) for v in grid.between)
+        if grid.unit in ("sd", "size"):  # a width of nothing would be another effect
+            least = min(value_of(grid, v, scale, scales.rows) for v in grid.values)
+            low = max(low, 0.5 * least)
+        if low < values[name] < high:
+            out[name] = (low, high)
+    return out
+
+
+def shaped_all(
+    workshop: Workshop, base: Fit, scales: Scales, refits: Sequence[Refit],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
+) -> list[Refit]:  # fmt: skip
+    """The refits, best first; those near the best of them with their shapes estimated, where that
+    gains more than `PRICE` for each shape."""
+    out = list(refits)
+    least = min(out[0].merit - WITHIN, SHARE * out[0].merit)
+    tried = [
+        i for i, r in enumerate(out)
+        if r.merit >= least and any(shape_bounds(c, scales) for c in r.candidates)
+    ][:SHAPED]  # fmt: skip
+
+    one = partial(_one, workshop, scales, [out[i] for i in tried], tuple(train), seed)
+    for i, numbers in zip(tried, kept.each(stage, len(tried), one), strict=True):
+        name = " and ".join(map(str, out[i].candidates))
+        kept.failures.of_task(f"the shapes of {name}", numbers)
+        if "shapes" in numbers:
+            old, shapes = out[i], numbers["shapes"]
+            made = _reshaped(old.candidates, scales, shapes)
+            fitter = workshop.fitter(made)
+            fit = fitter.restored(train, numbers)
+            cost = old.cost + PRICE * len(shapes)
+            gain = fit.log_likelihood - base.log_likelihood
+            if gain - cost > old.merit:
+                out[i] = Refit(old.index, made, fitter, fit, gain, cost)
+    return sorted(out, key=lambda r: -r.merit)
+
+
+def _one(
+    workshop: Workshop, scales: Scales, refits: Sequence[Refit], train: Sequence[Experiment],
+    seed: np.random.SeedSequence, k: int,
+) -> Numbers:  # fmt: skip
+    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, k))
+    return _shaped(workshop, scales, refits[k], train, own)
+
+
+def _shaped(
+    workshop: Workshop, scales: Scales, r: Refit, train: Sequence[Experiment],
+    seed: np.random.SeedSequence,
+) -> Numbers:  # fmt: skip
+    """The values of the shapes, in order, and the fit with them; empty where there is none, or one
+    of them runs to its bound."""
+    known = _bounded(r, scales)
+    start = {n: v for n, v in r.fit.start.items() if n not in known}
+    for name, (low, high, value) in known.items():
+        share = (value - low) / (high - low)
+        start[share_of(name)] = np.asarray(np.clip(share, INSIDE, 1.0 - INSIDE))
+    try:
+        fitter = workshop.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
+        fit = fitter.fit(train, seed, start, searched=True, quick=len(r.candidates) > 1)
+    except SSMError:
+        return {}
+    if not np.isfinite(fit.log_likelihood):
+        return {}
+    values = fit.values()
+    shares = np.array([values[share_of(n)] for n in known])
+    if np.any(np.minimum(shares, 1.0 - shares) < 0.5 * INSIDE):  # it wants to be another effect
+        return {}
+    shapes = np.array(
+        [a + (b - a) * s for (a, b, _), s in zip(known.values(), shares, strict=True)]
+    )
+    plain = workshop.fitter(_reshaped(r.candidates, scales, shapes))
+    own = {repr(s): s.data[1] for s in plain.problem.trace.parameter_symbols}
+    theta = [values[text] if text in values else float(plain.fixed[name])
+             for text, name in own.items()]  # fmt: skip
+    rest = slice(0, len(fit.z) - len(shapes))  # the shapes are the last parameters
+    return {
+        **fit.numbers, "shapes": shapes, "theta": np.array(theta), "z": fit.z[rest],
+        "information": fit.information[rest, rest], "at_bound": fit.at_bound[rest],
+    }  # fmt: skip
+
+
+def _bounded(r: Refit, scales: Scales) -> dict[str, tuple[float, float, float]]:
+    """Bounds and value of each shape that can be estimated, by the name of its parameter."""
+    return {
+        f"{c.shares or c.strength}_{name}": (low, high, dict(c.shape)[name])
+        for c in r.candidates
+        for name, (low, high) in shape_bounds(c, scales).items()
+    }
+
+
+def _reshaped(
+    candidates: Sequence[Candidate], scales: Scales, shapes: np.ndarray
+) -> tuple[Candidate, ...]:
+    """With these values of all shapes that can be estimated."""
+    rest = list(map(float, shapes))
+    out = []
+    for c in candidates:
+        own = {name: rest.pop(0) for name in shape_bounds(c, scales)}
+        out.append(c.with_shape(**own) if own else c)
+    return tuple(out)

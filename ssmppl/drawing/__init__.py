@@ -1,0 +1,1 @@
+"""How results are drawn and numbers are written: what the plots and the report share."""

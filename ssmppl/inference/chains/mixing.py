@@ -1,0 +1,281 @@
+"""Whether the chains of the parameters have mixed, and a warning where they have not.
+
+A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner, "Rank-normalization, folding, and
+localization: an improved R-hat for assessing convergence of MCMC", *Bayesian Analysis* 16 (2021):
+R-hat of split chains, equations (1) to (4), of the ranks and of those of distances from the median
+(section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8) to (11)).
+
+How often the states of a chain change, row by row, and a warning where they hardly do.
+
+Particle Gibbs leaves the right law invariant whatever its update rate, but a row that never changes
+has not been sampled: paths of a conditional particle filter meet in the reference, the earlier the
+row the likelier (Lindsten, Jordan and Schön 2014, section 3). The rate by row is their diagnostic.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from ssmppl.inference.methods.methods import PMMH, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.run.draws import ChainDraws
+from ssmppl.inference.run.problem import Problem
+from ssmppl.language.distributions import Dirac
+from ssmppl.language.model.traced import Site
+
+APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
+FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
+LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be told
+
+
+def mixing_attributes(
+    labels: list[str], draws: np.ndarray, interrupted: bool, method: Method, warmup: int
+) -> dict[str, str]:
+    """What goes to the attributes: nothing, or the warning, which is also given.
+
+    labels, draws : of the P free components, (chains, draws, P). Trials of fewer than `FEWEST`
+    draws and runs that were interrupted have none: they are known to be short.
+    """
+    chains, n, _ = draws.shape
+    if interrupted or chains < LEAST_CHAINS or n < FEWEST or not labels:
+        return {}
+    found = np.array([(rank_r_hat(c), bulk_ess(c)) for c in np.moveaxis(draws, 2, 0)])
+    r_hat, ess = np.where(np.isnan(found), [1.0, np.inf], found).T  # NaN: a constant
+    bad = (r_hat > APART) | (ess < FEW)
+    if not bad.any():
+        return {}
+    apart = bool((r_hat > APART).any())
+    worst = int(np.argmax(r_hat) if apart else np.argmin(ess))
+    others = int(bad.sum()) - 1
+    text = (
+        ("the chains have not mixed" if apart else "the chains hold too few independent draws")
+        + f": R-hat of {labels[worst]} is {r_hat[worst]:.3g}, its bulk ESS {ess[worst]:.3g}"
+        + (f"; {others} other parameters are like it" if others > 1 else "")
+        + ("; one other parameter is like it" if others == 1 else "")
+        + f". R-hat has to be below {APART:g} and the ESS at least {FEW:g} before means and "
+        f"intervals are used. Take more draws (there were {n} of each chain) and warmup ({warmup})"
+        + _instead(method)
+    )
+    warnings.warn(text, stacklevel=3)
+    return {"mixing_warning": text}
+
+
+def _instead(method: Method) -> str:
+    """What else can be done."""
+    name = type(method).__name__
+    if getattr(method, "interweave", "auto") is False:
+        return f', or ssm.{name}(interweave="auto")'
+    if isinstance(method, (Gibbs, MetropolisHastings)):
+        other = "MetropolisHastings" if isinstance(method, Gibbs) else "Gibbs"
+        return f", or another method, such as ssm.{other}()"
+    other = 'PGAS(interweave="auto")' if isinstance(method, PMMH) else "PMMH()"
+    return f", more particles, or another method, such as ssm.{other}"
+
+
+def rank_r_hat(draws: np.ndarray) -> float:
+    """The larger R-hat of ranks and of folded ranks, split chains; draws (chains, n)."""
+    halves = _split(draws)
+    return max(_r_hat(_ranked(halves)), _r_hat(_ranked(np.abs(halves - np.median(halves)))))
+
+
+def bulk_ess(draws: np.ndarray) -> float:
+    """Effective sample size of the ranks of split chains, draws (chains, n).
+
+    Autocorrelations are summed up to where Geyer's pairs of them turn negative, made to fall
+    (Geyer 1992, "Practical Markov chain Monte Carlo").
+    """
+    z = _ranked(_split(draws))
+    chains, n = z.shape
+    centred = z - z.mean(axis=1, keepdims=True)
+    size = 1 << (2 * n - 1).bit_length()
+    power = np.abs(np.fft.rfft(centred, size, axis=1)) ** 2
+    covariance = (np.fft.irfft(power, size, axis=1)[:, :n] / n).mean(axis=0)
+    within = covariance[0] * n / (n - 1.0)
+    total = covariance[0] + z.mean(axis=1).var(ddof=1)
+    if not total > 0.0:
+        return np.nan
+    rho = 1.0 - (within - covariance) / total
+    rho[0] = 1.0
+    pairs = rho[: 2 * ((n - 1) // 2)].reshape(-1, 2).sum(axis=1)
+    end = int(np.argmax(np.append(pairs[:-1] < 0.0, True)))
+    falling = np.minimum.accumulate(pairs[:end])
+    tau = -1.0 + 2.0 * float(falling.sum()) + max(float(rho[2 * end]), 0.0)
+    return chains * n / max(tau, 1.0 / np.log10(chains * n))
+
+
+def _split(draws: np.ndarray) -> np.ndarray:
+    """Both halves of each chain, (2 chains, n // 2), without the middle draw of an odd number."""
+    half = draws.shape[1] // 2
+    return np.concatenate([draws[:, :half], draws[:, -half:]])
+
+
+def _ranked(draws: np.ndarray) -> np.ndarray:
+    """Normal scores of the ranks of all draws together, equal ones sharing their mean rank."""
+    _, place, counts = np.unique(draws, return_inverse=True, return_counts=True)
+    mean_rank = np.cumsum(counts) - 0.5 * (counts - 1.0)
+    return ndtri((mean_rank[place.reshape(draws.shape)] - 0.375) / (draws.size + 0.25))
+
+
+def _r_hat(z: np.ndarray) -> float:
+    """Of chains (m, n); NaN where nothing varies."""
+    n = z.shape[1]
+    within, between = z.var(axis=1, ddof=1).mean(), n * z.mean(axis=1).var(ddof=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return float(np.sqrt((between / within + n - 1.0) / n))
+
+
+LOW = 0.02  # share of draws at which a row changes, below which there is a warning
+STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
+Paths = tuple[np.ndarray, ...]
+PIECE = 2**25  # bytes of draws that are looked at together
+FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
+
+
+@dataclass(frozen=True)
+class Watch:
+    """How the trajectories of a chain have moved, for one whose draws leave them out.
+
+    waiting : draws of the warmup to come. draws : n since then. Of these for each experiment,
+    (T, D): first, last; changed, how often a number was another than in the draw before; mean;
+    square, the sum of squared distances from it.
+    """
+
+    waiting: int
+    draws: int = 0
+    first: Paths = ()
+    last: Paths = ()
+    changed: Paths = ()
+    mean: Paths = ()
+    square: Paths = ()
+
+    @np.errstate(invalid="ignore", over="ignore")  # as in `movement`
+    def after(self, paths: Sequence[np.ndarray]) -> Watch:
+        """With one more draw (Welford 1962)."""
+        if self.waiting:
+            return replace(self, waiting=self.waiting - 1)
+        new, n = tuple(p.copy() for p in paths), self.draws + 1
+        if n == 1:
+            none = tuple(np.zeros_like(p) for p in new)
+            return Watch(0, 1, new, new, none, new, none)
+        off = [x - m for x, m in zip(new, self.mean, strict=True)]
+        mean = tuple(m + o / n for m, o in zip(self.mean, off, strict=True))
+        apart = [x - m for x, m in zip(new, mean, strict=True)]
+        square = tuple(s + o * a for s, o, a in zip(self.square, off, apart, strict=True))
+        pairs = zip(self.changed, new, self.last, strict=True)
+        changed = tuple(c + (x != before) for c, x, before in pairs)
+        return Watch(0, n, self.first, new, changed, mean, square)
+
+
+def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
+    """What goes to the attributes: the least rate over rows, and the warning, which is also given.
+
+    The rate of a row is the share of successive draws between which some component changed that is
+    not deterministic. A discrete state that the data determine need not change: its rows count
+    where the chains differ besides. Where draws leave trajectories out, all that the chains have
+    made count, which after an interrupt, or in a checkpoint that holds more, may be more draws than
+    were asked for.
+    """
+    least, stuck = 1.0, []
+    kept = "path_0" in result[0].draws
+    draws = min(len(c.draws["path_0"]) if kept else c.state.watch.draws for c in result)
+    if draws < 2:
+        return {}
+    for i, e in enumerate(problem.experiments):
+        free, discrete = random_components(problem, e.steps)
+        if kept:
+            rate, ever, apart = movement([c.draws[f"path_{i}"] for c in result])
+        else:
+            rate, ever, apart = watched_movement([c.state.watch for c in result], i)
+        # a continuous one that stands still is never right
+        counted = free & (~discrete | (apart > STUCK_APART))
+        varied = free & ever
+        if (counted | varied).any():
+            least = min(least, float(rate[counted | varied].min()))
+        if draws >= FEWEST_FOR_RATES:
+            rows = np.flatnonzero((counted & (rate < LOW)).any(axis=1))
+            stuck += [(i, int(rows[0]) + 1, int(rows[-1]) + 1, len(rows))] if len(rows) else []
+    if not stuck:
+        return {"trajectory_update_rate": least}
+    several = len(problem.experiments) > 1
+    where = "; ".join(
+        f"{n} rows from {first} to {last}" + (f" of experiment {i + 1}" if several else "")
+        for i, first, last, n in stuck
+    )
+    text = (
+        f"the trajectory hardly ever changed at {where} (fewer than {LOW:.0%} of the draws): these "
+        "states, and parameters that hang on them, were not sampled. Take more particles, or "
+        "ssm.PMMH()"
+    )
+    warnings.warn(text, stacklevel=3)
+    return {"trajectory_update_rate": least, "trajectory_warning": text}
+
+
+def random_components(problem: Problem, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """(T, D) each: which components have a law of their own, and which of them are discrete."""
+    trace = problem.trace
+    place = {s: k for k, s in enumerate(trace.state_symbols)}
+    free = np.zeros((steps, len(place)), dtype=bool)
+    discrete = np.zeros((steps, len(place)), dtype=bool)
+    roles: list[tuple[slice, Sequence[Site]]] = [
+        (slice(0, 1), list(trace.initial.values())),
+        (slice(1, None), list(trace.transition.values())),
+    ]
+    for rows, sites in roles:
+        for site in sites:
+            columns = [place[s] for s in site.components]
+            free[rows, columns] = not isinstance(site.distribution, Dirac)
+            discrete[rows, columns] = site.distribution.support().kind == "integers"
+    return free, discrete
+
+
+@np.errstate(invalid="ignore", over="ignore")  # of states that overflow, which say nothing here
+def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each chain's draws (draws, T, D), which may lie on disk and are read in pieces: the share
+    of successive draws that differ, whether any differ, and R-hat, 1 where draws are not finite;
+    (T, D) each."""
+    n, shape = len(paths[0]), paths[0].shape[1:]
+    size = max(1, PIECE // max(1, len(paths) * paths[0][0].nbytes))
+    changed, ever = np.zeros(shape, dtype=int), np.zeros(shape, dtype=bool)
+    mean = square = np.zeros((len(paths), *shape))
+    first, last = paths[0][:1], None
+    for a in range(0, n, size):
+        piece = np.stack([p[a : a + size] for p in paths])
+        changed += (piece[:, 1:] != piece[:, :-1]).sum(axis=(0, 1))
+        if last is not None:
+            changed += (piece[:, 0] != last).sum(axis=0)
+        last = piece[:, -1]
+        ever |= (piece != first).any(axis=(0, 1))
+        new = piece.mean(axis=1)
+        m, off = piece.shape[1], new - mean  # (Chan, Golub and LeVeque 1983)
+        square = square + piece.var(axis=1) * m + off**2 * (a * m / (a + m))
+        mean = mean + off * (m / (a + m))
+    return changed / (len(paths) * (n - 1)), ever, gelman_rubin(mean, square / (n - 1))
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def watched_movement(watches: Sequence[Watch], i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `movement`, of experiment i of chains that were watched."""
+    changed = np.stack([w.changed[i] for w in watches])
+    start = watches[0].first[i]
+    ever = (changed > 0).any(axis=0) | np.any([w.first[i] != start for w in watches], axis=0)
+    mean = np.stack([w.mean[i] for w in watches])
+    variance = np.stack([w.square[i] / (w.draws - 1) for w in watches])
+    pairs = sum(w.draws - 1 for w in watches)
+    return changed.sum(axis=0) / pairs, ever, gelman_rubin(mean, variance)
+
+
+def gelman_rubin(means: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """R-hat (T, D) of chains by their means and variances (chains, T, D) (Gelman and Rubin 1992);
+    1 where nothing ever varied, infinite where chains stand still apart, and for one chain 1."""
+    if len(means) < 2:
+        return np.ones(means.shape[1:])
+    within = variances.mean(axis=0)
+    between = means.var(axis=0, ddof=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.sqrt(1.0 + between / within)
+    return np.where(between > 0.0, ratio, 1.0)

@@ -1,0 +1,33 @@
+"""Methods that need the density of the states' laws, where a covariance leaves none."""
+
+from __future__ import annotations
+
+from ssmppl.analysis.structure import linear_gaussian, without_density
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.language.model.traced import Trace
+
+WITHOUT = {  # what to use instead: of a linear Gaussian model, and of others
+    "sample": ("ssm.MetropolisHastings()", "ssm.PMMH()"),
+    "maximize": ("ssm.DirectOptimization()", "ssm.IF2()"),
+    "smooth": ("ssm.KalmanSmoother()", 'ssm.FFBSi(kernel="genealogy")'),
+    "score": ('proposal="auto"', "ssm.maximize with ssm.IF2()"),
+}
+
+
+def need_density(trace: Trace, method: str, verb: str) -> None:
+    """Refuse a method that weighs states by the density of their transition where there is none.
+
+    Raises
+    ------
+    ArgumentError : a covariance is singular; names the law, and what needs no density.
+    """
+    reason = without_density(trace)
+    if reason is None:
+        return
+    linear = not isinstance(linear_gaussian(trace), NotApplicable)
+    raise ArgumentError(
+        f"{method} needs the density of the states: {reason.reason}",
+        fix=f"use {WITHOUT[verb][0 if linear else 1]}, which needs none; or write components that "
+        "follow without a noise of their own as states of law ssm.Dirac",
+        where=reason.where,
+    )

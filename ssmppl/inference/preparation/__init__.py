@@ -1,0 +1,1 @@
+"""What is decided before a method runs: which one, which proposal, and where it begins."""

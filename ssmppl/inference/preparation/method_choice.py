@@ -1,0 +1,190 @@
+"""Which method a verb takes where it is left to choose, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.proposals.smooth import smooth_filter_applies
+from ssmppl.analysis.structure import deterministic_memory, noisy_start, without_density
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.methods.methods import (
+    IF2,
+    PGAS,
+    PMMH,
+    DirectOptimization,
+    FFBSi,
+    ForwardBackward,
+    Gibbs,
+    KalmanSmoother,
+    MetropolisHastings,
+    ScoreAscent,
+)
+from ssmppl.inference.particles.deterministic import Deterministic
+from ssmppl.inference.preparation.exact_models import KIND
+from ssmppl.language.distributions import Dirac
+from ssmppl.language.model.traced import Trace
+
+ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
+FEW = 6  # numbers that a random walk moves at once without trouble
+
+
+def choose_sampler(
+    kind: str | NotApplicable,
+    updates: Sequence[Update],
+    numbers: int,
+    stuck: str = "",
+    singular: NotApplicable | None = None,
+) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
+    """The method for a model of this kind with these updates, and the reason.
+
+    kind : of an exact model (`KIND`), or why it is none. Where the states are drawn exactly, Gibbs
+    needs no tuning if every parameter has a closed-form conditional; those that mix slowly given
+    the states are moved with them integrated out besides. Where some have none, slices given the
+    states mix slowly and cost a pass over the data each, and a random walk on the exact likelihood,
+    which integrates the states out, is better as long as the parameters are few; where the states
+    have no noise there is nothing else.
+    updates : where the states are drawn exactly. numbers : of the free parameters. stuck : as of
+    `why_stuck`, for the others. singular : why the states have no joint density, as Gibbs and PGAS
+    need it.
+    """
+    if singular is not None:
+        if isinstance(kind, NotApplicable):
+            return PMMH(), f"{singular.reason}: a random walk on the particle filter's likelihood"
+        return MetropolisHastings(), (
+            f"{kind}, and {singular.reason}: a random walk on the exact likelihood, "
+            "which needs none"
+        )
+    if isinstance(kind, NotApplicable):
+        if not stuck:
+            return PGAS(interweave="auto"), (
+                "the model is not linear Gaussian: trajectories by conditional SMC; parameters "
+                "that the warmup finds slow given the states are moved along with these"
+            )
+        if numbers <= FEW:
+            return PMMH(), f"{stuck}: a random walk on the particle filter's likelihood"
+        return PGAS(), (
+            f"{stuck}, but {numbers} numbers are too many for a random walk: conditional SMC "
+            "without ancestor sampling; see the attribute trajectory_update_rate, and take more "
+            "particles where it is low"
+        )
+    if kind == KIND[Deterministic]:
+        return MetropolisHastings(), (
+            f"the model is {kind}, so that its likelihood is exact, and its gradient, where "
+            "there is one in closed form, guides the steps"
+        )
+    open_ = [c for u in updates if u.conditional is None for c in u.block]
+    if not open_:
+        if not updates:
+            return Gibbs(), (
+                f"{kind}, without free parameters: exact trajectories by backward sampling"
+            )
+        reason = (
+            f"{kind}, and every parameter has a closed-form conditional: exact trajectories by "
+            "backward sampling"
+        )
+        if kind != "linear Gaussian":
+            return Gibbs(), reason
+        return Gibbs(interweave="auto"), (
+            f"{reason}; parameters that the warmup finds slow given the states are moved with the "
+            "states integrated out too"
+        )
+    named = ", ".join(dict.fromkeys(open_))
+    if numbers <= FEW:
+        return MetropolisHastings(), (
+            f"{kind}, but {named} has no closed-form conditional: a random walk on the "
+            "exact likelihood"
+        )
+    return Gibbs(), (
+        f"{kind}, with {numbers} numbers to move, too many for a random walk: exact "
+        f"trajectories, and slices for {named}"
+    )
+
+
+def why_stuck(trace: Trace, rows: int | None) -> str:
+    """Why PGAS cannot be relied on to move the trajectories of a model; empty where it can.
+
+    Where a deterministic component never forgets its past, no ancestor can be sampled for the
+    reference trajectory, and its early states change the less the more rows there are for each
+    particle (Lindsten, Jordan and Schön 2014; Lindsten, Bunch, Singh and Schön 2015). PMMH draws
+    all of the trajectory anew. Given a trajectory of counts, parameters can move only little,
+    however well it moves itself.
+
+    rows : of the longest data set; None: not known.
+    """
+    if deterministic_memory(trace) is not None:
+        return ""
+    if noisy_start(trace):
+        return (
+            "every state follows from those before it, so that PGAS has no trajectory to move; "
+            + start_as_parameter(trace)
+        )
+    random = [
+        s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
+    ]
+    reason = (
+        "a deterministic component never forgets its past, so that PGAS cannot join a trajectory "
+        "to other ancestors"
+    )
+    if all(d.support().kind == "integers" for d in random):
+        return f"{reason}, and given a trajectory of counts parameters move slowly"
+    if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
+        return f"{reason}, and over more than {ROWS_WITHOUT_ANCESTORS} rows hardly moves its start"
+    return ""
+
+
+def start_as_parameter(trace: Trace) -> str:
+    """How a model whose states have noise in their first row only is made exact."""
+    name = noisy_start(trace)[0].name
+    return (
+        f"only the first row of the states has noise: with it as a parameter ({name}_first in "
+        f"@prior, ssm.Dirac({name}_first) in @initial) the likelihood is exact, and everything "
+        "faster"
+    )
+
+
+def choose_maximiser(
+    kind: str | NotApplicable, trace: Trace
+) -> tuple[DirectOptimization | ScoreAscent | IF2, str]:
+    """The method of `maximize` for a model of this kind, and the reason."""
+    if not isinstance(kind, NotApplicable):
+        return DirectOptimization(), (
+            f"the model is {kind}, so that its likelihood and score are exact"
+        )
+    obstacle = smooth_filter_applies(trace)
+    if obstacle is None:
+        return DirectOptimization(), (
+            "for one scalar state a particle filter's likelihood can be made continuous in the "
+            "parameters"
+        )
+    singular = without_density(trace)
+    if singular is not None:
+        return IF2(), f"{singular.reason}: iterated filtering, which needs none"
+    if deterministic_memory(trace) is None and not noisy_start(trace):
+        return IF2(), (
+            "components that follow without a noise of their own never forget the past, so that "
+            "particle smoothing takes time that grows with the square of the rows: iterated "
+            "filtering, which only simulates; of some hundred rows ScoreAscent is more precise"
+        )
+    return ScoreAscent(), (
+        "Fisher's identity gives the score by particle smoothing; direct optimisation does not "
+        f"apply: {obstacle.reason}"
+        + (f"; {start_as_parameter(trace)}" if noisy_start(trace) else "")
+    )
+
+
+def choose_smoother(
+    kind: str | NotApplicable, trace: Trace
+) -> tuple[KalmanSmoother | ForwardBackward | FFBSi, str]:
+    """The method of `smooth` for a model of this kind, and the reason."""
+    if isinstance(kind, NotApplicable):
+        singular = without_density(trace)
+        if singular is not None:
+            return FFBSi(kernel="genealogy"), (
+                f"{singular.reason}: the ancestors of the filter's own particles, which need none"
+            )
+        return FFBSi(), f"the model is not linear and Gaussian: {kind.reason}"
+    if kind == KIND[Deterministic]:
+        return FFBSi(kernel="genealogy"), f"the model is {kind}, and every trajectory is the same"
+    chosen = KalmanSmoother() if kind == "linear Gaussian" else ForwardBackward()
+    return chosen, f"the model is {kind}"

@@ -1,0 +1,217 @@
+"""Estimate: what `maximize` returns, on the natural scale of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl import markup
+from ssmppl.data import unpack_parameters
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.language.model.traced import Trace
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+__all__ = ["NO_METHOD", "Estimate", "by_name", "free_components", "make_estimate", "table"]
+
+NO_METHOD = "none"  # where every parameter is fixed
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters that maximise the likelihood (or the posterior density), with their uncertainty.
+
+    Parameters
+    ----------
+    parameters : value of every parameter by name, the fixed ones too: a number, or an array of the
+        prior's shape.
+    covariance : of the free components, labelled as `phi`, `A[0, 1]`: the inverse of the observed
+        information. NaN where the information is not positive definite; `attrs["covariance"]` then
+        says so. NaN too for a component whose maximum is at an edge of its support
+        (`attrs["held_at_edge"]`, exact models only): the others' is that with it held there.
+    standard_errors : roots of its diagonal, by name, as `parameters`; without the fixed ones.
+    log_likelihood : at the estimate; with particles an estimate, whose standard error is
+        `attrs["log_likelihood_error"]`.
+    iterates : Dataset with dim `iteration`, the way to the estimate; of `IF2` with dim `start` too,
+        and with `perturbed_log_likelihood`, what the swarm's particle filter made of each pass. Of
+        exact methods with `objective`, the log-likelihood, with the log prior density where the
+        posterior was maximised. Where a parameter has such a name, an underscore follows theirs.
+    attrs : method, why it was taken, `converged`, `interrupted`, seed, seconds; where random
+        numbers were used, `monte_carlo_errors`: the estimate's own standard errors by component.
+    """
+
+    parameters: dict[str, float | np.ndarray]
+    covariance: pd.DataFrame
+    standard_errors: dict[str, float | np.ndarray]
+    log_likelihood: float
+    iterates: xr.Dataset
+    attrs: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        lines, rows = [*self._head(), ""], self._rows()
+        widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
+        for row in rows:
+            cells = [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
+            lines.append("  ".join([row[0].ljust(widths[0]), *cells]).rstrip())
+        return "\n".join(lines + [f"\nNote: {note}" for note in self.notes])
+
+    def _repr_html_(self) -> str:
+        title, likelihood = self._head()
+        head, *rows = self._rows()
+        cells = [(markup.code(row[0]), *map(markup.text, row[1:])) for row in rows]
+        notes = "".join(markup.paragraph(f"Note: {note}") for note in self.notes)
+        parts = markup.heading(title), markup.paragraph(likelihood), markup.table(cells, head)
+        return "".join(parts) + notes
+
+    def _head(self) -> tuple[str, str]:
+        """What was maximised and how, and the log-likelihood."""
+        name, method = self.attrs.get("model", ""), self.attrs.get("method", "")
+        title = f"{name}: maximum {self.attrs.get('objective', '')} by {method}"
+        if method == NO_METHOD:
+            title = f"{name}: likelihood of the given parameters"
+        error = self.attrs.get("log_likelihood_error")
+        spread = f" (Monte Carlo error {error:.2g})" if error else ""
+        return title, f"log-likelihood {self.log_likelihood:.6f}{spread}"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        """The table as text, its head first."""
+        shown = self.table()
+        rows = [("", *(str(c).replace("_", " ") for c in shown.columns))]
+        for label, cells in shown.iterrows():
+            value, *errors = map(float, cells)
+            known = [f"{e:.3g}" if e else "" for e in errors]
+            if errors[0] == 0.0:
+                known[0] = "fixed"
+            rows.append((str(label), f"{value:.6g}", *known))
+        return rows
+
+    def table(self) -> pd.DataFrame:
+        """One row for each component: estimate, standard error, Monte Carlo error if there is one.
+
+        The standard error of a fixed parameter is zero.
+
+        Returns
+        -------
+        DataFrame : indexed as `covariance`, with the fixed components.
+        """
+        import pandas as pd
+
+        noise: dict[str, float] = self.attrs.get("monte_carlo_errors") or {}
+        rows: dict[str, dict[str, float]] = {}
+        for name, value in self.parameters.items():
+            errors = self.standard_errors.get(name)
+            for index in np.ndindex(np.shape(value)):
+                label = name + (f"[{', '.join(map(str, index))}]" if index else "")
+                row = {"estimate": float(np.asarray(value)[index])}
+                row["standard_error"] = 0.0 if errors is None else float(np.asarray(errors)[index])
+                if noise:
+                    lower = ", ".join(map(str, sorted(index, reverse=True)))
+                    row["monte_carlo_error"] = noise.get(label, noise.get(f"{name}[{lower}]", 0.0))
+                rows[label] = row
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    @property
+    def notes(self) -> list[str]:
+        """What has to be known before the figures are used."""
+        out = []
+        if self.attrs.get("interrupted"):
+            out.append("interrupted; this is the best point so far")
+        elif self.attrs.get("converged") is False:
+            reason = self.attrs.get("stopped", "")
+            out.append("not converged" + (f": {reason}" if reason else ""))
+        out += [
+            f"{label} is within a standard error of {edge:g}, the edge of what it can be: no "
+            "interval about it follows from that standard error"
+            for label, edge in self.attrs.get("at_edge", {}).items()
+        ]
+        out += [
+            f"the maximum in {label} is at {edge:g}, the edge of what it can be, and has no "
+            "standard error; those of the others hold with it there"
+            for label, edge in self.attrs.get("held_at_edge", {}).items()
+        ]
+        how, _, reason = str(self.attrs.get("covariance", "")).partition(": ")
+        return [*out, f"no standard errors: {reason}"] if how == "none" else out
+
+
+def free_components(trace: Trace, held: dict[str, np.ndarray]) -> np.ndarray:
+    """(P,) which components of theta belong to parameters that are not fixed."""
+    return np.array([s.data[1] not in held for s in trace.parameter_symbols], dtype=bool)
+
+
+def by_name(trace: Trace, values: np.ndarray) -> dict[str, float | np.ndarray]:
+    """Values (P,) of the components by name, numbers for scalar parameters."""
+    named = unpack_parameters(trace, values)
+    return {n: float(v) if v.ndim == 0 else v for n, v in named.items()}
+
+
+def table(labels: list[str], matrix: np.ndarray) -> pd.DataFrame:
+    """A square matrix with these labels on both sides."""
+    import pandas as pd
+
+    return pd.DataFrame(matrix, index=labels, columns=labels)
+
+
+def _edges(trace: Trace, theta: np.ndarray, errors: np.ndarray) -> dict[str, float]:
+    """The components within a standard error of an end of their supports, and that end."""
+    env = dict(zip(trace.parameter_symbols, theta, strict=True))
+    spread = dict(zip(trace.parameter_symbols, errors, strict=True))
+    found: dict[str, float] = {}
+    for site in trace.parameters.values():
+        support = site.distribution.support()
+        if support.kind != "interval":
+            continue
+        ends = (np.broadcast_to(e.view(np.ndarray), site.shape).ravel()
+                for e in (array(support.lower), array(support.upper)))  # fmt: skip
+        for s, *own in zip(site.value.ravel(), *ends, strict=True):
+            for edge in evaluate(own, env):
+                if abs(env[s] - float(edge)) < spread[s]:
+                    found[repr(s)] = float(edge)
+    return found
+
+
+def beside(parameters: Collection[str], name: str) -> str:
+    """What iterates call a dimension or a figure, where a parameter may have the name."""
+    return f"{name}_" if name in parameters else name
+
+
+def make_estimate(
+    trace: Trace, theta: np.ndarray, covariance: np.ndarray, log_likelihood: float,
+    iterates: np.ndarray, held: dict[str, np.ndarray], attrs: dict[str, Any],
+    figures: Mapping[str, np.ndarray] | None = None,
+) -> Estimate:  # fmt: skip
+    """An Estimate from arrays over all P components: theta (P,), covariance (P, P), iterates
+    (K, P), or (starts, K, P); figures, (K,) or (starts, K), go with the iterates.
+
+    Rows and columns of fixed parameters are left out of the covariance.
+    """
+    dims = [beside(trace.parameters, n) for n in ("start", "iteration")[3 - iterates.ndim :]]
+    free = free_components(trace, held)
+    labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
+    errors = np.full(len(theta), np.nan)
+    with np.errstate(invalid="ignore"):
+        errors[free] = np.sqrt(np.diagonal(covariance)[free])
+    edges = _edges(trace, theta, errors)
+    attrs = {**attrs, "at_edge": edges} if edges else attrs
+    variables = unpack_parameters(trace, iterates) if len(theta) else {}
+    variables |= {beside(trace.parameters, n): v for n, v in (figures or {}).items()}
+    return Estimate(
+        parameters=by_name(trace, theta),
+        covariance=table(labels, covariance[np.ix_(free, free)]),
+        standard_errors={n: v for n, v in by_name(trace, errors).items() if n not in held},
+        log_likelihood=log_likelihood,
+        iterates=to_dataset(
+            variables,
+            sample_dim=tuple(dims),
+            over_time=(),
+            coords={d: np.arange(n) for d, n in zip(dims, iterates.shape, strict=False)},
+            attrs={k: v for k, v in attrs.items() if v is not None},
+        ),
+        attrs=attrs,
+    )

@@ -1,0 +1,101 @@
+"""A model bound to data and compiled: what every algorithm starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals.proposals import Proposal
+from ssmppl.analysis.structure import flat_start
+from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
+from ssmppl.codegen.modules.program import Program, compile_trace
+from ssmppl.data import Experiment, bind
+from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.traced import Trace
+from ssmppl.language.trace import trace
+
+# What filters without particles are called where a proposal is asked for.
+EXACT = ("kalman", "forward", "deterministic")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The traced model, its data sets and its generated program."""
+
+    trace: Trace
+    experiments: tuple[Experiment, ...]
+    program: Program
+
+    @property
+    def rows(self) -> int:
+        """Of all data sets together."""
+        return sum(e.steps for e in self.experiments)
+
+    def proposal(self, name: str, integrate: bool = False, others: Sequence[str] = ()) -> Proposal:
+        """A derived proposal.
+
+        integrate : whether it may integrate states out, so that particles are of the others only,
+            or look ahead by a guide.
+        others : what else the caller takes under this name, for the error.
+
+        Raises
+        ------
+        ArgumentError : no proposal has this name, or it could not be derived; gives the reason.
+        """
+        found = self.program.proposal(name) if isinstance(name, str) else None
+        if found is None:
+            if name in EXACT:
+                raise ArgumentError(
+                    f"proposal={name!r} is an exact filter, without particles",
+                    fix="leave method= out, or take a method whose likelihood is exact, as "
+                    "MetropolisHastings, Gibbs, EM and DirectOptimization do where there is one",
+                )
+            known = [n for n in self.program.proposals if integrate or n != "twisted"]
+            known = ["auto", *known, *((*MARGINAL, "tempered") if integrate else ()), *others]
+            raise ArgumentError(
+                f"proposal={name!r} is not known for this model",
+                fix=f"use one of: {listing(name, known)}",
+            )
+        if isinstance(found, NotApplicable):
+            fix = 'use proposal="auto" or "bootstrap"'
+            if flat_start(self.trace):
+                fix = "use an exact method, or give the state a proper law in @initial"
+            raise ArgumentError(f"proposal={name!r} does not apply: {found}", fix=fix)
+        if name in MARGINAL and not integrate:
+            raise ArgumentError(
+                f"proposal={name!r} integrates states out, and this method needs particles of all "
+                "of them",
+                fix='use proposal="auto", "bootstrap" or "guided"; log_likelihood, '
+                "particle_filter, PMMH and FFBSi know what to do with the others",
+            )
+        return found
+
+
+def missing_of(experiments: Sequence[Experiment]) -> Missing:
+    """What the data lack, as far as the generated code depends on it."""
+    none = all(bool(np.all(e.seen == 1.0)) for e in experiments)
+    partial: frozenset[str] = frozenset()
+    return Missing(none, partial.union(*(e.partial for e in experiments)))
+
+
+def pose(model: Model, data: Any) -> Problem:
+    """Trace the model, bind the data and compile.
+
+    Raises
+    ------
+    ModelError, DataError : naming the place, what was found and the fix.
+    """
+    traced = trace(model)
+    if not traced.observations:
+        raise ModelError(
+            f"model {traced.name!r} has no @observation function: there is nothing to condition on",
+            fix="declare the law of y_t with @model.observation",
+            where=model.location,
+        )
+    experiments = tuple(bind(traced, data))
+    return Problem(traced, experiments, compile_trace(traced, missing_of(experiments)))

@@ -1,0 +1,25 @@
+"""Seeds of runs, and of all places within a run: chains, repeats, experiments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ssmppl.codegen.kernels.math.random import new_state
+from ssmppl.errors import ArgumentError
+
+
+def seed_sequence(seed: Any) -> np.random.SeedSequence:
+    """The root of a call's random numbers."""
+    whole = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool)
+    if seed is not None and (not whole or seed < 0):
+        raise ArgumentError(
+            f"seed={seed!r}", fix="give a whole number of at least 0, or None for a random one"
+        )
+    return np.random.SeedSequence(seed)
+
+
+def random_state(root: np.random.SeedSequence, *path: int) -> np.ndarray:
+    """State of the kernels' generator at a place in the work (chain, repeat, experiment, ...)."""
+    return new_state(np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *path)))

@@ -1,0 +1,354 @@
+"""The verbs `explain` and `compile`: what was derived from a model, and why."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ssmppl import markup
+from ssmppl.analysis.conjugacy.conjugacy import Update, derive_updates
+from ssmppl.analysis.conjugacy.describe import joined
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
+from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable
+from ssmppl.analysis.finite import FiniteStates, finite_states
+from ssmppl.analysis.proposals.noises import Noises, noises
+from ssmppl.analysis.proposals.proposals import Proposal
+from ssmppl.analysis.proposals.tempered import tempered
+from ssmppl.analysis.structure import (
+    LinearGaussian,
+    deterministic_memory,
+    linear_gaussian,
+    without_density,
+)
+from ssmppl.codegen.modules.program import Program, compile_trace
+from ssmppl.data import Experiment, bind, unread
+from ssmppl.data.times import label_text, spacing
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.chains.interweaving import applicable, with_states
+from ssmppl.inference.particles.deterministic import Deterministic
+from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.method_choice import (
+    choose_maximiser,
+    choose_sampler,
+    choose_smoother,
+    why_stuck,
+)
+from ssmppl.inference.run.problem import missing_of
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.transforms import transforms
+from ssmppl.language.trace import trace
+
+PAGE = 100  # columns
+LONGEST_LAW = 600  # characters of a law, some six lines
+MOST_NAMED = 8  # columns that are not read
+TEMPERED = (
+    "for rows that tell far more than the transition: particles are weighed by rising powers of "
+    "the observation's density, and take Metropolis steps between them"
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that was derived from a model; `print` it, or show it in a notebook.
+
+    Attributes
+    ----------
+    structure : the model as a linear Gaussian one, or why it is not.
+    conditional : the states that are linear and Gaussian given the others, or why there are none.
+    finite : the values that its states take where they are few, or why they are not.
+    proposals : by name, how particles move, or why that could not be derived.
+    updates : the Gibbs updates of the parameters, in the order in which they are made.
+    memory : for how many steps a deterministic state remembers; None where it never forgets.
+    noises : what drives the states, or why it cannot be told.
+    eliminable : the parameters that PGAS can integrate out, and why not the others.
+    rows : of the longest data set, where there are data.
+    """
+
+    trace: Trace
+    structure: LinearGaussian | NotApplicable
+    conditional: ConditionallyLinear | NotApplicable
+    finite: FiniteStates | NotApplicable
+    proposals: dict[str, Proposal | NotApplicable]
+    updates: tuple[Update, ...]
+    memory: int | None
+    noises: Noises | NotApplicable
+    eliminable: Eliminable
+    data: str = ""
+    rows: int | None = None
+    labels: tuple[tuple[str, str], ...] = ()
+
+    def sections(self) -> list[tuple[str, list[tuple[str, str]]]]:
+        """The parts of the plan, as `print` shows them.
+
+        Returns
+        -------
+        list of (str, list of (str, str))
+            Of each part its title, and its rows: what, and how.
+        """
+        t = self.trace
+        out = [
+            ("Priors", _laws(t.parameters)),
+            ("Initial law, t = 1", _laws(t.initial)),
+            ("Transition, x_prev to x", _laws(t.transition)),
+            ("Observation", _laws(t.observations)),
+        ]
+        if t.inputs:
+            out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
+                                   for n, s in t.inputs.items()]))  # fmt: skip
+        if self.data:
+            out.append(("Data", [("bound", self.data), *self.labels]))
+        out.append(("Structure", self._structure()))
+        rows = [self._proposal(n, p) for n, p in self.proposals.items()]
+        guided = self.proposals.get("guided")
+        if isinstance(guided, NotApplicable) and tempered(t, Missing()):
+            rows.append(("tempered", TEMPERED))
+        noisy = not isinstance(exact_model(t), Deterministic)
+        if noisy:
+            out.append(("Particle filter", rows))
+            out.append(("Trajectories", [("PGAS", self._trajectories())]))
+        out.append(("Chosen, unless a method is named", self._choices()))
+        singular = without_density(t)
+        if singular is not None:
+            out.append(("Parameters given the states", [("none", _reason(singular))]))
+        elif self.updates and noisy:
+            out.append(("Parameters given the states", [_update(u) for u in self.updates]))
+            out.append(("Interweaved with these, where parameters mix slowly", self._interweaved()))
+            out.append(("Eliminated in PGAS, where asked for", self._eliminated()))
+        return [(title, rows) for title, rows in out if rows]
+
+    def _structure(self) -> list[tuple[str, str]]:
+        if isinstance(self.finite, FiniteStates):
+            return [("finite states", f"{len(self.finite.values)} combinations of values: the "
+                     "likelihood is exact, by the forward algorithm; particles are used only where "
+                     "they are asked for")]  # fmt: skip
+        if isinstance(exact_model(self.trace), Deterministic):
+            return [("no noise", "given the parameters the states are known: the likelihood is "
+                     "exact, by running them once")]  # fmt: skip
+        if isinstance(self.structure, NotApplicable):
+            found = [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
+            if isinstance(self.conditional, ConditionallyLinear):
+                found.append(("given the others", _integrated(self.conditional)))
+            return found
+        return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
+                 "used only where they are asked for")]  # fmt: skip
+
+    def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
+        if isinstance(proposal, NotApplicable):
+            return name, f"not derived: {_reason(proposal)}"
+        return name, proposal.explanation
+
+    def _choices(self) -> list[tuple[str, str]]:
+        exact = exact_model(self.trace)
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        choices: dict[str, tuple[Any, str]] = {
+            "sample": choose_sampler(
+                kind,
+                self.updates,
+                self._numbers(),
+                why_stuck(self.trace, self.rows),
+                without_density(self.trace),
+            )
+        }
+        if self.trace.parameters:
+            choices["maximize"] = choose_maximiser(kind, self.trace)
+        choices["smooth"] = choose_smoother(kind, self.trace)
+        return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
+
+    def _numbers(self) -> int:
+        """How many numbers the parameters have on the unconstrained scale."""
+        return sum(len(p.free) for p in transforms(self.trace))
+
+    def _interweaved(self) -> list[tuple[str, str]]:
+        exact = exact_model(self.trace)
+        found = applicable(self.noises, None if isinstance(exact, NotApplicable) else exact)
+        if isinstance(found, NotApplicable):
+            return [("nothing", _reason(found))]
+        rows = [("PGAS", with_states(found))]
+        if not isinstance(exact, NotApplicable):
+            rows.insert(0, ("Gibbs", f"{', '.join(found.tied)}: moved with the states "
+                            "integrated out, if the warmup finds a parameter slow given the states")
+                        )  # fmt: skip
+        return rows
+
+    def _eliminated(self) -> list[tuple[str, str]]:
+        rows = [
+            (joined(u.components), "integrated out while trajectories are drawn, each particle "
+             f"carrying its statistics: {u.family}")
+            for u in self.eliminable.updates
+        ]  # fmt: skip
+        why = self.eliminable.refused.items()
+        return [*rows, *((repr(c), f"stays: {_reason(reason)}") for c, reason in why)]
+
+    def _trajectories(self) -> str:
+        singular = without_density(self.trace)
+        if singular is not None:
+            return f"does not apply: {_reason(singular)}"
+        flat = [s.name for s in self.trace.initial.values() if not s.distribution.proper]
+        if flat:
+            return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"
+        if self.memory is None:
+            return (
+                "conditional SMC without ancestor sampling: a deterministic component never "
+                "forgets its past, so a path cannot be joined to another ancestor; take more "
+                "particles, or PMMH"
+            )
+        if self.memory == 0:
+            return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
+        return (
+            "conditional SMC with ancestor sampling, over the noisy components: deterministic "
+            f"ones forget their past in {self.memory} step{'s' * (self.memory > 1)}, whose "
+            "densities enter the ancestor weights"
+        )
+
+    def __str__(self) -> str:
+        lines = [f"{self.trace.name}", "=" * len(self.trace.name)]
+        for title, rows in self.sections():
+            lines += ["", title, "-" * len(title)]
+            width = max(len(what) for what, _ in rows)
+            for what, how in rows:
+                first, *rest = [w for line in how.split("\n") for w in _wrapped(line, width)]
+                lines.append(f"{what:<{width}}  {first}".rstrip())
+                lines += [f"{'':<{width}}  {line}".rstrip() for line in rest]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        parts = [markup.heading(self.trace.name)]
+        for title, rows in self.sections():
+            cells = [(markup.code(what), markup.text(how)) for what, how in rows]
+            parts.append(f"<b>{markup.text(title)}</b>{markup.table(cells, left=(0, 1))}")
+        return "".join(parts)
+
+
+def _reason(found: NotApplicable) -> str:
+    return found.reason + (f"\n{found.where.short}" if found.where else "")
+
+
+def _integrated(split: ConditionallyLinear) -> str:
+    names = ", ".join(map(repr, split.linear))
+    verb = "is" if len(split.linear) == 1 else "are"
+    return (
+        f"{names} {verb} linear and Gaussian: a Kalman filter for each particle integrates "
+        f"{'it' if verb == 'is' else 'them'} out, and only the other states are sampled "
+        '(Rao-Blackwellised; proposals "marginal", "marginal_guided", "marginal_auxiliary")'
+    )
+
+
+def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
+    return [(s.name, _cut(f"~ {s.distribution!r}")) for s in sites.values()]
+
+
+def _cut(law: str) -> str:
+    """A law short enough to be read: one whose mean is a loop of small steps fills pages."""
+    if len(law) <= LONGEST_LAW:
+        return law
+    head = law[: law.rindex(" ", 0, LONGEST_LAW)]
+    return f"{head} ... (cut here; ssm.compile(model).source() has all of it, in steps)"
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    """A line folded to the page, its continuation indented a little further."""
+    indent = " " * (len(line) - len(line.lstrip()))
+    room = max(PAGE - width - 2, 40)
+    return textwrap.wrap(
+        line, room, subsequent_indent=indent + "  ", break_long_words=False,
+        break_on_hyphens=False, drop_whitespace=True,
+    ) or [""]  # fmt: skip
+
+
+def _update(update: Update) -> tuple[str, str]:
+    title, _, law = str(update.explanation).partition(": ")
+    return title, law
+
+
+def explain(model: Model, data: Any = None) -> Plan:
+    """What is derived from the model, and why: structure, proposals, one update per parameter.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : checks that they fit, and takes account of what is missing in them.
+
+    Returns
+    -------
+    Plan : `print` it; it renders as tables in a notebook.
+
+    Raises
+    ------
+    ModelError, DataError : what is wrong, where, and the fix.
+    """
+    traced = trace(model)
+    missing, bound, rows = Missing(none=True), "", None
+    labels: tuple[tuple[str, str], ...] = ()
+    if data is not None:
+        experiments = bind(traced, data)
+        missing = missing_of(experiments)
+        gaps = sum(int((e.seen == 0).sum()) for e in experiments)
+        rows = max(e.steps for e in experiments)
+        bound = ", ".join(f"{e.steps} rows" for e in experiments)
+        bound += f", {gaps} missing" if gaps else ", none missing"
+        labels = _labels(experiments) + _unread(unread(traced, data), experiments)
+    program = compile_trace(traced, missing)
+    return Plan(
+        traced,
+        linear_gaussian(traced),
+        conditionally_linear(traced),
+        finite_states(traced),
+        program.proposals,
+        tuple(derive_updates(traced, (), missing)),
+        deterministic_memory(traced),
+        noises(traced, missing),
+        eliminable(traced, (), missing),
+        bound,
+        rows,
+        labels,
+    )
+
+
+def _labels(experiments: Sequence[Experiment]) -> tuple[tuple[str, str], ...]:
+    """How rows are labelled: the ends of each data set that has labels, and uneven steps."""
+    times = [e.time for e in experiments if e.time is not None]
+    if not times:
+        return ()
+    ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
+    uneven = next((found for t in times if (found := spacing(t))), "")
+    return (("labels", ends), *([("steps", uneven)] if uneven else []))
+
+
+def _unread(
+    columns: Sequence[str], experiments: Sequence[Experiment]
+) -> tuple[tuple[str, str], ...]:
+    """Columns that no law reads, one of which may have been meant to name the rows."""
+    if not columns:
+        return ()
+    named = ", ".join(columns[:MOST_NAMED]) + (", ..." if len(columns) > MOST_NAMED else "")
+    if all(e.time is None for e in experiments):
+        named += "; rows have numbers: call a column of times or dates `time` to name them"
+    return (("not read", named),)
+
+
+def compile(model: Model, data: Any = None) -> Program:
+    """Generate the program of a model.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : with them, the variant that deals with what is missing in them; None: the one for
+        complete data.
+
+    Returns
+    -------
+    Program : `.source()` is its text, `.path` its file.
+
+    Raises
+    ------
+    ModelError, DataError : what is wrong, where, and the fix.
+    """
+    traced = trace(model)
+    missing = Missing(none=True) if data is None else missing_of(bind(traced, data))
+    return compile_trace(traced, missing)

@@ -1,0 +1,293 @@
+"""The verb `forecast`: what comes after the data."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.codegen.modules.program import Program, compile_trace
+from ssmppl.counts import check_room
+from ssmppl.data import (
+    bind_inputs,
+    check_defined,
+    unpack_observations,
+    unpack_parameters,
+    unpack_states,
+)
+from ssmppl.data.parameters import pack
+from ssmppl.data.times import label_text
+from ssmppl.errors import ArgumentError
+from ssmppl.expressions.arrays import array
+from ssmppl.expressions.evaluate import evaluate
+from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.run.labels import TIME_ZONES, observes, zone_of
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.verbs.predict import all_draws, group, parameters_of, posterior_of, states_of
+from ssmppl.inference.verbs.simulate import check_finite, check_samplers, feeds_back
+from ssmppl.language.distributions import MvNormal
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.traced import Trace
+from ssmppl.language.trace import trace
+from ssmppl.results import time_axes, to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# A forecast starts from draws of the last state, which known parameters have as well.
+KNOWN = (
+    "give what ssm.sample returns; at known parameters that is "
+    "ssm.sample(model, data, fixed=estimate.parameters, warmup=0)"
+)
+
+
+def forecast(
+    model: Model,
+    idata: Any,
+    steps: int | None = None,
+    inputs: Any = None,
+    *,
+    experiment: int | None = None,
+    seed: int | None = None,
+) -> xr.Dataset:
+    """Draws of the states and observations after the last row of the data.
+
+    Each posterior draw of the parameters and of x_T is continued by the model's laws: one draw of
+    p(x_{T+1:T+H}, y_{T+1:T+H} | y_{1:T}) each.
+
+    Parameters
+    ----------
+    model : the model that was sampled.
+    idata : what `sample` returned, with its states.
+    steps : number H of rows; may be left out where `inputs` tell it.
+    inputs : the inputs of the rows T+1, ..., T+H: mapping of arrays, DataFrame or Dataset. The step
+        into the first of them is driven by the data's last input.
+    experiment : which one is continued, from 1, where several were sampled.
+    seed : the same seed gives the same draws.
+
+    Returns
+    -------
+    Dataset
+        States and observations (draw, time, ...) and parameters (draw, ...); all chains one after
+        the other. Its time goes on from the data's where that is evenly spaced; where the data's
+        dates had a time zone, days and months are those of that zone. All dates are in UTC.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix; inputs
+        with labels of the data's rows among them.
+    """
+    traced, posterior = trace(model), posterior_of(idata, KNOWN)
+    check_samplers(traced)
+    future, steps, source = bind_inputs(traced, inputs, steps)
+    labels = source.time
+    mark, axis = _which(traced, posterior, experiment)
+    theta = parameters_of(traced, posterior)
+    paths = states_of(traced, posterior, mark, axis)
+    if paths is None:
+        raise ArgumentError(
+            "the posterior holds no trajectories: a forecast starts from the last state",
+            fix="sample with states=True",
+        )
+    theta, paths = all_draws(theta), all_draws(paths)
+    rows = paths.shape[1]
+    d, k = paths.shape[2], len(traced.observation_symbols)
+    check_room(
+        f"{len(paths)} draws of {steps} rows", len(paths) * steps * (d + k), "ask for fewer rows"
+    )
+    given = _past(idata, "constant_data", traced.inputs, mark, rows)
+    columns = [given[n].reshape(rows, -1) for n in traced.inputs]
+    u = np.concatenate([np.concatenate([np.zeros((rows, 0)), *columns], axis=1), future])
+    check_defined(traced, source, u, after=rows)
+    y = np.zeros((rows + steps, len(traced.observation_symbols)))
+    feedback = feeds_back(traced)
+    if feedback:
+        seen = _past(idata, "observed_data", traced.observations, mark, rows)
+        y[:rows] = pack(traced.observations.values(), seen)
+    program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
+    states, observed = _continued(program, theta, paths, y, u, feedback, root)
+    check_finite(traced, states, observed)
+    zone = zone_of(posterior.attrs, axis)
+    _check_after(posterior[axis].values, labels)
+    if labels is None:
+        labels = after(posterior[axis].values, steps, zone)
+    over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
+    return to_dataset(
+        over_time | unpack_parameters(traced, theta),
+        over_time=set(over_time),
+        time=labels,
+        attrs={
+            "model": traced.name,
+            "seed": str(root.entropy),
+            "after": int(rows),
+            "experiment": experiment or 1,
+            "observes": observes(traced),
+        }
+        | ({TIME_ZONES: {"time": zone}} if zone else {}),
+    )
+
+
+def _check_after(time: np.ndarray, labels: np.ndarray | None) -> None:
+    """Labels of the inputs follow those of the data, where both have an order."""
+    if labels is None or time.dtype.kind not in "iufM" or labels.dtype.kind not in "iufM":
+        return
+    if (time.dtype.kind == "M") != (labels.dtype.kind == "M"):
+        return
+    early = int(np.sum(labels <= time[-1]))
+    if early:
+        last, first = label_text(time[-1]), label_text(labels[0])
+        raise ArgumentError(
+            f"inputs begin at {first}, and the data end at {last}: {early} of their {len(labels)} "
+            "rows are not after the data",
+            fix=f"give the inputs of the rows after {last} only, or without labels",
+        )
+
+
+def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
+    """Labels of the rows that follow `time`: numbers and dates go on where they are evenly spaced
+    (dates also by months and the like), else there are row numbers.
+
+    zone : that dates, which are in UTC, were given in: steps of whole days and longer are those of
+        its calendar.
+    """
+    count = np.arange(1, steps + 1)
+    if np.issubdtype(time.dtype, np.datetime64):
+        import pandas as pd
+
+        if zone and len(time) > 2 and (found := _by_calendar(time, steps, zone)) is not None:
+            return found
+        spacing = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
+        if spacing is not None:
+            return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=spacing)[1:])
+        if len(time) > 2:
+            warnings.warn(
+                "the dates of the data are not evenly spaced, so that the rows of the forecast are "
+                f"numbered on from {len(time) + 1}. Where a row is absent from the data, give it, "
+                "with NaN for what was not measured: each row is one step of the model",
+                stacklevel=3,
+            )
+    elif np.issubdtype(time.dtype, np.timedelta64):  # NumPy takes these for numbers too
+        gaps = np.diff(time)
+        if len(gaps) and np.all(gaps == gaps[0]):
+            return np.asarray(time[-1] + gaps[0] * count)
+    elif np.issubdtype(time.dtype, np.number) and len(time):
+        gaps = np.diff(time) if len(time) > 1 else np.ones(1, time.dtype)
+        rounding = 4.0 * np.spacing(np.abs(np.asarray(time, dtype=float)).max())
+        if np.allclose(gaps, gaps[0], rtol=1e-6, atol=rounding):
+            return np.asarray(time[-1] + gaps[0] * count)
+    return len(time) + count
+
+
+def _by_calendar(time: np.ndarray, steps: int, zone: str) -> np.ndarray | None:
+    """The dates (UTC) that follow by whole days, weeks, months, ... of a zone's calendar, on the
+    clock of its days; None where the steps are others, or the zone is not known."""
+    import pandas as pd
+
+    try:
+        local = pd.DatetimeIndex(time).tz_localize("UTC").tz_convert(zone).tz_localize(None)
+    except (KeyError, ValueError):  # no such zone on this computer
+        return None
+    step = pd.DatetimeIndex(local, freq="infer").freq
+    if step is None or (local[-1] + step - local[-1]) % pd.Timedelta(days=1):
+        return None
+    dates = pd.date_range(local[-1], periods=steps + 1, freq=step)[1:]
+    # an hour that the clock leaves out is the next one, of one that comes twice it is the first
+    there = dates.tz_localize(zone, nonexistent="shift_forward", ambiguous=np.full(steps, True))
+    return np.asarray(there.tz_convert(None))
+
+
+def _continued(
+    program: Program, theta: np.ndarray, paths: np.ndarray, y: np.ndarray, u: np.ndarray,
+    feedback: bool, root: np.random.SeedSequence,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """States (n, H, D) and observations (n, H, K) of the rows of u that follow those of paths."""
+    n, rows, d = paths.shape
+    steps, k = len(u) - rows, y.shape[1]
+    states, observed = np.empty((n, steps, d)), np.empty((n, steps, k))
+    simulate, observe = program.entry("simulate_on"), program.entry("observe_states")
+    seen = np.ones_like(y)
+    missing = np.isnan(y[rows - 1])
+    unknown = feedback and bool(missing.any())
+    gain = _gain(program.trace, theta, paths[:, -1], u[rows - 1], rows, missing) if unknown else ()
+    for r in range(n):
+        stream, own = random_state(root, r), y
+        if feedback:  # what is drawn is written there, for the transition to read
+            own = np.nan_to_num(y)
+        if unknown:
+            drawn = np.empty((rows, k, 1))
+            x = np.ascontiguousarray(paths[r][:, :, None])
+            observe(theta[r], own[:rows], seen[:rows], u[:rows], stream, x, drawn)
+            own[rows - 1] = np.where(missing, drawn[-1, :, 0], y[rows - 1])
+            for left, given, k_given in gain:  # Matheron's rule: a joint draw, corrected
+                own[rows - 1, left] += k_given[r] @ (y[rows - 1] - drawn[-1, :, 0])[given]
+        x, out = np.empty((steps, d, 1)), np.empty((steps, k, 1))
+        last = np.ascontiguousarray(paths[r, -1][:, None])
+        simulate(theta[r], own, seen, u, rows, last, stream, x, out, feedback)
+        states[r], observed[r] = x[:, :, 0], out[:, :, 0]
+    return states, observed
+
+
+def _gain(
+    trace: Trace, theta: np.ndarray, x: np.ndarray, u: np.ndarray, t: int, missing: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each channel jointly Gaussian and measured in part at row t: the missing components (m,),
+    the measured ones (s,), and C_ms C_ss^-1 (n, m, s) for each row of theta (n, P) and x (n, D).
+    Other joint laws are measured as a whole or not at all."""
+    values: dict[Expr, np.ndarray] = {symbol("time", "t"): np.array(float(t))}
+    values |= zip(trace.parameter_symbols, theta.T, strict=True)
+    values |= zip(trace.state_symbols, x.T, strict=True)
+    values |= zip(trace.input_symbols, u, strict=True)
+    place = {s: i for i, s in enumerate(trace.observation_symbols)}
+    out = []
+    for site in trace.observations.values():
+        own = np.array([place[s] for s in site.components])
+        law, gone = site.distribution, missing[own]
+        if isinstance(law, MvNormal) and gone.any() and not gone.all():
+            found = evaluate(array(law.covariance_matrix()), values)
+            found = np.broadcast_to(found.T, (len(theta), len(own), len(own)))  # symmetric
+            cross, spread = found[:, ~gone][:, :, gone], found[:, ~gone][:, :, ~gone]
+            out.append((own[gone], own[~gone], np.linalg.solve(spread, cross).transpose(0, 2, 1)))
+    return out
+
+
+def _which(trace: Trace, posterior: Any, experiment: int | None) -> tuple[str, str]:
+    """What follows the variables' names, and the dim over time, of the experiment asked for.
+
+    Raises
+    ------
+    ArgumentError : there are several, and none or an unknown one was asked for.
+    """
+    known = [int(d.removeprefix("time_")) for d in time_axes(posterior.dims) if d != "time"]
+    if not known and experiment in (None, 1):
+        return "", "time"
+    if experiment in known:
+        return f"_{experiment}", f"time_{experiment}"
+    raise ArgumentError(
+        f"experiment={experiment!r}, and the posterior is of "
+        + (f"the experiments {', '.join(map(str, known))}" if known else "a single experiment"),
+        fix=f"give experiment={known[0]}, or another of them" if known else "leave experiment out",
+    )
+
+
+def _past(
+    idata: Any, name: str, names: Iterable[str], mark: str, rows: int
+) -> dict[str, np.ndarray]:
+    """Values (T, ...) by name, of a group of the data that were sampled.
+
+    Raises
+    ------
+    ArgumentError : they are not there.
+    """
+    found, out = group(idata, name), {}
+    for n in names:
+        if found is None or f"{n}{mark}" not in found:
+            raise ArgumentError(
+                f"the group {name!r} has no {n!r}, which the last step of the data needs",
+                fix="give what ssm.sample returned, with all its groups",
+            )
+        out[n] = np.asarray(found[f"{n}{mark}"].values, dtype=np.float64)
+    return out

@@ -1,0 +1,270 @@
+"""The verb `leave_future_out`: how well a model predicts the next row, its parameters known from
+the rows before it only.
+
+P.-C. Bürkner, J. Gabry and A. Vehtari (2020), "Approximate leave-future-out cross-validation for
+Bayesian time series models", *J. Statistical Computation and Simulation* 90, in its forward form:
+draws of p(theta | y_{1:L}) serve the rows after L too, weighted by
+
+    w_t(theta) = p(y_{L+1:t} | y_{1:L}, theta),
+
+smoothed by a generalised Pareto law (Vehtari, Simpson, Gelman, Yao and Gabry 2024); where its shape
+says that the weights can no longer be trusted, the model is sampled anew given the rows so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, OK
+from ssmppl.counts import check_count, check_number
+from ssmppl.data import Experiment
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.inference.methods.methods import Method
+from ssmppl.inference.particles.filtering import FilterSettings, failure
+from ssmppl.inference.preparation.exact_models import exact_model
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.problem import Problem, pose
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.run.tasks import run_tasks
+from ssmppl.inference.verbs.predict import all_draws, parameters_of, posterior_of
+from ssmppl.inference.verbs.sample import sample
+from ssmppl.language.model.model import Model
+from ssmppl.results import arviz, to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TASKS = 16  # pieces that the draws are cut into
+TIED = 1e-9  # difference of log weights that is rounding
+THRESHOLD = 0.7  # of the Pareto shape: beyond it the weights' errors are no longer known
+
+
+def leave_future_out(
+    model: Model,
+    data: Any,
+    *,
+    first: int | None = None,
+    method: Method | None = None,
+    draws: int = 500,
+    warmup: int = 500,
+    chains: int = 4,
+    threshold: float = THRESHOLD,
+    particles: int = 1000,
+    start: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Log predictive densities log p(y_t | y_{1:t-1}) with the parameters integrated out.
+
+    Models of the same data are compared by their sums over the same rows. Unlike leave-one-out
+    scores of the rows (`az.loo`), nothing after a row tells of it.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : one data set, as of `sample`.
+    first : the first row that is predicted, from 2; None: a quarter of the rows after the first.
+    method, draws, warmup, chains : of `sample`, each time that it is called.
+    threshold : Pareto shape beyond which the model is sampled anew.
+    particles : of the filters that give the predictive densities of each draw, where there is no
+        exact one.
+    start, fixed : as in `sample`.
+    seed : the same seed gives the same numbers, whatever the executor.
+    executor : any `concurrent.futures.Executor`; None: threads.
+    progress : whether `sample` shows its progress, on stderr.
+
+    Returns
+    -------
+    Dataset over `time` (the predicted rows)
+        `elpd`: log p(y_t | y_{1:t-1}), NaN where nothing was measured; `mc_error`: its Monte Carlo
+        standard error, by the spread of the weighted draws and the effective number of those of
+        the parameter that mixes worst; `pareto_shape`; `sampled_anew`: whether
+        the draws for this row are new ones. Attributes: `elpd`, the sum; `standard_error`, of the
+        sum, from its spread over the rows; `refits`, how often `sample` was called.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    KeyboardInterrupt : Ctrl-C, while it samples too; nothing is kept.
+    """
+    check_executor(executor)
+    check_number("threshold", threshold, lambda v: True, "give a number, as 0.7", infinite=True)
+    problem = pose(model, data)
+    if len(problem.experiments) > 1:
+        raise ArgumentError(
+            f"{len(problem.experiments)} data sets: rows are left out of one series at a time",
+            fix="give one data set",
+        )
+    check_count("particles", particles, 1)
+    if set(problem.trace.parameters) <= set(fixed or {}):
+        raise ArgumentError(
+            "no parameter is free, so that there is nothing to integrate out",
+            fix="take the log-likelihood increments of ssm.particle_filter, or of "
+            "ssm.kalman_filter or ssm.forward_filter where they are exact",
+        )
+    (whole,) = problem.experiments
+    begin = max(2, whole.steps // 4 + 1) if first is None else first
+    check_count("first", begin, 2)
+    if begin > whole.steps:
+        raise ArgumentError(
+            f"first={begin}, and the data have {whole.steps} rows",
+            fix="give a row of the data that leaves enough before it to learn from",
+        )
+    root = seed_sequence(seed)
+    seeds = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 1))
+    settings: dict[str, Any] = {
+        "draws": draws, "warmup": warmup, "chains": chains, "method": method, "start": start,
+        "fixed": fixed, "executor": executor, "progress": progress, "states": False,
+    }  # fmt: skip
+    rows: list[_Row] = []
+    refits, increments, efficiency = 0, np.empty((0, whole.steps)), 1.0
+    since = begin - 1  # the rows that the draws know
+    for t in range(begin - 1, whole.steps):
+        fresh = refits == 0
+        if not fresh:
+            log_w, shape = _smoothed(increments[:, since:t].sum(axis=1))
+            fresh = not shape <= threshold  # NaN is none to trust
+        if fresh:
+            idata = sample(model, _until(whole, t), seed=_number(seeds, refits), **settings)
+            posterior = posterior_of(idata)
+            if posterior.attrs["interrupted"]:  # a part of its draws, where nobody asked for it
+                raise KeyboardInterrupt
+            theta, efficiency = parameters_of(problem.trace, posterior), _efficiency(posterior)
+            stream = np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, 2, refits))
+            increments = _increments(problem, theta, particles, stream, executor)
+            since, refits, shape = t, refits + 1, -np.inf
+            log_w = np.full(len(increments), -np.log(len(increments)))
+        rows.append(_row(whole, t, log_w, increments[:, t], float(shape), fresh, efficiency))
+    elpd = np.array([r.elpd for r in rows])
+    measured = np.isfinite(elpd) | np.isneginf(elpd)
+    n = int(measured.sum())
+    with np.errstate(invalid="ignore"):  # NaN where a row was impossible to every draw
+        spread = float(np.sqrt(n * np.var(elpd[measured], ddof=1))) if n > 1 else float("nan")
+    labels = np.arange(1, whole.steps + 1) if whole.time is None else whole.time
+    return to_dataset(
+        {
+            "elpd": elpd[None],
+            "mc_error": np.array([[r.mc_error for r in rows]]),
+            "pareto_shape": np.array([[r.pareto_shape for r in rows]]),
+            "sampled_anew": np.array([[r.sampled_anew for r in rows]]),
+        },
+        time=labels[begin - 1 :],
+        attrs={
+            "model": problem.trace.name, "elpd": float(elpd[measured].sum()),
+            "standard_error": spread, "refits": refits, "threshold": threshold,
+            "seed": str(root.entropy),
+        },
+    ).isel(draw=0, drop=True)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Row:
+    elpd: float
+    mc_error: float
+    pareto_shape: float
+    sampled_anew: bool
+
+
+def _row(
+    whole: Experiment, t: int, log_w: np.ndarray, increment: np.ndarray, shape: float, fresh: bool,
+    efficiency: float,
+) -> _Row:  # fmt: skip
+    """The weighted mean of p(y_t | y_{1:t-1}, theta)."""
+    if not whole.seen[t].any():
+        return _Row(np.nan, np.nan, shape, fresh)
+    top = increment.max()
+    if top == -np.inf:
+        return _Row(-np.inf, np.nan, shape, fresh)
+    w, p = np.exp(log_w - log_w.max()), np.exp(increment - top)
+    w /= w.sum()
+    mean = float(w @ p)
+    error = float(np.sqrt(np.sum(w**2 * (p - mean) ** 2) / efficiency)) / mean
+    return _Row(float(np.log(mean) + top), error, shape, fresh)
+
+
+def _smoothed(log_w: np.ndarray) -> tuple[np.ndarray, float]:
+    """Normalised log weights, their tail smoothed, and the shape of the Pareto law that did it."""
+    top, n = log_w.max(), len(log_w)
+    if not np.isfinite(top):
+        return log_w, np.inf
+    tail = min(int(np.ceil(min(n / 5.0, 3.0 * np.sqrt(n)))), n - 1)  # draws, as of psislw
+    if np.partition(log_w, n - 1 - tail)[n - 1 - tail] > top - TIED:
+        # As after rows without data: so many have the greatest weight that there is no tail, and
+        # psislw, with none beyond its cut, would say that nothing can be trusted.
+        return log_w - logsumexp(log_w), -np.inf
+    if hasattr(arviz(), "psislw"):
+        smoothed, shape = arviz().psislw(log_w)
+    else:  # ArviZ 1.x
+        smoothed, shape = import_module("arviz_stats.base").array_stats.psislw(log_w)
+    return np.asarray(smoothed), float(shape)
+
+
+def _efficiency(posterior: Any) -> float:
+    """Effective draws of the parameter that mixes worst, as a share of the draws; 1 at most."""
+    total = posterior.sizes["chain"] * posterior.sizes["draw"]
+    found = arviz().ess(posterior, method="mean")
+    least = min((float(found[n].min()) for n in found.data_vars), default=float(total))
+    return min(1.0, least / total) if np.isfinite(least) else 1.0
+
+
+def _until(whole: Experiment, rows: int) -> dict[str, np.ndarray]:
+    """The first rows as `sample` takes them."""
+    return {n: v[:rows] for n, v in (whole.observed | whole.inputs).items()}
+
+
+def _number(seeds: np.random.SeedSequence, refit: int) -> int:
+    own = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, refit))
+    return int(own.generate_state(1, np.uint64)[0])
+
+
+def _increments(
+    problem: Problem, theta: np.ndarray, particles: int, root: np.random.SeedSequence,
+    executor: Executor | None,
+) -> np.ndarray:  # fmt: skip
+    """(S, T) log p(y_t | y_{1:t-1}, theta) of each draw, chains one after the other."""
+    flat = all_draws(theta)
+    settings = None
+    if isinstance(exact_model(problem.trace), NotApplicable):
+        middle = np.median(flat, axis=0)
+        chosen = choose(problem, middle, exact=False, integrate=True).name
+        settings = FilterSettings(particles, chosen)
+    pieces = [p for p in np.array_split(np.arange(len(flat)), TASKS) if len(p)]
+    task = partial(_some_increments, problem, flat, settings, root)
+    return np.concatenate(run_tasks(task, pieces, executor=executor))
+
+
+def _some_increments(
+    problem: Problem, theta: np.ndarray, settings: FilterSettings | None,
+    root: np.random.SeedSequence, which: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Of some of the draws; a function that another process can be sent."""
+    (e,) = problem.experiments
+    out = np.full((len(which), e.steps), -np.inf)
+    model = exact_model(problem.trace)
+    for row, s in zip(out, which, strict=True):
+        if settings is None:
+            assert not isinstance(model, NotApplicable)
+            try:
+                row[:] = model.filter(e, theta[s]).log_increments
+            except SamplingError:
+                continue
+            continue
+        ess = np.empty(e.steps)
+        status, t = problem.program.entry(f"filter_{settings.proposal}")(
+            theta[s], e.y, e.seen, e.u, settings.particles, None, 1.0,
+            random_state(root, int(s)), row, ess, None,
+        )  # fmt: skip
+        if status not in (OK, ALL_ZERO):
+            raise failure(problem, theta[s], status, t, e)
+    return out

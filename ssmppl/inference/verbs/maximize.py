@@ -1,0 +1,306 @@
+"""The verb `maximize`: maximum likelihood, and posterior modes."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.structure import noisy_start
+from ssmppl.data import check_values
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
+from ssmppl.inference.maximum import (
+    direct_optimization,
+    em,
+    iterated_filtering,
+    particle_em,
+    psaem,
+    score_ascent,
+)
+from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.edges import Edges, edges
+from ssmppl.inference.methods.methods import (
+    EM,
+    IF2,
+    PSAEM,
+    DirectOptimization,
+    ParticleEM,
+    ScoreAscent,
+)
+from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, log_of_mean
+from ssmppl.inference.particles.scores import Smoothing, combine, complete_scores, several_runs
+from ssmppl.inference.preparation.exact_models import kind_of
+from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
+from ssmppl.inference.preparation.method_choice import choose_maximiser, start_as_parameter
+from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.settings import check_settings
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.estimate import NO_METHOD, Estimate, free_components, make_estimate
+from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.inference.run.tasks import run_tasks
+from ssmppl.language.model.model import Model
+
+# The methods: what climbs under each class of settings.
+CLIMBS: dict[type, Callable[[Setup, Any], Ascent]] = {
+    DirectOptimization: direct_optimization.climb,
+    EM: em.climb,
+    ParticleEM: particle_em.climb,
+    PSAEM: psaem.climb,
+    ScoreAscent: score_ascent.climb,
+    IF2: iterated_filtering.climb,
+}
+OBJECTIVES = ("likelihood", "posterior")
+PARTICLES, REPEATS = 1000, 16  # of the log-likelihood and the information at the estimate
+TRAJECTORIES = 1000
+
+
+def maximize(
+    model: Model,
+    data: Any,
+    method: Any = None,
+    *,
+    start: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    objective: str = "likelihood",
+    seed: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+) -> Estimate:
+    """Maximise the likelihood of the parameters, or their posterior density.
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    method : settings such as `ssm.DirectOptimization(...)`; None chooses by structure, and the
+        attributes say what and why.
+    start : parameter values to begin from; what is not given begins at a pilot's mode (at moderate
+        values, where the likelihood is exact).
+    fixed : parameters held at these values.
+    objective : "likelihood", for which the priors serve as supports only; or "posterior", which
+        adds the log prior density on the parameters' own scale, without a Jacobian.
+    seed : the same seed gives the same estimate, whatever the executor; None: a random one.
+    executor : any `concurrent.futures.Executor`; None: threads.
+    progress : whether to show how far it is, on stderr.
+
+    Returns
+    -------
+    Estimate
+        Parameters, covariance from the observed information, log-likelihood, iterates. Ctrl-C ends
+        the climb early and returns the best so far, with the attribute `interrupted`.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix.
+    """
+    began = time.perf_counter()
+    if objective not in OBJECTIVES:
+        raise ArgumentError(
+            f"objective={objective!r}", fix=f"use one of: {listing(str(objective), OBJECTIVES)}"
+        )
+    if method is not None and type(method) not in CLIMBS:
+        names = ", ".join(f"ssm.{c.__name__}(...)" for c in CLIMBS)
+        raise ArgumentError(
+            f"method={method!r} is no method of maximisation",
+            fix=written_as(method, CLIMBS) or f"use {names} or None",
+        )
+    check_executor(executor)
+    check_settings(method)
+    problem = pose(model, data)
+    held = check_values(problem.trace, fixed, argument="fixed")
+    near = check_values(problem.trace, start, argument="start")
+    twice = [n for n in near if n in held]
+    if twice:
+        raise ArgumentError(
+            f"{twice[0]!r} is given in start and in fixed", fix=f"leave {twice[0]!r} out of one"
+        )
+    root = seed_sequence(seed)
+    space = space_of(problem, held, near)
+    setup = Setup(problem, space, objective, held, near, root, executor, progress)
+    if not len(space.where):
+        chosen, reason = None, "every parameter is fixed, or the model has none"
+        ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
+    else:
+        chosen, reason = (method, "by the user") if method is not None else choose_method(setup)
+        ascent = CLIMBS[type(chosen)](setup, chosen)
+    attrs: dict[str, Any] = {
+        "model": problem.trace.name,
+        "method": type(chosen).__name__ if chosen is not None else NO_METHOD,
+        "method_chosen": reason,
+        "objective": objective,
+        "settings": asdict(chosen) if chosen is not None else {},
+        "fixed": dict(fixed or {}),
+        **ascent.report,
+        "interrupted": ascent.interrupted,
+        "seed": str(root.entropy),
+    }
+    value = _log_likelihood(setup, ascent, attrs)
+    covariance = _covariance(setup, ascent, attrs)
+    if ascent.error is not None:
+        labels, errors = map(repr, problem.trace.parameter_symbols), np.diagonal(ascent.error)
+        free = free_components(problem.trace, held)
+        attrs["monte_carlo_errors"] = {
+            label: float(np.sqrt(max(e, 0.0)))
+            for label, e, f in zip(labels, errors, free, strict=True)
+            if f
+        }
+    attrs["seconds"] = time.perf_counter() - began
+    return make_estimate(
+        problem.trace, ascent.theta, covariance, value, ascent.iterates, held, attrs,
+        ascent.figures,
+    )  # fmt: skip
+
+
+def choose_method(setup: Setup) -> tuple[Any, str]:
+    """The method for a model's structure, and why."""
+    exact = setup.exact
+    kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+    trace = setup.problem.trace
+    chosen, reason = choose_maximiser(kind, trace)
+    if isinstance(chosen, ScoreAscent) and noisy_start(trace):
+        warnings.warn(
+            f"{type(chosen).__name__} may take minutes for each hundred rows here: "
+            f"{start_as_parameter(trace)}",
+            stacklevel=3,
+        )
+    return chosen, f"automatically: {reason}"
+
+
+def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> float:
+    """log p(y | theta): the method's own, else exact, else estimated, its error into `attrs`."""
+    if ascent.log_likelihood is not None:
+        return ascent.log_likelihood
+    problem, theta = setup.problem, ascent.theta
+    if not isinstance(setup.exact, NotApplicable):
+        return setup.exact.log_likelihood(problem.experiments, theta)
+    try:
+        settings = FilterSettings(PARTICLES, choose(problem, theta).name)
+        task = estimates_task(problem, theta, settings, setup.seed(1))
+        pieces = [range(r, r + 1) for r in range(REPEATS)]
+        log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
+    except (SamplingError, KeyboardInterrupt):
+        return np.nan
+    value, error = log_of_mean(log_z)
+    if value > -np.inf:
+        attrs["log_likelihood_error"] = error
+    return value
+
+
+def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:
+    """(P, P) inverse observed information of the free components; `attrs` says how, or why not."""
+    p, where = len(ascent.theta), setup.space.where
+    nothing = np.full((p, p), np.nan)
+    if not len(where):
+        return nothing
+    information = ascent.information
+    if ascent.report.get("without_maximum"):
+        attrs["covariance"] = "the likelihood has no maximum"
+        return nothing
+    if information is None and ascent.interrupted:
+        attrs["covariance"] = "none: interrupted before the observed information was known"
+        return nothing
+    if ascent.no_information:
+        attrs["covariance"] = f"none: {ascent.no_information}"
+        return nothing
+    if information is None:
+        information = _information(setup, ascent.theta, None)
+    found = score = None
+    if information is not None and not isinstance(setup.exact, NotApplicable):
+        found = edges(setup, ascent.theta, information)
+    if found is not None:
+        labels = [repr(s) for s in setup.problem.trace.parameter_symbols]
+        attrs["held_at_edge"] = {labels[i]: edge for i, edge in found.components.items()}
+        if not found.kept.any():
+            attrs["covariance"] = "every parameter is at an edge of what it can be"
+            return nothing
+        information = _information(setup, ascent.theta, found)
+        if found.moving:
+            score = _score_of(setup, found).score(ascent.theta)[1]
+    if information is None:
+        attrs["covariance"] = "none: no second derivatives of the log-likelihood"
+        return nothing
+    covariance = natural_covariance(setup, ascent.theta, information, found, score)
+    if isinstance(covariance, NotApplicable):
+        attrs["covariance"] = f"none: {covariance.reason}"
+        return nothing
+    attrs["covariance"] = "inverse observed information"
+    if found is not None:
+        attrs["covariance"] += f", with {', '.join(attrs['held_at_edge'])} held at the edge"
+    return covariance
+
+
+def _information(setup: Setup, theta: np.ndarray, found: Edges | None) -> np.ndarray | None:
+    if not isinstance(setup.exact, NotApplicable):
+        return _score_of(setup, found).information(theta)
+    try:
+        scores = complete_scores(setup.problem, setup.held)
+        settings = FilterSettings(PARTICLES, choose(setup.problem, theta, exact=False).name)
+        smoothing = Smoothing(settings, TRAJECTORIES)
+        runs = several_runs(
+            scores, theta, smoothing, True, setup.seed(2), range(REPEATS), setup.executor
+        )
+    except (ArgumentError, SamplingError):
+        return None
+    return combine(runs).information
+
+
+def _score_of(setup: Setup, found: Edges | None) -> ExactScore:
+    """Of an exact likelihood, in what is free and not held at an edge that stays where it is."""
+    assert not isinstance(setup.exact, NotApplicable), setup.exact
+    free = free_components(setup.problem.trace, setup.held)
+    free[[] if found is None else [i for i in found.components if i not in found.moving]] = False
+    return exact_score(setup.exact, setup.problem.experiments, free, setup.space.theta)
+
+
+def natural_covariance(
+    setup: Setup,
+    theta: np.ndarray,
+    information: np.ndarray,
+    found: Edges | None = None,
+    score: np.ndarray | None = None,
+) -> np.ndarray | NotApplicable:
+    """The delta method: J (J' I J - d2 log prior)^-1 J' over all components of theta.
+
+    At a maximum the gradient in theta vanishes, so that the second derivatives of theta(z) drop out
+    of the likelihood's part. The prior counts for objective "posterior" only.
+
+    found : parameters at an edge, which are held there and have NaN. score : (P,) the gradient of
+    the likelihood where it does not vanish, as such an edge moves with other parameters.
+    """
+    try:
+        z = setup.space_at(theta) if found is None else found.z
+    except (ValueError, np.linalg.LinAlgError):
+        return NotApplicable("the estimate lies on the edge of what the parameters can be")
+    kept = np.ones(len(z), dtype=bool) if found is None else found.kept
+    point = setup.chart.at(z)
+    jacobian = point.jacobian[:, kept]
+    with np.errstate(all="ignore"):
+        curvature = jacobian.T @ information @ jacobian
+    if setup.with_prior or score is not None:
+        slope = point.inverse().T @ point.d_log_prior if score is None else -score
+        second = setup.chart.curvature(z, slope)
+        curvature = curvature + second.theta[np.ix_(kept, kept)]
+    if setup.with_prior:
+        curvature = curvature - second.log_prior[np.ix_(kept, kept)]
+    if not np.all(np.isfinite(curvature)):
+        return NotApplicable("the observed information is not finite at the estimate")
+    scale = np.sqrt(np.abs(np.diagonal(curvature)))
+    if not np.all(scale > 0.0):
+        return NotApplicable("the observed information is singular: a parameter is not identified")
+    values = np.linalg.eigvalsh(curvature / np.outer(scale, scale))
+    if values[0] < 1e-10:
+        return NotApplicable(
+            "the observed information is not positive definite: the estimate is no interior "
+            "maximum, or some parameters are not identified"
+        )
+    covariance = jacobian @ np.linalg.solve(curvature, jacobian.T)
+    at_edge = [] if found is None else list(found.components)
+    covariance[at_edge, :] = covariance[:, at_edge] = np.nan
+    return covariance

@@ -1,0 +1,307 @@
+"""The verb `sample`: chains from the posterior, as ArviZ InferenceData."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.structure import without_density
+from ssmppl.counts import check_count, check_room
+from ssmppl.data import check_values, unpack_parameters, unpack_states
+from ssmppl.errors import ArgumentError, NotApplicable, written_as
+from ssmppl.inference.chains import (
+    coordinates,
+    elimination,
+    gibbs,
+    interweaving,
+    metropolis,
+    mixing,
+    pgas,
+    pmmh,
+    smc2,
+)
+from ssmppl.inference.chains.parameter_steps import plan_updates
+from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.checkpoints.chains import ChainFile
+from ssmppl.inference.checkpoints.codec import Codec
+from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
+from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.preparation import pilot, proposal_choice
+from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
+from ssmppl.inference.preparation.settings import check_settings
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import Block, ChainDraws, stack
+from ssmppl.inference.run.estimate import free_components
+from ssmppl.inference.run.executors import check_executor
+from ssmppl.inference.run.labels import Labels, check_names, observes
+from ssmppl.inference.run.problem import Problem, pose
+from ssmppl.inference.run.progress import announced
+from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.language.model.model import Model
+from ssmppl.language.model.transforms import transforms
+from ssmppl.results import to_inference_data
+
+PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
+    MetropolisHastings: metropolis.prepare,
+    Gibbs: gibbs.prepare,
+    PMMH: pmmh.prepare,
+    PGAS: pgas.prepare,
+}
+
+# What the states of chains are made of, and what is found before they begin.
+STATES = Codec(
+    [
+        coordinates.WalkState, coordinates.Point, coordinates.Run, pmmh.Local, pgas.PGASState,
+        gibbs.GibbsState,
+        interweaving.Tuning, elimination.Learned, mixing.Watch, smc2.State, smc2.Particles,
+        pilot.Pilot, pilot.Tuning, proposal_choice.Choice,
+    ]
+)  # fmt: skip
+
+
+def sample(
+    model: Model,
+    data: Any,
+    method: Method | None = None,
+    *,
+    draws: int = 1000,
+    warmup: int = 1000,
+    chains: int = 4,
+    start: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    thin: int = 1,
+    states: bool = True,
+    seed: int | None = None,
+    executor: Executor | None = None,
+    progress: bool = True,
+    checkpoint: str | os.PathLike[str] | None = None,
+) -> Any:
+    """Draw from p(theta, x_{1:T} | y_{1:T}).
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
+        of finitely many states, `ssm.MetropolisHastings(...)` where states have no noise too,
+        `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
+        None: for the former Gibbs if every parameter has a closed-form conditional (with
+        `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
+        while the parameters are few; for the others PGAS, likewise with `interweave="auto"`, or
+        PMMH where no ancestors can be sampled, the data are long or the states counts, and the
+        parameters are few. `explain` and the attributes say which, and why.
+    draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
+        warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
+    start : parameter values near which to begin; the chains are dispersed round a mode found from
+        there.
+    fixed : parameters held at these values.
+    thin : keep every thin-th draw.
+    states : whether to keep the trajectories.
+    seed : the same seed gives the same draws, whatever the executor.
+    executor : any `concurrent.futures.Executor`; None: a thread for each chain, up to the cores.
+    progress : whether to show a progress bar, on stderr.
+    checkpoint : a file that keeps where the chains stand and what they drew, written every half
+        minute, at Ctrl-C, at an error and at the end. After a kill or a power cut the same call
+        goes on from it and returns the draws that it would have returned, bit for bit; without a
+        seed it takes up that of the file. Once all is drawn, it returns that at once. The same call
+        with more `draws` (of `SMC2`: up to its `parameters`) goes on to those of one longer run;
+        with fewer it returns the first of them. All else has to be as it was: model, data, method
+        and settings, versions of this package, Python, NumPy, SciPy and Numba. Draws that exceed
+        128 MB go to a folder beside it, `<checkpoint>.draws`, and variables of the result that do
+        are read from there when they are looked at. Reading a checkpoint executes nothing.
+
+    Returns
+    -------
+    InferenceData (ArviZ 0.x) or DataTree (ArviZ 1.x)
+        Groups:
+
+        * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
+        * sample_stats (not of SMC2): lp, acceptance_rate, and log_likelihood (MetropolisHastings:
+          exact; PMMH: the estimate at the draw) or update_rate and ess (PGAS: share of the
+          trajectory that a sweep changed, ESS / N);
+        * log_likelihood (PMMH; PGAS on request): log p(y_t | y_1:t-1, theta), for
+          leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
+        * observed_data, constant_data (inputs).
+
+        Attributes name method, settings, seed, versions, the plan, and the time taken; after PGAS
+        also trajectory_update_rate, the least share of draws between which a row of the trajectory
+        changed, and where rows hardly do trajectory_warning, which is given as a warning too. So is
+        mixing_warning, where R-hat of some parameter is above 1.05 or its bulk ESS below 100; never
+        of one chain, of fewer than 100 draws of each, of SMC2 or of an interrupted run.
+        Ctrl-C returns what was drawn, with the attribute `interrupted`.
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix. A
+        checkpoint that is damaged or of another call is refused, and left as it is. One that cannot
+        be written (a disk that is full) is an error before anything is drawn; later it is a
+        warning, and sampling goes on.
+    """
+    began = time.perf_counter()
+    for name, value, least in (("draws", draws, 1), ("warmup", warmup, 0), ("chains", chains, 1),
+                               ("thin", thin, 1)):  # fmt: skip
+        check_count(name, value, least)
+    check_executor(executor)
+    check_settings(method)
+    problem = pose(model, data)
+    held = check_values(problem.trace, fixed, argument="fixed")
+    near = check_values(problem.trace, start, argument="start")
+    chosen, reason = (method, "") if method is not None else _chosen(problem, held)
+    prepare = PREPARE.get(type(chosen))
+    if prepare is None and not isinstance(chosen, SMC2):
+        names = ", ".join(f"ssm.{m.__name__}(...)" for m in (*PREPARE, SMC2))
+        raise ArgumentError(
+            f"method={method!r} is no method of sampling",
+            fix=written_as(method, (*PREPARE, SMC2)) or f"use {names} or None",
+        )
+    if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
+        states, warmup, thin = False, 0, 1
+        chosen = smc2.settled(chosen, draws)
+    if not states and all(name in held for name in problem.trace.parameters):
+        what = "SMC2 draws parameters only" if isinstance(chosen, SMC2) else "states=False"
+        raise ArgumentError(
+            f"there is nothing to draw: no parameter is free, and {what}",
+            fix="draw the states, by another method than SMC2 and without states=False, or leave a "
+            "parameter out of fixed=",
+        )
+    check_names(problem.trace, problem.experiments, states)
+    if checkpoint is None:
+        _check_room(problem, chosen, chains, draws, states)
+    root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
+    if checkpoint is not None:
+        origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
+        kept = ChainFile(checkpoint, origin, seed, root, STATES, draws)
+        root = kept.root
+    setup = Setup(problem, space, held, chains, warmup, thin, root, states, kept)
+    report: dict[str, Any]
+    if isinstance(chosen, SMC2):
+        result, report = smc2.drawn(setup, chosen, draws, executor, progress)
+    else:
+        assert prepare is not None
+        result, report = _drawn(setup, prepare, chosen, draws, executor, progress, kept)
+    attrs = {
+        "model": problem.trace.name,
+        "method": type(chosen).__name__,
+        "method_chosen": "by the user" if method is not None else "automatically",
+        **({"method_reason": reason} if reason else {}),
+        **report,
+        "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
+        "observes": observes(problem.trace),
+        "interrupted": any(c.interrupted for c in result),
+        "seconds": time.perf_counter() - began if kept is None else kept.seconds,
+    }  # fmt: skip
+    if isinstance(chosen, PGAS):
+        attrs |= mixing.update_rate_attributes(problem, result)
+    whole = stack(result) if kept is None else kept.stack(result)
+    if not isinstance(chosen, SMC2):
+        free = free_components(problem.trace, held)
+        labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
+        theta = whole[0]["theta"][:, :, free]
+        attrs |= mixing.mixing_attributes(labels, theta, bool(attrs["interrupted"]), chosen, warmup)
+    return _to_arviz(problem, whole, held, states, attrs)
+
+
+def _check_room(problem: Problem, method: Method, chains: int, draws: int, states: bool) -> None:
+    """That memory holds what the draws have of each row, twice: of each chain, and put together."""
+    each = {"states": len(problem.trace.state_symbols) if states else 0}
+    by_row = isinstance(method, PMMH) or (isinstance(method, PGAS) and method.log_likelihood)
+    each["log-likelihoods"] = int(by_row)
+    fix = "thin= with fewer draws keeps fewer, checkpoint= keeps them on disk"
+    check_room(
+        f"{chains} chains of {draws} draws of the {' and '.join(n for n, v in each.items() if v)} "
+        f"of {problem.rows} rows, twice while they are put together",
+        2 * chains * draws * problem.rows * sum(each.values()),
+        f"states=False leaves them out, {fix}" if states else fix,
+    )
+
+
+def _drawn(
+    setup: Setup, prepare: Callable[[Setup, Any], Sampler], method: Method, draws: int,
+    executor: Executor | None, progress: bool, kept: ChainFile | None,
+) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:  # fmt: skip
+    """The chains of a method, and what it has to report."""
+    if kept is None or kept.report is None or not kept.finished(setup.warmup + draws):
+        with announced(type(method).__name__, "preparing", shown=progress):
+            sampler = prepare(setup, method)
+        if kept is not None:
+            kept.report = sampler.report
+    else:  # nothing is left to draw, and nothing needs to be compiled for it
+        sampler = Sampler(_finished, [None] * setup.chains, kept.report)
+    result = run_chains(
+        sampler.step_block, sampler.states, draws, setup.warmup, executor=executor,
+        progress=progress, title=type(method).__name__, keep=kept,
+    )  # fmt: skip
+    return result, sampler.report
+
+
+def _finished(state: Any, n: int) -> tuple[Any, Block]:
+    raise AssertionError("a finished chain draws no more")
+
+
+def _origin(
+    problem: Problem, method: Method, held: Mapping[str, np.ndarray],
+    near: Mapping[str, np.ndarray], chains: int, warmup: int, thin: int, states: bool,
+) -> Origin:  # fmt: skip
+    """All that the draws depend on, but for the seed and their number."""
+    own = ", ".join(f"{f.name}={text_of(getattr(method, f.name))}" for f in fields(method))
+    plain = {
+        "method": f"{type(method).__name__}({own})", "chains=": str(chains),
+        "warmup=": str(warmup), "thin=": str(thin), "states=": str(states),
+        "fixed=": f"{{{text_of(held)}}}", "start=": f"{{{text_of(near)}}}",
+    }  # fmt: skip
+    digests = {"model": model_digest(problem.trace), "data": data_digest(problem.experiments)}
+    return Origin(digests, plain | versions())
+
+
+def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
+    exact = exact_model(problem.trace)
+    numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
+    stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
+    singular = without_density(problem.trace)
+    if isinstance(exact, NotApplicable) or singular is not None:
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        return choose_sampler(kind, (), numbers, stuck, singular)
+    return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers)
+
+
+def _to_arviz(
+    problem: Problem, whole: tuple[dict[str, np.ndarray], dict[str, np.ndarray]],
+    held: dict[str, np.ndarray], states: bool, attrs: dict[str, Any],
+) -> Any:  # fmt: skip
+    drawn, stats = whole
+    trace = problem.trace
+    posterior = {n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held}
+    labels = Labels(problem.experiments)
+    over_time: list[str] = []
+    observed: dict[str, np.ndarray] = {}
+    inputs: dict[str, np.ndarray] = {}
+    log_likelihood: dict[str, np.ndarray] = {}
+    for i, e in enumerate(problem.experiments):
+        if states:
+            paths = labels.named(i, unpack_states(trace, drawn[f"path_{i}"]), leading=3)
+            posterior |= paths
+            over_time += list(paths) if not labels.several else []
+        observed |= labels.named(i, e.observed)
+        inputs |= labels.named(i, e.inputs)
+        if f"increment_{i}" in drawn:
+            log_likelihood |= labels.named(i, {"y": drawn[f"increment_{i}"]}, leading=3)
+    return to_inference_data(
+        posterior=posterior,
+        sample_stats=stats,
+        observed_data=observed,
+        constant_data=inputs or None,
+        log_likelihood=log_likelihood or None,
+        over_time=over_time,
+        time=labels.time,
+        dims=labels.dims,
+        coords=labels.coords,
+        attrs=attrs | labels.attrs,
+    )

@@ -1,0 +1,392 @@
+"""The verb `smooth`: states given all of the data, at known parameters.
+
+What each smoothing method finds: draws from the joint law, or moments of the marginal ones.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from ssmppl.counts import check_count, check_room
+from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
+from ssmppl.errors import ArgumentError, NotApplicable, listing, written_as
+from ssmppl.inference.chains import pgas
+from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
+from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.methods.methods import (
+    PGAS,
+    FFBSi,
+    FixedLag,
+    ForwardBackward,
+    KalmanSmoother,
+    SmoothingMethod,
+)
+from ssmppl.inference.methods.requirements import need_density
+from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
+from ssmppl.inference.particles.filtering import FilterSettings
+from ssmppl.inference.particles.fixed_lag import LAG, collapse, distinct, lag_moments
+from ssmppl.inference.particles.marginal import is_marginal, marginal_paths, may_integrate
+from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.method_choice import choose_smoother
+from ssmppl.inference.preparation.proposal_choice import choose, resolve_settings
+from ssmppl.inference.preparation.settings import check_settings
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.labels import component_dims, observes, with_data
+from ssmppl.inference.run.problem import EXACT, Problem, pose
+from ssmppl.inference.run.ranges import total_of
+from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.inference.verbs.filters import LEVELS, quantile_levels
+from ssmppl.language.model.model import Model
+from ssmppl.results import to_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+PARTICLES, TRAJECTORIES = 1000, 1000
+PGAS_WARMUP = 100  # sweeps that are dropped
+COLLAPSED = 'Use more particles, proposal="twisted", or method=ssm.PGAS().'
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of `smooth`, checked; None where the caller left a number to the method."""
+
+    problem: Problem
+    theta: np.ndarray
+    particles: int | None
+    trajectories: int | None
+    levels: np.ndarray
+    root: np.random.SeedSequence
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a method gives for one experiment: draws (M, T, D), or moments; and its report.
+
+    moments : mean (T, D), covariance (T, D, D), cross (T, D, D), quantiles (T, P, D).
+    over_time : further variables (T,).
+    """
+
+    attrs: dict[str, Any]
+    paths: np.ndarray | None = None
+    moments: tuple[np.ndarray, ...] | None = None
+    over_time: Mapping[str, np.ndarray] | None = None
+
+
+def by_exact_passes(
+    call: Call, chosen: SmoothingMethod, method: SmoothingMethod | str | None
+) -> list[Found]:
+    """Exact moments, or exact draws."""
+    if call.particles is not None and method is not None:
+        raise ArgumentError(
+            f"particles={call.particles}: {type(chosen).__name__} is exact and has none",
+            fix="leave particles= out, or use method=ssm.FFBSi()",
+        )
+    trace = call.problem.trace
+    model = kalman_model(trace) if isinstance(chosen, KalmanSmoother) else hidden_markov(trace)
+    assert not isinstance(model, NotApplicable)
+    _check_draws(call, call.trajectories or 0)
+    experiments, theta = call.problem.experiments, call.theta
+    if call.trajectories is not None:
+        streams = [random_state(call.root, i) for i in range(len(experiments))]
+        drawn = model.draw_each(experiments, theta, streams, call.trajectories)
+        if isinstance(model, HiddenMarkov):
+            values = [total_of(f.log_increments) for f in model.filter_each(experiments, theta)]
+        else:
+            values = [model.log_likelihood([e], theta) for e in experiments]
+        pairs = zip(drawn, values, strict=True)
+        return [Found({"log_likelihood": v}, paths=paths) for paths, v in pairs]
+    if isinstance(model, HiddenMarkov):
+        smoothed = model.smooth_each(experiments, theta)
+        spreads = [model.quantiles(law, call.levels) for _, law in smoothed]
+        moments = [m for m, _ in smoothed]
+    else:
+        moments = [model.smooth(e, theta) for e in experiments]
+        spreads = []
+        for m in moments:
+            sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
+            spreads.append(m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :])
+    return [
+        Found({"log_likelihood": m.log_likelihood}, moments=(m.mean, m.covariance, m.cross, s))
+        for m, s in zip(moments, spreads, strict=True)
+    ]
+
+
+def _filter(call: Call, method: FFBSi | FixedLag, integrate: bool = False) -> FilterSettings:
+    """The filter's settings, "auto" resolved among the particle proposals."""
+    proposal = method.proposal
+    if proposal in EXACT:
+        exact = {"kalman": "ssm.KalmanSmoother(), or ", "forward": "ssm.ForwardBackward(), or "}
+        raise ArgumentError(
+            f'{type(method).__name__}(proposal="{proposal}") has no particles',
+            fix=f"use {exact.get(proposal, '')}another proposal",
+        )
+    if proposal == "auto":
+        proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name
+    n = PARTICLES if call.particles is None else call.particles
+    settings = resolve_settings(
+        call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
+        method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
+    )  # fmt: skip
+    longest = max(e.steps for e in call.problem.experiments)
+    each = len(call.problem.trace.state_symbols) + 2  # with weight and ancestor
+    check_room(
+        f"{n} particles of each of {longest} rows", longest * n * each, "give fewer particles"
+    )
+    return settings
+
+
+def _check_draws(call: Call, draws: int) -> None:
+    """That memory holds the trajectories."""
+    rows = call.problem.rows
+    numbers = draws * rows * len(call.problem.trace.state_symbols)
+    check_room(f"{draws} trajectories of {rows} rows", numbers, "give fewer trajectories")
+
+
+def by_ffbsi(call: Call, method: FFBSi) -> list[Found]:
+    """Independent draws, given a particle filter's particles."""
+    if method.kernel != "genealogy":
+        need_density(call.problem.trace, f'FFBSi(kernel="{method.kernel}")', "smooth")
+    settings = _filter(call, method, integrate=may_integrate(call.problem, method))
+    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
+    _check_draws(call, draws)
+    marginal = is_marginal(settings.proposal)
+    kernel, why = "exact", "states that are linear given the others are integrated out"
+    if not marginal:
+        kernel, why = choose_kernel(call.problem, settings, draws, method.kernel)
+    out = []
+    for i, e in enumerate(call.problem.experiments):
+        stream = random_state(call.root, i)
+        system = particle_system(call.problem, call.theta, settings, e, stream)
+        own = call.problem, call.theta, e, system, draws, stream
+        paths = marginal_paths(*own) if marginal else draw_paths(*own, kernel, method.moves)
+        report = {
+            "particles": settings.particles, "proposal": settings.proposal, "kernel": kernel,
+            "kernel_chosen": why, "log_likelihood": system.log_Z,
+        }  # fmt: skip
+        over_time = {"distinct": distinct(paths), "ess": system.ess}
+        if not marginal:
+            report |= collapse(over_time["distinct"], system, draws, e, COLLAPSED)
+        out.append(Found(report, paths=paths, over_time=over_time))
+    return out
+
+
+def by_fixed_lag(call: Call, method: FixedLag) -> list[Found]:
+    """Moments, each row's from the ancestors of particles some rows later."""
+    if call.trajectories is not None:
+        raise ArgumentError(
+            f"trajectories={call.trajectories}: FixedLag knows marginals only, no joint law to "
+            "draw trajectories from",
+            fix="leave trajectories= out, or use ssm.FFBSi()",
+        )
+    settings = _filter(call, method)
+    lag = LAG if method.lag is None else method.lag
+    out = []
+    for i, e in enumerate(call.problem.experiments):
+        stream = random_state(call.root, i)
+        system = particle_system(call.problem, call.theta, settings, e, stream)
+        m = lag_moments(system, lag, call.levels)
+        report = {
+            "particles": settings.particles, "proposal": settings.proposal, "lag": lag,
+            "log_likelihood": system.log_Z,
+        }  # fmt: skip
+        moments = m.mean, m.covariance, m.cross, m.quantiles
+        over_time = {"distinct": m.distinct, "ess": system.ess}
+        n = settings.particles
+        report |= collapse(m.distinct, system, n, e, COLLAPSED)
+        out.append(Found(report, moments=moments, over_time=over_time))
+    return out
+
+
+def by_pgas(call: Call, method: PGAS) -> list[Found]:
+    """Successive trajectories of one chain at fixed parameters."""
+    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
+    if method.particles is None and call.particles is not None:
+        method = PGAS(call.particles, method.proposal)
+    held = unpack_parameters(call.problem.trace, call.theta)
+    space = space_of(call.problem, held, {})
+    setup = Setup(call.problem, space, held, 1, PGAS_WARMUP, 1, call.root)
+    sampler = pgas.prepare(setup, method)
+    (chain,) = run_chains(
+        sampler.step_block, sampler.states, draws, PGAS_WARMUP, progress=False
+    )  # fmt: skip
+    report = {k: sampler.report[k] for k in ("particles", "proposal", "ancestor_sampling")}
+    report |= {"warmup": PGAS_WARMUP, "update_rate": float(chain.stats["update_rate"].mean())}
+    report["trajectories_are"] = "successive draws of a Markov chain, correlated"
+    out = []
+    for i in range(len(call.problem.experiments)):
+        paths = chain.draws[f"path_{i}"]
+        out.append(Found(report, paths=paths, over_time={"distinct": distinct(paths)}))
+    return out
+
+
+# what a method may be called by
+NAMES: dict[str, SmoothingMethod] = {
+    "kalman": KalmanSmoother(),
+    "forward_backward": ForwardBackward(),
+    "ffbsi": FFBSi(),
+    "exact": FFBSi(kernel="exact"),
+    "rejection": FFBSi(kernel="rejection"),
+    "mcmc": FFBSi(kernel="mcmc"),
+    "genealogy": FFBSi(kernel="genealogy"),
+    "fixed_lag": FixedLag(),
+    "pgas": PGAS(),
+}
+
+
+def smooth(
+    model: Model,
+    data: Any,
+    parameters: Mapping[str, Any],
+    method: SmoothingMethod | str | None = None,
+    *,
+    particles: int | None = None,
+    trajectories: int | None = None,
+    quantiles: tuple[float, ...] = LEVELS,
+    seed: int | None = None,
+) -> xr.Dataset | list[xr.Dataset]:
+    """The states given all of the data, p(x_{1:T} | y_{1:T}, parameters).
+
+    Parameters
+    ----------
+    model : the model, as declared.
+    data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
+    parameters : value of each parameter of the model, {} where it has none.
+    method : `ssm.KalmanSmoother()`, exact, for linear Gaussian models; `ssm.ForwardBackward()`,
+        exact, where the states take finitely many values; `ssm.FFBSi(...)`, particles
+        with backward simulation; `ssm.PGAS(...)`, a Markov chain of conditional particle filters;
+        `ssm.FixedLag(...)`, marginal moments from the genealogy. Or one of the names "kalman",
+        "forward_backward", "ffbsi", "exact", "rejection", "mcmc", "genealogy", "pgas",
+        "fixed_lag". None: the exact one where there is one, else FFBSi; the attribute
+        `method_chosen` says why.
+    particles : number N; None: 1000, and for PGAS its own. An exact smoother, where `method` is
+        left to the model, does without. Moments have a bias of order 1 / N, but
+        those of PGAS, whose chain has the right law for every N >= 2.
+    trajectories : number M of draws; None: exact moments from an exact smoother, and 1000 draws
+        from FFBSi and PGAS.
+    quantiles : levels of the quantiles that go with moments.
+    seed : the same seed gives the same numbers; None: a random one.
+
+    Returns
+    -------
+    Dataset, or a list of them for several experiments
+        Draws: the states, dims (trajectory, time, ...), and over time `distinct`, how many values
+        the draws have at each step, and for FFBSi `ess`, of the filter.
+        Moments, dim `draw` of length 1: as of `kalman_filter`, ``x``, ``x_sd``, ``x_quantile`` and
+        ``covariance`` of all stacked components, but given all of the data; and
+        ``covariance_previous``, that of x_t (`state`) with x_{t-1} (`state_`), NaN in the first
+        row. For FixedLag also `distinct`, the ancestors that are left.
+        Both: the data, ``y_observed`` of channels y and ``u_input`` of inputs u, (time, ...).
+        Attributes name method, settings, seed and the log-likelihood (exact, or the filter's
+        estimate).
+
+    Raises
+    ------
+    ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
+    SamplingError : weights vanish or are NaN; names the step, the user's line, the parameters.
+    """
+    began = time.perf_counter()
+    check_settings(method)
+    problem = pose(model, data)
+    theta = check_parameters(problem.trace, parameters)
+    chosen, why = _choose(problem, method)
+    levels = quantile_levels(quantiles)
+    root = seed_sequence(seed)
+    for name, value, least in (("particles", particles, 1), ("trajectories", trajectories, 1)):
+        if value is not None:
+            check_count(name, value, least)
+    call = Call(problem, theta, particles, trajectories, levels, root)
+    if isinstance(chosen, KalmanSmoother | ForwardBackward):
+        found = by_exact_passes(call, chosen, method)
+    elif isinstance(chosen, FFBSi):
+        found = by_ffbsi(call, chosen)
+    elif isinstance(chosen, FixedLag):
+        found = by_fixed_lag(call, chosen)
+    else:
+        found = by_pgas(call, chosen)
+    attrs = {
+        "model": problem.trace.name, "method": type(chosen).__name__, "method_chosen": why,
+        "settings": asdict(chosen), "seed": str(root.entropy),
+        "seconds": time.perf_counter() - began,
+    }  # fmt: skip
+    datasets = [
+        _dataset(call, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
+    ]
+    return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
+    exact = exact_model(problem.trace)
+    if method is None:
+        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        chosen, why = choose_smoother(kind, problem.trace)
+        return chosen, f"automatically: {why}"
+    kinds = (KalmanSmoother, ForwardBackward, FFBSi, FixedLag, PGAS)
+    if isinstance(method, str):
+        if method not in NAMES:
+            raise ArgumentError(
+                f"method={method!r} is unknown",
+                fix=written_as(method, kinds) or f"use one of: {listing(method, NAMES)}",
+            )
+        method = NAMES[method]
+    if not isinstance(method, SmoothingMethod):
+        names = ", ".join(f"ssm.{t.__name__}(...)" for t in kinds)
+        raise ArgumentError(
+            f"method={method!r} is no method of smoothing",
+            fix=written_as(method, kinds) or f"use {names}, a name, or None",
+        )
+    needed: tuple[str, KalmanModel | HiddenMarkov | NotApplicable] | None = None
+    if isinstance(method, KalmanSmoother):
+        needed = "a linear Gaussian model", kalman_model(problem.trace)
+    elif isinstance(method, ForwardBackward):
+        needed = "states of finitely many values", hidden_markov(problem.trace)
+    if needed is not None and isinstance(needed[1], NotApplicable):
+        raise ArgumentError(
+            f"{type(method).__name__} needs {needed[0]}: {needed[1].reason}",
+            fix="use ssm.FFBSi(...) or ssm.PGAS(...), or None, which picks by structure",
+            where=needed[1].where,
+        )
+    return method, "by the user"
+
+
+def _dataset(call: Call, experiment: Experiment, found: Found, attrs: dict[str, Any]) -> xr.Dataset:
+    trace = call.problem.trace
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {}
+    if found.paths is not None:
+        variables, sample_dim = dict(unpack_states(trace, found.paths)), "trajectory"
+    else:
+        assert found.moments is not None
+        sample_dim = "draw"
+        mean, covariance, cross, spread = (m[None] for m in found.moments)
+        cross = cross.copy()
+        cross[:, 0] = np.nan
+        variables = dict(unpack_states(trace, mean))
+        sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
+        for n, v in unpack_states(trace, sd).items():
+            variables[f"{n}_sd"] = v
+            dims[f"{n}_sd"] = ["time", *component_dims(n, v, 2)]
+        variables |= {"covariance": covariance, "covariance_previous": cross}
+        dims |= {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
+        coords["state"] = coords["state_"] = [repr(s) for s in trace.state_symbols]
+        if len(call.levels):
+            by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(call.levels))]
+            for name in by_level[0]:
+                variables[f"{name}_quantile"] = np.stack([q[name] for q in by_level], axis=-1)
+                own = component_dims(name, by_level[0][name], 2)
+                dims[f"{name}_quantile"] = ["time", *own, "quantile"]
+            coords["quantile"] = call.levels
+    out = to_dataset(
+        variables, sample_dim=sample_dim, time=experiment.time, dims=dims, coords=coords,
+        attrs={**attrs, **found.attrs, "observes": observes(trace)},
+    )  # fmt: skip
+    out = out.assign({k: ("time", v) for k, v in (found.over_time or {}).items()})
+    return with_data(out, experiment)

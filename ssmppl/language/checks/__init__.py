@@ -1,0 +1,1 @@
+"""Checks of what a model declares, made where it is traced."""

@@ -1,0 +1,239 @@
+"""Rules on what a law may give: names, kinds of distributions, agreement of a state's laws."""
+
+from __future__ import annotations
+
+import keyword
+import math
+import unicodedata
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from ssmppl.errors import Location, ModelError, listing
+from ssmppl.expressions.expr import symbols_of, to_text, topological
+from ssmppl.language.distributions import Dirac, Distribution, Flat, InverseWishart, Wishart
+
+RESERVED = {
+    "t": "the row number",
+    "time": "the dimension of the rows in results",
+    "draw": "the dimension of draws in results",
+    "chain": "the dimension of chains in results",
+    "trajectory": "the dimension of trajectories in results",
+}
+
+
+def a(role: str) -> str:
+    """With its article."""
+    return f"an {role}" if role[0] in "aeiou" else f"a {role}"
+
+
+def check_name(name: Any, role: str, where: Location) -> None:
+    """Names must be arguments that a law can have, and no dimension of results."""
+    if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name):
+        raise ModelError(
+            f"{a(role)} has the name {name!r}, which no argument of a Python function can have",
+            fix="use letters, digits and underscores, starting with a letter, and no keyword",
+            where=where,
+        )
+    if (read := unicodedata.normalize("NFKC", name)) != name:
+        raise ModelError(
+            f"{a(role)} is named {name!r} with the characters {_characters(name, read)}, which "
+            f"Python reads as {read!r} in an argument",
+            fix=f"write {read!a} for the name, or choose one of plain letters",
+            where=where,
+        )
+    if name in RESERVED:
+        raise ModelError(
+            f"{a(role)} is named {name!r}, which means {RESERVED[name]}",
+            fix=f"choose another name, for example {name + '_'!r}",
+            where=where,
+        )
+
+
+def _characters(name: str, read: str) -> str:
+    """Those of a name that are not in what Python reads for it, by their Unicode names."""
+    return ", ".join(unicodedata.name(c, repr(c)) for c in dict.fromkeys(name) if c not in read)
+
+
+def check_dims(
+    known: Mapping[str, tuple[str, tuple[int, ...]]], where: Mapping[str, Location]
+) -> None:
+    """No name is that of a dimension of another quantity in results; known : role and shape."""
+    for name, (role, shape) in known.items():
+        for k in range(len(shape)):
+            if (own := f"{name}_dim_{k}") in known:
+                raise ModelError(
+                    f"{a(known[own][0])} is named {own!r}, which is in results a dimension of the "
+                    f"{role} {name!r}",
+                    fix=f"choose another name, for example '{name}_{k}_dim'",
+                    where=where.get(own),
+                )
+
+
+def check_returned(
+    returned: Any, role: str, function: str, where: Location
+) -> dict[str, Distribution]:
+    """The laws by name."""
+    if not isinstance(returned, Mapping) or not returned:
+        found = "nothing" if returned is None else repr(returned)
+        raise ModelError(
+            f"@{role} {function} returned {found}",
+            fix='return a dictionary {"name": distribution}',
+            where=where,
+        )
+    for name, distribution in returned.items():
+        if isinstance(distribution, Distribution):
+            continue
+        called = isinstance(distribution, type) and issubclass(distribution, Distribution)
+        if called:
+            found, fix = f"the class {distribution.__name__}", "call it with its parameters"
+        else:
+            found = repr(distribution)
+            fix = f"return ssm.Dirac(...) if {name!r} is deterministic, or a distribution such "
+            fix += "as ssm.Normal(mean, sd=...)"
+        raise ModelError(
+            f"@{role} {function}: {name!r} is {found}, which is no distribution",
+            fix=fix,
+            where=where,
+        )
+    return dict(returned)
+
+
+def check_law(name: str, distribution: Distribution, role: str) -> None:
+    """What may stand as a prior, as a law of states, as an observation."""
+    where = distribution.location
+    kind = type(distribution).__name__
+    improper = isinstance(distribution, Flat)
+    if role == "prior" and isinstance(distribution, Dirac):
+        raise ModelError(
+            f"the prior of {name!r} is Dirac",
+            fix=f"fix it by fixed={{{name!r}: value}} in the verb, or compute it inside "
+            "the functions that use it",
+            where=where,
+        )
+    if role == "prior" and distribution.discrete:
+        raise ModelError(
+            f"the prior of {name!r} is {kind}: parameters are continuous",
+            fix="make it a state with a Dirac transition, or compare models",
+            where=where,
+        )
+    allowed = role == "prior" or (role == "initial" and kind == "Flat")
+    if improper and not allowed:
+        raise ModelError(
+            f"the law of {name!r} is {kind}, which is improper",
+            fix=f"use {kind} as a prior"
+            + (", or in @initial of a linear Gaussian model" if kind == "Flat" else "")
+            + "; a vague law is one of large spread",
+            where=where,
+        )
+    if role in ("initial", "transition", "proposal") and not distribution.drawable:
+        raise distribution.undrawable(f"{name!r} is a state, which particles draw")
+    if role == "observation" and isinstance(distribution, Dirac):
+        raise ModelError(
+            f"the observation {name!r} is Dirac: data would have likelihood zero",
+            fix="give the channel a noise, for example ssm.Normal(value, sd=...)",
+            where=where,
+        )
+    if 0 in distribution.shape:
+        raise ModelError(
+            f"{name!r} has shape {distribution.shape}, which holds nothing",
+            fix="give it at least one component",
+            where=where,
+        )
+    for parameter, values in distribution.parameters.items():
+        nodes = topological(values.ravel())
+        if any(n.op == "const" and math.isnan(n.data) for n in nodes):
+            raise ModelError(
+                f"{kind} of {name!r}: {parameter.rstrip('_')} holds NaN, whatever the symbols are",
+                fix="look for the constant that is NaN (0/0, np.log of a negative number, a "
+                "missing entry of an array)",
+                where=where,
+            )
+
+
+def check_read(name: str, distribution: Distribution, role: str, kinds: Collection[str]) -> None:
+    """Refuse symbols of other kinds than the arguments of the function: another law kept them."""
+    for s in symbols_of(distribution.arguments()):
+        if s.data[0] not in kinds:
+            raise ModelError(
+                f"the law of {name!r} reads {to_text(s)}, a symbol of another law than this "
+                f"@{role}",
+                fix="name what a law needs among its arguments; what one law keeps in a variable "
+                "or a dictionary means nothing in another",
+                where=distribution.location,
+            )
+
+
+def is_symmetric(distribution: Distribution) -> bool:
+    """Whether values are symmetric matrices, whose two halves share their symbols."""
+    return isinstance(distribution, (Wishart, InverseWishart))
+
+
+def check_states(
+    initial: Mapping[str, Any], transition: Mapping[str, Any], proposal: Mapping[str, Any]
+) -> None:
+    """Every state has its laws, and they agree; arguments are sites by name."""
+    for name, site in initial.items():
+        if name not in transition:
+            raise ModelError(
+                f"state {name!r} has an initial law but no transition",
+                fix=f"return {name!r} from a @transition function too; the transitions give: "
+                f"{listing(name, transition)}",
+                where=site.distribution.location,
+            )
+    for role, sites in (("transition", transition), ("proposal", proposal)):
+        for name, site in sites.items():
+            _check_against_initial(role, name, site, initial)
+    if proposal:
+        _check_proposal(transition, proposal)
+
+
+def _check_against_initial(role: str, name: str, site: Any, initial: Mapping[str, Any]) -> None:
+    where = site.distribution.location
+    if name not in initial:
+        raise ModelError(
+            f"@{role} gives {name!r}, which has no initial law",
+            fix=f"return it from @initial too; @initial gives: {listing(name, initial)}",
+            where=where,
+        )
+    first = initial[name]
+    if site.shape != first.shape:
+        raise ModelError(
+            f"state {name!r} has shape {site.shape} in its {role} and shape "
+            f"{first.shape} in its initial law",
+            fix="give both the same shape; np.zeros(n) makes a mean of length n",
+            where=where,
+        )
+    symmetric = is_symmetric(first.distribution)
+    if is_symmetric(site.distribution) != symmetric and not isinstance(site.distribution, Dirac):
+        kinds = [type(s.distribution).__name__ for s in (first, site)]
+        raise ModelError(
+            f"state {name!r} is {kinds[0]} at first and {kinds[1]} in its {role}: one is "
+            "a symmetric matrix, the other is not",
+            fix="use Wishart or InverseWishart in both (or Dirac in the transition)",
+            where=where,
+        )
+
+
+def _check_proposal(transition: Mapping[str, Any], proposal: Mapping[str, Any]) -> None:
+    some = next(iter(proposal.values()))
+    for name, site in transition.items():
+        fixed = isinstance(site.distribution, Dirac)
+        if name not in proposal:
+            if fixed:
+                continue
+            raise ModelError(
+                f"@proposal gives no law for the state {name!r}",
+                fix=f"return {name!r} from it too; it gives: {listing(name, proposal)}",
+                where=some.where,
+            )
+        law = proposal[name].distribution
+        kinds = [type(d).__name__ for d in (site.distribution, law)]
+        if isinstance(law, Dirac) != fixed or law.discrete != site.distribution.discrete:
+            raise ModelError(
+                f"the transition of {name!r} is {kinds[0]}, its proposal {kinds[1]}: they do not "
+                "cover the same values",
+                fix="leave a deterministic state out of @proposal"
+                if fixed
+                else "propose from a distribution with the support of the transition",
+                where=law.location,
+            )

@@ -1,0 +1,43 @@
+"""All distributions of the language, by name."""
+
+from ssmppl.language.distributions.base import Distribution, Draws, Support
+from ssmppl.language.distributions.continuous import (
+    Flat,
+    HalfFlat,
+    LogNormal,
+    Normal,
+    Uniform,
+    VonMises,
+)
+from ssmppl.language.distributions.discrete import (
+    Bernoulli,
+    BetaBinomial,
+    Binomial,
+    Categorical,
+    Dirac,
+    NegativeBinomial,
+    Poisson,
+)
+from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
+from ssmppl.language.distributions.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
+from ssmppl.language.distributions.positive import Beta, Exponential, Gamma, InverseGamma, Weibull
+from ssmppl.language.distributions.symmetric import (
+    Cauchy,
+    HalfCauchy,
+    HalfNormal,
+    Laplace,
+    StudentT,
+)
+from ssmppl.language.distributions.truncated import Truncated
+
+DISTRIBUTIONS: dict[str, type[Distribution]] = {
+    cls.__name__: cls
+    for cls in (
+        Normal, MvNormal, LogNormal, StudentT, Laplace, Cauchy, HalfNormal, HalfCauchy, Uniform,
+        Exponential, Weibull, Gamma, InverseGamma, Beta, VonMises, Dirichlet, Wishart,
+        InverseWishart, Poisson, NegativeBinomial, Binomial, BetaBinomial, Bernoulli, Categorical,
+        Dirac, Truncated, Mixture, ZeroInflated, Flat, HalfFlat,
+    )
+}  # fmt: skip
+
+__all__ = [*DISTRIBUTIONS, "DISTRIBUTIONS", "Distribution", "Draws", "Support"]

@@ -1,0 +1,596 @@
+"""What every distribution offers: parameters, support, log density, sampler, moments.
+
+All of it as expressions, so that one definition serves the interpreter, the analyses and the
+generated code. A sampler is an expression over the "random" nodes of `draws.py`.
+
+Errors of a distribution's construction: what was given, and how it is written.
+
+Random draws as nodes of expressions: standard normal, uniform, gamma, Poisson, binomial, von
+Mises ones.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ssmppl.errors import Location, ModelError, UnsupportedOperation, nearest_first
+from ssmppl.expressions.arrays import ExprArray, array, elementwise
+from ssmppl.expressions.expr import Expr, apply, constant, user_location
+from ssmppl.expressions.properties import never_negative
+
+WIDEST = 30  # characters of an argument that is written again in a fix
+
+
+def checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
+    """`init`, with a ModelError in place of Python's TypeError where the arguments do not fit."""
+    signature = inspect.signature(init)
+    by_name = [p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    positional = [
+        p.name for p in signature.parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD
+    ][1:]
+
+    @functools.wraps(init)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            signature.bind(self, *args, **kwargs)
+        except TypeError as error:
+            raise misfit(
+                type(self).__name__, error, args, kwargs, positional, by_name, self.by_name
+            ) from None
+        init(self, *args, **kwargs)
+
+    return checked
+
+
+def misfit(
+    name: str, error: TypeError, args: tuple[Any, ...], kwargs: dict[str, Any],
+    positional: Sequence[str], by_name: Sequence[str] = (), called: str = "",
+) -> ModelError:  # fmt: skip
+    """What a law says whose arguments do not fit: Python's error, and how it is written.
+
+    positional, by_name : its arguments; the latter are called `called`.
+    """
+    given = f"{len(args)} without a name"
+    given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
+    found = f"{name}: {error}; given were {given}"
+    known = [f"{k}=" for k in by_name]
+    *most, last = known or [""]
+    options = f"{', '.join(most)} or {last}" if most else last
+    unknown = [k for k in kwargs if k not in (*positional, *by_name)]
+    if unknown:
+        nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
+        fix = f"the arguments of {name} are {nearest}"
+    elif by_name and len(args) > len(positional):
+        found = f"{name} takes its {called} by name: {options}"
+        arrays = any(np.ndim(a) for a in args if isinstance(a, np.ndarray))  # print as no Python
+        own = [str(a) for a in args] if len(args) == len(positional) + 1 and not arrays else []
+        if not own or kwargs or max(map(len, own)) > WIDEST:
+            own = [*positional, "..."]
+        fix = f"write {name}({', '.join([*own[:-1], f'{by_name[0]}={own[-1]}'])})"
+        fix += f", or {' or '.join(known[1:])}" if known[1:] else ""
+    else:
+        fix = f"write {name}({', '.join([*positional, *known])})"
+    return ModelError(found, fix=fix, where=user_location())
+
+
+def one_of(name: str, options: dict[str, Any], where: Location | None = None) -> tuple[str, Any]:
+    """The one spread that was given; an error naming the options where there is none or several."""
+    given = {k: v for k, v in options.items() if v is not None}
+    if len(given) != 1:
+        wanted = ", ".join(f"{k}=" for k in options)
+        found = ", ".join(f"{k}=" for k in given) or "none of them"
+        raise ModelError(
+            f"{name} takes exactly one of {wanted}; found {found}",
+            fix=f"name the spread, for example {name}(..., {next(iter(options))}=1.0)",
+            where=where or user_location(),
+        )
+    return next(iter(given.items()))
+
+
+class Draws:
+    """Makes the "random" nodes of one sampler; each draw is a node of its own."""
+
+    def __init__(self, owner: str):
+        self.owner, self.count = owner, 0
+
+    def _node(self, kind: str, *args: Any) -> Expr:
+        self.count += 1
+        return Expr("random", tuple(map(_node, args)), (kind, (self.owner, self.count)))
+
+    def normal(self) -> Expr:
+        """Standard normal."""
+        return self._node("normal")
+
+    def uniform(self) -> Expr:
+        """Uniform on the open interval (0, 1)."""
+        return self._node("uniform")
+
+    def gamma(self, shape: Any, buffered: bool = False) -> Expr:
+        """Gamma with unit rate; buffered: made of a normal and a uniform where these will do."""
+        if buffered:
+            return self._node("gamma_by", shape, self.normal(), self.uniform())
+        return self._node("gamma", shape)
+
+    def poisson(self, rate: Any) -> Expr:
+        return self._node("poisson", rate)
+
+    def binomial(self, n: Any, p: Any) -> Expr:
+        return self._node("binomial", n, p)
+
+    def vonmises(self, concentration: Any) -> Expr:
+        """Von Mises round 0, on [-pi, pi]."""
+        return self._node("vonmises", concentration)
+
+
+class Generator:
+    """What a user's sampler draws from: these methods of NumPy's `Generator`, with its arguments.
+
+    Every call is a draw of its own. A sampler that is called with NumPy's generator instead, and
+    numbers, does the same.
+    """
+
+    def __init__(self, draws: Draws):
+        self._draws = draws
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
+        """Uniform between low and high, neither of them ever drawn.
+
+        Parameters
+        ----------
+        low, high : the ends, numbers or expressions.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return low + (high - low) * self._draws.uniform()
+
+    def random(self) -> Any:
+        """Uniform between 0 and 1.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return self._draws.uniform()
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0) -> Any:
+        """Normal of mean loc and standard deviation scale.
+
+        Parameters
+        ----------
+        loc, scale : its mean and standard deviation.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return loc + scale * self._draws.normal()
+
+    def standard_normal(self) -> Any:
+        """Normal of mean 0 and standard deviation 1.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return self._draws.normal()
+
+    def exponential(self, scale: Any = 1.0) -> Any:
+        """Exponential of mean scale.
+
+        Parameters
+        ----------
+        scale : its mean.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return -scale * apply("log", self._draws.uniform())
+
+    def gamma(self, shape: Any, scale: Any = 1.0) -> Any:
+        """Gamma of mean shape times scale.
+
+        Parameters
+        ----------
+        shape, scale : its shape, and the scale, 1 / rate.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return scale * self._draws.gamma(shape)
+
+    def poisson(self, lam: Any = 1.0) -> Any:
+        """Poisson of mean lam.
+
+        Parameters
+        ----------
+        lam : its mean.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return self._draws.poisson(lam)
+
+    def binomial(self, n: Any, p: Any) -> Any:
+        """Binomial: successes among n, each of probability p.
+
+        Parameters
+        ----------
+        n : number of trials.
+        p : probability of each success.
+
+        Returns
+        -------
+        expression : the draw.
+        """
+        return self._draws.binomial(n, p)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        known = [n for n in vars(Generator) if not n.startswith("_")]
+        raise ModelError(
+            f"a sampler asks for rng.{name}, which there is not",
+            fix=f"make the draw of those that there are: {', '.join(known)}; a beta variable is "
+            "a / (a + b) of two gamma ones",
+            where=user_location(),
+        )
+
+
+def _node(value: Any) -> Expr:
+    return value if isinstance(value, Expr) else constant(value)
+
+
+INFINITY = math.inf
+LOG_2 = math.log(2.0)
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Support:
+    """Where a distribution lives.
+
+    kind : "real", "interval" (between lower and upper), "integers" (likewise), "simplex",
+        "positive definite", or "point" (Dirac).
+    lower, upper : bounds, of the distribution's shape; infinite where there is none.
+    """
+
+    kind: str
+    lower: ExprArray
+    upper: ExprArray
+
+
+class Distribution:
+    """Base of all distributions.
+
+    Subclasses set `parameters` (name -> ExprArray) through `_set`, and define the methods below.
+    Elementwise distributions (`joint = False`) are independent over their shape; joint ones
+    (`joint = True`: MvNormal, Dirichlet, Wishart, ...) have one density for the whole value.
+    """
+
+    joint = False
+    discrete = False
+    proper = True
+    closed = False  # whether the lower bound itself belongs to the support
+    open_above = False  # whether the upper one does not
+    drawable = True  # whether it has a sampler
+    by_name = "spread"  # what the keyword-only arguments are called in messages
+    parameters: dict[str, ExprArray]
+    ranges: dict[str, tuple[float, float, bool]]  # by parameter: low, high, without the ends
+    shape: tuple[int, ...]
+    location: Location
+
+    def __init_subclass__(cls) -> None:
+        if "__init__" in cls.__dict__:
+            cls.__init__ = checking_arguments(cls.__init__)  # type: ignore[method-assign]
+
+    def _set(self, **parameters: Any) -> None:
+        """Convert, broadcast (elementwise distributions) and remember the parameters.
+
+        Where a name is also that of a method (mean, shape), it is kept with an underscore.
+        """
+        self.location = user_location()
+        arrays = {}
+        for name, value in parameters.items():
+            try:
+                arrays[name] = array(value)
+            except (TypeError, ValueError) as error:
+                if isinstance(error, UnsupportedOperation):
+                    raise
+                raise ModelError(
+                    f"{type(self).__name__}: {_plain_name(name)} is {value!r}, which is no "
+                    "number or symbol",
+                    fix="pass numbers, arrays of numbers, or expressions of the function's "
+                    "arguments",
+                    where=self.location,
+                ) from None
+            if any(e.op == "const" and math.isnan(e.data) for e in arrays[name].ravel()):
+                raise ModelError(
+                    f"{type(self).__name__}: {_plain_name(name)} is nan",
+                    fix="pass numbers, or expressions of the function's arguments",
+                    where=self.location,
+                )
+        if not self.joint:
+            try:
+                shape = np.broadcast_shapes(*(a.shape for a in arrays.values()))
+            except ValueError:
+                shapes = ", ".join(f"{_plain_name(n)} {a.shape}" for n, a in arrays.items())
+                raise ModelError(
+                    f"{type(self).__name__}: shapes do not agree: {shapes}",
+                    fix="give parameters of one shape, or scalars",
+                    where=self.location,
+                ) from None
+            arrays = {n: array(np.broadcast_to(a.view(np.ndarray), shape))
+                      for n, a in arrays.items()}  # fmt: skip
+            self.shape = shape
+        self.parameters, self.ranges = arrays, {}
+
+    def _require(self, name: str, low: float, high: float = INFINITY, strict: bool = True) -> None:
+        """Refuse numbers out of range; symbols are checked where they have values (`in_range`)."""
+        self.ranges[name] = low, high, strict
+        for e in self.parameters[name].ravel():
+            if e.op != "const":
+                continue
+            inside = low < e.data < high if strict else low <= e.data <= high
+            if not inside:
+                brackets = "()" if strict else "[]"
+                raise ModelError(
+                    f"{type(self).__name__}: {_plain_name(name)} = {e.data:g} is outside "
+                    f"{brackets[0]}{low:g}, {high:g}{brackets[1]}",
+                    fix=f"give a {_plain_name(name)} inside that range",
+                    where=self.location,
+                )
+
+    def in_range(self) -> ExprArray | None:
+        """Whether the parameters that are no numbers allow a draw: element by element, or () for a
+        joint law; None where nothing has to be asked.
+
+        Ends of the range are let through: a spread of zero is a law at one point, and sums of
+        probabilities miss 0 and 1 by rounding.
+        """
+        inside: ExprArray | None = None
+        for name, (low, high, strict) in self.ranges.items():
+            values = self.parameters[name]
+            if all(e.op == "const" for e in values.ravel()):
+                continue
+            slack, own = 0.0 if strict else ROUNDING, []
+            if low != 0.0 or not all(map(never_negative, values.ravel())):
+                own.append(elementwise("le", low - slack, values))
+            if high < INFINITY:
+                own.append(elementwise("le", values, high + slack))
+            for condition in own:
+                each = list(array(condition).ravel()) if self.joint else [array(condition)]
+                for c in each:
+                    inside = array(c) if inside is None else array(elementwise("and", inside, c))
+        return inside
+
+    def __getattr__(self, name: str) -> ExprArray:
+        try:
+            return self.__dict__["parameters"][name]
+        except KeyError:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}") from None
+
+    def __repr__(self) -> str:
+        def text(a: ExprArray) -> str:
+            flat = list(a.ravel())
+            if not flat:
+                return "[]"
+            same = all(e is flat[0] for e in flat)
+            return repr(flat[0]) if same else "[" + ", ".join(map(repr, flat)) + "]"
+
+        inside = ", ".join(f"{_plain_name(n)}={text(a)}" for n, a in self.parameters.items())
+        return f"{type(self).__name__}({inside})"
+
+    def inside(self) -> tuple[Distribution, ...]:
+        """The laws that this one is made of."""
+        base = self.__dict__.get("base")
+        return () if base is None else (base,)
+
+    def undrawable(self, why: str) -> ModelError:
+        """The error of a law that is not `drawable` where it has to be."""
+        return next(law for law in self.inside() if not law.drawable).undrawable(why)
+
+    def expressions(self) -> list[Expr]:
+        """All that the law is made of: its parameters, and what else it holds."""
+        own = [e for p in self.parameters.values() for e in p.ravel()]
+        return [*own, *(e for law in self.inside() for e in law.expressions())]
+
+    def arguments(self) -> list[Expr]:
+        """What the user gave for the parameters of the law and of those inside of it."""
+        own = [e for p in self.parameters.values() for e in p.ravel()]
+        return [*own, *(e for law in self.inside() for e in law.arguments())]
+
+    def rebuilt(self, parameters: Mapping[str, Any]) -> Distribution:
+        """The law of this family with these for its own `parameters`, at its place in the file."""
+        values = {**self.parameters, **parameters}
+        return self._at_place(type(self)(**{n.rstrip("_"): array(v) for n, v in values.items()}))  # type: ignore[call-arg]
+
+    def _at_place(self, new: Distribution) -> Distribution:
+        new.location = self.location
+        return new
+
+    def element(self, index: tuple[int, ...]) -> Distribution:
+        """The law of one element of an elementwise law."""
+        return self.rebuilt({n: a[index] for n, a in self.parameters.items()})
+
+    # -- to be defined by each distribution
+    def log_densities(self, value: ExprArray) -> ExprArray:
+        """Log density on the support: of the distribution's shape, or () for a joint one."""
+        raise AttributeError
+
+    def support(self) -> Support:
+        """Where the value may lie."""
+        return Support("real", self._full(-INFINITY), self._full(INFINITY))
+
+    def sample(self, draws: Draws) -> ExprArray:
+        """A draw as an expression over random nodes."""
+        raise AttributeError
+
+    def mean(self) -> ExprArray:
+        """Expectation; nan where it does not exist."""
+        raise AttributeError
+
+    def variance(self) -> ExprArray:
+        """Variances of the components; nan where they do not exist."""
+        raise AttributeError
+
+    def cdf(self, value: ExprArray) -> ExprArray:
+        """Distribution function, element by element (not for joint distributions)."""
+        raise AttributeError
+
+    def quantile(self, p: ExprArray) -> ExprArray:
+        """Inverse of `cdf`: for discrete distributions the smallest value with cdf >= p."""
+        raise AttributeError
+
+    # -- the upper tail, each to full relative accuracy where the distribution says how
+    def survival(self, value: ExprArray) -> ExprArray:
+        """P(X > value), element by element."""
+        return 1.0 - self.cdf(value)
+
+    def survival_quantile(self, p: ExprArray) -> ExprArray:
+        """Inverse of `survival`."""
+        return self.quantile(1.0 - array(p))
+
+    def log_cdf(self, value: ExprArray) -> ExprArray:
+        """Log of `cdf`, where the distribution says how beyond the range of floating point."""
+        return array(elementwise("log", self.cdf(value)))
+
+    def log_survival(self, value: ExprArray) -> ExprArray:
+        """Log of `survival`, likewise."""
+        return array(elementwise("log", self.survival(value)))
+
+    def weighted(self, power: int) -> tuple[ExprArray, Distribution] | None:
+        """(E[X^k], the distribution with density proportional to x^k times this one's), k = power.
+
+        For counts x (x-1) ... (x-k+1) takes the place of x^k, and the distribution is that of
+        X - k. None where it is no distribution of the language.
+        """
+        return None
+
+    def has_moment(self, power: int) -> ExprArray:
+        """Whether the tails are light enough for E|X|^power, as a condition."""
+        return self._full(1.0)
+
+    # -- in terms of the above
+    def _full(self, value: float) -> ExprArray:
+        return array(np.full(self.shape, value))
+
+    def open_sides(self, lower: ExprArray, upper: ExprArray) -> tuple[bool, bool]:
+        """Whether lower (upper) bounds nothing: never inside the support."""
+        support = self.support()
+        return (
+            all(map(_never_above, array(lower).ravel(), support.lower.ravel())),
+            all(map(_never_above, support.upper.ravel(), array(upper).ravel())),
+        )
+
+    def log_mass(self, lower: ExprArray, upper: ExprArray) -> ExprArray:
+        """log P(lower <= X <= upper), element by element.
+
+        From the tail that the interval lies in, so that a far one is not lost to rounding.
+        """
+        lower, upper = array(lower), array(upper)
+        whole_left, whole_right = self.open_sides(lower, upper)
+        if whole_left:
+            return self.log_cdf(upper)
+        below = lower - 1.0 if self.discrete else lower
+        if whole_right:
+            return self.log_survival(below)
+        cdf_below = self.log_cdf(below)
+        left = log_difference(self.log_cdf(upper), cdf_below)
+        right = log_difference(self.log_survival(below), self.log_survival(upper))
+        return array(elementwise("where", elementwise("lt", cdf_below, -LOG_2), left, right))
+
+    def quantile_between(
+        self, p: ExprArray, q: ExprArray, lower: ExprArray, upper: ExprArray
+    ) -> ExprArray:
+        """Quantile of the distribution restricted to [lower, upper] at p, q = 1 - p."""
+        whole_left, whole_right = self.open_sides(lower, upper)
+        if whole_left:
+            return self.quantile(p * self.cdf(upper))
+        below = lower - 1.0 if self.discrete else lower
+        if whole_right and not self.discrete:
+            return self.survival_quantile(q * self.survival(below))
+        low = self.cdf(below)
+        left = self.quantile(q * low + p * (1.0 if whole_right else self.cdf(upper)))
+        rest = 0.0 if whole_right else p * self.survival(upper)
+        right = self.survival_quantile(q * self.survival(below) + rest)
+        return array(elementwise("where", elementwise("lt", low, 0.5), left, right))
+
+    def sample_above(self, draws: Draws, lower: ExprArray) -> ExprArray | None:
+        """A draw given X >= lower, for those that do not invert their upper tail; else None."""
+        return None
+
+    def guarded_log_densities(self, value: ExprArray) -> ExprArray:
+        """`log_densities`, and -inf outside the support.
+
+        Of a discrete law NaN where a parameter is out of its range: a count of 0 takes no
+        logarithm of it. The formulas of continuous laws are NaN there by themselves.
+        """
+        support = self.support()
+        density = array(self.log_densities(value))
+        if support.kind not in ("interval", "integers"):
+            return density
+        out = np.empty(density.shape, dtype=object)
+        wide: list[Any] = [
+            np.broadcast_to(array(a).view(np.ndarray), density.shape)
+            for a in (support.lower, support.upper, value)
+        ]
+        lower, upper, v = wide
+        for i in np.ndindex(density.shape):
+            inside = constant(1.0)
+            if not (lower[i].op == "const" and lower[i].data == -INFINITY):
+                closed = self.discrete or self.closed
+                inside = apply("le" if closed else "lt", lower[i], v[i])
+            if not (upper[i].op == "const" and upper[i].data == INFINITY):
+                below = apply("lt" if self.open_above else "le", v[i], upper[i])
+                inside = below if inside.op == "const" else apply("and", inside, below)
+            if self.discrete:
+                whole = apply("eq", v[i], apply("floor", v[i]))
+                inside = whole if inside.op == "const" else apply("and", inside, whole)
+            out[i] = apply("where", inside, density[i], -INFINITY)
+        allowed = self.in_range() if self.discrete else None
+        return array(out if allowed is None else elementwise("where", allowed, out, math.nan))
+
+    def log_density(self, value: Any, guard: bool = True) -> Expr:
+        """Log density of the whole value, one expression; -inf outside the support.
+
+        guard=False leaves the support out, as the analyses need it.
+        """
+        value = array(value)
+        parts = self.guarded_log_densities(value) if guard else self.log_densities(value)
+        return array(np.sum(array(parts)))[()]
+
+
+def log_difference(a: Any, b: Any) -> ExprArray:
+    """log(exp(a) - exp(b)) for a > b."""
+    return array(a + elementwise("log1p", -array(elementwise("exp", array(b) - a))))
+
+
+def in_order(op: str, lower: ExprArray, upper: ExprArray) -> ExprArray | None:
+    """Whether lower op upper, "lt" or "le", element by element; None where it surely is so."""
+    for pair in zip(lower.ravel(), upper.ravel(), strict=True):
+        numbers = [e.data for e in pair if e.op == "const"]
+        if len(numbers) < 2 and not any(map(math.isinf, numbers)):
+            return array(elementwise(op, lower, upper))
+    return None
+
+
+def _never_above(a: Expr, b: Expr) -> bool:
+    """Whether a <= b is known without values for symbols."""
+    return a is b or (a.op == b.op == "const" and a.data <= b.data)
+
+
+def _plain_name(name: str) -> str:
+    """A parameter as the user knows it."""
+    return name.removeprefix("like_").rstrip("_")

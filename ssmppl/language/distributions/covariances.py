@@ -1,0 +1,115 @@
+"""What the covariance of a traced MvNormal is made of: independent components, or too few noises.
+
+One with zeros off its diagonal is a Normal law of each component, and is taken as such. One whose
+rank is less than its size (q G G', one noise that drives several states) has no density; draws need
+a root of it, found by the Cholesky recursion in the given order, whose pivots of zero leave columns
+of zeros (Higham 2002, "Accuracy and stability of numerical algorithms", section 10.3).
+A pivot that is zero in some cases only leaves zeros there. What was found is held against the
+matrix over a wide range, as one that is singular at moderate values may have another noise beyond.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import elementwise as ew
+from ssmppl.expressions.expr import Expr, constant
+from ssmppl.expressions.test_points import PLAIN, Places, moderate, numbers_at, wide, with_cases
+from ssmppl.language.distributions.base import Distribution
+from ssmppl.language.distributions.continuous import Normal
+from ssmppl.language.distributions.multivariate import MvNormal
+
+ZERO = 1e-10  # of the variances: what is zero in floating point
+AGREE = 1e-8  # of the variances: what a root may differ by
+LARGEST = 12  # components; the root of more is not written out in symbols
+
+
+def independent(law: Distribution) -> Distribution:
+    """A Normal law of each component in place of an MvNormal one with zeros off its diagonal."""
+    if not isinstance(law, MvNormal):
+        return law
+    matrix = law.parameters[law.spread].view(np.ndarray)
+    zero = constant(0.0)
+    if any((matrix[i, j] is zero) == (i == j) for i, j in np.ndindex(matrix.shape)):
+        return law
+    name = {"covariance": "variance", "precision": "precision", "cholesky": "sd"}[law.spread]
+    spread: dict[str, ExprArray] = {name: array(np.diagonal(matrix))}
+    normal = Normal(law.mean_, **spread)  # type: ignore[arg-type]
+    normal.location = law.location
+    return normal
+
+
+def find_root(law: Distribution) -> None:
+    """Give an MvNormal law of singular covariance its root."""
+    if not isinstance(law, MvNormal) or law.spread != "covariance":
+        return
+    matrix = law.parameters["covariance"]
+    if len(matrix) <= LARGEST:
+        law.root = _singular_root(matrix)
+
+
+def _singular_root(matrix: ExprArray) -> ExprArray | None:
+    """Lower triangular L, (d, d), with L L' = the matrix wherever it is a covariance; None where
+    its rank is full at moderate values of its symbols, or no such L was found."""
+    entries = with_cases(matrix.ravel())
+    points = moderate(entries)
+    values, scale, valid = _covariances(entries, points)
+    plain = values[:PLAIN][valid[:PLAIN]]
+    if not len(plain) or np.linalg.matrix_rank(plain, hermitian=True).max() == len(matrix):
+        return None
+    n, zero = len(matrix), constant(0.0)
+    left = np.array(matrix.view(np.ndarray), dtype=object)
+    root = np.full((n, n), zero, dtype=object)
+    for k in range(n):
+        column = numbers_at(with_cases(left[k:, k]), points)[valid]
+        small = np.abs(column) <= ZERO * (scale[:, k:] * scale[:, k, None])[valid]  # (points, rows)
+        gone = small[:, 0]
+        if not small[gone].all() or np.any(column[~gone, 0] < 0.0):
+            return None
+        if gone.all():
+            continue
+        pivot = ew("sqrt", left[k, k])
+        for i in range(k, n):
+            if not small[:, i - k].all():
+                own = pivot if i == k else left[i, k] / pivot
+                if gone.any():  # a noise that is there in some cases only
+                    own = ew("where", ew("lt", ZERO * matrix[k, k], left[k, k]), own, 0.0)
+                root[i, k] = own
+        for i in range(k + 1, n):
+            for j in range(k + 1, n):
+                left[i, j] = left[i, j] - root[i, k] * root[j, k]
+    return array(root) if _is_root(array(root), matrix) else None
+
+
+def _is_root(root: ExprArray, matrix: ExprArray) -> bool:
+    """Whether L L' = the matrix at wide points, and in all cases of the conditions in it.
+
+    Points where rounding leaves L without a number are no witness.
+    """
+    n = len(matrix)
+    entries = with_cases(matrix.ravel())
+    forms = with_cases([*matrix.ravel(), *root.ravel()])
+    points = wide(entries)
+    values, scale, valid = _covariances(entries, points)
+    found = numbers_at(forms[n * n :], points).reshape(-1, n, n)
+    with np.errstate(all="ignore"):
+        apart = np.abs(found @ found.transpose(0, 2, 1) - values)
+        differs = apart > AGREE * scale[:, :, None] * scale[:, None, :]
+    return not np.any(differs[valid])
+
+
+def _covariances(entries: list[Expr], points: Places) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The matrix at each point, (P, d, d), the roots of its diagonal, (P, d), and whether it is a
+    covariance there, (P,)."""
+    n = math.isqrt(len(entries))
+    values = numbers_at(entries, points).reshape(-1, n, n)
+    valid = np.isfinite(values).all(axis=(1, 2))
+    values = np.where(valid[:, None, None], values, 0.0)
+    diagonal = np.diagonal(values, axis1=1, axis2=2)
+    scale = np.sqrt(np.abs(diagonal))
+    unit = np.where(scale > 0.0, scale, 1.0)
+    least = np.linalg.eigvalsh(values / unit[:, :, None] / unit[:, None, :])[:, 0]
+    return values, scale, valid & (diagonal >= 0.0).all(axis=1) & (least >= -AGREE)

@@ -1,0 +1,1 @@
+"""Models and their traces: what a user declares, and what a call of it on symbols gives."""

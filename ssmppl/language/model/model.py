@@ -1,0 +1,277 @@
+"""Model: what a user declares, held and not yet looked at.
+
+The decorators only remember the functions; `trace.py` runs them on symbols when a verb first
+needs the model, and raises there what is wrong with them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import linecache
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ssmppl import markup
+from ssmppl.errors import Location, ModelError, UnknownName
+from ssmppl.expressions.expr import user_location
+from ssmppl.language.model.closure_digest import digest_of_code, plain_function
+
+Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
+_MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
+ROLES = ("prior", "initial", "transition", "observation", "proposal")
+VERBS = ("compile", "diagnose", "evidence", "explain", "forecast", "forward_filter",
+         "kalman_filter", "leave_future_out", "log_likelihood", "maximize", "particle_filter",
+         "plot_likelihood", "predict", "sample", "score", "simulate", "smooth")  # fmt: skip
+_ELSEWHERE = {  # decorators of other libraries
+    **dict.fromkeys(("emission", "emissions", "measurement", "likelihood", "obs"), "observation"),
+    **dict.fromkeys(("dynamics", "process", "motion", "state"), "transition"),
+    **dict.fromkeys(("init", "start", "initial_state"), "initial"),
+    **dict.fromkeys(("parameters", "params", "priors"), "prior"),
+    "importance": "proposal",
+}
+
+
+class Model:
+    """A state space model, declared by decorated functions.
+
+    The decorators `prior`, `initial`, `transition` and `observation` each take a function that
+    returns ``{name: distribution}`` and whose arguments name what it depends on: parameters,
+    states (their value at t), inputs, and ``t``. All but `initial` may be used several times.
+
+    Parameters
+    ----------
+    name : shown in results and messages.
+    inputs : names of the measured inputs u_t; a mapping name -> length where some are vectors, with
+        None for a number.
+
+    Examples
+    --------
+    >>> import ssmppl as ssm
+    >>> walk = ssm.Model("random walk")
+    >>> @walk.prior
+    ... def prior():
+    ...     return {"q": ssm.InverseGamma(2, scale=1)}
+    >>> @walk.initial
+    ... def initial():
+    ...     return {"x": ssm.Normal(0, sd=10)}
+    >>> @walk.transition
+    ... def transition(x, q):
+    ...     return {"x": ssm.Normal(x, variance=q)}
+    >>> @walk.observation
+    ... def observation(x):
+    ...     return {"y": ssm.Normal(x, sd=1)}
+    """
+
+    def __init__(
+        self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = ()
+    ):
+        self.location = user_location()
+        if not isinstance(name, str):
+            raise ModelError(
+                f"the name of a model is {name!r}",
+                fix='give a string, ssm.Model("ice varves")',
+                where=self.location,
+            )
+        if isinstance(inputs, str):
+            raise ModelError(
+                f"inputs is the string {inputs!r}",
+                fix=f"give a tuple of names, inputs=({inputs!r},)",
+                where=self.location,
+            )
+        if not isinstance(inputs, Iterable):
+            raise ModelError(
+                f"inputs is {inputs!r}",
+                fix='give a tuple of names, inputs=("torque",), or their lengths by name',
+                where=self.location,
+            )
+        pairs = list(inputs.items() if isinstance(inputs, Mapping) else ((n, None) for n in inputs))
+        for key, length in pairs:
+            whole = length is None or (isinstance(length, (int, np.integer)) and length > 0)
+            if not (isinstance(key, str) and key.isidentifier()) or not whole:
+                raise ModelError(
+                    f"input {key!r} of length {length!r}",
+                    fix="input names are Python identifiers; the length of a vector input is a "
+                    "positive whole number, None stands for a number",
+                    where=self.location,
+                )
+        if len(dict(pairs)) < len(pairs):
+            names = [key for key, _ in pairs]
+            raise ModelError(
+                f"inputs holds a name twice: {', '.join(map(repr, names))}",
+                fix="name each input once",
+                where=self.location,
+            )
+        self.name = name
+        self.inputs: dict[str, tuple[int, ...]] = {
+            key: () if length is None else (int(length),) for key, length in pairs
+        }
+        self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
+
+    def prior(self, function: Law = _MISSING) -> Law:
+        """Declare priors of parameters.
+
+        Parameters
+        ----------
+        function : returns their laws by name; its arguments are parameters declared earlier.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
+        return self._declare("prior", function)
+
+    def initial(self, function: Law = _MISSING) -> Law:
+        """Declare the law of x_1, the state at the first row of the data.
+
+        Parameters
+        ----------
+        function : returns the laws of all states by name; its arguments are parameters, inputs
+            and ``t``.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
+        return self._declare("initial", function)
+
+    def transition(self, function: Law = _MISSING) -> Law:
+        """Declare the law of x_{t+1} given x_t (and u_t, t, y_t where the arguments name them).
+
+        Parameters
+        ----------
+        function : returns the laws of states by name; its arguments are parameters, states,
+            inputs, observation channels and ``t``.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
+        return self._declare("transition", function)
+
+    def observation(self, function: Law = _MISSING) -> Law:
+        """Declare the law of y_t given x_t (and u_t, t).
+
+        Parameters
+        ----------
+        function : returns the laws of channels by name; its arguments are parameters, states,
+            inputs and ``t``.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
+        return self._declare("observation", function)
+
+    def proposal(self, function: Law = _MISSING) -> Law:
+        """Override the derived proposal of x_{t+1}, from which particles are drawn.
+
+        Parameters
+        ----------
+        function : returns the laws of all states by name; its arguments are those of a transition,
+            but observation channels mean y_{t+1} here.
+
+        Returns
+        -------
+        function : itself, so that the name stays what it was.
+        """
+        return self._declare("proposal", function)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # what Python and notebooks ask every object for
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        near = difflib.get_close_matches(name.lower(), [*ROLES, *VERBS, *_ELSEWHERE], 1)
+        meant = _ELSEWHERE.get(near[0], near[0]) if near else ""
+        if meant in VERBS:
+            fix = f"the verbs are functions: write ssm.{meant}(model, ...)"
+        elif meant:
+            fix = f"write @model.{meant}"
+        else:
+            fix = (
+                f"its decorators are {', '.join(ROLES)}; the verbs are functions, ssm.sample(model)"
+            )
+        raise UnknownName(f"a model has no {name!r}", fix=fix, where=user_location())
+
+    def _declare(self, role: str, function: Law) -> Law:
+        if not (inspect.isfunction(function) or inspect.ismethod(function)):
+            found = f"@{role} of model {self.name!r} stands on {function!r}, which is no function"
+            if function is _MISSING:
+                found = f"@{role} of model {self.name!r} is called without a function"
+            raise ModelError(
+                found,
+                fix=f"write @model.{role} (without parentheses) on the line above a def",
+                where=user_location(),
+            )
+        if role in ("initial", "proposal") and self.functions[role]:
+            first = location_of(self.functions[role][0])
+            raise ModelError(
+                f"a second @{role} function; the first is at {first}",
+                fix=f"return all states from one @{role} function; in a notebook, run the cell of "
+                "ssm.Model(...) again before its functions",
+                where=location_of(function),
+            )
+        self.functions[role].append(function)
+        return function
+
+    @property
+    def signature(self) -> tuple:
+        """What traces of this model are cached by: changes when a function is declared, and when a
+        variable that one reads from outside gets another value."""
+        functions = [f for role in ROLES for f in self.functions[role]]
+        outer = digest_of_code(functions)
+        return (self.name, tuple(self.inputs.items()), *map(tuple, self.functions.values()), outer)
+
+    def __repr__(self) -> str:
+        declared = ", ".join(
+            f.__name__ for role in ROLES for f in self.functions[role]
+        )  # no tracing in a repr
+        inputs = f", inputs={tuple(self.inputs)}" if self.inputs else ""
+        return f"<Model {self.name!r}{inputs}: {declared or 'nothing declared'}>"
+
+    def _repr_html_(self) -> str:
+        """What was declared, where, on what each law depends, and the functions as they stand."""
+        rows, texts = [], []
+        for role in ROLES:
+            for function in self.functions[role]:
+                where = location_of(function)
+                names = ", ".join(inspect.signature(function).parameters)
+                needs = markup.code(names) if names else markup.text("nothing")
+                rows.append((markup.text(role), needs, markup.text(where.place)))
+                texts.append(_source(function))
+        lengths = [n + (f" ({s[0]} numbers)" if s else "") for n, s in self.inputs.items()]
+        if lengths:
+            rows.insert(0, (markup.text("inputs"), markup.code(", ".join(lengths)), ""))
+        if not rows:
+            return markup.heading(self.name) + markup.paragraph("Nothing is declared yet.")
+        head = ("law", "depends on", "declared at")
+        found = markup.heading(self.name) + markup.table(rows, head, left=(0, 1, 2))
+        source = "\n\n".join(t for t in texts if t)
+        style = "text-align:left"
+        if source:
+            inside = f"<pre style='{style}'>{markup.text(source)}</pre>"
+            found += markup.folded("the functions", inside)
+        return found
+
+
+def _source(function: Callable[..., Any]) -> str:
+    """Its text; empty where that is not at hand."""
+    try:
+        return textwrap.dedent(inspect.getsource(plain_function(function))).strip()
+    except (OSError, TypeError):
+        return ""
+
+
+def location_of(function: Callable[..., Any]) -> Location:
+    """Where a function is defined: the line of its `def`, below its decorators."""
+    code = plain_function(function).__code__
+    line = code.co_firstlineno
+    linecache.checkcache(code.co_filename)  # it may have been edited and run again
+    for candidate in range(line, line + 20):
+        text = linecache.getline(code.co_filename, candidate).lstrip()
+        if text.startswith(("def ", "async def ")) or "lambda" in text:
+            line = candidate
+            break
+    return Location(code.co_filename, line, function.__name__)

@@ -1,0 +1,156 @@
+"""What a traced model is: its quantities, each a site with its law in terms of symbols.
+
+A `Trace` holds, for every parameter, state and observation, its distribution(s) in terms of
+symbols, and where each expression was written. Kinds of symbols:
+
+================  ============================================================
+parameter         theta
+state             x_t where it is drawn, weighed and observed
+state_prev        x_{t-1}, the arguments of a transition
+observation       y_t;  seen: 1 where that component of y_t was measured
+observation_prev  y_{t-1}, where a transition names a channel
+input, input_prev u_t and u_{t-1};  time, time_prev: the row number, from 1
+================  ============================================================
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from functools import cached_property, wraps
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ssmppl.compiling import LOCK
+from ssmppl.errors import Location
+from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.language.distributions import Distribution
+from ssmppl.language.model.pickling import Known, digest_of, packed, unpacked
+
+
+@dataclass(frozen=True)
+class Site:
+    """One named quantity under one law.
+
+    value : the symbols of the quantity, of the distribution's shape (symmetric matrices share
+        the symbols of their lower half).
+    """
+
+    name: str
+    role: str
+    distribution: Distribution
+    value: ExprArray
+    where: Location
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.value.shape
+
+    @cached_property
+    def components(self) -> list[Expr]:
+        """The distinct symbols of the value, row by row."""
+        return list(dict.fromkeys(self.value.ravel()))
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The traced model; see the module's docstring for its symbols.
+
+    choices : element of an array that a symbol chose -> (the index, the number of elements).
+    """
+
+    name: str
+    parameters: dict[str, Site]
+    initial: dict[str, Site]
+    transition: dict[str, Site]
+    observations: dict[str, Site]
+    proposal: dict[str, Site]
+    inputs: dict[str, tuple[int, ...]]
+    locations: dict[Expr, Location]
+    functions: dict[str, list[Location]] = field(default_factory=dict)
+    choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Packed once, and one object in each process that gets it: what was generated for it is
+        found again by its identity."""
+        content = self.__dict__.get("_packed")
+        if content is None:
+            content = packed((type(self), *(getattr(self, f.name) for f in fields(self))))
+            object.__setattr__(self, "_packed", content)
+        _received.put(digest_of(content), self)
+        return _receive, (content,)
+
+    @cached_property
+    def parameter_symbols(self) -> list[Expr]:
+        return [s for site in self.parameters.values() for s in site.components]
+
+    @cached_property
+    def state_symbols(self) -> list[Expr]:
+        return [s for site in self.initial.values() for s in site.components]
+
+    @cached_property
+    def state_prev_symbols(self) -> list[Expr]:
+        return [previous(s) for s in self.state_symbols]
+
+    @cached_property
+    def observation_symbols(self) -> list[Expr]:
+        return [s for site in self.observations.values() for s in site.components]
+
+    @cached_property
+    def input_symbols(self) -> list[Expr]:
+        return [s for n, shape in self.inputs.items() for s in symbols("input", n, shape).ravel()]
+
+
+_received: Known[Trace] = Known(most=64)
+
+
+def _receive(content: bytes) -> Trace | None:
+    def made() -> Trace:
+        kind, *values = unpacked(content)
+        trace: Trace = kind(*values)
+        return trace
+
+    return _received.get(digest_of(content), made)
+
+
+def previous(s: Expr) -> Expr:
+    """The symbol of the same quantity one step earlier."""
+    kind, name, index = s.data
+    return symbol(kind + "_prev", name, index)
+
+
+def seen(s: Expr) -> Expr:
+    """The symbol that is 1 where this component of an observation was measured, else 0."""
+    return symbol("seen", *s.data[1:])
+
+
+def symbols(kind: str, name: str, shape: tuple[int, ...], symmetric: bool = False) -> ExprArray:
+    """The symbols of a named quantity, of the given shape."""
+    out = np.empty(shape, dtype=object)
+    for i in np.ndindex(*shape):
+        index = (max(i), min(i)) if symmetric else i
+        out[i] = symbol(kind, name, index)
+    return array(out)
+
+
+Derived = TypeVar("Derived")
+
+
+def once_per_trace(derive: Callable[[Trace], Derived]) -> Callable[[Trace], Derived]:
+    """What is derived from a trace alone: derived once, and kept for as long as the trace lives."""
+    kept: dict[int, tuple[weakref.ref[Trace], Derived]] = {}
+
+    @wraps(derive)
+    def derived(trace: Trace) -> Derived:
+        key = id(trace)
+        if key not in kept:
+            with LOCK:
+                if key not in kept:
+                    reference = weakref.ref(trace, lambda _: kept.pop(key, None))
+                    kept[key] = reference, derive(trace)
+        return kept[key][1]
+
+    return derived
