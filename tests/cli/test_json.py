@@ -15,7 +15,7 @@ from ssmppl.cli.rendering import plain
 from ssmppl.modelfile import load_model, read_csv
 from ssmppl.results import arviz
 from tests.cli.shared import QUICK, WEATHER, answer, run, write
-from tests.gap.made_up import effect_found
+from tests.diagnosis.made_up import effect_found
 
 PAGE = Path(__file__).parent.parent.parent / "docs" / "command_line.md"
 Q = ("-p", "q=0.3")

@@ -17,7 +17,7 @@ import ssmppl as ssm
 from ssmppl.inference.run import progress as progress_module
 from ssmppl.inference.run.progress import Progress, announced
 from tests.cli.shared import QUICK, answer, fails, interrupted_after, run
-from tests.gap.made_up import effect_found
+from tests.diagnosis.made_up import effect_found
 
 ROOT = Path(__file__).parent.parent.parent
 RED, YELLOW, BOLD = "\x1b[31m", "\x1b[33m", "\x1b[1m"

@@ -26,8 +26,8 @@ from ssmppl.language.distributions.base import Draws
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.trace import trace
 from tests.codegen.models import declare
-from tests.language.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
-from tests.language.test_truncated import COUNTS, check_counts
+from tests.language.distributions.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
+from tests.language.distributions.test_truncated import COUNTS, check_counts
 
 N = 20_000
 LEVEL = 1e-6 / (len(CASES) + 6 * len(JOINT_CASES) + len(TRUNCATED_CASES))  # Bonferroni

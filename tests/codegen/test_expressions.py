@@ -2,7 +2,8 @@
 
 In plain Python the comparison is exact to the last bit, with the kernels' scalar functions in the
 interpreter's table too, so that it is the text that is tested and not the accuracy of `exp`
-(`tests/kernels` does that). A few are compiled and compared with the interpreter as it stands.
+(`tests/codegen/kernels` does that). A few are compiled and compared with the interpreter as it
+stands.
 """
 
 import numpy as np

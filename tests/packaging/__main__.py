@@ -19,16 +19,16 @@ HERE = Path(__file__).parent
 
 # What depends on other packages most: data, results, files, plots, the command line, compilers.
 SUITE = [
-    "tests/test_data.py",
-    "tests/test_plots.py",
+    "tests/data/test_data.py",
+    "tests/diagnosis/report/test_panels.py",
     "tests/test_results.py",
     "tests/cli/test_commands.py",
     "tests/cli/test_reading.py",
     "tests/codegen/test_native.py",
     "tests/codegen/test_program.py",
-    "tests/inference/test_forecast.py",
-    "tests/inference/test_predict.py",
-    "tests/inference/test_sample.py",
+    "tests/inference/verbs/test_forecast.py",
+    "tests/inference/verbs/test_predict.py",
+    "tests/inference/verbs/test_sample.py",
     "tests/plots",
 ]
 # Of the development's packages, those that the tests do not import.

@@ -11,7 +11,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl import markup
-from tests.gap.made_up import ALL, effect_found
+from tests.diagnosis.made_up import ALL, effect_found
 from tests.plots.results import data, level, maximised
 
 

@@ -5,8 +5,8 @@ import pytest
 
 from ssmppl.inference.exact.kalman import start_of
 from ssmppl.inference.exact.kalman_matrices import smoothed
-from tests.kernels.kalman_matrices import random_data, random_model, with_flat
-from tests.kernels.test_kalman_diffuse import experiment
+from tests.codegen.kernels.kalman_matrices import random_data, random_model, with_flat
+from tests.codegen.kernels.test_kalman_diffuse import experiment
 from tests.statistics.checks import seed_of
 
 kalman_smoother = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")

@@ -5,11 +5,11 @@ here is: reduce the argument to a short interval, evaluate a polynomial there, p
 together with selects only.  The methods are those of W. J. Cody and W. Waite, *Software
 Manual for the Elementary Functions* (1980), and J.-M. Muller, *Elementary Functions*
 (3rd ed., 2016), chapters 3 and 11; the coefficients are interpolants at Chebyshev nodes,
-computed with 60 digits (`tests/kernels/coefficients.py` recomputes them).
+computed with 60 digits (`tests/codegen/kernels/coefficients.py` recomputes them).
 
-Errors against mpmath, in units in the last place, are in `tests/kernels/test_elementary.py`:
-exp, log, sin, cos below 2, the others below 4.  NaN stays NaN, infinities are honoured,
-exp(-inf) is exactly 0; the sign of zero is not kept.
+Errors against mpmath, in units in the last place, are in
+`tests/codegen/kernels/test_elementary.py`: exp, log, sin, cos below 2, the others below 4.  NaN
+stays NaN, infinities are honoured, exp(-inf) is exactly 0; the sign of zero is not kept.
 """
 
 from __future__ import annotations

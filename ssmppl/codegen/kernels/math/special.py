@@ -4,7 +4,8 @@ Sources: M. Abramowitz and I. A. Stegun, *Handbook of Mathematical Functions* (A
 M. J. Wichura's AS 241, *Applied Statistics* 37 (1988), for the normal quantile; C. Loader, *Fast
 and accurate computation of binomial probabilities* (2000), for powers over factorials without
 cancellation.  Relative errors are below 1e-12 (near a zero of the function: absolute errors);
-`tests/kernels/test_special.py` has the ranges.  Outside their domain the functions return NaN.
+`tests/codegen/kernels/test_special.py` has the ranges.  Outside their domain the functions
+return NaN.
 
 Incomplete gamma and beta functions, regularised, and their inverses in x.
 

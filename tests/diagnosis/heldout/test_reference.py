@@ -1,0 +1,48 @@
+"""The reference: what it does with fits that go astray."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssmppl.diagnosis.heldout import reference
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.fit import Fitter
+from ssmppl.inference.run.seeds import seed_sequence
+from tests.diagnosis.model.test_basis import THETA, asked, simulated
+
+FIXED = {n: np.asarray(v) for n, v in THETA.items() if n != "phi"}
+
+
+@pytest.mark.slow
+def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
+    screen = asked(simulated(lambda x, w, u: 0.15 * x * u, "x and u"))
+    trace, missing = screen.question.trace, screen.question.smoother.missing
+    workshop = Workshop(trace, missing, FIXED, Settings(particles=100))
+    start = {n: np.asarray(v) for n, v in THETA.items()}
+    base = workshop.fitter(())
+    train = list(screen.experiments)
+    fit = base.fit(train, seed_sequence(1), start, searched=True)
+    groups = reference.signal(screen, ())
+    assert groups
+
+    def made():
+        return reference.fit_reference(
+            workshop, (), fit, screen, train, seed_sequence(2), Checkpoint(None, {})
+        )
+
+    fitter, found = made()
+    assert fitter is not base
+    assert found.log_likelihood > fit.log_likelihood + 2.0
+    fitted = Fitter.fit
+
+    def astray(self, *args, **kwargs):
+        out = fitted(self, *args, **kwargs)
+        return replace(out, log_likelihood=out.log_likelihood - 1e4)
+
+    monkeypatch.setattr(Fitter, "fit", astray)
+    fitter, found = made()
+    assert fitter is base
+    assert found is fit

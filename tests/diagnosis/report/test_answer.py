@@ -1,0 +1,130 @@
+"""What the held-out rows must say before a verdict."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import ssmppl as ssm
+from ssmppl.diagnosis import diagnose
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, closed, interval_of
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.report import answer, tables
+from ssmppl.diagnosis.report.answer import _curves_beat
+from ssmppl.diagnosis.report.words import headline
+from ssmppl.drawing.numerals import interval
+from ssmppl.language.trace import trace
+from tests.diagnosis import models
+from tests.diagnosis.harness import scales
+from tests.diagnosis.small import level, levels
+
+
+@pytest.mark.parametrize(
+    ("nats", "error", "share", "chosen", "expected"),
+    [
+        (16.0, 3.0, 0.58, True, True),
+        (16.0, 9.0, 0.58, True, False),  # chance explains it
+        (2.9, 0.9, 0.94, True, False),  # the catalogue's effects close nearly all
+        (6.0, 2.0, float("nan"), True, True),  # no share is given
+        (6.0, 2.0, 1.0, False, True),  # nothing was chosen: the share is the curves' own
+        (-6.0, 2.0, 1.2, True, False),
+    ],
+)
+def test_curves_beat_the_catalogue(nats, error, share, chosen, expected):
+    far = SimpleNamespace(beyond=Gain(nats, error, nats / 150), rows=[{"F": share}])
+    assert _curves_beat(far, chosen) is expected
+    assert _curves_beat(SimpleNamespace(beyond=None, rows=[]), chosen) is False
+
+
+# -- a verdict agrees with the checks
+@pytest.fixture
+def few_sets(monkeypatch):
+    monkeypatch.setattr(diagnose, "SETS", {"fast": 60, "full": 60})
+
+
+def quiet(**kwargs):
+    """A report on data of the model itself."""
+    return ssm.diagnose(level(), levels(80), ["sensor drift"], mode="fast", progress=False,
+                        **kwargs)  # fmt: skip
+
+
+def test_where_nothing_stands_out_no_gap_is_measurable(few_sets):
+    report = quiet()
+    assert report.verdict == "no measurable gap"
+    assert min(report.where["p"].min(), report.detection["p"].min()) > 0.05
+    assert "passed all" in str(report)
+
+
+def test_a_check_that_fails_is_a_gap(few_sets, monkeypatch):
+    """z = 39 and "no measurable gap" stood in one report."""
+    whole = answer._detection
+
+    def failed(screen):
+        table = whole(screen)
+        table.loc[table.index[0], ["z", "p"]] = 39.0, 1e-6
+        return table
+
+    monkeypatch.setattr(answer, "_detection", failed)
+    report = quiet()
+    assert report.verdict == "none of these"
+    first = report.detection.iloc[0]
+    assert f"({first['statistic']} of y, p < 0.001)" in headline(report)
+    assert "no measurable gap" not in str(report).lower()
+
+
+def test_a_place_that_stands_out_is_a_gap_with_its_stretch_and_curve(few_sets, monkeypatch):
+    whole = tables.where_table
+
+    def found(screen, alpha):
+        table, groups = whole(screen, alpha)
+        mean = table.index[table["moment"] == "mean"][0]
+        table.loc[mean, ["t_from", "t_to", "z", "p"]] = 20, 40, 39.0, 1e-6
+        return table.sort_values("p").reset_index(drop=True), groups
+
+    monkeypatch.setattr(tables, "where_table", found)
+    report = quiet()
+    assert report.verdict == "none of these"
+    equation = report.where.iloc[0]["equation"]
+    assert f"in the mean of {equation}, strongest at t = 20 to 40 (p < 0.001)" in headline(report)
+    assert set(report.missing["equation"]) == {equation}
+
+
+def test_places_and_checks_share_the_error_rate():
+    """A fifth of it each, so that their p is five times the family's own."""
+    assert tables.shared([0.004, 0.02, 0.5]).tolist() == pytest.approx([0.02, 0.1, 1.0])
+
+
+# -- the chosen effects need not have the shape that led the screen
+def test_a_chosen_effect_of_another_shape_has_its_numbers():
+    """KeyError: 'stribeck_v' ended every run on a record of a ship."""
+    head = next(c for c in models_candidates() if c.effect.name == "coulomb friction")
+    other = replace(head.with_shape(v0=0.123), strength="coulomb_friction_v_2")
+    refit = SimpleNamespace(
+        candidates=(other,), strengths=[0.25], errors={"coulomb_friction_v_2": 0.01}, bounds=[]
+    )
+    question = SimpleNamespace(candidates=[head])
+    screen = SimpleNamespace(question=question, experiments=[SimpleNamespace(time=None)])
+    results = SimpleNamespace(chosen=refit, screen=screen, unfitted=None)
+    (found,) = answer._leading(results, [0])
+    assert found == {"row": 0, "form": "v0 = 0.123", "sign": "one-sided", "estimate": 0.25,
+                     "se": 0.01}  # fmt: skip
+
+
+def models_candidates():
+    """Of the oscillator."""
+    made = trace(models.build("oscillator"))
+    return offers(made, scales(made))[0]
+
+
+# -- an interval of a model against itself
+def test_a_share_of_the_reference_itself_is_no_comparison():
+    rng = np.random.default_rng(1)
+    gains = 1.0 + 0.1 * rng.standard_normal((1, 200))
+    base = np.zeros((1, 200))
+    share = closed(base, gains, gains)
+    assert share.F == 1.0
+    assert np.isnan(interval_of(share)).all()
+    assert interval(*interval_of(share)) == "no comparison: the reference is this model itself"
+    other = closed(base, 0.9 * gains, gains)
+    assert np.isfinite(interval_of(other)).all()

@@ -1,0 +1,277 @@
+"""What `diagnose` returns, and what `print` says of it to a reader without statistics."""
+
+import dataclasses
+import math
+import pickle
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ssmppl.diagnosis.report import report as module
+from ssmppl.diagnosis.report.findings import COLUMNS, MODES, VERDICTS, tabulate
+from ssmppl.diagnosis.report.report import GapReport
+from ssmppl.diagnosis.report.words import (
+    alternatives,
+    class_letters,
+    headline,
+    how_far,
+    label,
+    leaders,
+    listed,
+    next_steps,
+    sentence,
+    untold,
+    where,
+    which,
+)
+from ssmppl.drawing.numerals import DASH, interval, number, p_text, percent, span, with_error
+from ssmppl.errors import ArgumentError
+from tests.diagnosis.made_up import ALL, NAN, effect_found, fast, no_gap, none_of_these, several
+
+
+def empty(verdict="no measurable gap", **fields):
+    """A report that holds nothing."""
+    tables = {name: tabulate(name) for name in COLUMNS if name not in ("missing", "left_out")}
+    return GapReport(verdict=verdict, **tables, **fields)
+
+
+# -- numbers
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (number(0.012345), "0.0123"), (number(12345.6), "12,300"), (number(-0.5), "−0.5"),
+        (number(0), "0"), (number(NAN), DASH), (number(None), DASH), (number("x"), DASH),
+        (number(1.23e-7), "1.23e-07"), (number(9.996), "10"), (number(-math.inf), "−∞"),
+        (number(24.3, 2), "24"), (number(4e9), "4.00e+09"),
+        (with_error(0.31243, 0.0413), "0.312 ± 0.041"), (with_error(-247.8, 28.1), "−248 ± 28"),
+        (with_error(1.2, 0.0), "1.2"), (with_error(1.2, NAN), "1.2"),
+        (with_error(0.0021, 0.003), "0.0021 ± 0.0030"), (with_error(12345, 1500), "12,300 ± 1,500"),
+        (percent(0.861), "86%"), (percent(-0.12), "−12%"), (percent(NAN), DASH),
+        (percent(-0.001), "0%"), (percent(1.08), "108%"),
+        (p_text(0.0004), "p < 0.001"), (p_text(0.0123), "p = 0.012"), (p_text(0.43), "p = 0.43"),
+        (p_text(NAN), "p unknown"),
+        (interval(0.71, 0.99), "95% interval 71% to 99%"),
+        (interval(0.4, math.inf), "95% interval: at least 40%"),
+        (interval(-math.inf, 0.9), "95% interval: at most 90%"),
+        (interval(-math.inf, math.inf), "95% interval: unbounded"),
+        (interval(NAN, 1), "no comparison: the reference is this model itself"),
+        (span(1, 400), "t = 1 to 400"), (span(1899.0, 1899), "t = 1899"), (span(NAN, 3), ""),
+        (span(np.datetime64("2024-01-01").astype(object), "2024-02-01 00:00:00"),
+         "t = 2024-01-01 to 2024-02-01"),
+        (span(np.datetime64("2024-01-01", "us"), np.datetime64("2024-02-01T06", "us")),
+         "t = 2024-01-01 to 2024-02-01T06:00:00"),
+    ],
+)  # fmt: skip
+def test_numbers_are_written_for_readers(text, found):
+    assert text == found
+
+
+@given(st.floats(min_value=1e-30, max_value=1e30), st.booleans())
+def test_a_number_keeps_three_digits(size, negative):
+    value = -size if negative else size
+    back = float(number(value).replace("−", "-").replace(",", ""))
+    assert abs(back - value) <= 0.00501 * abs(value)
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-4, 1e5))
+def test_a_value_is_rounded_by_less_than_a_tenth_of_its_error(value, error):
+    first, _, second = with_error(value, error).replace("−", "-").replace(",", "").partition(" ± ")
+    assert abs(float(first) - value) <= 0.0501 * error
+    assert abs(float(second) - error) <= 0.0501 * error
+
+
+# -- names
+def test_effects_are_named_in_equations_and_of_inputs():
+    assert label("quadratic drag", "v") == "quadratic drag in v"
+    assert label("Sensor bias", "y") == "Sensor bias of y"
+    assert label("parameter break", "level") == "parameter break of level"
+    assert label("the estimated curve", "") == "the estimated curve"
+    assert listed(["a", "b", "c"], "or") == "a, b or c"
+    assert listed([]) == ""
+    assert sentence("x[0] moves.") == "X[0] moves."
+
+
+def test_leaders_are_the_chosen_causes_each_on_its_equation():
+    report = several()
+    assert [(r["effect"], r["equation"]) for r in leaders(report)] == [
+        ("coulomb friction", "speed[0]"),
+        ("coulomb friction", "speed[1]"),
+    ]
+    same_name = dataclasses.replace(report, chosen=["coulomb friction"] * 2)
+    assert leaders(same_name) == leaders(report)
+    # one that is not among the causes is named all the same
+    other = dataclasses.replace(report, chosen=["my effect"])
+    assert "my effect" in headline(other)
+    assert leaders(no_gap()) == []
+
+
+def test_letters_go_to_classes_with_several_members_best_first():
+    assert class_letters(several()) == {2: "A", 3: "B"}
+    assert class_letters(effect_found()) == {1: "A"}
+    assert class_letters(none_of_these()) == {}
+
+
+def test_of_many_rivals_some_are_named_and_the_rest_counted():
+    report = dataclasses.replace(several(), chosen=["input saturation"])
+    assert alternatives(report, leaders(report)[0]) == [
+        "input saturation of u1",
+        "dead zone of u1",
+        "cubic stiffness in speed[0]",
+        "2 more",
+    ]
+
+
+# -- the first line
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("effect_found", ["lacks one of these", "cannot tell which", "quadratic drag in v or "
+                          "state-dependent damping in v", "86%", "71% to 99%"]),
+        ("none_of_these", ["lacks something in the mean of v", "none of the 87 effects tried",
+                           "62%", "41% to 83%", "p < 0.001"]),
+        ("no_gap", ["No measurable gap", "none of the 87 effects", "p = 0.43"]),
+        ("fast", ["The screen", "p < 0.001", "cannot tell which", "not been measured yet"]),
+        ("several", ["2 effects", "(1) coulomb friction in speed[0];", "(2) coulomb friction in "
+                     "speed[1] or stribeck in speed[1]", "at least 40%"]),
+        ("break_of_level", ["“Nile” lacks parameter break of level", "86%", "at most 99%"]),
+    ],
+)  # fmt: skip
+def test_the_first_sentence_is_the_verdict_with_number_and_uncertainty(name, parts):
+    report = ALL[name]()
+    text = headline(report)
+    assert [p for p in parts if p not in text] == []
+    assert " ".join(str(report).split()).startswith(text)
+    assert text.endswith(".")
+
+
+def test_an_effect_that_gains_nothing_on_data_kept_back_is_said_so():
+    report = effect_found()
+    lost = report.closed.assign(F=NAN, F_low=NAN, F_high=NAN)
+    assert "too uncertain to say how far the gap closes" in headline(
+        dataclasses.replace(report, closed=lost)
+    )
+    stood_out = dataclasses.replace(no_gap(), causes=report.causes)
+    assert "stood out at first (p < 0.001)" in headline(stood_out)
+
+
+# -- the whole text
+@pytest.mark.parametrize("name", ALL)
+def test_the_text_fits_the_page_and_holds_no_leftovers(name):
+    text = str(ALL[name]())
+    assert max(map(len, text.splitlines())) <= 100
+    assert not re.search(r"\bnan\b|\binf\b|None(?! of)|  \.|\.\.|\( |,,", text)
+    assert "\N{NO-BREAK SPACE}" not in text
+    assert not re.search(r" [a-z] =$| [a-z] <$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_nats_are_explained_once(name):
+    assert str(ALL[name]()).count("1 nat is 2.7 times") == 1
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+@pytest.mark.parametrize("mode", MODES)
+def test_an_empty_report_can_be_printed(verdict, mode):
+    text = str(empty(verdict, mode=mode))
+    assert "Where" in text
+    assert not re.search(r"\bnan\b|None(?! of)", text)
+
+
+def test_the_table_marks_what_was_chosen_predicted_and_alike():
+    lines = str(effect_found()).splitlines()
+    row = {line.split("  ")[0 if line.startswith("→") else 1]: line for line in lines if " ± " in
+           line and "  " in line and line[:2] in ("→ ", "  ")}  # fmt: skip
+    assert row["→ quadratic drag in v"].endswith(" A")
+    assert any("coulomb friction" in line and "7.2 *" in line for line in lines)
+    assert not any("input saturation" in line and "*" in line for line in lines)
+
+
+def test_where_names_the_places_that_stand_out_and_no_others():
+    found = where(effect_found())
+    assert found == ["In the mean of v, strongest at t = 412 to 563 and where |v| > 1.2 "
+                     "(z = 6.1, p < 0.001)."]  # fmt: skip
+    assert len(where(several())) == 2
+    assert "the noise level of z<1>" in where(several())[1]
+    assert where(no_gap()) == ["No equation stands out from chance."]
+
+
+def test_how_far_says_what_moved_and_which_way():
+    good = " ".join(how_far(effect_found()))
+    assert f"{number(math.exp(0.0812))} times as probable" in good
+    assert "falls from 0.213 to 0.094" in good
+    assert "t = 711 to 1000" in good
+    assert "does not fall: it goes from 0.2 to 0.22" in " ".join(how_far(several()))
+    assert "fast mode" in how_far(fast())[0]
+    report = effect_found()
+    worse = dataclasses.replace(report, closed=report.closed.assign(F=-0.12, F_low=-0.4))
+    assert "made the predictions worse" in " ".join(how_far(worse))
+    assert how_far(no_gap()) == ["On data that took no part in the choice (t = 711 to 1000), no "
+                                 "gap could be measured."]  # fmt: skip
+
+
+def test_the_curve_of_none_of_these_is_told_where_its_band_leaves_zero():
+    text = " ".join(which(none_of_these()))
+    assert re.search(r"largest at x = −?0\.5: −?0\.399 \(95% band", text)
+    flat = none_of_these()
+    flat = dataclasses.replace(flat, missing=flat.missing.assign(low=-1.0, high=1.0))
+    assert "largest" not in " ".join(which(flat))
+
+
+def test_what_would_tell_rivals_apart_is_named():
+    steps = " ".join(next_steps(effect_found()))
+    assert "record data with a slow sine of u that keeps x small while v is large" in steps
+    unknown = dataclasses.replace(several(), chosen=["input saturation"])
+    assert "None of the simple inputs" in " ".join(next_steps(unknown))
+    assert "full mode" in " ".join(next_steps(fast()))
+    stopped = dataclasses.replace(effect_found(), interrupted=True)
+    assert "goes on from the stages done" in next_steps(stopped)[0]
+
+
+def test_what_does_not_apply_is_told_with_its_reason():
+    told = untold(several())
+    assert "Input delay for u2: u2 is constant in these data." in told
+    assert any("@ssm.primitive" in line for line in told)
+
+
+def test_what_does_not_apply_for_one_reason_is_told_once():
+    cells = [("drag", "x"), ("stop", "x"), ("stop", "x"), ("drag", "w"), ("outliers", "")]
+    why = "it is only the integral of v"
+    found = [{"part": p, "equation": e, "reason": why} for p, e in cells]
+    report = dataclasses.replace(several(), not_applicable=tabulate("not_applicable", found))
+    assert untold(report)[-3:] == [
+        "Drag and stop for x: it is only the integral of v.",
+        "Drag for w: it is only the integral of v.",
+        "Outliers: it is only the integral of v.",
+    ]
+
+
+# -- the object
+def test_a_table_takes_its_columns_and_no_others():
+    table = tabulate("where", [{"equation": "v", "z": 2.0}])
+    assert tuple(table.columns) == COLUMNS["where"]
+    assert table["p"].isna().all()
+    with pytest.raises(ArgumentError, match=r"no column 'zz'[\s\S]*equation"):
+        tabulate("where", [{"zz": 1}])
+
+
+def test_a_report_refuses_what_it_does_not_know():
+    with pytest.raises(ArgumentError, match="'perfect'"):
+        empty("perfect")
+    with pytest.raises(ArgumentError, match="'slow'"):
+        empty(mode="slow")
+    with pytest.raises(ArgumentError, match="'causes' of a report lacks z, p"):
+        dataclasses.replace(effect_found(), causes=effect_found().causes.drop(columns=["z", "p"]))
+
+
+def test_a_report_crosses_processes():
+    report = effect_found()
+    assert str(pickle.loads(pickle.dumps(report))) == str(report)
+
+
+def test_a_report_without_a_presenter_says_what_to_import(monkeypatch):
+    monkeypatch.setattr(module, "PRESENTERS", {})
+    with pytest.raises(ArgumentError, match=r"ssmppl\.plots"):
+        empty().plot()

@@ -1,0 +1,307 @@
+"""Which candidates are refitted, how refits are ranked and tested, and which base they stand on."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ssmppl.diagnosis import diagnose as diagnosis
+from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.model.scales import Scale, Scales
+from ssmppl.diagnosis.model.smoothing import Settings
+from ssmppl.diagnosis.run.checkpoint import Checkpoint
+from ssmppl.diagnosis.screening.familywise import familywise, tail_p
+from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.selection import attribution as module
+from ssmppl.diagnosis.selection import refit as refits_of
+from ssmppl.diagnosis.selection.attribution import Attribution, _rebase, attribute
+from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.refit import Refit, asleep, best_of_groups, delays, leading, mates
+from ssmppl.diagnosis.selection.refit_test import gain_p
+from ssmppl.inference.run.problem import missing_of, pose
+from ssmppl.inference.run.seeds import seed_sequence
+from tests.diagnosis.small import level, levels
+from tests.statistics.checks import seed_of
+
+
+# -- which
+def screen_of(heights, rho, shapes=None):
+    """A screen with one column for each group, but for groups with more shapes."""
+    heights, count = np.asarray(heights, float), len(heights)
+    return SimpleNamespace(
+        family=SimpleNamespace(leaders=np.argsort(-heights, kind="stable").tolist()),
+        found=SimpleNamespace(gain=0.5 * heights**2, status=("",) * count, rho=np.asarray(rho)),
+        groups=np.arange(count),
+    )
+
+
+def test_what_is_almost_the_same_as_one_above_it_waits():
+    rho = np.eye(7)
+    rho[0, 1] = rho[1, 0] = 0.99
+    rho[2, 4] = rho[4, 2] = -0.97
+    found = leading(screen_of([9.0, 8.9, 7.0, 6.0, 5.0, 4.0, 1.2], rho))
+    assert found == [0, 2, 3, 5]  # the last promises less than a nat
+
+
+def test_what_is_like_the_best_refit_comes_next():
+    rho = np.eye(6)
+    for k, r in {1: 0.99, 2: -0.85, 3: 0.5, 4: 0.9}.items():
+        rho[0, k] = rho[k, 0] = r
+    screen = screen_of([5.0, 5.0, 4.0, 6.0, 3.0, 5.0], rho)
+    done = [SimpleNamespace(index=(0,)), SimpleNamespace(index=(4,))]
+    assert mates(screen, done) == [1, 2]
+    assert mates(screen, []) == []
+
+
+def test_a_choice_among_shapes_costs():
+    """A date among hundreds gains nats by that alone: less is enough for one that had no choice."""
+    dated = Refit((0,), (), None, None, gain=10.6, cost=np.log(300.0))
+    plain = Refit((1,), (), None, None, gain=9.0, cost=0.0)
+    assert plain.merit > dated.merit
+    assert dated.merit == pytest.approx(10.6 - np.log(300.0))
+
+
+def test_what_the_fit_cannot_show_is_fitted_anew():
+    """A fold of a channel that is never below 0; not of one that is, and of no other effect."""
+    fold = ssm_effects.sensor_rectification
+    bound = [Candidate(fold, "y", role="channel"), Candidate(fold, "z", role="channel"),
+             Candidate(fold, "noisy", role="channel"),
+             Candidate(ssm_effects.sensor_bias, "y", role="channel"),
+             Candidate(replace(fold), "gain", role="parameter")]  # fmt: skip
+    values = np.linspace(0.1, 3.0, 50)
+    scale = {"y": Scale.of(values), "z": Scale.of(values - 1.0), "noisy": Scale.of(values - 0.3)}
+    screen = SimpleNamespace(
+        family=SimpleNamespace(leaders=[3, 1, 4, 2, 0]),
+        question=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
+    )
+    assert asleep(screen) == [4, 2, 0]
+
+
+# -- tested
+def test_the_p_of_a_gain_is_that_of_a_score_as_large():
+    rng = np.random.default_rng(seed_of("gain p"))
+    groups = np.repeat([0, 1], [1, 200])
+    null = rng.standard_normal((200, 201))
+    family = familywise(np.zeros(201), null, groups=groups)
+    screen = SimpleNamespace(family=family, groups=groups)
+
+    def p(column, gain):
+        return gain_p(screen, SimpleNamespace(index=(column,), gain=gain))
+
+    for column, label in ((0, 0), (5, 1)):
+        assert p(column, 12.0) == tail_p(family.put(label, np.sqrt(24.0)), family.maxima)
+    gains = [p(0, g) for g in (-3.0, 0.0, 2.0, 5.0, 9.0, 20.0, 300.0)]
+    assert gains == sorted(gains, reverse=True)
+    assert gains[0] == 1.0
+    assert gains[-1] < 1e-6
+    assert p(0, 8.0) < 0.1 * p(5, 8.0)
+
+
+# -- fitted
+@pytest.fixture(scope="module")
+def asked():
+    """The screen of a random walk that is right, at its fit."""
+    problem = pose(level(), levels(120, 0.0, "right"))
+    missing = missing_of(problem.experiments)
+    workshop = Workshop(problem.trace, missing, {}, Settings())
+    fitter = workshop.fitter(())
+    fit = fitter.fit(problem.experiments, seed_sequence(1), {})
+    e = problem.experiments[0]
+    states = fitter.states(e, fit.theta, np.ones(4, np.uint64))
+    scales = Scales.of(problem.trace, states, e.y, e.u, e.steps)
+    question = Question(problem.trace, scales, missing, (), Settings(),
+                        ["constant load", "outliers", "level break"])  # fmt: skip
+    screen = ask(question, problem.experiments, fit.theta, 100, seed_sequence(2),
+                 Checkpoint(None, {}))  # fmt: skip
+    return workshop, fit, screen
+
+
+def lower(workshop, fit):
+    """The same fit, stopped at another place, some nats below."""
+    fitter, theta = workshop.fitter(()), fit.theta * np.array([6.0, 0.7])
+    experiments = fit.problem.experiments
+    value = fitter.kalman.log_likelihood(experiments, theta)
+    assert value < fit.log_likelihood - 5.0
+    numbers = fit.numbers | {"theta": theta, "log_likelihood": np.asarray(value)}
+    return fitter.restored(experiments, numbers)
+
+
+@pytest.mark.slow
+def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
+    """A model with an effect holds the model without it: what ends far below is not ranked."""
+    workshop, fit, screen = asked
+    made = refits_of.refit
+
+    def lost(*args):
+        found = made(*args)
+        value = found.fit.log_likelihood - 40.0
+        return replace(found, fit=replace(found.fit, log_likelihood=value))
+
+    own = [[leading(screen)[0]]]
+    given = (workshop, fit, screen, own, screen.experiments, seed_sequence(3))
+    done, reasons = refits_of.refit_all(*given, Checkpoint(None, {}), "refitting")
+    assert [len(done), reasons] == [1, []]
+    monkeypatch.setattr(refits_of, "refit", lost)
+    done, reasons = refits_of.refit_all(*given, Checkpoint(None, {}), "refitting")
+    assert done == []
+    assert "nats below the model's own" in reasons[0]
+
+
+@pytest.mark.slow
+def test_a_better_place_for_the_parameters_is_no_effect(asked):
+    """A base fit that stopped too early makes every effect gain; the model is fitted again from
+    where the best of them ended, and the gains shrink by what that gives."""
+    workshop, fit, screen = asked
+    bad, kept = lower(workshop, fit), Checkpoint(None, {})
+    done, _ = refits_of.refit_all(
+        workshop, bad, screen, [[k] for k in leading(screen)], screen.experiments,
+        seed_sequence(3), kept, "refitting",
+    )  # fmt: skip
+    out = Attribution(bad, list(done))
+    assert out.refits[0].gain > 5.0
+    _rebase(out, workshop, screen.experiments, seed_sequence(4), kept, worth=3.0)
+    assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
+    shift = fit.log_likelihood - bad.log_likelihood
+    for before, after in zip(done, out.refits, strict=True):
+        assert after.gain == pytest.approx(before.gain - shift, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_right_model_is_not_accused_by_a_bad_start(asked):
+    workshop, fit, screen = asked
+    out = Attribution(lower(workshop, fit))
+    attribute(out, workshop, screen, screen.experiments, seed_sequence(5), 0.05,
+              Checkpoint(None, {}))  # fmt: skip
+    assert out.chosen is None
+    assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
+    """What is projected out of the basis: a wave whose period no screen has, among others."""
+    _, _, screen = asked
+    load = next(c for c in screen.question.candidates if c.effect.name == "constant load")
+    columns, seen = screen.columns_of([load])
+    assert columns.shape == (screen.sets, 1)
+    k = screen.question.candidates.index(load)
+    np.testing.assert_array_equal(columns[:, 0], screen.stacked("columns")[:, k])
+    assert seen[0] == screen.observed.columns[k]
+    jump = next(c for c in screen.question.candidates if c.effect.name == "level break")
+    other = replace(jump, shape=(("date", 17.3),))
+    found, _ = screen.columns_of([other])
+    best = next(int(j) for j in screen.family.best
+                if screen.question.candidates[j].group == jump.group)  # fmt: skip
+    np.testing.assert_array_equal(found[:, 0], screen.stacked("columns")[:, best])
+
+
+# -- shapes that are whole numbers, and effects that fail
+def refit_at(k, merit):
+    return Refit((k,), (), None, None, gain=merit)
+
+
+def delayed_screen():
+    """Columns 0 to 2 are the delays of one effect, 3 is an effect without, 4 and 5 another's."""
+    delayed = SimpleNamespace(effect=SimpleNamespace(states={"past": "delay"}))
+    plain = SimpleNamespace(effect=SimpleNamespace(states={"held": None}))
+    return SimpleNamespace(
+        question=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2),
+        groups=np.array([7, 7, 7, 3, 8, 8]),
+        found=SimpleNamespace(status=["", "", "too little", "", "", ""]),
+    )
+
+
+def test_other_delays_of_those_near_the_best_are_refitted():
+    screen = delayed_screen()
+    assert delays(screen, [refit_at(3, 40.0), refit_at(0, 30.0), refit_at(4, 10.0)]) == [1]
+    assert delays(screen, [refit_at(0, 30.0), refit_at(4, 10.0)]) == [1, 5]
+    assert delays(screen, []) == []
+
+
+def test_of_refits_that_differ_in_their_shape_the_best_stands():
+    screen = delayed_screen()
+    found = best_of_groups(screen, [refit_at(k, m) for k, m in ((0, 5.0), (3, 7.0), (1, 9.0))])
+    assert [(r.index[0], r.gain) for r in found] == [(1, 9.0), (3, 7.0)]
+
+
+@pytest.mark.parametrize(
+    ("gains", "left"),
+    [({1: 5.0, 2: 4.0, 3: 2.0}, 3), ({1: 5.0, 2: 4.0, 3: -2.0}, 2), ({1: 5.0, 2: -4.0, 3: -2.0}, 1),
+     ({1: -5.0, 2: -4.0, 3: -2.0}, 1)],
+)  # fmt: skip
+def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left):
+    """The number of effects left, by what each number of them gains on the held-out rows."""
+    chain = [Refit(tuple(range(n)), ("effect",) * n, n, None, 10.0 * n) for n in (1, 2, 3)]
+    out = Attribution(None, chosen=chain[2], fewer=chain[:2])
+    results = SimpleNamespace(attribution=out, base=0, fit=None)
+
+    def predict(fitter, *_):
+        return SimpleNamespace(log_density=np.full((8, 4), ({0: 0.0} | gains)[fitter] / 4.0))
+
+    monkeypatch.setattr(diagnosis, "predict", predict)
+    monkeypatch.setattr(diagnosis, "measure", lambda out, *_: None)
+    running = object.__new__(diagnosis._Diagnosis)
+    running.parts, running.experiments = SimpleNamespace(confirm=[]), ()
+    running.root, running.kept = seed_sequence(1), Checkpoint(None, {})
+    running._borne_out(results)
+    assert len(out.chosen.candidates) == left
+    assert len(out.notes) == 3 - left
+    assert out.left_out is (left < 3)
+    if out.notes:
+        assert out.notes[-1].endswith(f"kept instead: {' and '.join(['effect'] * left)}")
+
+
+@pytest.mark.parametrize(
+    ("refitted", "gain", "p", "expected"),
+    [
+        ((), 0.0, 0.001, 0),
+        ((1,), 5.0, 0.001, 0),
+        ((1,), 19.0, 0.001, None),  # another one gains more
+        ((1,), 5.0, 0.04, None),  # it does not stand out
+        ((0, 1), 5.0, 0.001, None),
+    ],
+)
+def test_what_leads_and_could_not_be_refitted(refitted, gain, p, expected):
+    screen = screen_of([6.0, 3.0, 0.5], np.eye(3))
+    screen.significant = np.array([p, 0.2, 1.0])
+    refits = [Refit((k,), (), None, None, gain) for k in refitted]
+    assert module._unfitted(screen, refits, 0.025) == expected
+
+
+@pytest.mark.parametrize("wanted", [1, 2, 3])
+def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, wanted):
+    """Where one effect stands for the best, and each step forward adds one."""
+    taken = []
+
+    def forward(out, *args, rough):
+        taken.append(args[-1])
+        more = args[-1] - len(out.chosen.candidates)
+        out.chosen = replace(out.chosen, candidates=out.chosen.candidates + ("more",) * more)
+
+    one = Refit((0,), ("first",), None, None, 9.0)
+    monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
+    monkeypatch.setattr(module, "_best_pair", lambda *_, **__: None)
+    monkeypatch.setattr(module, "_forward", forward)
+    screen = screen_of([6.0, 3.0], np.eye(2))
+    screen.question = SimpleNamespace(scales=None)
+    out = Attribution(None)
+    module.attribute(out, None, screen, (), seed_sequence(1), 0.05, Checkpoint(None, {}),
+                     always=True, singles=2, steps=wanted, quick=True)  # fmt: skip
+    assert len(out.chosen.candidates) == wanted
+    assert taken == {1: [], 2: [2, 2], 3: [2, 3]}[wanted]
+
+
+@pytest.mark.parametrize(("top", "share"), [(1.1, 1.0), (0.6, 0.5), (0.1, 0.25)])
+def test_a_fit_starts_where_the_data_are_likelier(monkeypatch, top, share):
+    """The quadratic promises a strength of 1; the likelihood is highest at `top`."""
+    monkeypatch.setattr(refits_of, "space_of", lambda _, fixed, start: SimpleNamespace(theta=start))
+    fitter = SimpleNamespace(
+        exact=False, problem=None, fixed={},
+        estimate=lambda _, theta, stream: -((theta["new"] - top) ** 2) + theta["old"],
+    )  # fmt: skip
+    start = {"old": 3.0, "new": 1.0}
+    found = refits_of._shortened(fitter, start, ["new"], (), seed_sequence(1))
+    assert found == {"old": 3.0, "new": share}
+    fitter.exact = True
+    assert refits_of._shortened(fitter, start, ["new"], (), seed_sequence(1)) == start
