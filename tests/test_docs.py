@@ -36,6 +36,20 @@ def test_every_page_is_in_the_navigation():
     assert listed == {page.stem for page in (DOCS / "tutorials").glob("*.md")}
 
 
+def test_the_glossary_and_the_readme_name_folders_that_exist():
+    page = (DOCS / "explanations" / "glossary.md").read_text(encoding="utf-8")
+    last = [line.split("|")[-2] for line in page.splitlines() if line.startswith("| ")]
+    named = re.findall(r"`([\w/.]+)`", " ".join(last))
+    assert len(named) > 40
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = text.partition("## Structure of the code")[2].partition("Imports point one way")[0]
+    outer = ""
+    for indent, name in re.findall(r"(?m)^( {6}| {8})([\w.]+/?)(?: |$)", text):
+        named.append(name if len(indent) == 6 else outer + name)
+        outer = name if len(indent) == 6 else outer
+    assert [n for n in named if not (ROOT / "ssmppl" / n).exists()] == []
+
+
 @pytest.mark.parametrize(
     "name",
     ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "bench/README.md", "examples/README.md"],
