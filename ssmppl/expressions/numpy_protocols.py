@@ -47,7 +47,7 @@ _ROUNDED = "np.floor(x + 0.5), which takes halves up, where NumPy takes them to 
 _SORTED = "np.minimum and np.maximum of the elements"
 _TABLE = "np.where(...) by pieces, or wrap the table by @ssm.primitive"
 # by the names that NumPy, SciPy and their ufuncs have
-INSTEAD: dict[str, str] = {
+UNSUPPORTED: dict[str, str] = {
     **dict.fromkeys(["round", "rint", "around"], _ROUNDED),
     **dict.fromkeys(["trunc", "fix"], "np.sign(x) * np.floor(np.abs(x))"),
     **dict.fromkeys(["select", "piecewise"], "np.where(condition, a, b), one inside another"),
@@ -87,8 +87,8 @@ INSTEAD: dict[str, str] = {
 def fix_for(name: str, known: Iterable[str]) -> str:
     """What to write for a function of this name: what is known to do, else those that are spelled
     nearly so."""
-    if name in INSTEAD:
-        return f"write {INSTEAD[name]}"
+    if name in UNSUPPORTED:
+        return f"write {UNSUPPORTED[name]}"
     if name in known:  # a namesake in another module, as in np.linalg
         return f"write np.{name}"
     near = ", ".join(difflib.get_close_matches(name, sorted(known), SHOWN))

@@ -95,9 +95,7 @@ def _wanted(d: Distribution) -> Iterable[Import]:
 def _laws(d: Distribution) -> Iterable[Distribution]:
     """A law and those that it is made of."""
     yield d
-    within = d.components if isinstance(d, Mixture) else []
-    within = [d.base] if isinstance(d, ZeroInflated | Truncated) else within
-    for part in within:
+    for part in d.inside():
         yield from _laws(part)
 
 

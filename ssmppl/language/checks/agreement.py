@@ -20,7 +20,7 @@ import numpy as np
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.from_density import VALUE, Written
 
 Function = Callable[[np.ndarray], np.ndarray]

@@ -20,7 +20,8 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, substitute, symbol, topological
-from ssmppl.language.distributions.base import INFINITY, Distribution, Draws, Support
+from ssmppl.language.distributions.base import INFINITY, Distribution, Support
+from ssmppl.language.distributions.draws import Draws
 
 Pattern = tuple[float | None, ...]  # by argument: its number, None for a symbol
 Forms = Mapping[str, Expr]  # part -> its expression
@@ -123,12 +124,6 @@ class Written(Distribution):
         return self._at_place(self.with_parameters({**self.parameters, **own}))
 
     # -- what the user's functions give, component by component
-    def _each(self, make: Any) -> ExprArray:
-        out = np.empty(self.shape, dtype=object)
-        for i in np.ndindex(self.shape):
-            out[i] = make(i)
-        return array(out)
-
     def _replacement(self, i: tuple[int, ...]) -> dict[Expr, Expr]:
         return {place(n): a[i] for n, a in self.parameters.items()}
 

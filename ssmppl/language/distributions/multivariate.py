@@ -12,7 +12,7 @@ Channels that are Gaussian one after the other; no user writes this law, analyse
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,8 +24,16 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, as_expr, constant, topological
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.expressions.test_points import moderate, with_cases
-from ssmppl.language.distributions.base import Distribution, Draws, Support, one_of
-from ssmppl.language.distributions.continuous import LOG_2PI, Normal
+from ssmppl.language.distributions.base import (
+    LOG_2PI,
+    Distribution,
+    MeanLink,
+    Support,
+    VarianceLink,
+    one_of,
+)
+from ssmppl.language.distributions.continuous import Normal
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.positive import (
     LEAST_SHARE,
     log_gamma,
@@ -130,6 +138,9 @@ class MvNormal(_Joint):
         it: methods that need no density of the transition take it.
     """
 
+    gaussian_noise = True
+    maximisers: ClassVar = {"mean_": lambda law, value: value}
+    mean_link = MeanLink("mean_", "identity")
     root: ExprArray | None = None  # of a singular covariance, (d, d); see `covariances.py`
 
     def __init__(
@@ -148,6 +159,8 @@ class MvNormal(_Joint):
                 where=self.location,
             )
         self.shape = self.mean_.shape
+        power = {"covariance": 1.0, "precision": -1.0, "cholesky": 0.5}[self.spread]
+        self.variance_link = VarianceLink(self.spread, power)
 
     def mean(self):
         return self.mean_
@@ -303,6 +316,8 @@ def _log_gamma_p(x: Any, p: int) -> Any:
 
 
 class _WishartFamily(_Joint):
+    symmetric = True
+
     def __init__(self, df: Any, *, scale: Any):
         self._set(df=df, scale=scale)
         p = len(self._matrix("scale"))

@@ -16,8 +16,8 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.properties import never_negative
-from ssmppl.language.distributions.base import INFINITY, Distribution
-from ssmppl.language.distributions.continuous import Normal, _where
+from ssmppl.language.distributions.base import INFINITY, Distribution, where
+from ssmppl.language.distributions.continuous import Normal
 
 
 def holding(conditions: Iterable[ExprArray | None]) -> ExprArray | None:
@@ -65,8 +65,8 @@ def cut(law: Distribution, value: ExprArray) -> ExprArray:
         middle = lower + (0.0 if law.discrete else 1.0)
     elif low_end:
         middle = upper - 1.0
-    inside = law.log_densities(_where(within, value, middle))
-    return _where(within, inside, -INFINITY)
+    inside = law.log_densities(where(within, value, middle))
+    return where(within, inside, -INFINITY)
 
 
 SUM_ROUNDING = 1e-6  # by which shares that are expressions may miss the sum 1

@@ -20,7 +20,8 @@ import numpy as np
 from ssmppl.errors import Location, ModelError, nearest_first
 from ssmppl.expressions.expr import Expr, as_expr, symbols_of, topological, user_location
 from ssmppl.language.checks.agreement import Agreement, agreement
-from ssmppl.language.distributions.base import INFINITY, Draws, Generator, misfit
+from ssmppl.language.distributions.base import INFINITY, misfit
+from ssmppl.language.distributions.draws import Draws, Generator
 from ssmppl.language.distributions.from_density import (
     VALUE,
     Bounds,

@@ -14,7 +14,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.checkpoints.origin import model_digest
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.trace import trace
 from tests.language.user_defined.written_laws import (
     NAMES,
