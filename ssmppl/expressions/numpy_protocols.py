@@ -3,9 +3,7 @@
 NumPy hands every ufunc and array function that meets an `Expr` or an `ExprArray` to
 `apply_ufunc` and `apply_function` below (NEP 13 and NEP 18). Functions that only move elements
 run as NumPy has them; those that compute stand in the table `FUNCTIONS`; all others are refused
-by name, with the nearest that exist.
-
-Functions that symbols do not have, and what to write for them.
+by name, with what `UNSUPPORTED` says to write for them, or the nearest that exist.
 """
 
 from __future__ import annotations
