@@ -179,11 +179,11 @@ class _Tracer:
         """Refuse a default that was taken where the name is a quantity, which it would hide."""
         for name, role, where in self.defaults:
             if name in self.known or name == "t":
-                told = self._unknown(name, role, where)
+                unknown = self._unknown(name, role, where)
                 raise ModelError(
                     f"@{role} {where.function} takes the default of {name!r}, which hides the "
-                    f"model's {name!r}: {told.found}",
-                    fix=f"rename the argument if its default is meant; else {told.fix}",
+                    f"model's {name!r}: {unknown.found}",
+                    fix=f"rename the argument if its default is meant; else {unknown.fix}",
                     where=where,
                 )
 

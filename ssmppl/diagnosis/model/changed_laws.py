@@ -25,7 +25,7 @@ from ssmppl.language.distributions import (
     Truncated,
     ZeroInflated,
 )
-from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.from_density import UserDefined
 
 Index = tuple[int, ...]
 Changes = Mapping[Index, Expr]
@@ -137,7 +137,7 @@ def has_scale(d: Distribution) -> NotApplicable | None:
     reason = f"its law is {kind}, whose variance follows from its mean"
     if isinstance(inner, Dirac):
         reason = "it has no noise (Dirac)"
-    elif isinstance(inner, (Mixture, Written)):
+    elif isinstance(inner, (Mixture, UserDefined)):
         reason = f"its law is {kind}, of which no argument is known to be its spread"
     return NotApplicable(reason, d.location)
 

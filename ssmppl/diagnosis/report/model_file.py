@@ -31,7 +31,7 @@ from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
-from ssmppl.language.distributions.from_density import Origin, Written
+from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive
@@ -88,7 +88,7 @@ def _wanted(d: Distribution) -> Iterable[Import]:
         if node.op == "call":
             yield Import.of_primitive(node.data)
     for part in _laws(d):
-        if isinstance(part, Written):
+        if isinstance(part, UserDefined):
             yield Import.of_law(part.origin)
 
 
@@ -385,7 +385,7 @@ class _Writer:
             for i, (k, v) in enumerate(bounds.items()):
                 inside.append(f"{k}={lines.array(v, scalar=not wide or i > 0)}")
             return _call(kind, inside, room)
-        if isinstance(d, Written):
+        if isinstance(d, UserDefined):
             return self._written(d, lines, room)
         by_name = {p.name for p in inspect.signature(type(d).__init__).parameters.values()
                    if p.kind is p.KEYWORD_ONLY}  # fmt: skip
@@ -401,7 +401,7 @@ class _Writer:
             texts.append(f"{plain}={text}" if named else text)
         return _call(kind, texts, room)
 
-    def _written(self, d: Written, lines: Lines, room: int) -> str:
+    def _written(self, d: UserDefined, lines: Lines, room: int) -> str:
         """A law of the user's own, its arguments by name."""
         texts = []
         for i, (argument, values) in enumerate(d.parameters.items()):

@@ -1,11 +1,7 @@
-"""Mixture: one of several laws by a hidden choice, which is summed out.
-
-McLachlan and Peel (2000), "Finite mixture models".
-
-ZeroInflated: a law of counts with more zeros than are its own.
-
-Lambert (1992), "Zero-inflated Poisson regression, with an application to defects in
-manufacturing", *Technometrics* 34.
+"""Mixture: one of several laws by a hidden choice, which is summed out (McLachlan and Peel 2000,
+"Finite mixture models"); ZeroInflated: a law of counts with more zeros than are its own (Lambert
+1992, "Zero-inflated Poisson regression, with an application to defects in manufacturing",
+*Technometrics* 34).
 """
 
 from __future__ import annotations

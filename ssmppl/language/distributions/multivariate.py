@@ -1,12 +1,10 @@
-"""Distributions of vectors and matrices with one joint density.
+"""Distributions of vectors and matrices with one joint density: MvNormal, Dirichlet, Wishart and
+InverseWishart; `SequentialNormal`, channels that are Gaussian one after the other, is made by
+analyses only.
 
 Gelman et al. (2013), "Bayesian data analysis", appendix A, for densities and moments; samplers:
 Cholesky (MvNormal), normalised gammas (Dirichlet), Bartlett's decomposition (Wishart), Smith and
-Hocking (1972), algorithm AS 53.
-
-What is asked of a matrix that is a parameter of a law, where the law is written.
-
-Channels that are Gaussian one after the other; no user writes this law, analyses make it.
+Hocking (1972), algorithm AS 53. Matrices that are parameters are checked where the law is made.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ UNEQUAL, ROUNDING = 1e-6, 1e-10
 
 def checked_matrix(law: Distribution, name: str) -> ExprArray:
     """A parameter that must be a square, symmetric, positive definite matrix, or of the name
-    "cholesky" the lower factor of one; of symbols as far as can be told.
+    "cholesky" the lower factor of one; of symbols as far as can be known.
 
     Raises
     ------

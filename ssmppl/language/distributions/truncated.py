@@ -17,7 +17,7 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
 from ssmppl.language.distributions.base import Distribution, Support, in_order, where
-from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
 from ssmppl.language.distributions.nested import holding
 from ssmppl.language.distributions.truncated_moments import is_infinite, weighted_moments
@@ -49,7 +49,7 @@ class Truncated(Distribution):
                 else "truncate a scalar distribution such as Normal, Gamma or Poisson",
                 where=user_location(),
             )
-        if isinstance(dist, Written) and not dist.inverts():
+        if isinstance(dist, UserDefined) and not dist.inverts():
             raise ModelError(
                 f"Truncated: {dist.origin.name} has no distribution function, or no inverse of it",
                 fix=f"declare both, @{dist.origin.name}.cdf and @{dist.origin.name}.quantile; or "
