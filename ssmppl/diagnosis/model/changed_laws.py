@@ -48,26 +48,6 @@ def _inner(d: Distribution) -> Distribution:
     return d.base if isinstance(d, (Truncated, ZeroInflated)) else d
 
 
-def truncated(base: Distribution, bounds: Mapping[str, ExprArray]) -> Truncated:
-    """With the bounds of `bounds_of`; infinite ones are left out."""
-    kept = {k: v for k, v in bounds.items() if not infinite(v)}
-    return Truncated(base, **kept)
-
-
-def infinite(bound: Any) -> bool:
-    """Whether a bound bounds nothing."""
-    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
-
-
-def bounds_of(d: Truncated) -> dict[str, ExprArray]:
-    """As the user gave them: whole numbers are taken of them again where the law is discrete."""
-    out = {}
-    for name, op in (("lower", "ceil"), ("upper", "floor")):
-        flat = [e.args[0] if d.discrete and e.op == op else e for e in d.parameters[name].ravel()]
-        out[name] = array(array(flat).reshape(d.shape))
-    return out
-
-
 def substituted(d: Distribution, replacement: Mapping[Expr, Expr]) -> Distribution:
     """The law with symbols replaced; the law itself where it holds none of them."""
     own = d.parameters
@@ -183,7 +163,4 @@ def heavier(d: Distribution, changes: Changes) -> Distribution:
     student: Distribution = StudentT(array(ew("div", 1.0, inverse)), wide["loc"],
                                      scale=wide["scale"])  # fmt: skip
     student.location = d.location
-    if isinstance(d, Truncated):
-        student = truncated(student, bounds_of(d))
-        student.location = d.location
-    return student
+    return d.with_base(student) if isinstance(d, Truncated) else student

@@ -25,13 +25,13 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.candidates import slug
-from ssmppl.diagnosis.model.changed_laws import bounds_of, infinite
 from ssmppl.diagnosis.report.spelling import Lines
 from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
 from ssmppl.language.distributions.from_density import Origin, UserDefined
+from ssmppl.language.distributions.truncated_moments import is_infinite
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive
@@ -109,7 +109,7 @@ def nodes_of(d: Distribution) -> list[Expr]:
     if isinstance(d, ZeroInflated):
         return [*nodes_of(d.base), *d.p.ravel()]
     if isinstance(d, Truncated):
-        return [*nodes_of(d.base), *(e for a in bounds_of(d).values() for e in a.ravel())]
+        return [*nodes_of(d.base), *(e for a in d.given_bounds().values() for e in a.ravel())]
     return [e for a in d.parameters.values() for e in array(a).ravel()]
 
 
@@ -379,7 +379,7 @@ class _Writer:
             law = self._distribution(d.base, lines, room - 20)
             return _call(kind, [law, lines.array(d.p, scalar=_same(d.p))], room)
         if isinstance(d, Truncated):
-            bounds = {k: v for k, v in bounds_of(d).items() if not infinite(v)}
+            bounds = {k: v for k, v in d.given_bounds().items() if not is_infinite(v)}
             wide = d.base.shape != d.shape
             inside = [self._distribution(d.base, lines, room - 16)]
             for i, (k, v) in enumerate(bounds.items()):

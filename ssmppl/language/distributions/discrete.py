@@ -22,7 +22,7 @@ from ssmppl.language.distributions.positive import Beta
 TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
 
 
-def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
+def _xlogy(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
     """count * log(p), 0 where the count is 0 whatever p is."""
     return where(ew("eq", count, 0.0), 0.0, array(count) * ew(log, p))
 
@@ -71,7 +71,7 @@ class Poisson(_Counts):
 
     def log_densities(self, value):
         v = array(value)
-        return _times_log(v, self.rate) - self.rate - ew("gammaln", v + 1.0)
+        return _xlogy(v, self.rate) - self.rate - ew("gammaln", v + 1.0)
 
     def sample(self, draws):
         return self._each(lambda i: draws.poisson(self.rate[i]))
@@ -129,7 +129,7 @@ class NegativeBinomial(_Counts):
     def log_densities(self, value):
         v, m, r = array(value), self.mean_, self.dispersion
         choose = array(ew("gammaln_rise", r, v)) - ew("gammaln", v + 1.0)
-        return choose - r * ew("log1p", m / r) + _times_log(v, m / (r + m))
+        return choose - r * ew("log1p", m / r) + _xlogy(v, m / (r + m))
 
     def sample(self, draws):
         def draw(i):
@@ -227,7 +227,7 @@ class Binomial(_OutOf):
 
     def log_densities(self, value):
         v, n = array(value), self.n
-        return self._log_choose(v) + _times_log(v, self.p) + _times_log(n - v, -self.p, "log1p")
+        return self._log_choose(v) + _xlogy(v, self.p) + _xlogy(n - v, -self.p, "log1p")
 
     def sample(self, draws):
         return self._each(lambda i: draws.binomial(self.n[i], self.p[i]))

@@ -96,9 +96,15 @@ class Truncated(Distribution):
         values = {**self.parameters, **parameters}
         base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
         bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
-        kept = {n: b for n, b in bounds.items() if not is_infinite(b)}
-        # one law of several may have infinite bounds alone, which it is given as they are
-        return self._at_place(Truncated(base, **(kept or bounds)))
+        return self._at_place(_between(base, bounds))
+
+    def given_bounds(self) -> dict[str, ExprArray]:
+        """Both as the user gave them, without the whole numbers taken of them."""
+        return {n: _as_given(self.parameters[n], self.discrete) for n in ("lower", "upper")}
+
+    def with_base(self, base: Distribution) -> Distribution:
+        """Another law between the same bounds."""
+        return self._at_place(_between(base, self.given_bounds()))
 
     def _refuse_empty(self) -> None:
         """Numbers that leave (nearly) nothing of the base."""
@@ -325,6 +331,12 @@ def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[fl
         p, q = (1.0 / (1.0 + math.exp(-s)), 1.0 / (1.0 + math.exp(s)))
         out.append((p, q, step * math.pi * math.cosh(t) * p * q))
     return out
+
+
+def _between(base: Distribution, bounds: dict[str, ExprArray]) -> Truncated:
+    """With these bounds but for infinite ones; one law of several may have no others, which it is
+    given as they are."""
+    return Truncated(base, **({n: b for n, b in bounds.items() if not is_infinite(b)} or bounds))
 
 
 def _as_given(bound: Any, discrete: bool) -> ExprArray:

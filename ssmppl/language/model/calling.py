@@ -24,7 +24,7 @@ from ssmppl.language.model.model import location_of
 from ssmppl.language.model.name_hints import name_hint
 
 Law = Callable[..., Any]
-Known = Mapping[str, str]  # name of a quantity -> its role
+Roles = Mapping[str, str]  # name of a quantity -> its role
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))) + os.sep
 # NumPy's messages about object arrays, which np.array makes of symbols
 _OBJECT_ARRAY = re.compile(r"has no callable|dtype\('O'\)|not supported for the input types")
@@ -76,15 +76,15 @@ _ASKED_OF_SYMBOLS = tuple(
 )  # fmt: skip
 
 
-def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> Any:
+def call(function: Law, role: str, arguments: dict[str, Any], known: Roles) -> Any:
     """What the law returns for these arguments.
 
     It is called twice: a law that is not the same again draws random numbers or changes something,
     and what was drawn would be frozen into the model.
     """
     check_lookups(function, role, arguments)
-    first = once(function, role, arguments, known)
-    again = once(function, role, arguments, known)
+    first = call_once(function, role, arguments, known)
+    again = call_once(function, role, arguments, known)
     if not _same(first, again):
         raise ModelError(
             f"@{role} {function.__name__} gives another law when it is called again",
@@ -95,7 +95,7 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
     return first
 
 
-def once(function: Law, role: str, arguments: dict[str, Any], known: Known) -> Any:
+def call_once(function: Law, role: str, arguments: dict[str, Any], known: Roles) -> Any:
     """What the function returns; its errors are raised at the user's line."""
     try:
         signature = inspect.signature(function)
@@ -141,7 +141,7 @@ def return_location(function: Law) -> Location:
 
 
 # -- names from outside of the law
-def check_outer_names(function: Law, role: str, known: Known) -> None:
+def check_outer_names(function: Law, role: str, known: Roles) -> None:
     """Refuse a law that reads a variable of Python's named as a quantity of the model, itself or
     in a function of the user's that it calls.
 
@@ -225,7 +225,7 @@ def _of_a_library(error: UnsupportedOperation, function: Law) -> UnsupportedOper
 
 
 def _wrapped(
-    error: Exception, function: Law, role: str, arguments: dict[str, Any], known: Known
+    error: Exception, function: Law, role: str, arguments: dict[str, Any], known: Roles
 ) -> ModelError:
     """An exception inside a user's function, at the user's line."""
     frames = _frames(function, error.__traceback__)

@@ -61,7 +61,7 @@ def holder_of(function: Callable[..., Any]) -> Any:
     return getattr(sys.modules.get(module), function.__qualname__, None)
 
 
-class Known(Generic[Thing]):
+class UnpackedCache(Generic[Thing]):
     """The last things that were unpacked in this process, by digest."""
 
     def __init__(self, most: int):

@@ -30,7 +30,7 @@ from ssmppl.language.distributions.from_density import (
     placeholder,
     user_defined_class,
 )
-from ssmppl.language.model.calling import once, return_location
+from ssmppl.language.model.calling import call_once, return_location
 from ssmppl.language.model.closure_digest import Declared, digest_of_code
 from ssmppl.language.model.model import location_of
 from ssmppl.language.model.pickling import holder_of
@@ -436,7 +436,7 @@ def form(
         elif part not in ("mean", "variance"):
             own[first] = VALUE
         with np.errstate(all="ignore"):  # what is no number is refused below
-            value = once(function, verb, own, {})
+            value = call_once(function, verb, own, {})
         found.append(_expression(value, function, verb))
     fault = _fault(part, found, parameters, pattern)
     if fault:
