@@ -69,12 +69,10 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
         elif (spread := _spread(site, name, prev)) is not None:
             best = spread
         else:
-            reason = (
-                f"{_plain(name)} of {site.name} ({type(d).__name__}) depends on the state before"
-            )
-            return NotApplicable(reason, where)
+            which = f"{name.rstrip('_')} of {site.name} ({type(d).__name__})"
+            return NotApplicable(f"{which} depends on the state before", where)
         changed[name] = best if d.joint else _replaced(d.parameters[name], best, prev)
-    return _with(d, changed).log_density(site.value, guard=False)
+    return d.rebuilt(changed).log_density(site.value, guard=False)
 
 
 def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
@@ -182,12 +180,3 @@ def _replaced(old: ExprArray, best: ExprArray, prev: Sequence[Expr]) -> ExprArra
     for i in np.ndindex(old.shape):
         out[i] = wide[i] if depends_on(old[i], prev) else old[i]
     return array(out)
-
-
-def _with(d: Distribution, changed: dict[str, ExprArray]) -> Distribution:
-    """The same law with other values for some parameters."""
-    return d.rebuilt(changed)
-
-
-def _plain(name: str) -> str:
-    return name.rstrip("_")

@@ -30,8 +30,8 @@ from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
+from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
-from ssmppl.language.distributions.truncated_moments import is_infinite
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive

@@ -82,6 +82,7 @@ class Distribution:
     closed = False  # whether the lower bound itself belongs to the support
     open_above = False  # whether the upper one does not
     drawable = True  # whether it has a sampler
+    guards_range = False  # whether its density has to be told where a parameter is out of range
     symmetric = False  # whether values are symmetric matrices, whose two halves share symbols
     by_name = "spread"  # what the keyword-only arguments are called in messages
     trials = ""  # the parameter that is a number of trials
@@ -383,11 +384,16 @@ class Distribution:
     def guarded_log_densities(self, value: ExprArray) -> ExprArray:
         """`log_densities`, and -inf outside the support.
 
-        Of a discrete law NaN where a parameter is out of its range: a count of 0 takes no
-        logarithm of it. The formulas of continuous laws are NaN there by themselves.
+        Of a discrete law, and of others with `guards_range`, NaN where a parameter is out of its
+        range: a count of 0 takes no logarithm of it. The formulas of most continuous laws are NaN
+        there by themselves.
         """
+        density = self._guarded_support(array(self.log_densities(value)), value)
+        allowed = self.in_range() if self.discrete or self.guards_range else None
+        return density if allowed is None else where(allowed, density, math.nan)
+
+    def _guarded_support(self, density: ExprArray, value: ExprArray) -> ExprArray:
         support = self.support()
-        density = array(self.log_densities(value))
         if support.kind not in ("interval", "integers"):
             return density
         out = np.empty(density.shape, dtype=object)
@@ -408,8 +414,7 @@ class Distribution:
                 whole = apply("eq", v[i], apply("floor", v[i]))
                 inside = whole if inside.op == "const" else apply("and", inside, whole)
             out[i] = apply("where", inside, density[i], -INFINITY)
-        allowed = self.in_range() if self.discrete else None
-        return array(out if allowed is None else elementwise("where", allowed, out, math.nan))
+        return array(out)
 
     def log_density(self, value: Any, guard: bool = True) -> Expr:
         """Log density of the whole value, one expression; -inf outside the support.
@@ -429,6 +434,11 @@ def where(condition: Any, a: Any, b: Any) -> ExprArray:
 def log_difference(a: Any, b: Any) -> ExprArray:
     """log(exp(a) - exp(b)) for a > b."""
     return array(a + elementwise("log1p", -array(elementwise("exp", array(b) - a))))
+
+
+def is_infinite(bound: Any) -> bool:
+    """Whether a bound bounds nothing."""
+    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
 
 
 def in_order(op: str, lower: ExprArray, upper: ExprArray) -> ExprArray | None:

@@ -70,6 +70,7 @@ class UserDefined(Distribution):
         placeholders and, for a draw, random nodes.
     """
 
+    guards_range = True
     origin: Origin
     bounds: Bounds
     patterns: np.ndarray
@@ -140,11 +141,6 @@ class UserDefined(Distribution):
 
     def log_densities(self, value):
         return self._at("density", value)
-
-    def guarded_log_densities(self, value):
-        density = super().guarded_log_densities(value)
-        allowed = None if self.discrete else self.in_range()  # the base's asks discrete ones
-        return density if allowed is None else array(ew("where", allowed, density, math.nan))
 
     def support(self):
         if self.bounds.discrete:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -50,6 +49,7 @@ class Mixture(Distribution):
     """
 
     truncatable = False
+    guards_range = True
     components: tuple[Distribution, ...]
 
     def __init__(self, weights: Any, components: Sequence[Distribution]):
@@ -144,11 +144,6 @@ class Mixture(Distribution):
 
     def log_densities(self, value):
         return log_sum(self.weights, self._parts(array(value)))
-
-    def guarded_log_densities(self, value):
-        density = super().guarded_log_densities(value)
-        allowed = None if self.discrete else self.in_range()  # of discrete ones it has been asked
-        return density if allowed is None else where(allowed, density, math.nan)
 
     def sample(self, draws):
         def draw(i):

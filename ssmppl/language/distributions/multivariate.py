@@ -115,10 +115,6 @@ def _check_symmetry(law: Distribution, name: str, m: ExprArray) -> None:
 class _Joint(Distribution):
     joint = True
 
-    def _matrix(self, name: str) -> ExprArray:
-        """A parameter that must be a square, symmetric, positive definite matrix."""
-        return checked_matrix(self, name)
-
     def _where_definite(self, m: ExprArray, density: ExprArray) -> ExprArray:
         """`where_definite`, unless m surely is."""
         return density if surely_positive(m) else array(where_definite(m, density[()]))
@@ -147,7 +143,7 @@ class MvNormal(_Joint):
         options = {"covariance": covariance, "precision": precision, "cholesky": cholesky}
         self.spread, value = one_of("MvNormal", options)
         self._set(**{"mean_": mean, self.spread: value})
-        matrix = self._matrix(self.spread)
+        matrix = checked_matrix(self, self.spread)
         if self.mean_.ndim == 0:
             self.parameters["mean_"] = array(np.full(len(matrix), self.mean_[()]))
         if self.mean_.shape != (len(matrix),):
@@ -318,7 +314,7 @@ class _WishartFamily(_Joint):
 
     def __init__(self, df: Any, *, scale: Any):
         self._set(df=df, scale=scale)
-        p = len(self._matrix("scale"))
+        p = len(checked_matrix(self, "scale"))
         if self.df.ndim:
             raise ModelError(
                 f"{type(self).__name__}: df has shape {self.df.shape}",

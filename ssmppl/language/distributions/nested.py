@@ -15,7 +15,7 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.properties import never_negative
-from ssmppl.language.distributions.base import INFINITY, Distribution, where
+from ssmppl.language.distributions.base import INFINITY, Distribution, is_infinite, where
 from ssmppl.language.distributions.continuous import Normal
 
 SUM_ROUNDING = 1e-6  # by which shares that are expressions may miss the sum 1
@@ -52,8 +52,7 @@ def cut(law: Distribution, value: ExprArray) -> ExprArray:
     neither it nor a derivative of it is NaN."""
     support = law.support()
     lower, upper = array(support.lower), array(support.upper)
-    low_end, high_end = (all(e.op == "const" and math.isinf(e.data) for e in b.ravel())
-                         for b in (lower, upper))  # fmt: skip
+    low_end, high_end = is_infinite(lower), is_infinite(upper)
     closed = law.discrete or law.closed
     within = None
     if not low_end:

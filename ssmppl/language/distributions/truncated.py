@@ -16,11 +16,11 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
-from ssmppl.language.distributions.base import Distribution, Support, in_order, where
+from ssmppl.language.distributions.base import Distribution, Support, in_order, is_infinite, where
 from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
 from ssmppl.language.distributions.nested import holding
-from ssmppl.language.distributions.truncated_moments import is_infinite, weighted_moments
+from ssmppl.language.distributions.truncated_moments import weighted_moments
 
 MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
 MOST_SUMMED = 256  # and that its moments are summed over, where they have no formula

@@ -15,18 +15,13 @@ import numpy as np
 
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.language.distributions.base import LOG_2PI, Distribution, where
+from ssmppl.language.distributions.base import LOG_2PI, Distribution, is_infinite, where
 
 NODES = 20  # exact to 1e-10 where the density falls by e^-FALL
 FALL = 30.0
 # Likewise, of intervals that are narrow beside their distance from 0; see `moments_from_zero`.
 NARROW, NARROW_NODES, NARROW_FALL = 0.1, 12, 10.0
 FLAT = 40.0  # standard deviations, or widths of an exponential, beyond which nothing is left
-
-
-def is_infinite(bound: Any) -> bool:
-    """Whether a bound bounds nothing."""
-    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
 
 
 def normal_moments(base: Any, lower: ExprArray, upper: ExprArray) -> tuple[ExprArray, ExprArray]:
