@@ -77,8 +77,8 @@ from ssmppl.language.distributions import (
     Wishart,
     ZeroInflated,
 )
-from ssmppl.language.model.calling import advice
 from ssmppl.language.model.model import Model
+from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
 from ssmppl.language.user_defined.primitive import primitive
 from ssmppl.tables import summary
@@ -207,9 +207,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name != "plots" and name not in _LATER:
-        told = "" if name.startswith("__") else advice(name, __all__)
+        hint = "" if name.startswith("__") else name_hint(name, __all__)
         raise AttributeError(
-            f"module {__name__!r} has no attribute {name!r}" + (f": {told}" if told else "")
+            f"module {__name__!r} has no attribute {name!r}" + (f": {hint}" if hint else "")
         )
     if name == "plots":
         return importlib.import_module(f"{__name__}.plots")

@@ -72,11 +72,11 @@ def bind(
     if data is None and not need_observations:
         data = {}
     named = [*trace.observations, *trace.inputs]
-    once = _Once(
+    common = _Common(
         {n: site.distribution.support() for n, site in trace.observations.items()},
         tuple(_needed(trace)),
     )
-    return [_bind(trace, s, need_observations, steps, once) for s in sources(data, named)]
+    return [_bind(trace, s, need_observations, steps, common) for s in sources(data, named)]
 
 
 def unread(trace: Trace, data: Any) -> list[str]:
@@ -128,14 +128,16 @@ def bind_inputs(trace: Trace, inputs: Any, steps: int | None) -> tuple[np.ndarra
 
 
 @dataclass(frozen=True)
-class _Once:
+class _Common:
     """What is the same for all data sets: the channels' supports, and what `_needed` gives."""
 
     supports: dict[str, Support]
     needed: tuple[tuple[Expr, Site], ...]
 
 
-def _bind(trace: Trace, source: Source, need: bool, steps: int | None, once: _Once) -> Experiment:
+def _bind(
+    trace: Trace, source: Source, need: bool, steps: int | None, common: _Common
+) -> Experiment:
     inputs = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
     observed = {}
     for name, site in trace.observations.items():
@@ -151,12 +153,12 @@ def _bind(trace: Trace, source: Source, need: bool, steps: int | None, once: _On
     partial = {
         name
         for name, site in trace.observations.items()
-        if _check_observation(source, site, observed[name], env, once.supports[name])
+        if _check_observation(source, site, observed[name], env, common.supports[name])
     }
     packed = pack(trace.observations.values(), observed).reshape(rows, -1)
     missing = np.isnan(packed)
     if need:
-        _check_needed(trace, source, missing, once.needed)
+        _check_needed(trace, source, missing, common.needed)
     check_defined(trace, source, u, packed, ~missing if need else None)
     return Experiment(
         y=np.ascontiguousarray(np.where(missing, 0.0, packed)),

@@ -45,7 +45,7 @@ from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.simulate import check_samplers
-from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.model.model import Model
 
 SETS = {"fast": 100, "full": 200}  # simulated data sets
@@ -158,7 +158,7 @@ class _Diagnosis:
             f"The law of {n}, {type(s.distribution).__name__}, has no distribution function "
             "(.cdf): its one-step predictions are not checked."
             for n, s in self.trace.observations.items()
-            if isinstance(s.distribution, Written) and not s.distribution.has_cdf
+            if isinstance(s.distribution, UserDefined) and not s.distribution.has_cdf
         ]
         described = {
             "alpha": alpha, "seed": self.root.entropy, "fixed": self.fixed, "particles": number,

@@ -1,25 +1,16 @@
 """Algebraic forms of an `Expr` in chosen symbols: separable, polynomial, affine, quadratic.
 
-Sums of products: coefficients times monomials in functions of a block of symbols.
-
-The separable form of an `Expr` in chosen symbols.
-
 `separate(e, block)` writes e = sum_i c_i s_i where each s_i is a product of powers of functions of
-the block alone and each c_i is free of the block. It does not depend on how the user spelled e:
-products are multiplied out, quotients and roots become exponents, common factors are taken out
-of sums, and log and exp are carried through products and sums.
+the block alone, a monomial, and each c_i is free of the block. It does not depend on how the user
+spelled e: products are multiplied out, quotients and roots become exponents, common factors are
+taken out of sums, and log and exp are carried through products and sums. Logarithms and fractional
+powers of products are split as for positive factors, which is what the terms of a log density are
+on their support. Callers that build on a form check it numerically.
 
-Logarithms and fractional powers of products are split as for positive factors, which is what the
-terms of a log density are on their support. Callers that build on a form check it numerically.
-
-How factorisations of small matrices separate: rules of `separate` for matrix nodes.
-
-A matrix is a function of the block times what is free of it, or the other way round, or linear in a
-symmetric matrix Q of the block so that its inverse is linear in Q^-1 (`Congruence`).
-
-Matrices M that are linear in a symmetric matrix Q, with M^-1 linear in Q^-1.
-
-L Q L' with L a matrix of numbers, Kronecker products of Q with one, several Q down the diagonal:
+Of the factorisations of a small matrix, the matrix is a function of the block times what is free of
+it, or the other way round, or linear in a symmetric matrix Q of the block so that its inverse is
+linear in Q^-1 (`Congruence`): L Q L' with L a matrix of numbers, Kronecker products of Q with one,
+several Q down the diagonal,
 
     (M^-1)_ij = sum_kl G_ijkl (Q^-1)_kl,        log det M = (n / p) log det Q + c,
 
@@ -54,11 +45,15 @@ from ssmppl.expressions.expr import (
 )
 from ssmppl.expressions.zero import cancels, wide_points
 
-__all__ = ["split_constant"]
-
 Monomial = frozenset  # of (atom: Expr, exponent: float)
 ONE: Monomial = frozenset()
 Terms = dict[Monomial, list[Expr]]  # coefficient as a list of summands
+Matrix = Callable[[np.ndarray], np.ndarray]
+MAX_TERMS = 600  # of a product that is multiplied out
+POINTS = 64  # at which a form is compared with what it was made of
+_CONGRUENCE_POINTS = 4
+_TOLERANCE = 1e-11
+_MINUS = constant(-1.0)
 
 
 def monomial_expr(monomial: Monomial) -> Expr:
@@ -102,11 +97,7 @@ def scaled(a: Terms, factor: Expr) -> Terms:
     return {m: [factor * p for p in c] for m, c in a.items()}
 
 
-Matrix = Callable[[np.ndarray], np.ndarray]
-_POINTS = 4
-_TOLERANCE = 1e-11
-
-
+# -- matrices that are linear in a symmetric matrix, with inverses that are linear in its inverse
 @dataclass(frozen=True, eq=False)
 class Congruence:
     """entries : of Q, row by row, (p * p,). inverse : G, (n, n, p, p). power : n / p."""
@@ -167,7 +158,7 @@ def _fitted(at: Matrix, inverted: Matrix, entries: tuple[Expr, ...], n: int) -> 
     g[np.abs(g) < _TOLERANCE * np.abs(g).max()] = 0.0
     form = Congruence(entries, g, n / p, float(np.linalg.slogdet(at(identity))[1]))
     rng = np.random.default_rng(1)
-    for _ in range(_POINTS):
+    for _ in range(_CONGRUENCE_POINTS):
         a = rng.standard_normal((p, p))
         q = a @ a.T + identity
         found, expected = np.linalg.inv(at(q)), np.einsum("ijkl,kl->ij", g, np.linalg.inv(q))
@@ -189,9 +180,7 @@ def _lower_half(symbols: frozenset[Expr]) -> dict[tuple[int, int], Expr] | None:
     return half if set(half) == {(i, j) for i in range(p) for j in range(i + 1)} else None
 
 
-_MINUS = constant(-1.0)
-
-
+# -- separation
 class NotSeparable(Exception):
     """Raised at the node at which a separation fails."""
 
@@ -306,9 +295,6 @@ def _inverse_of(node: Expr) -> Expr | None:
     n, source = node.data, first.args[0]
     whole = [item(source, i, j) for i in range(n) for j in range(n)]
     return source if all(a is b for a, b in zip(node.args, whole, strict=True)) else None
-
-
-MAX_TERMS = 600
 
 
 @dataclass(frozen=True)
@@ -582,9 +568,7 @@ def _equated(condition: Expr) -> dict[Expr, Expr]:
     return {}
 
 
-POINTS = 64  # at which a form is held against what it was made of
-
-
+# -- polynomials
 def polynomial(
     expression: Expr, symbols: Sequence[Expr], degree: int
 ) -> dict[tuple[Expr, ...], Expr] | NotApplicable:

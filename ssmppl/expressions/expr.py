@@ -1,18 +1,8 @@
-"""Applying an operation: constants folded, neutral elements dropped, spellings brought together.
+"""Scalar expressions, for the rest of the project: the names of `node.py`, and
 
-Walking the graph under expressions: order, tables for pickling, dependence, substitution.
-
-Expressions as a person writes them.
-
-Scalar expressions, for the rest of the project: every name of the modules below.
-
-    node.py  where the user wrote a node
-    node.py        Expr: one interned, immutable node type
-    simplify.py    apply: an operation, simplified
-    graph.py       walking the nodes under an expression: order, dependence, substitution
-    text.py        how a person writes it
-
-Import from here; the five modules are how it is made.
+- `apply`: an operation with constants folded, neutral elements dropped, spellings brought together;
+- walks over the graph under expressions: order, tables for pickling, dependence, substitution;
+- `to_text`: an expression as a person writes it.
 """
 
 from __future__ import annotations
@@ -68,6 +58,10 @@ __all__ = [
 ]
 
 
+_FACTORS = {"neg", "mul", "div"}
+
+
+# -- operations, simplified
 def apply(op: str, *operands: Any) -> Expr:
     """The node of `op` on nodes or numbers, with constants folded and neutral elements dropped.
 
@@ -142,9 +136,6 @@ def without_exponentials(a: Expr) -> tuple[Expr, Expr | None]:
         if not missing:
             done[waiting.pop()] = _gathered(node, done)
     return done[a]
-
-
-_FACTORS = {"neg", "mul", "div"}
 
 
 def _gathered(a: Expr, done: dict[Expr, tuple[Expr, Expr | None]]) -> tuple[Expr, Expr | None]:
@@ -254,6 +245,7 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
             return number, e
 
 
+# -- walks over the graph
 def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) -> list[Expr]:
     """Every node under `roots`, arguments before users, each once; without recursion.
 
@@ -385,6 +377,7 @@ def rebuilt(node: Expr, args: tuple[Expr, ...]) -> Expr:
     return apply(node.op, *args) if node.op in FOLD else Expr(node.op, args, node.data)
 
 
+# -- text
 _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "pow": ("**", 4)}
 _INFIX |= {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "mod": ("%", 2)}
 LONGEST = 10_000

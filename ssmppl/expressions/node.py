@@ -9,7 +9,8 @@ small matrices (`MATRIX_OPS`) are nodes over the matrix's entries, whose results
 What an operation means is defined by `evaluate.py`, how it is spelled in generated code by
 `codegen/text/render.py`, its derivative by `calculus.py`: three tables over the names below.
 
-Where the user wrote each node, and which are elements of an array that a symbol chose.
+While a model is traced, `recording` and `choosing` keep where the user wrote each node, and which
+nodes are elements of an array that a symbol chose.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ INDEX_BY_SYMBOL = (
 # (all of them by `ssmppl.expressions`):
 #   "apply"     (op, *operands): the node of an operation, simplified     expr.py
 #   "pickle"    (node): what its __reduce__ gives                         expr.py
-#   "text"      (node): how a person writes it                            text.py
+#   "text"      (node): how a person writes it                            expr.py
 #   "ufunc"     (ufunc, method, inputs, kwargs): NumPy's NEP 13           numpy_protocols.py
 #   "function"  (func, args, kwargs): NumPy's NEP 18                      numpy_protocols.py
 behaviour: dict[str, Callable[..., Any]] = {}
@@ -90,7 +91,7 @@ class Expr:
 
     `data` holds the value of a "const", (kind, name, index) of a "symbol", the position of an
     "item", (kind, key) of a "random" draw, the function of a "call", the size of a matrix.
-    `_symbols` holds the symbols under the node once they were asked for: see `graph.symbols_in`.
+    `_symbols` holds the symbols under the node once they were asked for: see `expr.symbols_in`.
     """
 
     __slots__ = ("__weakref__", "_symbols", "args", "data", "op")
@@ -111,9 +112,9 @@ class Expr:
                 object.__setattr__(node, "data", data)
                 object.__setattr__(node, "_symbols", None)
                 _interned[key] = node
-        places = PLACES.get()
-        if places is not None and args:  # symbols are not written there
-            note(node, places)
+        locations = LOCATIONS.get()
+        if locations is not None and args:  # symbols are not written there
+            note(node, locations)
         return node
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -338,11 +339,12 @@ def as_expr(value: Any) -> Expr:
     raise TypeError(f"no expression can be made of {value!r} of type {type(value).__name__}")
 
 
-# Of the block that records; None where none does. And the place that its nodes are given.
-PLACES: ContextVar[dict[Expr, Location] | None] = ContextVar("places", default=None)
+# -- where nodes are from
+# Of the block that records; None where none does. And the location that its nodes are given.
+LOCATIONS: ContextVar[dict[Expr, Location] | None] = ContextVar("locations", default=None)
 CHOICES: ContextVar[dict[Expr, tuple[Expr, int]] | None] = ContextVar("choices", default=None)
 _given: ContextVar[Location | None] = ContextVar("given", default=None)
-# Frames of these folders are never the place "where the user wrote it".
+# Frames of these folders are never where the user wrote it.
 _OWN = tuple(
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
     for d in ("expressions", "language")
@@ -355,13 +357,13 @@ _OWN += tuple(  # SciPy lies beside NumPy
 
 @contextmanager
 def recording() -> Iterator[dict[Expr, Location]]:
-    """Within the block, the first place where the user wrote each node is kept in the result."""
-    places: dict[Expr, Location] = {}
-    token = PLACES.set(places)
+    """Within the block, the first line where the user wrote each node is kept in the result."""
+    locations: dict[Expr, Location] = {}
+    token = LOCATIONS.set(locations)
     try:
-        yield places
+        yield locations
     finally:
-        PLACES.reset(token)
+        LOCATIONS.reset(token)
 
 
 @contextmanager
@@ -377,23 +379,23 @@ def choosing() -> Iterator[dict[Expr, tuple[Expr, int]]]:
 
 
 @contextmanager
-def attributed(places: dict[Expr, Location], location: Location) -> Iterator[None]:
-    """Within the block, nodes that have no place in `places` yet get this one.
+def attributed(locations: dict[Expr, Location], location: Location) -> Iterator[None]:
+    """Within the block, nodes that have none in `locations` yet get this location.
 
     For what is derived from a line of the user's rather than written there.
     """
-    tokens = PLACES.set(places), _given.set(location)
+    tokens = LOCATIONS.set(locations), _given.set(location)
     try:
         yield
     finally:
-        PLACES.reset(tokens[0])
+        LOCATIONS.reset(tokens[0])
         _given.reset(tokens[1])
 
 
-def note(node: Expr, places: dict[Expr, Location]) -> None:
-    """Keep the place of a node that has none."""
-    if node not in places:
-        places[node] = _given.get() or user_location()
+def note(node: Expr, locations: dict[Expr, Location]) -> None:
+    """Keep the location of a node that has none."""
+    if node not in locations:
+        locations[node] = _given.get() or user_location()
 
 
 def user_location() -> Location:

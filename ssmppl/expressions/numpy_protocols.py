@@ -3,9 +3,7 @@
 NumPy hands every ufunc and array function that meets an `Expr` or an `ExprArray` to
 `apply_ufunc` and `apply_function` below (NEP 13 and NEP 18). Functions that only move elements
 run as NumPy has them; those that compute stand in the table `FUNCTIONS`; all others are refused
-by name, with the nearest that exist.
-
-Functions that symbols do not have, and what to write for them.
+by name, with what `UNSUPPORTED` says to write for them, or the nearest that exist.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ _ROUNDED = "np.floor(x + 0.5), which takes halves up, where NumPy takes them to 
 _SORTED = "np.minimum and np.maximum of the elements"
 _TABLE = "np.where(...) by pieces, or wrap the table by @ssm.primitive"
 # by the names that NumPy, SciPy and their ufuncs have
-INSTEAD: dict[str, str] = {
+UNSUPPORTED: dict[str, str] = {
     **dict.fromkeys(["round", "rint", "around"], _ROUNDED),
     **dict.fromkeys(["trunc", "fix"], "np.sign(x) * np.floor(np.abs(x))"),
     **dict.fromkeys(["select", "piecewise"], "np.where(condition, a, b), one inside another"),
@@ -87,8 +85,8 @@ INSTEAD: dict[str, str] = {
 def fix_for(name: str, known: Iterable[str]) -> str:
     """What to write for a function of this name: what is known to do, else those that are spelled
     nearly so."""
-    if name in INSTEAD:
-        return f"write {INSTEAD[name]}"
+    if name in UNSUPPORTED:
+        return f"write {UNSUPPORTED[name]}"
     if name in known:  # a namesake in another module, as in np.linalg
         return f"write np.{name}"
     near = ", ".join(difflib.get_close_matches(name, sorted(known), SHOWN))

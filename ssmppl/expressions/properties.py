@@ -1,9 +1,6 @@
-"""What the form of an expression says about its sign, whatever values its symbols have.
-
-What the conditions of expressions ask.
-
-Where an expression has no value whatever its unknown symbols are: an index that no element has,
-the root of a negative input.
+"""What the form of an expression says: whether it can be negative, which conditions it asks, and
+where it has no value whatever its unknown symbols are (an index that no element has, the root of a
+negative input).
 """
 
 from __future__ import annotations
@@ -21,6 +18,16 @@ from ssmppl.expressions.node import BOOLEAN
 
 _OF_ANY = {"exp", "abs", "sqrt"}  # none below 0, of whatever number
 _OF_SUCH = {"add", "mul", "div", "maximum", "minimum"}  # of such numbers such a number
+
+Choices = Mapping[Expr, tuple[Expr, int]]  # as `node.choosing` keeps them
+
+# How a part has no value, the larger before the less: comparisons with NaN have one.
+_FINE, _NAN, _OUTSIDE = np.int8(0), np.int8(1), np.int8(2)
+_NOTHING_WRONG = np.zeros((), dtype=np.int8)
+
+# Of finite numbers they are numbers, or infinite.
+_ALWAYS = BOOLEAN | {"add", "sub", "mul", "neg", "abs", "sign", "floor", "ceil", "minimum",
+                     "maximum", "where", "exp", "sin", "cos", "tanh", "arctan"}  # fmt: skip
 
 
 def never_negative(e: Expr) -> bool:
@@ -54,17 +61,6 @@ def affirmed(condition: Expr) -> tuple[Expr, bool]:
     if condition.op == "le":  # a <= b is not b < a
         return Expr("lt", condition.args[::-1]), True
     return (Expr("eq", condition.args), True) if condition.op == "ne" else (condition, False)
-
-
-Choices = Mapping[Expr, tuple[Expr, int]]  # as `provenance.choosing` keeps them
-
-# How a part has no value, the larger before the less: comparisons with NaN have one.
-_FINE, _NAN, _OUTSIDE = np.int8(0), np.int8(1), np.int8(2)
-_NOTHING_WRONG = np.zeros((), dtype=np.int8)
-
-# Of finite numbers they are numbers, or infinite.
-_ALWAYS = BOOLEAN | {"add", "sub", "mul", "neg", "abs", "sign", "floor", "ceil", "minimum",
-                     "maximum", "where", "exp", "sin", "cos", "tanh", "arctan"}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""Values of symbols at which forms are held against each other: moderate ones, wide ones, and such
-that each condition holds at some of them and fails at others.
+"""Test points: values of symbols at which two forms of an expression are compared. Moderate ones,
+wide ones, and such that each condition holds at some of them and fails at others.
 
 `where`, `maximum`, `minimum` and `abs` have conditions. Each number that one compares with is among
 the values of the symbols in it; one that they do not decide both ways is itself set to true and
@@ -16,7 +16,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import BOOLEAN, Expr, apply, constant, symbols_of, topological
 from ssmppl.expressions.properties import affirmed, conditions_of
 
-Places = dict[Expr, np.ndarray]
+TestPoints = dict[Expr, np.ndarray]
 PLAIN, CASES, WIDE = 4, 64, 512  # how many, moderate ones without and with conditions, wide ones
 LEAST, MOST = -6.0, 5.0  # powers of ten of wide values
 AROUND = (-1.0, -0.1, 0.0, 0.1, 1.0)  # a number that is compared with, in parts of it
@@ -40,7 +40,7 @@ def with_cases(forms: Iterable[Expr]) -> list[Expr]:
     return [done[f] for f in forms]
 
 
-def moderate(forms: list[Expr]) -> Places:
+def moderate(forms: list[Expr]) -> TestPoints:
     """Where most parameters may be; the first PLAIN of them whatever conditions there are.
 
     forms : as `with_cases` has them.
@@ -51,7 +51,7 @@ def moderate(forms: list[Expr]) -> Places:
     return _decided(forms, _crossed(values, compared, rng), rng)
 
 
-def wide(forms: list[Expr]) -> Places:
+def wide(forms: list[Expr]) -> TestPoints:
     """Of many magnitudes; half of the points have positive values only."""
     rng, compared = np.random.default_rng(21), _compared(forms)
     values = {}
@@ -78,7 +78,9 @@ def _compared(forms: list[Expr]) -> dict[Expr, list[float]]:
     return found
 
 
-def _crossed(values: Places, compared: dict[Expr, list[float]], rng: np.random.Generator) -> Places:
+def _crossed(
+    values: TestPoints, compared: dict[Expr, list[float]], rng: np.random.Generator
+) -> TestPoints:
     """With half of a symbol's values at, and on both sides of, what it is compared with."""
     for s, numbers in compared.items():
         if numbers:
@@ -90,7 +92,7 @@ def _crossed(values: Places, compared: dict[Expr, list[float]], rng: np.random.G
     return values
 
 
-def _decided(forms: list[Expr], values: Places, rng: np.random.Generator) -> Places:
+def _decided(forms: list[Expr], values: TestPoints, rng: np.random.Generator) -> TestPoints:
     """With truth values for the conditions that are the same everywhere."""
     conditions = conditions_of(forms)
     size = len(next(iter(values.values()))) if values else PLAIN
@@ -105,8 +107,8 @@ def _decided(forms: list[Expr], values: Places, rng: np.random.Generator) -> Pla
     return values
 
 
-def numbers_at(forms: list[Expr], places: Places) -> np.ndarray:
+def numbers_at(forms: list[Expr], points: TestPoints) -> np.ndarray:
     """(points, forms): their values."""
-    size = max((len(v) for v in places.values()), default=1)
-    values = evaluate([constant(0.0), *forms], places)
+    size = max((len(v) for v in points.values()), default=1)
+    values = evaluate([constant(0.0), *forms], points)
     return np.stack([np.broadcast_to(np.asarray(v, dtype=float), size) for v in values[1:]], axis=1)

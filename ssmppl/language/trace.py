@@ -22,10 +22,9 @@ from ssmppl.language.checks.rules import (
     check_read,
     check_returned,
     check_states,
-    is_symmetric,
 )
-from ssmppl.language.distributions.covariances import find_root, independent
 from ssmppl.language.model.calling import call, check_outer_names, return_location
+from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.traced import Site, Trace, symbols
 
@@ -130,7 +129,7 @@ class _Tracer:
                     )
                 if function_role in ("prior", "initial", "observation"):
                     self._claim(name, role, distribution.shape, line)
-                    if is_symmetric(distribution):
+                    if distribution.symmetric:
                         self.symmetric.add(name)
                 value = symbols(role, name, distribution.shape, name in self.symmetric)
                 sites[name] = Site(name, role, distribution, value, where)
@@ -180,11 +179,11 @@ class _Tracer:
         """Refuse a default that was taken where the name is a quantity, which it would hide."""
         for name, role, where in self.defaults:
             if name in self.known or name == "t":
-                told = self._unknown(name, role, where)
+                unknown = self._unknown(name, role, where)
                 raise ModelError(
                     f"@{role} {where.function} takes the default of {name!r}, which hides the "
-                    f"model's {name!r}: {told.found}",
-                    fix=f"rename the argument if its default is meant; else {told.fix}",
+                    f"model's {name!r}: {unknown.found}",
+                    fix=f"rename the argument if its default is meant; else {unknown.fix}",
                     where=where,
                 )
 

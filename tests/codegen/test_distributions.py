@@ -21,8 +21,7 @@ from ssmppl.codegen.text.module import Layout, ModuleText, Section, Target
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.checks.rules import is_symmetric
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.trace import trace
 from tests.codegen.models import declare
@@ -38,7 +37,7 @@ class Compiled:
     """Sampler and log density of one distribution, as passes over particles."""
 
     def __init__(self, distribution, parameters):
-        value = symbols("state", "x", distribution.shape, is_symmetric(distribution))
+        value = symbols("state", "x", distribution.shape, distribution.symmetric)
         site = Site("x", "state", distribution, value, NOWHERE)
         each = [
             Site(s.data[1], "parameter", D.Normal(0, sd=1), array([s]), NOWHERE) for s in parameters

@@ -13,7 +13,7 @@ from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.expressions.numpy_protocols import INSTEAD
+from ssmppl.expressions.numpy_protocols import UNSUPPORTED
 
 NAMES = {"x": (), "y": (), "k": (), "v": (3,), "w": (3,), "A": (3, 3), "S": (3, 3), "B": (2, 3)}
 C = np.array([[1.0, 0.5, -1.0], [0.25, 2.0, 0.0], [0.0, 1.0, 3.0]])
@@ -312,5 +312,5 @@ def test_what_symbols_do_not_have_is_named_as_it_was_written(call, name, fix):
 
 @pytest.mark.parametrize("x", [-3.0, 0.5, 27.0, 200.0])
 def test_the_advice_for_erfcx_is_erfcx(x):
-    found = eval(INSTEAD["erfcx"], {"np": np, "scipy": scipy, "x": x})
+    found = eval(UNSUPPORTED["erfcx"], {"np": np, "scipy": scipy, "x": x})
     np.testing.assert_allclose(found, sp.erfcx(x), rtol=1e-9)

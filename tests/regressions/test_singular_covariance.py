@@ -18,7 +18,7 @@ from ssmppl.analysis.structure import without_density
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, topological
-from ssmppl.language.distributions.covariances import find_root
+from ssmppl.language.model.covariances import find_root
 from ssmppl.language.trace import trace
 
 DT, ROWS = 0.5, 40

@@ -26,11 +26,12 @@ from ssmppl.analysis.conjugacy.families import (
 )
 from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, Factor
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.algebra import Separation, affine, separate, split_constant
+from ssmppl.expressions.algebra import Separation, affine, separate
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import (
     Expr,
     constant,
+    split_constant,
     substitute,
     symbol,
     symbols_of,

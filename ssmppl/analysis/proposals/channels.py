@@ -12,7 +12,6 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, attributed
 from ssmppl.language.distributions import (
     Beta,
-    Categorical,
     Dirichlet,
     Mixture,
     MvNormal,
@@ -20,7 +19,6 @@ from ssmppl.language.distributions import (
     ZeroInflated,
 )
 from ssmppl.language.distributions.base import Distribution
-from ssmppl.language.distributions.from_density import Written
 from ssmppl.language.distributions.multivariate import SequentialNormal
 from ssmppl.language.model.traced import Site, Trace
 
@@ -40,8 +38,7 @@ def channels(site: Site) -> list[Channel | None]:
     """Of every component; None where its law has no distribution function, or no inverse of it."""
     law, y = of_components(site.distribution), site.value
     parts = _parts(law)
-    joint = law.joint and not isinstance(law, Categorical)
-    if joint or not all(map(_inverts, parts)):
+    if law.multivariate or not all(part.inverts() for part in parts):
         return [None] * len(site.components)
     first = {s: i for i, s in reversed(list(enumerate(y.ravel())))}
     places = [first[s] for s in site.components]
@@ -61,14 +58,6 @@ def _parts(law: Distribution) -> list[Distribution]:
     if isinstance(law, ZeroInflated) and isinstance(law.base, Mixture):
         return [ZeroInflated(part, law.p) for part in _parts(law.base)]
     return [law]
-
-
-def _inverts(law: Distribution) -> bool:
-    """Whether the quantiles of a law, and of what it is made of, have a formula."""
-    base = getattr(law, "base", None)
-    if base is not None and not _inverts(base):
-        return False
-    return not isinstance(law, Mixture) and (not isinstance(law, Written) or law.inverts())
 
 
 def _at(values: ExprArray, site: Site, place: int) -> Expr:

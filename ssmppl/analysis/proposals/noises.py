@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -21,26 +22,8 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.expr import Expr, apply, constant, symbol, symbols_of
-from ssmppl.language.distributions import (
-    Cauchy,
-    Dirac,
-    Distribution,
-    Exponential,
-    Gamma,
-    HalfCauchy,
-    HalfNormal,
-    InverseGamma,
-    Laplace,
-    LogNormal,
-    MvNormal,
-    Normal,
-    StudentT,
-    Uniform,
-    Weibull,
-)
+from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.traced import Site, Trace
-
-GAUSSIAN = (Normal, MvNormal, LogNormal)
 
 
 @dataclass(frozen=True)
@@ -139,29 +122,13 @@ def driven(sites: Sequence[Site], states: Sequence[Expr]) -> Driven:
 
 def _by_noise(site: Site, noise: list[Expr]) -> tuple[ExprArray, ExprArray] | None:
     """(x as a function of e, e as a function of x), None where the law is not of that kind."""
-    d, x = site.distribution, site.value
-    if isinstance(d, GAUSSIAN):
+    d: Any = site.distribution
+    x = site.value
+    if d.gaussian_noise:
         return array(d.sample(given_draws(site.name, noise))), array(d.standard(x))
-    found = _location_and_scale(d)
+    found = d.location_and_scale()
     if found is None:
         return None
     location, scale = (array(np.broadcast_to(array(a).view(np.ndarray), d.shape)) for a in found)
     e = array(np.array(noise, dtype=object).reshape(d.shape))
     return array(location + scale * e), array((x - location) / scale)
-
-
-def _location_and_scale(d: Distribution) -> tuple[ExprArray, ExprArray] | None:
-    zero = array(np.zeros(d.shape))
-    if isinstance(d, (StudentT, Laplace, Cauchy)):
-        return d.loc, d.scale
-    if isinstance(d, (HalfCauchy, InverseGamma, Weibull)):
-        return zero, d.scale
-    if isinstance(d, HalfNormal):
-        return zero, d.sd
-    if isinstance(d, Exponential):
-        return zero, d.mean()
-    if isinstance(d, Gamma):
-        return zero, array(d.mean() / d.shape_)
-    if isinstance(d, Uniform):
-        return d.lower, array(d.upper - d.lower)
-    return None

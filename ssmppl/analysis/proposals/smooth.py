@@ -11,7 +11,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import BOOLEAN, dependent, topological
 from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
-from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.model.traced import Trace
 
 JUMPING = BOOLEAN | {"floor", "ceil", "sign", "mod"}
@@ -35,7 +35,7 @@ def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
             return NotApplicable(f"draws of {kind} jump from one part to the other", d.location)
         draw = list(array(d.sample(Draws(site.name))).ravel())
         random = [n for n in topological(draw) if n.op == "random"]
-        jumps = dependent(draw, random) if isinstance(d, Written) else set()
+        jumps = dependent(draw, random) if isinstance(d, UserDefined) else set()
         if any(n.op in JUMPING for n in jumps):
             return NotApplicable(f"the sampler of {type(d).__name__} may jump", d.location)
         for node in random:

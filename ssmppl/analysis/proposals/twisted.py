@@ -19,6 +19,7 @@ small share of the particles moves by the transition, which bounds the weights.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from ssmppl.expressions.calculus import (
     lower_inverse,
 )
 from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, symbol
-from ssmppl.language.distributions import Dirac, Draws, LogNormal, MvNormal, Normal
+from ssmppl.language.distributions import Dirac, Draws, MvNormal
 from ssmppl.language.model.traced import Site, Trace
 
 DEFENSIVE = 0.02  # share of the transition in the proposal's mixture
@@ -111,11 +112,12 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
     noise: list[Expr] = []
     recovered: list[Expr] = []
     for site in sites:
-        d, own = site.distribution, site.value.ravel()
+        d: Any = site.distribution
+        own = site.value.ravel()
         if isinstance(d, Dirac):
             value.update(zip(own, array(d.mean()).ravel(), strict=True))
             continue
-        if not isinstance(d, (Normal, MvNormal, LogNormal)):
+        if not d.gaussian_noise:
             reason = f"the law of {site.name} is {type(d).__name__}, not one of a Gaussian noise"
             return NotApplicable(reason, d.location)
         if isinstance(d, MvNormal) and d.root is not None:

@@ -8,7 +8,7 @@ value. The result is free of x_{t-1}, and no smaller than the density anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,41 +23,6 @@ from ssmppl.expressions.expr import Expr, apply, attributed, constant, depends_o
 from ssmppl.language import distributions as laws
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.model.traced import Site, Trace
-
-Estimate = Callable[[Any, ExprArray], Any]
-
-
-TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
-
-
-# law -> parameter -> its maximising value, given the law and the value, the others fixed
-_MAXIMISERS: dict[type, dict[str, Estimate]] = {
-    laws.Normal: {"mean_": lambda d, v: v},
-    laws.MvNormal: {"mean_": lambda d, v: v},
-    laws.LogNormal: {"mean_": lambda d, v: ew("log", v)},
-    laws.StudentT: {"loc": lambda d, v: v},
-    laws.Laplace: {"loc": lambda d, v: v},
-    laws.Cauchy: {"loc": lambda d, v: v},
-    laws.HalfNormal: {"sd": lambda d, v: v},
-    laws.HalfCauchy: {"scale": lambda d, v: v},
-    laws.Exponential: {"rate": lambda d, v: 1.0 / v, "scale": lambda d, v: v},
-    laws.Gamma: {"rate": lambda d, v: d.shape_ / v, "scale": lambda d, v: v / d.shape_},
-    laws.InverseGamma: {"scale": lambda d, v: d.shape_ * v},
-    laws.Weibull: {"scale": lambda d, v: v},
-    laws.VonMises: {"mean_": lambda d, v: v},
-    laws.Poisson: {"rate": lambda d, v: ew("maximum", v, TINY)},
-    laws.NegativeBinomial: {"mean_": lambda d, v: ew("maximum", v, TINY)},
-    laws.Binomial: {
-        "p": lambda d, v: ew("minimum", ew("maximum", array(v / d.n), TINY), 1.0 - TINY)
-    },
-}
-# law -> its centre, and parameters of its spread: the density at a distance from the centre is
-# highest where the spread is that distance, and at the centre where it is smallest
-_SPREADS = {
-    laws.Normal: ("mean_", ("sd", "variance")), laws.StudentT: ("loc", ("scale",)),
-    laws.Laplace: ("loc", ("scale",)), laws.Cauchy: ("loc", ("scale",)),
-    laws.LogNormal: ("mean_", ("sd",)),
-}  # fmt: skip
 
 
 def transition_height(trace: Trace) -> Expr | NotApplicable:
@@ -89,26 +54,25 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     free = {n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())}
     if not free:
         return d.log_density(site.value, guard=False)
-    kind = type(d)
     if isinstance(d, laws.Mixture):
         return _mixture(site, d, prev)
     if isinstance(d, laws.ZeroInflated):
         return _zero_inflated(site, d, prev)
-    if isinstance(d, (laws.Bernoulli, laws.Categorical, laws.BetaBinomial)):
-        return constant(0.0)  # no probability is above 1
+    if d.highest is not None:
+        return constant(d.highest)
     if isinstance(d, laws.Uniform):
         return _uniform(site, prev)
-    known, changed = _MAXIMISERS.get(kind, {}), {}
+    known, changed = d.maximisers, {}
     for name in sorted(free, key=lambda n: n in known):  # spreads first
         if name in known:
             best = array(known[name](d, site.value))
         elif (spread := _spread(site, name, prev)) is not None:
             best = spread
         else:
-            reason = f"{_plain(name)} of {site.name} ({kind.__name__}) depends on the state before"
-            return NotApplicable(reason, where)
+            which = f"{name.rstrip('_')} of {site.name} ({type(d).__name__})"
+            return NotApplicable(f"{which} depends on the state before", where)
         changed[name] = best if d.joint else _replaced(d.parameters[name], best, prev)
-    return _with(d, changed).log_density(site.value, guard=False)
+    return d.rebuilt(changed).log_density(site.value, guard=False)
 
 
 def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
@@ -170,22 +134,26 @@ def _uniform(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
 
 
 def _spread(site: Site, name: str, prev: Sequence[Expr]) -> ExprArray | None:
-    """The value of a parameter of the spread that maximises the density, entry by entry.
+    """The value of a parameter of the spread that maximises the density, entry by entry: the
+    distance from the centre, or the least that the spread can be where that is more.
 
-    None where the parameter is none of these, or has no positive number below it.
+    None where the parameter is no such, or has no positive number below it.
     """
     d = site.distribution
-    centre, spreads = _SPREADS.get(type(d), ("", ()))
-    lowest = _lowest(d.parameters[name], prev) if name in spreads else None
+    spread, centre = d.variance_link, d.mean_link
+    if d.joint or spread is None or centre is None or spread.power < 0.0:
+        return None
+    lowest = _lowest(d.parameters[name], prev) if name == spread.parameter else None
     if lowest is None:
         return None
-    value = array(ew("log", site.value)) if isinstance(d, laws.LogNormal) else site.value
+    logs = centre.scale == "mean of the log"
+    value = array(ew("log", site.value)) if logs else site.value
     best = np.empty(site.shape, dtype=object)
     for i in np.ndindex(site.shape):
-        best[i], place = lowest[i], d.parameters[centre][i]
+        best[i], place = lowest[i], d.parameters[centre.parameter][i]
         if not depends_on(place, prev):
             away = apply("abs", value[i] - place)
-            best[i] = apply("maximum", best[i], away**2 if name == "variance" else away)
+            best[i] = apply("maximum", best[i], away**2 if spread.power == 1.0 else away)
     return array(best)
 
 
@@ -212,12 +180,3 @@ def _replaced(old: ExprArray, best: ExprArray, prev: Sequence[Expr]) -> ExprArra
     for i in np.ndindex(old.shape):
         out[i] = wide[i] if depends_on(old[i], prev) else old[i]
     return array(out)
-
-
-def _with(d: Distribution, changed: dict[str, ExprArray]) -> Distribution:
-    """The same law with other values for some parameters."""
-    return d.rebuilt(changed)
-
-
-def _plain(name: str) -> str:
-    return name.rstrip("_")

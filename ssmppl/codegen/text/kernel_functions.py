@@ -16,7 +16,6 @@ from ssmppl.codegen.text.sums import scalar_function, time_sum
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
-from ssmppl.language.distributions import Categorical
 from ssmppl.language.model.traced import Site, Trace
 from ssmppl.language.model.transforms import transforms
 
@@ -182,7 +181,7 @@ def predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
     """(mean, variance, P(Y <= y), P(Y < y)) for every component; nan where there is none."""
     d, y = of_components(site.distribution), site.value
     nothing = array(np.full(site.shape, np.nan))
-    if d.joint and not isinstance(d, Categorical):
+    if d.multivariate:
         below = strictly = nothing
     else:
         below = array(d.cdf(y))

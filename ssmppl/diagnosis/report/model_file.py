@@ -25,13 +25,13 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.candidates import slug
-from ssmppl.diagnosis.model.changed_laws import bounds_of, infinite
 from ssmppl.diagnosis.report.spelling import Lines
 from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
-from ssmppl.language.distributions.from_density import Origin, Written
+from ssmppl.language.distributions.base import is_infinite
+from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive
@@ -88,16 +88,14 @@ def _wanted(d: Distribution) -> Iterable[Import]:
         if node.op == "call":
             yield Import.of_primitive(node.data)
     for part in _laws(d):
-        if isinstance(part, Written):
+        if isinstance(part, UserDefined):
             yield Import.of_law(part.origin)
 
 
 def _laws(d: Distribution) -> Iterable[Distribution]:
     """A law and those that it is made of."""
     yield d
-    within = d.components if isinstance(d, Mixture) else []
-    within = [d.base] if isinstance(d, ZeroInflated | Truncated) else within
-    for part in within:
+    for part in d.inside():
         yield from _laws(part)
 
 
@@ -111,7 +109,7 @@ def nodes_of(d: Distribution) -> list[Expr]:
     if isinstance(d, ZeroInflated):
         return [*nodes_of(d.base), *d.p.ravel()]
     if isinstance(d, Truncated):
-        return [*nodes_of(d.base), *(e for a in bounds_of(d).values() for e in a.ravel())]
+        return [*nodes_of(d.base), *(e for a in d.given_bounds().values() for e in a.ravel())]
     return [e for a in d.parameters.values() for e in array(a).ravel()]
 
 
@@ -381,13 +379,13 @@ class _Writer:
             law = self._distribution(d.base, lines, room - 20)
             return _call(kind, [law, lines.array(d.p, scalar=_same(d.p))], room)
         if isinstance(d, Truncated):
-            bounds = {k: v for k, v in bounds_of(d).items() if not infinite(v)}
+            bounds = {k: v for k, v in d.given_bounds().items() if not is_infinite(v)}
             wide = d.base.shape != d.shape
             inside = [self._distribution(d.base, lines, room - 16)]
             for i, (k, v) in enumerate(bounds.items()):
                 inside.append(f"{k}={lines.array(v, scalar=not wide or i > 0)}")
             return _call(kind, inside, room)
-        if isinstance(d, Written):
+        if isinstance(d, UserDefined):
             return self._written(d, lines, room)
         by_name = {p.name for p in inspect.signature(type(d).__init__).parameters.values()
                    if p.kind is p.KEYWORD_ONLY}  # fmt: skip
@@ -403,7 +401,7 @@ class _Writer:
             texts.append(f"{plain}={text}" if named else text)
         return _call(kind, texts, room)
 
-    def _written(self, d: Written, lines: Lines, room: int) -> str:
+    def _written(self, d: UserDefined, lines: Lines, room: int) -> str:
         """A law of the user's own, its arguments by name."""
         texts = []
         for i, (argument, values) in enumerate(d.parameters.items()):

@@ -20,7 +20,7 @@ from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.problem import Problem
-from ssmppl.language.distributions import LogNormal, Uniform
+from ssmppl.language.distributions import Uniform
 from ssmppl.language.model.traced import Trace
 
 
@@ -131,9 +131,9 @@ def proposal_of(program: Program) -> str:
 
 def _steerable(program: Program) -> bool:
     """Whether the twisted proposal applies, and its extended Kalman filter can be trusted: it may
-    step out of the support of a LogNormal state, where its guide and its predictions are lost."""
+    step out of a support with an end, as LogNormal's, where its guide and predictions are lost."""
     laws = [s.distribution for s in program.trace.transition.values()]
     twisted = program.proposals.get("twisted", NotApplicable("there is none"))
     return not isinstance(twisted, NotApplicable) and not any(
-        isinstance(d, LogNormal) for d in laws
+        d.support().kind == "interval" for d in laws
     )

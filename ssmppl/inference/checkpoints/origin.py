@@ -18,7 +18,7 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.distributions import Distribution
-from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.model.traced import Site, Trace
 from ssmppl.language.user_defined.primitive import Primitive
 
@@ -122,7 +122,7 @@ def model_digest(trace: Trace) -> str:
 def _law(law: Distribution) -> str:
     """What its expressions are of: Normal(x, sd=a) and Normal(x, variance=a) hold the same."""
     parts = [type(law).__name__, repr(law.shape), *law.parameters, *map(_law, law.inside())]
-    if isinstance(law, Written):
+    if isinstance(law, UserDefined):
         parts += [repr(law.bounds), repr(law.patterns.tolist()),
                   repr([(pattern, *forms) for pattern, forms in law.forms.items()])]  # fmt: skip
     return f"({' '.join(parts)})"

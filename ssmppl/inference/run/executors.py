@@ -26,10 +26,10 @@ from contextlib import contextmanager
 from typing import Any
 
 from ssmppl.errors import ArgumentError, ExecutorError
-from ssmppl.language.model.pickling import Known, digest_of, packed, unpacked
+from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unpacked
 
 MOST = 8  # functions that a worker keeps; each may hold the data
-_functions: Known[Callable[..., Any]] = Known(MOST)
+_functions: UnpackedCache[Callable[..., Any]] = UnpackedCache(MOST)
 
 
 def check_executor(executor: Any) -> None:

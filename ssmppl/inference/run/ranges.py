@@ -7,8 +7,7 @@ Sums of log densities.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -17,11 +16,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distributions import (
-    BetaBinomial,
-    Binomial,
-    Categorical,
     Distribution,
-    Mixture,
     MvNormal,
     Truncated,
 )
@@ -121,12 +116,12 @@ def _of_one(
             else:
                 demand = f"the {called} of {name}, {e!r}, has to lie in {allowed}"
                 might.append((demand, f"if it leaves that range, {fix}; if not, {DOMAIN}"))
-    return _sums(law, values) if isinstance(law, (Categorical, Mixture)) else None
+    return _sums(law, values)
 
 
-def _sums(law: Categorical | Mixture, values: Mapping[Expr, float]) -> tuple[str, str] | None:
+def _sums(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, str] | None:
     """Shares that do not sum to 1, where their symbols have values."""
-    called, own = _shares(law)
+    called, own = law.shares() or ("", [])
     for index in np.ndindex(law.shape):
         shares = [array(share)[index] for share in own]
         if symbols_of(shares) and symbols_of(shares) <= set(values):
@@ -138,20 +133,16 @@ def _sums(law: Categorical | Mixture, values: Mapping[Expr, float]) -> tuple[str
     return None
 
 
-def _shares(law: Categorical | Mixture) -> tuple[str, Iterable[Any]]:
-    """What the shares of a law are called, and these."""
-    return ("weights", law.weights) if isinstance(law, Mixture) else ("probabilities", law.p)
-
-
 def _fix(law: Distribution, called: str, e: Expr, low: float, high: float) -> str:
     """A function that maps all numbers into the range."""
-    if isinstance(law, (Binomial, BetaBinomial)) and called == "n":
+    if called == law.trials:
         return (
             f"write a {called} that is never below 0, np.maximum({e!r}, 0); where several flows "
             "empty one compartment, draw each out of what the others have left"
         )
-    if isinstance(law, (Categorical, Mixture)):
-        return f"write {_shares(law)[0]} {_SHARES}"
+    shares = law.shares()
+    if shares is not None:
+        return f"write {shares[0]} {_SHARES}"
     if (low, high) == (0.0, 1.0):
         logistic = f"1 / (1 + np.exp(-({e!r})))"
         return f"write a {called} between 0 and 1 whatever the state, such as {logistic}"

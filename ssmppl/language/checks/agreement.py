@@ -20,8 +20,8 @@ import numpy as np
 from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
-from ssmppl.language.distributions.base import Draws
-from ssmppl.language.distributions.from_density import VALUE, Written
+from ssmppl.language.distributions.draws import Draws
+from ssmppl.language.distributions.from_density import VALUE, UserDefined
 
 Function = Callable[[np.ndarray], np.ndarray]
 TOLERANCE = 1e-6  # of what is integrated and compared
@@ -61,26 +61,26 @@ class Agreement:
 
 
 def agreement(
-    law: Written, places: Mapping[str, Location], draws: int, level: float, seed: int
+    law: UserDefined, locations: Mapping[str, Location], draws: int, level: float, seed: int
 ) -> Agreement:
     """Compare; see `DeclaredDistribution.check`.
 
-    places : of the functions that were declared, by part.
+    locations : of the functions that were declared, by part.
     """
     support = law.support()
     lower, upper = (float(evaluate(array(b)[()])) for b in (support.lower, support.upper))
     drawn = np.sort(_draws(law, draws, seed)) if law.drawable else np.empty(0)
-    by_draw = places.get("draw", places["density"])
+    by_draw = locations.get("draw", locations["density"])
     _check_inside(law, drawn, lower, upper, by_draw)
-    found = (_summed if law.discrete else _integrated)(law, lower, upper, drawn, places)
-    lines = [_check_total(law, found, places["density"])]
+    found = (_summed if law.discrete else _integrated)(law, lower, upper, drawn, locations)
+    lines = [_check_total(law, found, locations["density"])]
     for part, own in (("mean", found.mean), ("variance", found.variance)):
-        if part in places:
-            lines += _check_moment(law, part, own, places[part])
-    if "cdf" in places:
-        lines.append(_check_cdf(law, found, places["cdf"]))
-        if "quantile" in places:
-            lines.append(_check_quantile(law, places["quantile"]))
+        if part in locations:
+            lines += _check_moment(law, part, own, locations[part])
+    if "cdf" in locations:
+        lines.append(_check_cdf(law, found, locations["cdf"]))
+        if "quantile" in locations:
+            lines.append(_check_quantile(law, locations["quantile"]))
     p_value = None
     if drawn.size:
         p_value = _check_draws(law, found, len(drawn), level, by_draw)
@@ -103,7 +103,7 @@ class _Found:
 
 
 def _check_inside(
-    law: Written, drawn: np.ndarray, lower: float, upper: float, where: Location
+    law: UserDefined, drawn: np.ndarray, lower: float, upper: float, where: Location
 ) -> None:
     outside = drawn[~((drawn >= lower) & (drawn <= upper))]
     if outside.size:
@@ -122,36 +122,38 @@ def _check_inside(
         )
 
 
-def _check_total(law: Written, found: _Found, where: Location) -> str:
-    told = f"{'sums' if law.discrete else 'integrates'} to {found.total:.9g}"
+def _check_total(law: UserDefined, found: _Found, where: Location) -> str:
+    text = f"{'sums' if law.discrete else 'integrates'} to {found.total:.9g}"
     if not abs(found.total - 1.0) <= TOLERANCE + found.error:
         fix = "correct the density or the bounds"
         if 0.0 < found.total < math.inf:
             fix = f"add {-math.log(found.total):.9g} to the log density there, or {fix}"
-        raise ModelError(f"the density of {law!r} {told}, not to 1", fix=fix, where=where)
-    return f"{law!r}: the density {told}"
+        raise ModelError(f"the density of {law!r} {text}, not to 1", fix=fix, where=where)
+    return f"{law!r}: the density {text}"
 
 
-def _check_moment(law: Written, part: str, own: float, where: Location) -> list[str]:
-    told = float(evaluate(array(getattr(law, part)())[()]))
-    if not math.isfinite(told):  # what the integral tends to is not seen
+def _check_moment(law: UserDefined, part: str, own: float, where: Location) -> list[str]:
+    declared = float(evaluate(array(getattr(law, part)())[()]))
+    if not math.isfinite(declared):  # what the integral tends to is not seen
         return []
-    if not abs(told - own) <= 1e-5 * (1.0 + abs(own)):
-        raise _differs(law, f"the {part}", told, own, where)
+    if not abs(declared - own) <= 1e-5 * (1.0 + abs(own)):
+        raise _differs(law, f"the {part}", declared, own, where)
     return [f"the {part} is {own:.6g}, as declared"]
 
 
-def _check_cdf(law: Written, found: _Found, where: Location) -> str:
+def _check_cdf(law: UserDefined, found: _Found, where: Location) -> str:
     at, below = found.at, found.below
-    told = np.broadcast_to(evaluate(array(law.cdf(VALUE))[()], {VALUE: at}), at.shape)
-    gap = np.where(np.isnan(told), np.inf, np.abs(told - below))
+    declared = np.broadcast_to(evaluate(array(law.cdf(VALUE))[()], {VALUE: at}), at.shape)
+    gap = np.where(np.isnan(declared), np.inf, np.abs(declared - below))
     k = int(gap.argmax())
     if gap[k] > TOLERANCE + found.error:
-        raise _differs(law, f"the distribution function at {at[k]:.6g}", told[k], below[k], where)
+        raise _differs(
+            law, f"the distribution function at {at[k]:.6g}", declared[k], below[k], where
+        )
     return f"the distribution function agrees at {at.size} values"
 
 
-def _check_quantile(law: Written, where: Location) -> str:
+def _check_quantile(law: UserDefined, where: Location) -> str:
     for p in LEVELS:
         at = array(law.quantile(array(p)))
         low, high = (float(evaluate(array(law.cdf(v))[()])) for v in (at - 1.0, at))
@@ -168,7 +170,7 @@ def _check_quantile(law: Written, where: Location) -> str:
     return f"its inverse agrees at {len(LEVELS)} levels"
 
 
-def _check_draws(law: Written, found: _Found, n: int, level: float, where: Location) -> float:
+def _check_draws(law: UserDefined, found: _Found, n: int, level: float, where: Location) -> float:
     from scipy.stats import kstwo  # slow to import
 
     p_value = float(kstwo.sf(found.distance, n))
@@ -182,18 +184,20 @@ def _check_draws(law: Written, found: _Found, n: int, level: float, where: Locat
     return p_value
 
 
-def _differs(law: Written, what: str, told: float, own: float, where: Location) -> ModelError:
-    return ModelError(f"{what} of {law!r} is {told:.9g}, by its density {own:.9g}",
+def _differs(
+    law: UserDefined, what: str, declared: float, own: float, where: Location
+) -> ModelError:
+    return ModelError(f"{what} of {law!r} is {declared:.9g}, by its density {own:.9g}",
                       fix="correct the one or the other", where=where)  # fmt: skip
 
 
-def _draws(law: Written, draws: int, seed: int) -> np.ndarray:
+def _draws(law: UserDefined, draws: int, seed: int) -> np.ndarray:
     source = numpy_draws(np.random.default_rng(seed), (draws,))
     drawn = evaluate(array(law.sample(Draws("check")))[()], {}, source)
     return np.array(np.broadcast_to(drawn, (draws,)), dtype=float)
 
 
-def _log_density(law: Written, places: Mapping[str, Location]) -> Function:
+def _log_density(law: UserDefined, locations: Mapping[str, Location]) -> Function:
     form = array(law.log_densities(VALUE))[()]
 
     def at(x: np.ndarray) -> np.ndarray:
@@ -206,7 +210,7 @@ def _log_density(law: Written, places: Mapping[str, Location]) -> Function:
                 f"the log density of {law!r} is {found[bad][0]:g} at {x[bad][0]:.9g}, which is "
                 "inside of the support",
                 fix="correct the density or the bounds",
-                where=places["density"],
+                where=locations["density"],
             )
         return found
 
@@ -215,9 +219,13 @@ def _log_density(law: Written, places: Mapping[str, Location]) -> Function:
 
 # -- continuous laws
 def _integrated(
-    law: Written, lower: float, upper: float, drawn: np.ndarray, places: Mapping[str, Location]
+    law: UserDefined,
+    lower: float,
+    upper: float,
+    drawn: np.ndarray,
+    locations: Mapping[str, Location],
 ) -> _Found:
-    log_density = _log_density(law, places)
+    log_density = _log_density(law, locations)
     to_x, log_slope, to_s = _line(lower, upper)
 
     def log_g(s: np.ndarray) -> np.ndarray:
@@ -320,9 +328,13 @@ def _pieces(f: Callable[[np.ndarray], np.ndarray], cuts: np.ndarray) -> np.ndarr
 
 # -- discrete laws
 def _summed(
-    law: Written, lower: float, upper: float, drawn: np.ndarray, places: Mapping[str, Location]
+    law: UserDefined,
+    lower: float,
+    upper: float,
+    drawn: np.ndarray,
+    locations: Mapping[str, Location],
 ) -> _Found:
-    log_density = _log_density(law, places)
+    log_density = _log_density(law, locations)
     start = lower if math.isfinite(lower) else upper if math.isfinite(upper) else 0.0
     if not (math.isfinite(lower) or math.isfinite(upper)) and drawn.size:
         start = float(np.median(drawn))

@@ -26,18 +26,18 @@ class _Values:
     def __init__(self) -> None:
         self.found: set[float] = set()
         self.continuum = self.unbounded = False
-        self.told = True  # whether `found` are all
+        self.complete = True  # whether `found` are all
 
     def add(self, kind: str, lower: Expr, upper: Expr) -> None:
         """Those of a law with this support; of points, `_follow` adds them."""
         if kind == "integers" and lower.op == upper.op == "const":
             self.unbounded |= not upper.data - lower.data < MOST
-            self.told &= not self.unbounded
-            if self.told:
+            self.complete &= not self.unbounded
+            if self.complete:
                 self.found.update(np.arange(lower.data, upper.data + 0.5).tolist())
         elif kind != "point":
             self.continuum |= kind != "integers"
-            self.told = False
+            self.complete = False
 
 
 def check_indexes(trace: Trace) -> None:
@@ -84,10 +84,10 @@ def _follow(points: list[tuple[Expr, Expr]], values: dict[Expr, _Values]) -> Non
     for s, e in points:
         if e.op == "const":
             values[s].found.add(e.data)
-        elif e in values and values[e].told:
+        elif e in values and values[e].complete:
             values[s].found.update(values[e].found)
         else:
-            values[s].told = False
+            values[s].complete = False
 
 
 def _check(trace: Trace, site: Site, form: Expr, values: dict[Expr, _Values]) -> None:
@@ -110,12 +110,12 @@ def _check(trace: Trace, site: Site, form: Expr, values: dict[Expr, _Values]) ->
 
 
 def _combined(read: Iterable[Expr], values: dict[Expr, _Values]) -> dict[Expr, np.ndarray]:
-    """All combinations of the values of those symbols whose values are told; none if too many."""
-    told = {s: sorted(values[s].found) for s in read if s in values and values[s].told}
-    if not told or math.prod(len(v) for v in told.values()) > MOST:
+    """All combinations of values of those symbols whose values are all known; none if too many."""
+    listed = {s: sorted(values[s].found) for s in read if s in values and values[s].complete}
+    if not listed or math.prod(len(v) for v in listed.values()) > MOST:
         return {}
-    columns = np.array(list(itertools.product(*told.values())), dtype=float).T
-    return dict(zip(told, columns, strict=True))
+    columns = np.array(list(itertools.product(*listed.values())), dtype=float).T
+    return dict(zip(listed, columns, strict=True))
 
 
 def _check_alone(index: Expr, elements: int, own: _Values, where: Location) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.expr import symbols_of, to_text, topological
-from ssmppl.language.distributions import Dirac, Distribution, Flat, InverseWishart, Wishart
+from ssmppl.language.distributions import Dirac, Distribution
 
 RESERVED = {
     "t": "the row number",
@@ -102,7 +102,6 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
     """What may stand as a prior, as a law of states, as an observation."""
     where = distribution.location
     kind = type(distribution).__name__
-    improper = isinstance(distribution, Flat)
     if role == "prior" and isinstance(distribution, Dirac):
         raise ModelError(
             f"the prior of {name!r} is Dirac",
@@ -117,7 +116,7 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             where=where,
         )
     allowed = role == "prior" or (role == "initial" and kind == "Flat")
-    if improper and not allowed:
+    if not distribution.proper and not allowed:
         raise ModelError(
             f"the law of {name!r} is {kind}, which is improper",
             fix=f"use {kind} as a prior"
@@ -163,11 +162,6 @@ def check_read(name: str, distribution: Distribution, role: str, kinds: Collecti
             )
 
 
-def is_symmetric(distribution: Distribution) -> bool:
-    """Whether values are symmetric matrices, whose two halves share their symbols."""
-    return isinstance(distribution, (Wishart, InverseWishart))
-
-
 def check_states(
     initial: Mapping[str, Any], transition: Mapping[str, Any], proposal: Mapping[str, Any]
 ) -> None:
@@ -203,8 +197,8 @@ def _check_against_initial(role: str, name: str, site: Any, initial: Mapping[str
             fix="give both the same shape; np.zeros(n) makes a mean of length n",
             where=where,
         )
-    symmetric = is_symmetric(first.distribution)
-    if is_symmetric(site.distribution) != symmetric and not isinstance(site.distribution, Dirac):
+    law, symmetric = site.distribution, first.distribution.symmetric
+    if law.symmetric != symmetric and not isinstance(law, Dirac):
         kinds = [type(s.distribution).__name__ for s in (first, site)]
         raise ModelError(
             f"state {name!r} is {kinds[0]} at first and {kinds[1]} in its {role}: one is "

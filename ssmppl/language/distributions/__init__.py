@@ -1,6 +1,6 @@
 """All distributions of the language, by name."""
 
-from ssmppl.language.distributions.base import Distribution, Draws, Support
+from ssmppl.language.distributions.base import Distribution, Support
 from ssmppl.language.distributions.continuous import (
     Flat,
     HalfFlat,
@@ -18,6 +18,7 @@ from ssmppl.language.distributions.discrete import (
     NegativeBinomial,
     Poisson,
 )
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
 from ssmppl.language.distributions.multivariate import Dirichlet, InverseWishart, MvNormal, Wishart
 from ssmppl.language.distributions.positive import Beta, Exponential, Gamma, InverseGamma, Weibull

@@ -1,12 +1,8 @@
-"""What every distribution offers: parameters, support, log density, sampler, moments.
+"""What every distribution offers: parameters, support, log density, sampler, moments, and the facts
+about a law that analyses and the diagnosis ask for.
 
 All of it as expressions, so that one definition serves the interpreter, the analyses and the
 generated code. A sampler is an expression over the "random" nodes of `draws.py`.
-
-Errors of a distribution's construction: what was given, and how it is written.
-
-Random draws as nodes of expressions: standard normal, uniform, gamma, Poisson, binomial, von
-Mises ones.
 """
 
 from __future__ import annotations
@@ -16,7 +12,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,237 +20,13 @@ from ssmppl.errors import Location, ModelError, UnsupportedOperation, nearest_fi
 from ssmppl.expressions.arrays import ExprArray, array, elementwise
 from ssmppl.expressions.expr import Expr, apply, constant, user_location
 from ssmppl.expressions.properties import never_negative
-
-WIDEST = 30  # characters of an argument that is written again in a fix
-
-
-def checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
-    """`init`, with a ModelError in place of Python's TypeError where the arguments do not fit."""
-    signature = inspect.signature(init)
-    by_name = [p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY]
-    positional = [
-        p.name for p in signature.parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD
-    ][1:]
-
-    @functools.wraps(init)
-    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
-        try:
-            signature.bind(self, *args, **kwargs)
-        except TypeError as error:
-            raise misfit(
-                type(self).__name__, error, args, kwargs, positional, by_name, self.by_name
-            ) from None
-        init(self, *args, **kwargs)
-
-    return checked
-
-
-def misfit(
-    name: str, error: TypeError, args: tuple[Any, ...], kwargs: dict[str, Any],
-    positional: Sequence[str], by_name: Sequence[str] = (), called: str = "",
-) -> ModelError:  # fmt: skip
-    """What a law says whose arguments do not fit: Python's error, and how it is written.
-
-    positional, by_name : its arguments; the latter are called `called`.
-    """
-    given = f"{len(args)} without a name"
-    given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
-    found = f"{name}: {error}; given were {given}"
-    known = [f"{k}=" for k in by_name]
-    *most, last = known or [""]
-    options = f"{', '.join(most)} or {last}" if most else last
-    unknown = [k for k in kwargs if k not in (*positional, *by_name)]
-    if unknown:
-        nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
-        fix = f"the arguments of {name} are {nearest}"
-    elif by_name and len(args) > len(positional):
-        found = f"{name} takes its {called} by name: {options}"
-        arrays = any(np.ndim(a) for a in args if isinstance(a, np.ndarray))  # print as no Python
-        own = [str(a) for a in args] if len(args) == len(positional) + 1 and not arrays else []
-        if not own or kwargs or max(map(len, own)) > WIDEST:
-            own = [*positional, "..."]
-        fix = f"write {name}({', '.join([*own[:-1], f'{by_name[0]}={own[-1]}'])})"
-        fix += f", or {' or '.join(known[1:])}" if known[1:] else ""
-    else:
-        fix = f"write {name}({', '.join([*positional, *known])})"
-    return ModelError(found, fix=fix, where=user_location())
-
-
-def one_of(name: str, options: dict[str, Any], where: Location | None = None) -> tuple[str, Any]:
-    """The one spread that was given; an error naming the options where there is none or several."""
-    given = {k: v for k, v in options.items() if v is not None}
-    if len(given) != 1:
-        wanted = ", ".join(f"{k}=" for k in options)
-        found = ", ".join(f"{k}=" for k in given) or "none of them"
-        raise ModelError(
-            f"{name} takes exactly one of {wanted}; found {found}",
-            fix=f"name the spread, for example {name}(..., {next(iter(options))}=1.0)",
-            where=where or user_location(),
-        )
-    return next(iter(given.items()))
-
-
-class Draws:
-    """Makes the "random" nodes of one sampler; each draw is a node of its own."""
-
-    def __init__(self, owner: str):
-        self.owner, self.count = owner, 0
-
-    def _node(self, kind: str, *args: Any) -> Expr:
-        self.count += 1
-        return Expr("random", tuple(map(_node, args)), (kind, (self.owner, self.count)))
-
-    def normal(self) -> Expr:
-        """Standard normal."""
-        return self._node("normal")
-
-    def uniform(self) -> Expr:
-        """Uniform on the open interval (0, 1)."""
-        return self._node("uniform")
-
-    def gamma(self, shape: Any, buffered: bool = False) -> Expr:
-        """Gamma with unit rate; buffered: made of a normal and a uniform where these will do."""
-        if buffered:
-            return self._node("gamma_by", shape, self.normal(), self.uniform())
-        return self._node("gamma", shape)
-
-    def poisson(self, rate: Any) -> Expr:
-        return self._node("poisson", rate)
-
-    def binomial(self, n: Any, p: Any) -> Expr:
-        return self._node("binomial", n, p)
-
-    def vonmises(self, concentration: Any) -> Expr:
-        """Von Mises round 0, on [-pi, pi]."""
-        return self._node("vonmises", concentration)
-
-
-class Generator:
-    """What a user's sampler draws from: these methods of NumPy's `Generator`, with its arguments.
-
-    Every call is a draw of its own. A sampler that is called with NumPy's generator instead, and
-    numbers, does the same.
-    """
-
-    def __init__(self, draws: Draws):
-        self._draws = draws
-
-    def uniform(self, low: Any = 0.0, high: Any = 1.0) -> Any:
-        """Uniform between low and high, neither of them ever drawn.
-
-        Parameters
-        ----------
-        low, high : the ends, numbers or expressions.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return low + (high - low) * self._draws.uniform()
-
-    def random(self) -> Any:
-        """Uniform between 0 and 1.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return self._draws.uniform()
-
-    def normal(self, loc: Any = 0.0, scale: Any = 1.0) -> Any:
-        """Normal of mean loc and standard deviation scale.
-
-        Parameters
-        ----------
-        loc, scale : its mean and standard deviation.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return loc + scale * self._draws.normal()
-
-    def standard_normal(self) -> Any:
-        """Normal of mean 0 and standard deviation 1.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return self._draws.normal()
-
-    def exponential(self, scale: Any = 1.0) -> Any:
-        """Exponential of mean scale.
-
-        Parameters
-        ----------
-        scale : its mean.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return -scale * apply("log", self._draws.uniform())
-
-    def gamma(self, shape: Any, scale: Any = 1.0) -> Any:
-        """Gamma of mean shape times scale.
-
-        Parameters
-        ----------
-        shape, scale : its shape, and the scale, 1 / rate.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return scale * self._draws.gamma(shape)
-
-    def poisson(self, lam: Any = 1.0) -> Any:
-        """Poisson of mean lam.
-
-        Parameters
-        ----------
-        lam : its mean.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return self._draws.poisson(lam)
-
-    def binomial(self, n: Any, p: Any) -> Any:
-        """Binomial: successes among n, each of probability p.
-
-        Parameters
-        ----------
-        n : number of trials.
-        p : probability of each success.
-
-        Returns
-        -------
-        expression : the draw.
-        """
-        return self._draws.binomial(n, p)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        known = [n for n in vars(Generator) if not n.startswith("_")]
-        raise ModelError(
-            f"a sampler asks for rng.{name}, which there is not",
-            fix=f"make the draw of those that there are: {', '.join(known)}; a beta variable is "
-            "a / (a + b) of two gamma ones",
-            where=user_location(),
-        )
-
-
-def _node(value: Any) -> Expr:
-    return value if isinstance(value, Expr) else constant(value)
-
+from ssmppl.language.distributions.draws import Draws
 
 INFINITY = math.inf
 LOG_2 = math.log(2.0)
+LOG_2PI = math.log(2.0 * math.pi)
 ROUNDING = 1e-9
+WIDEST = 30  # characters of an argument that is written again in a fix
 
 
 @dataclass(frozen=True)
@@ -271,6 +43,31 @@ class Support:
     upper: ExprArray
 
 
+@dataclass(frozen=True)
+class MeanLink:
+    """How the mean of a law is moved: by increments of one parameter, on a scale.
+
+    scale : "identity", "log", "logit", or "mean of the log".
+    inverse : whether the parameter is a reciprocal, as a rate is, which falls where the mean grows.
+    """
+
+    parameter: str
+    scale: str
+    inverse: bool = False
+
+
+@dataclass(frozen=True)
+class VarianceLink:
+    """How the variance of a law is scaled: the parameter is in proportion to variance^power."""
+
+    parameter: str
+    power: float
+
+
+# (law, value) -> where a parameter of the law makes the density of the value highest
+Maximiser = Callable[[Any, ExprArray], Any]
+
+
 class Distribution:
     """Base of all distributions.
 
@@ -285,7 +82,17 @@ class Distribution:
     closed = False  # whether the lower bound itself belongs to the support
     open_above = False  # whether the upper one does not
     drawable = True  # whether it has a sampler
+    guards_range = False  # whether its density has to be told where a parameter is out of range
+    symmetric = False  # whether values are symmetric matrices, whose two halves share symbols
     by_name = "spread"  # what the keyword-only arguments are called in messages
+    trials = ""  # the parameter that is a number of trials
+    # What analyses make use of where it is known.
+    truncatable = True  # whether `Truncated` takes it
+    gaussian_noise = False  # whether draws are made of normal ones alone; then it has `standard`
+    maximisers: ClassVar[Mapping[str, Maximiser]] = {}  # by parameter, the others given
+    highest: float | None = None  # what no log density is above, 0 of probabilities
+    mean_link: MeanLink | None = None
+    variance_link: VarianceLink | None = None
     parameters: dict[str, ExprArray]
     ranges: dict[str, tuple[float, float, bool]]  # by parameter: low, high, without the ends
     shape: tuple[int, ...]
@@ -478,11 +285,54 @@ class Distribution:
         """
         return None
 
+    # -- what analyses make use of where it is known
+    def location_and_scale(self) -> tuple[ExprArray, ExprArray] | None:
+        """(m, s) with X = m + s Z, the law of Z free of what is in m and s."""
+        return None
+
+    def noise_free(self) -> ExprArray:
+        """Where the value would be without noise, which `mean_link` moves: mean or centre."""
+        return self.mean()
+
+    def kink(self) -> ExprArray | None:
+        """Where the density is not smooth inside of the support."""
+        return None
+
+    def truncated_moments(
+        self, lower: ExprArray, upper: ExprArray
+    ) -> tuple[ExprArray, ExprArray] | None:
+        """Mean and variance between bounds, in a form of the law's own."""
+        return None
+
+    def rounded_inside(self, drawn: ExprArray) -> ExprArray:
+        """A draw that was rounded to an open end of the support, moved inside."""
+        return drawn
+
+    def inverts(self) -> bool:
+        """Whether its quantiles, and those of the laws inside, have a formula."""
+        return all(law.inverts() for law in self.inside())
+
+    def shares(self) -> tuple[str, list[Any]] | None:
+        """Parameters that sum to 1, and what they are called; None where there are none."""
+        return None
+
     def has_moment(self, power: int) -> ExprArray:
         """Whether the tails are light enough for E|X|^power, as a condition."""
         return self._full(1.0)
 
     # -- in terms of the above
+    @property
+    def multivariate(self) -> bool:
+        """Whether there is one density for several components."""
+        return self.joint and self.shape != ()
+
+    def _each(self, draw: Callable[[tuple[int, ...]], Any]) -> ExprArray:
+        """An array of the distribution's shape, made index by index."""
+        out = np.empty(self.shape, dtype=object)
+        for i in np.ndindex(self.shape):
+            out[i] = draw(i)
+        return array(out)
+
     def _full(self, value: float) -> ExprArray:
         return array(np.full(self.shape, value))
 
@@ -534,11 +384,16 @@ class Distribution:
     def guarded_log_densities(self, value: ExprArray) -> ExprArray:
         """`log_densities`, and -inf outside the support.
 
-        Of a discrete law NaN where a parameter is out of its range: a count of 0 takes no
-        logarithm of it. The formulas of continuous laws are NaN there by themselves.
+        Of a discrete law, and of others with `guards_range`, NaN where a parameter is out of its
+        range: a count of 0 takes no logarithm of it. The formulas of most continuous laws are NaN
+        there by themselves.
         """
+        density = self._guarded_support(array(self.log_densities(value)), value)
+        allowed = self.in_range() if self.discrete or self.guards_range else None
+        return density if allowed is None else where(allowed, density, math.nan)
+
+    def _guarded_support(self, density: ExprArray, value: ExprArray) -> ExprArray:
         support = self.support()
-        density = array(self.log_densities(value))
         if support.kind not in ("interval", "integers"):
             return density
         out = np.empty(density.shape, dtype=object)
@@ -559,8 +414,7 @@ class Distribution:
                 whole = apply("eq", v[i], apply("floor", v[i]))
                 inside = whole if inside.op == "const" else apply("and", inside, whole)
             out[i] = apply("where", inside, density[i], -INFINITY)
-        allowed = self.in_range() if self.discrete else None
-        return array(out if allowed is None else elementwise("where", allowed, out, math.nan))
+        return array(out)
 
     def log_density(self, value: Any, guard: bool = True) -> Expr:
         """Log density of the whole value, one expression; -inf outside the support.
@@ -572,9 +426,19 @@ class Distribution:
         return array(np.sum(array(parts)))[()]
 
 
+def where(condition: Any, a: Any, b: Any) -> ExprArray:
+    """a where the condition holds, else b, element by element."""
+    return array(elementwise("where", condition, a, b))
+
+
 def log_difference(a: Any, b: Any) -> ExprArray:
     """log(exp(a) - exp(b)) for a > b."""
     return array(a + elementwise("log1p", -array(elementwise("exp", array(b) - a))))
+
+
+def is_infinite(bound: Any) -> bool:
+    """Whether a bound bounds nothing."""
+    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
 
 
 def in_order(op: str, lower: ExprArray, upper: ExprArray) -> ExprArray | None:
@@ -594,3 +458,70 @@ def _never_above(a: Expr, b: Expr) -> bool:
 def _plain_name(name: str) -> str:
     """A parameter as the user knows it."""
     return name.removeprefix("like_").rstrip("_")
+
+
+# -- errors of a distribution's construction: what was given, and how it is written
+def checking_arguments(init: Callable[..., None]) -> Callable[..., None]:
+    """`init`, with a ModelError in place of Python's TypeError where the arguments do not fit."""
+    signature = inspect.signature(init)
+    by_name = [p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY]
+    positional = [
+        p.name for p in signature.parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD
+    ][1:]
+
+    @functools.wraps(init)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        try:
+            signature.bind(self, *args, **kwargs)
+        except TypeError as error:
+            raise misfit(
+                type(self).__name__, error, args, kwargs, positional, by_name, self.by_name
+            ) from None
+        init(self, *args, **kwargs)
+
+    return checked
+
+
+def misfit(
+    name: str, error: TypeError, args: tuple[Any, ...], kwargs: dict[str, Any],
+    positional: Sequence[str], by_name: Sequence[str] = (), called: str = "",
+) -> ModelError:  # fmt: skip
+    """What a law says whose arguments do not fit: Python's error, and how it is written.
+
+    positional, by_name : its arguments; the latter are called `called`.
+    """
+    given = f"{len(args)} without a name"
+    given += f" and {', '.join(f'{k}=' for k in kwargs)}" if kwargs else ""
+    found = f"{name}: {error}; given were {given}"
+    known = [f"{k}=" for k in by_name]
+    *most, last = known or [""]
+    options = f"{', '.join(most)} or {last}" if most else last
+    unknown = [k for k in kwargs if k not in (*positional, *by_name)]
+    if unknown:
+        nearest = ", ".join(nearest_first(unknown[0], [*positional, *by_name])) or "none"
+        fix = f"the arguments of {name} are {nearest}"
+    elif by_name and len(args) > len(positional):
+        found = f"{name} takes its {called} by name: {options}"
+        arrays = any(np.ndim(a) for a in args if isinstance(a, np.ndarray))  # print as no Python
+        own = [str(a) for a in args] if len(args) == len(positional) + 1 and not arrays else []
+        if not own or kwargs or max(map(len, own)) > WIDEST:
+            own = [*positional, "..."]
+        fix = f"write {name}({', '.join([*own[:-1], f'{by_name[0]}={own[-1]}'])})"
+        fix += f", or {' or '.join(known[1:])}" if known[1:] else ""
+    else:
+        fix = f"write {name}({', '.join([*positional, *known])})"
+    return ModelError(found, fix=fix, where=user_location())
+
+
+def one_of(name: str, options: dict[str, Any], where: Location | None = None) -> tuple[str, Any]:
+    """The one spread that was given; an error naming the options where there is none or several."""
+    given = {k: v for k, v in options.items() if v is not None}
+    if len(given) != 1:
+        wanted = ", ".join(f"{k}=" for k in options)
+        found = ", ".join(f"{k}=" for k in given) or "none of them"
+        raise ModelError(
+            f"{name} takes exactly one of {wanted}; found {found}",
+            fix=f"name the spread, for example {name}(..., {next(iter(options))}=1.0)",
+            where=where or user_location(),
+        )
+    return next(iter(given.items()))

@@ -1,17 +1,14 @@
-"""Normal, LogNormal, Uniform and the improper Flat, elementwise of arrays.
+"""Normal, LogNormal, Uniform, the improper Flat, and VonMises, elementwise of arrays.
 
 Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 1995),
-"Continuous univariate distributions", volumes 1 and 2, in the parametrisations named in each class.
-
-VonMises: directions, elementwise of arrays.
-
-Mardia and Jupp (2000), "Directional statistics", section 3.5.4.
+"Continuous univariate distributions", volumes 1 and 2, in the parametrisations named in each class;
+of VonMises as in Mardia and Jupp (2000), "Directional statistics", section 3.5.4.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -22,28 +19,18 @@ from ssmppl.expressions.expr import apply
 from ssmppl.expressions.properties import never_negative
 from ssmppl.language.distributions.base import (
     INFINITY,
+    LOG_2PI,
     Distribution,
-    Draws,
+    MeanLink,
     Support,
+    VarianceLink,
     in_order,
     log_difference,
     one_of,
+    where,
 )
-
-LOG_2PI = math.log(2.0 * math.pi)
-_NAN = math.nan
-
-
-def _each(distribution: Distribution, draw: Any) -> ExprArray:
-    """An array of independent draws of the distribution's shape."""
-    out = np.empty(distribution.shape, dtype=object)
-    for i in np.ndindex(distribution.shape):
-        out[i] = draw(i)
-    return array(out)
-
-
-def _where(condition: Any, a: Any, b: Any) -> ExprArray:
-    return array(ew("where", condition, a, b))
+from ssmppl.language.distributions.draws import Draws
+from ssmppl.language.distributions.truncated_moments import normal_moments
 
 
 class Normal(Distribution):
@@ -56,12 +43,18 @@ class Normal(Distribution):
         1 / variance, positive.
     """
 
+    gaussian_noise = True
+    maximisers: ClassVar = {"mean_": lambda law, value: value}
+    mean_link = MeanLink("mean_", "identity")
+
     def __init__(self, mean: Any, *, sd: Any = None, variance: Any = None, precision: Any = None):
         self.spread, value = one_of(
             "Normal", {"sd": sd, "variance": variance, "precision": precision}
         )
         self._set(**{"mean_": mean, self.spread: value})
         self._require(self.spread, 0.0)
+        power = {"sd": 0.5, "variance": 1.0, "precision": -1.0}[self.spread]
+        self.variance_link = VarianceLink(self.spread, power)
 
     def in_range(self) -> ExprArray | None:
         # the square root of a negative variance or precision is no number without being asked
@@ -104,7 +97,7 @@ class Normal(Distribution):
 
     def sample(self, draws):
         sd = self.sd()
-        return self.mean_ + _each(self, lambda i: sd[i] * draws.normal())
+        return self.mean_ + self._each(lambda i: sd[i] * draws.normal())
 
     def standard(self, value: Any) -> ExprArray:
         """The standard normal draw behind a value."""
@@ -142,7 +135,7 @@ class Normal(Distribution):
         if whole_right:
             return True, self._full(-INFINITY), -a
         flip = array(ew("lt", 0.0, a))
-        return flip, _where(flip, -b, a), _where(flip, -a, b)
+        return flip, where(flip, -b, a), where(flip, -a, b)
 
     def log_mass(self, lower, upper):
         _, low, high = self._in_lower_tail(array(lower), array(upper))
@@ -153,7 +146,7 @@ class Normal(Distribution):
         if isinstance(flip, bool):
             p, q = (q, p) if flip else (p, q)
         else:
-            p, q = _where(flip, q, p), _where(flip, p, q)
+            p, q = where(flip, q, p), where(flip, p, q)
         z = array(ew("ndtri", q * ew("ndtr", low) + p * ew("ndtr", high)))
         # Beyond 30 standard deviations: Newton's method for log Phi(z) = target, from the tail's
         # leading term exp(-z^2 / 2); two steps are exact to rounding there.
@@ -166,12 +159,15 @@ class Normal(Distribution):
             value = array(ew("log_ndtr", far))
             slope = array(ew("exp", -0.5 * far**2 - 0.5 * LOG_2PI - value))
             far = far - (value - target) / slope
-        z = _where(ew("lt", high, -30.0), far, z)
+        z = where(ew("lt", high, -30.0), far, z)
         if isinstance(flip, bool):
             z = -z if flip else z
         else:
-            z = _where(flip, -z, z)
+            z = where(flip, -z, z)
         return self.mean_ + self.sd() * z
+
+    def truncated_moments(self, lower, upper):
+        return normal_moments(self, lower, upper)
 
 
 def _log_ndtr_between(low: Any, high: Any) -> ExprArray:
@@ -190,6 +186,11 @@ class LogNormal(Distribution):
     ----------
     mean, sd : mean and standard deviation of the *logarithm*; the median is exp(mean).
     """
+
+    gaussian_noise = True
+    maximisers: ClassVar = {"mean_": lambda law, value: ew("log", value)}
+    mean_link = MeanLink("mean_", "mean of the log")
+    variance_link = VarianceLink("sd", 0.5)
 
     def __init__(self, mean: Any, *, sd: Any):
         self._set(mean_=mean, sd=sd)
@@ -215,6 +216,9 @@ class LogNormal(Distribution):
 
     def variance(self):
         return self.mean() ** 2 * ew("expm1", self.sd**2)
+
+    def noise_free(self):
+        return array(ew("exp", self.mean_))
 
     def cdf(self, value):
         return self._log.cdf(_log_of_positive(value))
@@ -281,7 +285,7 @@ class Uniform(Distribution):
         return array(np.broadcast_to(array(-ew("log", self.upper - self.lower)), self.shape))
 
     def sample(self, draws):
-        return self.quantile(_each(self, lambda i: draws.uniform()))
+        return self.quantile(self._each(lambda i: draws.uniform()))
 
     def mean(self):
         return 0.5 * (self.lower + self.upper)
@@ -310,6 +314,12 @@ class Uniform(Distribution):
     def quantile_between(self, p, q, lower, upper):
         return q * lower + p * upper
 
+    def truncated_moments(self, lower, upper):
+        return 0.5 * (lower + upper), (upper - lower) ** 2 / 12.0
+
+    def location_and_scale(self):
+        return self.lower, array(self.upper - self.lower)
+
 
 class Flat(Distribution):
     """Flat(): an improper prior, constant on the whole line; for likelihoods only.
@@ -320,6 +330,7 @@ class Flat(Distribution):
     """
 
     proper = False
+    truncatable = False
 
     def __init__(self, shape: tuple[int, ...] = ()):
         self._set(zero=np.zeros(shape))
@@ -338,10 +349,10 @@ class Flat(Distribution):
         )
 
     def mean(self):
-        return self._full(_NAN)
+        return self._full(math.nan)
 
     def variance(self):
-        return self._full(_NAN)
+        return self._full(math.nan)
 
 
 class HalfFlat(Flat):
@@ -354,9 +365,6 @@ class HalfFlat(Flat):
 
     def support(self):
         return Support("interval", self._full(0.0), self._full(INFINITY))
-
-
-LOG_TURN = math.log(2.0 * math.pi)
 
 
 class VonMises(Distribution):
@@ -380,6 +388,10 @@ class VonMises(Distribution):
     """
 
     closed = True
+    truncatable = False
+    maximisers: ClassVar = {"mean_": lambda law, value: value}
+    mean_link = MeanLink("mean_", "identity")
+    variance_link = VarianceLink("concentration", -1.0)
 
     def __init__(self, mean: Any, *, concentration: Any):
         self._set(mean_=mean, concentration=concentration)
@@ -391,15 +403,15 @@ class VonMises(Distribution):
     def _allowed(self) -> ExprArray:
         """The concentration; NaN below 0, where the formulas are those of the opposite mean."""
         k = self.concentration
-        return k if all(map(never_negative, k.ravel())) else _where(ew("le", 0.0, k), k, _NAN)
+        return k if all(map(never_negative, k.ravel())) else where(ew("le", 0.0, k), k, math.nan)
 
     def log_densities(self, value):
         k = self._allowed()
         away = array(ew("cos", array(value) - self.mean_)) - 1.0
-        return k * away - LOG_TURN - ew("log", ew("i0e", k))
+        return k * away - LOG_2PI - ew("log", ew("i0e", k))
 
     def sample(self, draws):
-        drawn = self.mean_ + _each(self, lambda i: draws.vonmises(self.concentration[i]))
+        drawn = self.mean_ + self._each(lambda i: draws.vonmises(self.concentration[i]))
         return _within(drawn)
 
     def mean(self):
@@ -408,6 +420,9 @@ class VonMises(Distribution):
     def variance(self):
         k = self._allowed()
         return 1.0 - array(ew("i1e", k)) / ew("i0e", k)
+
+    def noise_free(self):
+        return self.mean_
 
     def _unrolled(self, value: Any) -> ExprArray:
         """The distribution function on the whole line, which grows by 1 with each turn."""

@@ -1,8 +1,5 @@
-"""Labels and points: Bernoulli, elementwise of arrays, Categorical, and Dirac.
-
-Values are whole numbers held as floating point, as all values of a model are.
-
-Counts, elementwise of arrays: Poisson, NegativeBinomial, Binomial, BetaBinomial.
+"""Counts: Poisson, NegativeBinomial, Binomial, BetaBinomial and Bernoulli, elementwise of arrays;
+Categorical; and Dirac, which is a point.
 
 Johnson, Kemp and Kotz (2005), "Univariate discrete distributions". Values are whole numbers held
 as floating point, as all values of a model are.
@@ -10,7 +7,7 @@ as floating point, as all values of a model are.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,15 +15,16 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import constant
-from ssmppl.language.distributions.base import INFINITY, Distribution, Support
-from ssmppl.language.distributions.continuous import _each, _where
+from ssmppl.language.distributions.base import INFINITY, Distribution, MeanLink, Support, where
 from ssmppl.language.distributions.nested import check_sum, holding, sum_holds
 from ssmppl.language.distributions.positive import Beta
 
+TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
 
-def _times_log(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
+
+def _xlogy(count: ExprArray, p: ExprArray, log: str = "log") -> ExprArray:
     """count * log(p), 0 where the count is 0 whatever p is."""
-    return _where(ew("eq", count, 0.0), 0.0, array(count) * ew(log, p))
+    return where(ew("eq", count, 0.0), 0.0, array(count) * ew(log, p))
 
 
 def _events(lower: Any) -> tuple[Any, Any]:
@@ -50,10 +48,10 @@ class _Counts(Distribution):
         return array(ew("maximum", self._floor(value), 0.0))
 
     def _below_zero(self, value: Any, otherwise: Any) -> ExprArray:
-        return _where(ew("lt", value, 0.0), 0.0, otherwise)
+        return where(ew("lt", value, 0.0), 0.0, otherwise)
 
     def _one_below_zero(self, value: Any, otherwise: Any) -> ExprArray:
-        return _where(ew("lt", value, 0.0), 1.0, otherwise)
+        return where(ew("lt", value, 0.0), 1.0, otherwise)
 
 
 class Poisson(_Counts):
@@ -64,16 +62,19 @@ class Poisson(_Counts):
     rate : mean and variance, not negative.
     """
 
+    maximisers: ClassVar = {"rate": lambda law, value: ew("maximum", value, TINY)}
+    mean_link = MeanLink("rate", "log")
+
     def __init__(self, rate: Any):
         self._set(rate=rate)
         self._require("rate", 0.0, strict=False)
 
     def log_densities(self, value):
         v = array(value)
-        return _times_log(v, self.rate) - self.rate - ew("gammaln", v + 1.0)
+        return _xlogy(v, self.rate) - self.rate - ew("gammaln", v + 1.0)
 
     def sample(self, draws):
-        return _each(self, lambda i: draws.poisson(self.rate[i]))
+        return self._each(lambda i: draws.poisson(self.rate[i]))
 
     def mean(self):
         return self.rate
@@ -102,7 +103,7 @@ class Poisson(_Counts):
             time = ew("where", ew("lt", k, 1.0), 0.0, time)
             return k + draws.poisson(ew("maximum", rate - time, 0.0))
 
-        return _each(self, draw)
+        return self._each(draw)
 
     def weighted(self, power):
         return self.rate**power, self
@@ -117,6 +118,9 @@ class NegativeBinomial(_Counts):
     dispersion : positive; the larger, the nearer to Poisson(mean).
     """
 
+    maximisers: ClassVar = {"mean_": lambda law, value: ew("maximum", value, TINY)}
+    mean_link = MeanLink("mean_", "log")
+
     def __init__(self, mean: Any, *, dispersion: Any):
         self._set(mean_=mean, dispersion=dispersion)
         self._require("mean_", 0.0, strict=False)
@@ -125,14 +129,14 @@ class NegativeBinomial(_Counts):
     def log_densities(self, value):
         v, m, r = array(value), self.mean_, self.dispersion
         choose = array(ew("gammaln_rise", r, v)) - ew("gammaln", v + 1.0)
-        return choose - r * ew("log1p", m / r) + _times_log(v, m / (r + m))
+        return choose - r * ew("log1p", m / r) + _xlogy(v, m / (r + m))
 
     def sample(self, draws):
         def draw(i):
             r = self.dispersion[i]
             return draws.poisson(draws.gamma(r) * self.mean_[i] / r)
 
-        return _each(self, draw)
+        return self._each(draw)
 
     def mean(self):
         return self.mean_
@@ -146,7 +150,7 @@ class NegativeBinomial(_Counts):
         shares, few = r + self.mean_, ew("lt", self.mean_, r)
         by_mean = ew("betaincc", k + 1.0, r, self.mean_ / shares)
         by_rest = ew("betainc", r, k + 1.0, r / shares)
-        return self._below_zero(value, _where(few, by_mean, by_rest))
+        return self._below_zero(value, where(few, by_mean, by_rest))
 
     def survival(self, value):
         k, r = self._count(value), self.dispersion
@@ -169,7 +173,7 @@ class NegativeBinomial(_Counts):
             speed = draws.gamma(r + k) * (1.0 - share)
             return k + draws.poisson(speed * ew("maximum", left, 0.0))
 
-        return _each(self, draw)
+        return self._each(draw)
 
     def weighted(self, power):
         # X - k given the weight: shape r + k, the same odds m / r
@@ -181,6 +185,8 @@ class NegativeBinomial(_Counts):
 
 class _OutOf(_Counts):
     """Successes out of n."""
+
+    trials = "n"
 
     def _require_trials(self) -> None:
         self._require("n", 0.0, strict=False)
@@ -209,6 +215,11 @@ class Binomial(_OutOf):
     p : probability of each success.
     """
 
+    maximisers: ClassVar = {
+        "p": lambda law, value: ew("minimum", ew("maximum", array(value / law.n), TINY), 1.0 - TINY)
+    }
+    mean_link = MeanLink("p", "logit")
+
     def __init__(self, n: Any, p: Any):
         self._set(n=n, p=p)
         self._require_trials()
@@ -216,10 +227,10 @@ class Binomial(_OutOf):
 
     def log_densities(self, value):
         v, n = array(value), self.n
-        return self._log_choose(v) + _times_log(v, self.p) + _times_log(n - v, -self.p, "log1p")
+        return self._log_choose(v) + _xlogy(v, self.p) + _xlogy(n - v, -self.p, "log1p")
 
     def sample(self, draws):
-        return _each(self, lambda i: draws.binomial(self.n[i], self.p[i]))
+        return self._each(lambda i: draws.binomial(self.n[i], self.p[i]))
 
     def mean(self):
         return self.n * self.p
@@ -230,12 +241,12 @@ class Binomial(_OutOf):
     def cdf(self, value):
         k = self._count(value)
         inside = ew("betainc", ew("maximum", self.n - k, 0.5), k + 1.0, 1.0 - self.p)
-        return self._below_zero(value, _where(ew("le", self.n, k), 1.0, inside))
+        return self._below_zero(value, where(ew("le", self.n, k), 1.0, inside))
 
     def survival(self, value):
         k = self._count(value)
         inside = ew("betainc", k + 1.0, ew("maximum", self.n - k, 0.5), self.p)
-        return self._one_below_zero(value, _where(ew("le", self.n, k), 0.0, inside))
+        return self._one_below_zero(value, where(ew("le", self.n, k), 0.0, inside))
 
     def quantile(self, p):
         return array(ew("binomial_quantile", self.n, self.p, p))
@@ -254,7 +265,7 @@ class Binomial(_OutOf):
             chance = ew("maximum", p - kth, 0.0) / (1.0 - kth)
             return k + draws.binomial(ew("maximum", n - k, 0.0), chance)
 
-        return _each(self, draw)
+        return self._each(draw)
 
     def weighted(self, power):
         factor = array(1.0)
@@ -276,6 +287,8 @@ class BetaBinomial(_OutOf):
     a, b : positive; the mean is n a / (a + b).
     """
 
+    highest = 0.0
+
     def __init__(self, n: Any, a: Any, b: Any):
         self._set(n=n, a=a, b=b)
         self._require_trials()
@@ -289,7 +302,7 @@ class BetaBinomial(_OutOf):
 
     def sample(self, draws):
         p = Beta(self.a, self.b).sample(draws)
-        return _each(self, lambda i: draws.binomial(self.n[i], p[i]))
+        return self._each(lambda i: draws.binomial(self.n[i], p[i]))
 
     def mean(self):
         return self.n * self.a / (self.a + self.b)
@@ -331,6 +344,9 @@ class Bernoulli(_Counts):
     p : the probability.
     """
 
+    highest = 0.0
+    mean_link = MeanLink("p", "logit")
+
     def __init__(self, p: Any):
         self._set(p=p)
         self._require("p", 0.0, 1.0, strict=False)
@@ -339,10 +355,10 @@ class Bernoulli(_Counts):
         return Support("integers", self._full(0.0), self._full(1.0))
 
     def log_densities(self, value):
-        return _where(ew("eq", value, 0.0), ew("log1p", -self.p), ew("log", self.p))
+        return where(ew("eq", value, 0.0), ew("log1p", -self.p), ew("log", self.p))
 
     def sample(self, draws):
-        return _each(self, lambda i: ew("lt", draws.uniform(), self.p[i]) * 1.0)
+        return self._each(lambda i: ew("lt", draws.uniform(), self.p[i]) * 1.0)
 
     def mean(self):
         return self.p
@@ -351,15 +367,15 @@ class Bernoulli(_Counts):
         return self.p * (1.0 - self.p)
 
     def cdf(self, value):
-        below = _where(ew("lt", value, 1.0), 1.0 - self.p, 1.0)
+        below = where(ew("lt", value, 1.0), 1.0 - self.p, 1.0)
         return self._below_zero(value, below)
 
     def survival(self, value):
-        above = _where(ew("lt", value, 1.0), self.p, 0.0)
+        above = where(ew("lt", value, 1.0), self.p, 0.0)
         return self._one_below_zero(value, above)
 
     def quantile(self, p):
-        return _where(ew("le", p, 1.0 - self.p), 0.0, 1.0)
+        return where(ew("le", p, 1.0 - self.p), 0.0, 1.0)
 
     def weighted(self, power):
         return Binomial(self._full(1.0), self.p).weighted(power)
@@ -373,6 +389,8 @@ class Categorical(_Counts):
     p : probabilities, shape (K,), of sum 1; a row ``P[state]`` of a transition matrix (K, K) for a
         Markov chain.
     """
+
+    highest = 0.0
 
     def __init__(self, p: Any):
         self.joint, self.shape = True, ()
@@ -389,6 +407,9 @@ class Categorical(_Counts):
 
     def in_range(self) -> ExprArray | None:
         return holding([super().in_range(), sum_holds(self.p)])
+
+    def shares(self):
+        return "probabilities", list(self.p)
 
     def support(self):
         return Support("integers", self._full(0.0), self._full(len(self.p) - 1.0))
@@ -433,7 +454,8 @@ class Dirac(Distribution):
     value : what it is.
     """
 
-    discrete = False
+    truncatable = False
+    mean_link = MeanLink("value", "identity")
 
     def __init__(self, value: Any):
         self._set(value=value)
@@ -442,7 +464,7 @@ class Dirac(Distribution):
         return Support("point", self.value, self.value)
 
     def log_densities(self, value):
-        return _where(ew("eq", value, self.value), 0.0, -INFINITY)
+        return where(ew("eq", value, self.value), 0.0, -INFINITY)
 
     def sample(self, draws):
         return self.value
@@ -454,7 +476,7 @@ class Dirac(Distribution):
         return self._full(0.0)
 
     def cdf(self, value):
-        return _where(ew("le", self.value, value), 1.0, 0.0)
+        return where(ew("le", self.value, value), 1.0, 0.0)
 
     def quantile(self, p):
         return self.value

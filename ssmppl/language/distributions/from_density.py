@@ -1,7 +1,7 @@
-"""Laws of a user's own: `Written`, made by what `@ssm.distribution` declares.
+"""User-defined laws: `UserDefined`, made by what `@ssm.distribution` declares.
 
 The user's functions are run on symbols where the law stands in a model, once for each pattern of
-numbers among its arguments; what they gave, in place holders for the value and the other arguments,
+numbers among its arguments; what they gave, in placeholders for the value and the other arguments,
 is all that is kept. So the law is expressions like any other, and no function of the user's
 travels to other processes.
 """
@@ -20,7 +20,8 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, substitute, symbol, topological
-from ssmppl.language.distributions.base import INFINITY, Distribution, Draws, Support
+from ssmppl.language.distributions.base import INFINITY, Distribution, Support
+from ssmppl.language.distributions.draws import Draws
 
 Pattern = tuple[float | None, ...]  # by argument: its number, None for a symbol
 Forms = Mapping[str, Expr]  # part -> its expression
@@ -28,7 +29,7 @@ VALUE = symbol("value", "value")  # what densities and distribution functions ar
 MOST_LISTED = 64  # values of a discrete law that are listed, all else following from the density
 
 
-def place(name: str) -> Expr:
+def placeholder(name: str) -> Expr:
     """What stands for an argument of the law in its forms."""
     return symbol("argument", name)
 
@@ -61,14 +62,15 @@ class Bounds:
         return np.arange(self.lower, self.upper + 0.5) if few else None
 
 
-class Written(Distribution):
+class UserDefined(Distribution):
     """A law that a user wrote; its class has the name of the user's function.
 
     patterns : of the law's shape, which of `forms` each component has.
-    forms : by pattern of numbers among the arguments, the user's functions in `VALUE`, `place`s
-        and, for a draw, random nodes.
+    forms : by pattern of numbers among the arguments, the user's functions in `VALUE`,
+        placeholders and, for a draw, random nodes.
     """
 
+    guards_range = True
     origin: Origin
     bounds: Bounds
     patterns: np.ndarray
@@ -93,7 +95,7 @@ class Written(Distribution):
         own = [e for forms in self.forms.values() for e in forms.values()]
         return [*super().expressions(), *own]
 
-    def with_parameters(self, parameters: Mapping[str, ExprArray]) -> Written:
+    def with_parameters(self, parameters: Mapping[str, ExprArray]) -> UserDefined:
         """The law with other expressions for its arguments; numbers stay what they are."""
         new = object.__new__(type(self))
         new.__dict__.update(self.__dict__)
@@ -123,14 +125,8 @@ class Written(Distribution):
         return self._at_place(self.with_parameters({**self.parameters, **own}))
 
     # -- what the user's functions give, component by component
-    def _each(self, make: Any) -> ExprArray:
-        out = np.empty(self.shape, dtype=object)
-        for i in np.ndindex(self.shape):
-            out[i] = make(i)
-        return array(out)
-
     def _replacement(self, i: tuple[int, ...]) -> dict[Expr, Expr]:
-        return {place(n): a[i] for n, a in self.parameters.items()}
+        return {placeholder(n): a[i] for n, a in self.parameters.items()}
 
     def _part(self, part: str, i: tuple[int, ...], value: Any = None) -> Expr:
         own = self._replacement(i)
@@ -145,11 +141,6 @@ class Written(Distribution):
 
     def log_densities(self, value):
         return self._at("density", value)
-
-    def guarded_log_densities(self, value):
-        density = super().guarded_log_densities(value)
-        allowed = None if self.discrete else self.in_range()  # the base's asks discrete ones
-        return density if allowed is None else array(ew("where", allowed, density, math.nan))
 
     def support(self):
         if self.bounds.discrete:
@@ -258,12 +249,12 @@ class Written(Distribution):
 
 
 @once
-def written_class(name: str) -> type[Written]:
+def user_defined_class(name: str) -> type[UserDefined]:
     """The class of the laws of this name."""
-    return type(name, (Written,), {"__doc__": f"{name}, as its user wrote it."})
+    return type(name, (UserDefined,), {"__doc__": f"{name}, as its user wrote it."})
 
 
-def _restored(name: str, content: dict[str, Any]) -> Written:
-    law = object.__new__(written_class(name))
+def _restored(name: str, content: dict[str, Any]) -> UserDefined:
+    law = object.__new__(user_defined_class(name))
     law.__dict__.update(content)
     return law

@@ -1,11 +1,7 @@
-"""Mixture: one of several laws by a hidden choice, which is summed out.
-
-McLachlan and Peel (2000), "Finite mixture models".
-
-ZeroInflated: a law of counts with more zeros than are its own.
-
-Lambert (1992), "Zero-inflated Poisson regression, with an application to defects in
-manufacturing", *Technometrics* 34.
+"""Mixture: one of several laws by a hidden choice, which is summed out (McLachlan and Peel 2000,
+"Finite mixture models"); ZeroInflated: a law of counts with more zeros than are its own (Lambert
+1992, "Zero-inflated Poisson regression, with an application to defects in manufacturing",
+*Technometrics* 34).
 """
 
 from __future__ import annotations
@@ -19,9 +15,10 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, user_location
-from ssmppl.language.distributions.base import INFINITY, Distribution, Draws, Support
-from ssmppl.language.distributions.continuous import _NAN, Flat, _each, _where
+from ssmppl.language.distributions.base import INFINITY, Distribution, Support, where
+from ssmppl.language.distributions.continuous import Flat
 from ssmppl.language.distributions.discrete import Dirac
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.nested import (
     check_sum,
     cut,
@@ -51,6 +48,8 @@ class Mixture(Distribution):
     choice is wanted, or conjugate draws of the components' parameters, make it a state.
     """
 
+    truncatable = False
+    guards_range = True
     components: tuple[Distribution, ...]
 
     def __init__(self, weights: Any, components: Sequence[Distribution]):
@@ -86,6 +85,12 @@ class Mixture(Distribution):
 
     def inside(self):
         return self.components
+
+    def shares(self):
+        return "weights", self.weights
+
+    def inverts(self):
+        return False
 
     def rebuilt(self, parameters):
         values = {**self.parameters, **parameters}
@@ -140,11 +145,6 @@ class Mixture(Distribution):
     def log_densities(self, value):
         return log_sum(self.weights, self._parts(array(value)))
 
-    def guarded_log_densities(self, value):
-        density = super().guarded_log_densities(value)
-        allowed = None if self.discrete else self.in_range()  # of discrete ones it has been asked
-        return density if allowed is None else _where(allowed, density, _NAN)
-
     def sample(self, draws):
         def draw(i):
             u, shared, out, below = draws.uniform(), _Shared(draws), None, 1.0
@@ -154,7 +154,7 @@ class Mixture(Distribution):
                 below = below - weight[i]
             return out
 
-        return _each(self, draw)
+        return self._each(draw)
 
     def _weighted_sum(self, parts: Iterable[Any]) -> ExprArray:
         total = array(0.0)
@@ -305,7 +305,7 @@ class ZeroInflated(Distribution):
         v, p = array(value), self.p
         parts = [self._full(0.0), self._of_base(array(np.zeros(v.shape)))]
         rest = array(ew("log1p", -none_below_zero(p)))
-        return _where(ew("eq", v, 0.0), log_sum([p, 1.0 - p], parts), rest + self._of_base(v))
+        return where(ew("eq", v, 0.0), log_sum([p, 1.0 - p], parts), rest + self._of_base(v))
 
     def _of_base(self, value: ExprArray) -> ExprArray:
         """The law's own log density from 0 on; -inf at zeros that it does not have."""
@@ -313,8 +313,8 @@ class ZeroInflated(Distribution):
         return array(self.base.log_densities(value) if from_zero else cut(self.base, value))
 
     def sample(self, draws):
-        u = _each(self, lambda i: draws.uniform())
-        return _where(ew("lt", u, self.p), 0.0, self.base.sample(draws))
+        u = self._each(lambda i: draws.uniform())
+        return where(ew("lt", u, self.p), 0.0, self.base.sample(draws))
 
     def mean(self):
         return (1.0 - self.p) * self.base.mean()
@@ -324,21 +324,21 @@ class ZeroInflated(Distribution):
 
     def cdf(self, value):
         inside = self.p + (1.0 - self.p) * self.base.cdf(value)
-        return _where(ew("lt", value, 0.0), 0.0, inside)
+        return where(ew("lt", value, 0.0), 0.0, inside)
 
     def survival(self, value):
         inside = (1.0 - self.p) * self.base.survival(value)
-        return _where(ew("lt", value, 0.0), 1.0, inside)
+        return where(ew("lt", value, 0.0), 1.0, inside)
 
     def quantile(self, p):
         left = array(p) - self.p
         law = self.base.quantile(array(ew("maximum", left, 0.0)) / (1.0 - self.p))
-        return _where(ew("le", left, 0.0), 0.0, law)
+        return where(ew("le", left, 0.0), 0.0, law)
 
     def survival_quantile(self, p):
         above = array(p) / (1.0 - self.p)
         law = self.base.survival_quantile(array(ew("minimum", above, 1.0)))
-        return _where(ew("le", 1.0, above), 0.0, law)
+        return where(ew("le", 1.0, above), 0.0, law)
 
     def sample_above(self, draws, lower):
         above_zero = all(e.op == "const" and e.data >= 1.0 for e in array(lower).ravel())

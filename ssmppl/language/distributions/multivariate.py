@@ -1,18 +1,16 @@
-"""Distributions of vectors and matrices with one joint density.
+"""Distributions of vectors and matrices with one joint density: MvNormal, Dirichlet, Wishart and
+InverseWishart; `SequentialNormal`, channels that are Gaussian one after the other, is made by
+analyses only.
 
 Gelman et al. (2013), "Bayesian data analysis", appendix A, for densities and moments; samplers:
 Cholesky (MvNormal), normalised gammas (Dirichlet), Bartlett's decomposition (Wishart), Smith and
-Hocking (1972), algorithm AS 53.
-
-What is asked of a matrix that is a parameter of a law, where the law is written.
-
-Channels that are Gaussian one after the other; no user writes this law, analyses make it.
+Hocking (1972), algorithm AS 53. Matrices that are parameters are checked where the law is made.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,8 +22,16 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, as_expr, constant, topological
 from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.expressions.test_points import moderate, with_cases
-from ssmppl.language.distributions.base import Distribution, Draws, Support, one_of
-from ssmppl.language.distributions.continuous import LOG_2PI, Normal
+from ssmppl.language.distributions.base import (
+    LOG_2PI,
+    Distribution,
+    MeanLink,
+    Support,
+    VarianceLink,
+    one_of,
+)
+from ssmppl.language.distributions.continuous import Normal
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.positive import (
     LEAST_SHARE,
     log_gamma,
@@ -39,7 +45,7 @@ UNEQUAL, ROUNDING = 1e-6, 1e-10
 
 def checked_matrix(law: Distribution, name: str) -> ExprArray:
     """A parameter that must be a square, symmetric, positive definite matrix, or of the name
-    "cholesky" the lower factor of one; of symbols as far as can be told.
+    "cholesky" the lower factor of one; of symbols as far as can be known.
 
     Raises
     ------
@@ -109,10 +115,6 @@ def _check_symmetry(law: Distribution, name: str, m: ExprArray) -> None:
 class _Joint(Distribution):
     joint = True
 
-    def _matrix(self, name: str) -> ExprArray:
-        """A parameter that must be a square, symmetric, positive definite matrix."""
-        return checked_matrix(self, name)
-
     def _where_definite(self, m: ExprArray, density: ExprArray) -> ExprArray:
         """`where_definite`, unless m surely is."""
         return density if surely_positive(m) else array(where_definite(m, density[()]))
@@ -130,6 +132,9 @@ class MvNormal(_Joint):
         it: methods that need no density of the transition take it.
     """
 
+    gaussian_noise = True
+    maximisers: ClassVar = {"mean_": lambda law, value: value}
+    mean_link = MeanLink("mean_", "identity")
     root: ExprArray | None = None  # of a singular covariance, (d, d); see `covariances.py`
 
     def __init__(
@@ -138,7 +143,7 @@ class MvNormal(_Joint):
         options = {"covariance": covariance, "precision": precision, "cholesky": cholesky}
         self.spread, value = one_of("MvNormal", options)
         self._set(**{"mean_": mean, self.spread: value})
-        matrix = self._matrix(self.spread)
+        matrix = checked_matrix(self, self.spread)
         if self.mean_.ndim == 0:
             self.parameters["mean_"] = array(np.full(len(matrix), self.mean_[()]))
         if self.mean_.shape != (len(matrix),):
@@ -148,6 +153,8 @@ class MvNormal(_Joint):
                 where=self.location,
             )
         self.shape = self.mean_.shape
+        power = {"covariance": 1.0, "precision": -1.0, "cholesky": 0.5}[self.spread]
+        self.variance_link = VarianceLink(self.spread, power)
 
     def mean(self):
         return self.mean_
@@ -303,9 +310,11 @@ def _log_gamma_p(x: Any, p: int) -> Any:
 
 
 class _WishartFamily(_Joint):
+    symmetric = True
+
     def __init__(self, df: Any, *, scale: Any):
         self._set(df=df, scale=scale)
-        p = len(self._matrix("scale"))
+        p = len(checked_matrix(self, "scale"))
         if self.df.ndim:
             raise ModelError(
                 f"{type(self).__name__}: df has shape {self.df.shape}",

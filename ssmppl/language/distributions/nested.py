@@ -1,9 +1,8 @@
-"""Laws inside of laws: whether they exist, and their density where the outer law has one.
+"""What laws of laws need: whether an inner law exists, its density where the outer law has one, and
+shares of 1, which are the probabilities of Categorical and the weights of Mixture.
 
-Shares of 1: the probabilities of Categorical and the weights of Mixture.
-
-Numbers that do not sum to 1 are refused where the law is made, expressions have to where they have
-values. What is chosen by shares has the density `log_sum`.
+Shares that are numbers and do not sum to 1 are refused where the law is made; expressions have to
+where they have values. What is chosen by shares has the density `log_sum`.
 """
 
 from __future__ import annotations
@@ -16,8 +15,12 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.properties import never_negative
-from ssmppl.language.distributions.base import INFINITY, Distribution
-from ssmppl.language.distributions.continuous import Normal, _where
+from ssmppl.language.distributions.base import INFINITY, Distribution, is_infinite, where
+from ssmppl.language.distributions.continuous import Normal
+
+SUM_ROUNDING = 1e-6  # by which shares that are expressions may miss the sum 1
+NUMBERS_ROUNDING = 1e-8  # and such as are numbers
+MOST = 700.0  # whose exponential is a number
 
 
 def holding(conditions: Iterable[ExprArray | None]) -> ExprArray | None:
@@ -49,8 +52,7 @@ def cut(law: Distribution, value: ExprArray) -> ExprArray:
     neither it nor a derivative of it is NaN."""
     support = law.support()
     lower, upper = array(support.lower), array(support.upper)
-    low_end, high_end = (all(e.op == "const" and math.isinf(e.data) for e in b.ravel())
-                         for b in (lower, upper))  # fmt: skip
+    low_end, high_end = is_infinite(lower), is_infinite(upper)
     closed = law.discrete or law.closed
     within = None
     if not low_end:
@@ -65,13 +67,8 @@ def cut(law: Distribution, value: ExprArray) -> ExprArray:
         middle = lower + (0.0 if law.discrete else 1.0)
     elif low_end:
         middle = upper - 1.0
-    inside = law.log_densities(_where(within, value, middle))
-    return _where(within, inside, -INFINITY)
-
-
-SUM_ROUNDING = 1e-6  # by which shares that are expressions may miss the sum 1
-NUMBERS_ROUNDING = 1e-8  # and such as are numbers
-MOST = 700.0  # whose exponential is a number
+    inside = law.log_densities(where(within, value, middle))
+    return where(within, inside, -INFINITY)
 
 
 def _sums(shares: Iterable[Any]) -> ExprArray:

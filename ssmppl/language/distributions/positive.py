@@ -7,7 +7,7 @@ Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 199
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,9 +15,17 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, apply, constant
 from ssmppl.expressions.properties import never_negative
-from ssmppl.language.distributions.base import INFINITY, Distribution, Draws, Support, one_of
-from ssmppl.language.distributions.continuous import _NAN, _each, _where
+from ssmppl.language.distributions.base import (
+    INFINITY,
+    Distribution,
+    MeanLink,
+    Support,
+    one_of,
+    where,
+)
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.symmetric import cut_exponential
+from ssmppl.language.distributions.truncated_moments import exponential_moments, moments_from_zero
 
 SMALL_SHAPE = 0.1  # below it, gamma draws may be too small for floating point
 LEAST_SHARE = float(np.finfo(float).tiny)  # whose logarithm still has an exponential
@@ -39,11 +47,16 @@ class Exponential(_Positive):
     """
 
     closed = True
+    maximisers: ClassVar = {
+        "rate": lambda law, value: 1.0 / value,
+        "scale": lambda law, value: value,
+    }
 
     def __init__(self, rate: Any = None, *, scale: Any = None):
         self.spread, value = one_of("Exponential", {"rate": rate, "scale": scale})
         self._set(**{self.spread: value})
         self._require(self.spread, 0.0)
+        self.mean_link = MeanLink(self.spread, "log", inverse=self.spread == "rate")
 
     def _rate(self) -> ExprArray:
         s = self.parameters[self.spread]
@@ -53,7 +66,7 @@ class Exponential(_Positive):
         return ew("log", self._rate()) - self._rate() * array(value)
 
     def sample(self, draws):
-        return -_each(self, lambda i: ew("log", draws.uniform())) / self._rate()
+        return -self._each(lambda i: ew("log", draws.uniform())) / self._rate()
 
     def mean(self):
         return 1.0 / self._rate()
@@ -88,6 +101,12 @@ class Exponential(_Positive):
     def quantile_between(self, p, q, lower, upper):
         return lower + cut_exponential(p, q, self._rate() * (upper - lower)) / self._rate()
 
+    def truncated_moments(self, lower, upper):
+        return exponential_moments(self, lower, upper)
+
+    def location_and_scale(self):
+        return self._full(0.0), self.mean()
+
 
 class Weibull(_Positive):
     """Weibull(shape, scale=): P(X > x) = ``exp(-(x / scale)^shape)``.
@@ -99,6 +118,9 @@ class Weibull(_Positive):
     shape : positive; 1 is the exponential law.
     scale : positive; 63% lie below it.
     """
+
+    maximisers: ClassVar = {"scale": lambda law, value: value}
+    mean_link = MeanLink("scale", "log")
 
     def __init__(self, shape: Any, *, scale: Any):
         self._set(shape_=shape, scale=scale)
@@ -162,6 +184,9 @@ class Weibull(_Positive):
         bounds = self._used(lower), self._used(upper)
         return self._back(self._hazard.quantile_between(p, q, *bounds))
 
+    def location_and_scale(self):
+        return self._full(0.0), self.scale
+
 
 class Gamma(_Positive):
     """Gamma(shape, rate= | scale=): mean shape / rate = shape scale.
@@ -172,11 +197,17 @@ class Gamma(_Positive):
     rate, scale : exactly one of them, positive; scale = 1 / rate.
     """
 
+    maximisers: ClassVar = {
+        "rate": lambda law, value: law.shape_ / value,
+        "scale": lambda law, value: value / law.shape_,
+    }
+
     def __init__(self, shape: Any, *, rate: Any = None, scale: Any = None):
         self.spread, value = one_of("Gamma", {"rate": rate, "scale": scale})
         self._set(**{"shape_": shape, self.spread: value})
         self._require("shape_", 0.0)
         self._require(self.spread, 0.0)
+        self.mean_link = MeanLink(self.spread, "log", inverse=self.spread == "rate")
 
     def _rate(self) -> ExprArray:
         s = self.parameters[self.spread]
@@ -187,7 +218,7 @@ class Gamma(_Positive):
         return a * ew("log", b) + (a - 1.0) * ew("log", v) - b * v - log_gamma(a)
 
     def sample(self, draws):
-        return _each(self, lambda i: draws.gamma(self.shape_[i])) / self._rate()
+        return self._each(lambda i: draws.gamma(self.shape_[i])) / self._rate()
 
     def mean(self):
         return self.shape_ / self._rate()
@@ -211,6 +242,9 @@ class Gamma(_Positive):
         rising = math.prod((self.shape_ + k for k in range(power)), start=array(1.0))
         return rising / self._rate() ** power, Gamma(self.shape_ + power, rate=self._rate())
 
+    def location_and_scale(self):
+        return self._full(0.0), array(self.mean() / self.shape_)
+
 
 class InverseGamma(_Positive):
     """InverseGamma(shape, scale=): 1 / X for X ~ Gamma(shape, rate=scale).
@@ -222,6 +256,8 @@ class InverseGamma(_Positive):
     shape, scale : positive; the mean is scale / (shape - 1) for shape > 1.
     """
 
+    maximisers: ClassVar = {"scale": lambda law, value: law.shape_ * value}
+
     def __init__(self, shape: Any, *, scale: Any):
         self._set(shape_=shape, scale=scale)
         self._require("shape_", 0.0)
@@ -232,16 +268,16 @@ class InverseGamma(_Positive):
         return a * ew("log", b) - (a + 1.0) * ew("log", v) - b / v - log_gamma(a)
 
     def sample(self, draws):
-        return self.scale / _each(self, lambda i: draws.gamma(self.shape_[i]))
+        return self.scale / self._each(lambda i: draws.gamma(self.shape_[i]))
 
     def mean(self):
         a = self.shape_
-        return _where(ew("lt", 1.0, a), self.scale / (a - 1.0), INFINITY)
+        return where(ew("lt", 1.0, a), self.scale / (a - 1.0), INFINITY)
 
     def variance(self):
         a = self.shape_
         finite = self.scale**2 / ((a - 1.0) ** 2 * (a - 2.0))
-        return _where(ew("lt", 2.0, a), finite, _where(ew("lt", 1.0, a), INFINITY, _NAN))
+        return where(ew("lt", 2.0, a), finite, where(ew("lt", 1.0, a), INFINITY, math.nan))
 
     def cdf(self, value):
         return array(ew("gammaincc", self.shape_, self.scale / array(ew("maximum", value, 0.0))))
@@ -258,6 +294,9 @@ class InverseGamma(_Positive):
     def has_moment(self, power):
         return array(ew("lt", float(power), self.shape_))
 
+    def location_and_scale(self):
+        return self._full(0.0), self.scale
+
 
 def _lower_end(e: Expr) -> float:
     """A number as it is; 0, the least that a positive parameter can be, for an expression."""
@@ -267,7 +306,7 @@ def _lower_end(e: Expr) -> float:
 def log_gamma(a: ExprArray) -> ExprArray:
     """log of the gamma function, NaN below 0: it is finite there, where no law has a density."""
     if not all(map(never_negative, a.ravel())):
-        a = _where(ew("le", 0.0, a), a, _NAN)
+        a = where(ew("le", 0.0, a), a, math.nan)
     return array(ew("gammaln", a))
 
 
@@ -317,7 +356,7 @@ class Beta(Distribution):
             first, second = draws.gamma(a), draws.gamma(b)
             return within_unit(first / (first + second))
 
-        return _each(self, draw)
+        return self._each(draw)
 
     def mean(self):
         return self.a / (self.a + self.b)
@@ -345,3 +384,14 @@ class Beta(Distribution):
             ((self.a + k) / (self.a + self.b + k) for k in range(power)), start=array(1.0)
         )
         return moment, Beta(self.a + power, self.b)
+
+    def truncated_moments(self, lower, upper):
+        """From the nearer end, of which the interval may be a small part."""
+        flip = array(ew("lt", 0.5, lower))
+        a, b = where(flip, self.b, self.a), where(flip, self.a, self.b)
+        ends = where(flip, 1.0 - upper, lower), where(flip, 1.0 - lower, upper)
+        mean, variance = moments_from_zero(Beta(a, b), *ends)
+        return where(flip, 1.0 - mean, mean), variance
+
+    def rounded_inside(self, drawn):
+        return array(within_unit(drawn))

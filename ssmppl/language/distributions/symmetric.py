@@ -7,18 +7,35 @@ Densities, moments and quantiles as in Johnson, Kotz and Balakrishnan (1994, 199
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
-from ssmppl.language.distributions.base import INFINITY, Distribution, Support
-from ssmppl.language.distributions.continuous import _NAN, Normal, _each, _where
+from ssmppl.language.distributions.base import (
+    INFINITY,
+    Distribution,
+    MeanLink,
+    Support,
+    VarianceLink,
+    where,
+)
+from ssmppl.language.distributions.continuous import Normal
 
 
 class _Symmetric(Distribution):
     """loc + scale * Z with Z symmetric round zero."""
+
+    maximisers: ClassVar = {"loc": lambda law, value: value}
+    mean_link = MeanLink("loc", "identity")
+    variance_link = VarianceLink("scale", 0.5)
+
+    def location_and_scale(self):
+        return self.loc, self.scale
+
+    def noise_free(self):
+        return self.loc
 
     def _standard_cdf(self, z: ExprArray) -> ExprArray:
         raise AttributeError
@@ -65,15 +82,15 @@ class StudentT(_Symmetric):
             half = 0.5 * self.df[i]
             return draws.normal() / ew("sqrt", draws.gamma(half) / half)
 
-        return self.loc + self.scale * _each(self, draw)
+        return self.loc + self.scale * self._each(draw)
 
     def mean(self):
-        return _where(ew("lt", 1.0, self.df), self.loc, _NAN)
+        return where(ew("lt", 1.0, self.df), self.loc, math.nan)
 
     def variance(self):
         finite = self.scale**2 * self.df / (self.df - 2.0)
-        infinite = _where(ew("lt", 1.0, self.df), INFINITY, _NAN)
-        return _where(ew("lt", 2.0, self.df), finite, infinite)
+        infinite = where(ew("lt", 1.0, self.df), INFINITY, math.nan)
+        return where(ew("lt", 2.0, self.df), finite, infinite)
 
     def has_moment(self, power):
         return array(ew("lt", float(power), self.df))
@@ -84,17 +101,17 @@ class StudentT(_Symmetric):
         half, total = 0.5 * self.df, self.df + z**2
         near = ew("betaincc", 0.5, half, z**2 / total)
         far = ew("betainc", half, 0.5, self.df / total)
-        tail = 0.5 * _where(ew("lt", z**2, self.df), near, far)
-        return _where(ew("lt", z, 0.0), tail, 1.0 - tail)
+        tail = 0.5 * where(ew("lt", z**2, self.df), near, far)
+        return where(ew("lt", z, 0.0), tail, 1.0 - tail)
 
     def _standard_quantile(self, p):
         # likewise by z^2/(nu+z^2) where z^2 < nu, else by nu/(nu+z^2)
         half, tails = 0.5 * self.df, 2.0 * array(ew("minimum", p, 1.0 - p))
         near = ew("lt", ew("betainc", half, 0.5, 0.5), tails)
-        x = array(ew("betainccinv", 0.5, half, _where(near, tails, 1.0)))
-        y = array(ew("betaincinv", half, 0.5, _where(near, 1.0, tails)))
-        z = array(ew("sqrt", self.df * _where(near, x / (1.0 - x), (1.0 - y) / y)))
-        return _where(ew("lt", p, 0.5), -z, z)
+        x = array(ew("betainccinv", 0.5, half, where(near, tails, 1.0)))
+        y = array(ew("betaincinv", half, 0.5, where(near, 1.0, tails)))
+        z = array(ew("sqrt", self.df * where(near, x / (1.0 - x), (1.0 - y) / y)))
+        return where(ew("lt", p, 0.5), -z, z)
 
 
 class Laplace(_Symmetric):
@@ -114,7 +131,7 @@ class Laplace(_Symmetric):
         return -ew("log", 2.0 * self.scale) - ew("abs", array(value) - self.loc) / self.scale
 
     def sample(self, draws):
-        return self.quantile(_each(self, lambda i: draws.uniform()))
+        return self.quantile(self._each(lambda i: draws.uniform()))
 
     def mean(self):
         return self.loc
@@ -124,15 +141,18 @@ class Laplace(_Symmetric):
 
     def _standard_cdf(self, z):
         tail = 0.5 * array(ew("exp", -ew("abs", z)))
-        return _where(ew("lt", z, 0.0), tail, 1.0 - tail)
+        return where(ew("lt", z, 0.0), tail, 1.0 - tail)
 
     def _standard_quantile(self, p):
         tail = array(ew("log", 2.0 * ew("minimum", p, 1.0 - p)))
-        return _where(ew("lt", p, 0.5), tail, -tail)
+        return where(ew("lt", p, 0.5), tail, -tail)
+
+    def kink(self):
+        return self.loc
 
     def _standard_log_cdf(self, z):
         above = ew("log1p", -0.5 * array(ew("exp", -ew("abs", z))))
-        return _where(ew("lt", z, 0.0), z - math.log(2.0), above)
+        return where(ew("lt", z, 0.0), z - math.log(2.0), above)
 
     def log_cdf(self, value):
         return self._standard_log_cdf((array(value) - self.loc) / self.scale)
@@ -146,16 +166,16 @@ class Laplace(_Symmetric):
         above = a + cut_exponential(p, q, array(b - a))
         below = b - cut_exponential(q, p, array(b - a))
         across = (super().quantile_between(p, q, lower, upper) - self.loc) / self.scale
-        one_side = _where(ew("le", 0.0, a), above, below)
+        one_side = where(ew("le", 0.0, a), above, below)
         crosses = ew("and", array(ew("lt", a, 0.0)), array(ew("lt", 0.0, b)))
-        return self.loc + self.scale * _where(crosses, across, one_side)
+        return self.loc + self.scale * where(crosses, across, one_side)
 
 
 def cut_exponential(p: ExprArray, q: ExprArray, width: ExprArray) -> ExprArray:
     """Quantile at p, q = 1 - p of an exponential with unit rate restricted to [0, width]."""
     near_zero = ew("log1p", p * array(ew("expm1", -width)))
     near_width = ew("log", q + p * array(ew("exp", -width)))
-    return -_where(ew("lt", p, 0.5), near_zero, near_width)
+    return -where(ew("lt", p, 0.5), near_zero, near_width)
 
 
 class Cauchy(_Symmetric):
@@ -176,13 +196,13 @@ class Cauchy(_Symmetric):
         return -ew("log", math.pi * self.scale) - ew("log1p", z**2)
 
     def sample(self, draws):
-        return self.quantile(_each(self, lambda i: draws.uniform()))
+        return self.quantile(self._each(lambda i: draws.uniform()))
 
     def mean(self):
-        return self._full(_NAN)
+        return self._full(math.nan)
 
     def variance(self):
-        return self._full(_NAN)
+        return self._full(math.nan)
 
     def has_moment(self, power):
         return self._full(0.0)
@@ -193,7 +213,7 @@ class Cauchy(_Symmetric):
 
     def _standard_quantile(self, p):
         tail = 1.0 / array(ew("tan", math.pi * ew("minimum", p, 1.0 - p)))
-        return _where(ew("lt", p, 0.5), -tail, tail)
+        return where(ew("lt", p, 0.5), -tail, tail)
 
 
 class _Half(Distribution):
@@ -219,6 +239,8 @@ class HalfNormal(_Half):
     ----------
     sd : standard deviation of X, positive; the mean of ``|X|`` is 0.80 sd.
     """
+
+    maximisers: ClassVar = {"sd": lambda law, value: value}
 
     def __init__(self, *, sd: Any):
         self._set(sd=sd)
@@ -251,6 +273,12 @@ class HalfNormal(_Half):
             return super().quantile_between(p, q, lower, upper)
         return self.full.quantile_between(p, q, array(ew("maximum", lower, 0.0)), upper)
 
+    def truncated_moments(self, lower, upper):
+        return self.full.truncated_moments(lower, upper)
+
+    def location_and_scale(self):
+        return self._full(0.0), self.sd
+
 
 class HalfCauchy(_Half):
     """HalfCauchy(scale=): ``|X|`` for X ~ Cauchy(0, scale=scale).
@@ -259,6 +287,8 @@ class HalfCauchy(_Half):
     ----------
     scale : the median of ``|X|``, positive.
     """
+
+    maximisers: ClassVar = {"scale": lambda law, value: value}
 
     def __init__(self, *, scale: Any):
         self._set(scale=scale)
@@ -269,7 +299,7 @@ class HalfCauchy(_Half):
         return self._full(INFINITY)
 
     def variance(self):
-        return self._full(_NAN)
+        return self._full(math.nan)
 
     def has_moment(self, power):
         return self._full(0.0)
@@ -287,3 +317,6 @@ class HalfCauchy(_Half):
 
     def survival_quantile(self, p):
         return self.scale / array(ew("tan", 0.5 * math.pi * array(p)))
+
+    def location_and_scale(self):
+        return self._full(0.0), self.scale

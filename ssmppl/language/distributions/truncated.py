@@ -2,13 +2,6 @@
 
 The log density is that of the base less log P(lower <= X <= upper); draws invert the base's
 distribution function on the part of (0, 1) that is left, from the tail that the interval is in.
-
-Moments of truncated laws that have them in closed form.
-
-Differences in such forms cancel in intervals that are narrow, or far out in a tail. Those are left
-to series and to Gauss-Legendre quadrature of the density, scaled to the interval: the relative
-error of a variance stays below some 1e-9 (of counts and of wide intervals, it is that of the
-probabilities, times the square of the mean over the variance).
 """
 
 from __future__ import annotations
@@ -23,156 +16,11 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import symbols_of, user_location
-from ssmppl.language.distributions.base import Distribution, Support, in_order
-from ssmppl.language.distributions.continuous import (
-    LOG_2PI,
-    Flat,
-    Normal,
-    Uniform,
-    VonMises,
-    _each,
-    _where,
-)
-from ssmppl.language.distributions.discrete import Dirac
-from ssmppl.language.distributions.from_density import Written
+from ssmppl.language.distributions.base import Distribution, Support, in_order, is_infinite, where
+from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.distributions.mixtures import Mixture, ZeroInflated
 from ssmppl.language.distributions.nested import holding
-from ssmppl.language.distributions.positive import Beta, Exponential, within_unit
-from ssmppl.language.distributions.symmetric import HalfNormal, Laplace
-
-NODES = 20  # exact to 1e-10 where the density falls by e^-FALL
-FALL = 30.0
-NARROW, NARROW_NODES, NARROW_FALL = 0.1, 12, 10.0  # likewise, of laws from 0 on; see `_continuous`
-FLAT = 40.0  # standard deviations, or widths of an exponential, beyond which nothing is left
-
-
-def is_infinite(bound: Any) -> bool:
-    """Whether a bound bounds nothing."""
-    return all(e.op == "const" and math.isinf(e.data) for e in array(bound).ravel())
-
-
-def normal_moments(base: Normal, lower: ExprArray, upper: ExprArray) -> tuple[ExprArray, ExprArray]:
-    """By quadrature where the mode is outside or the interval narrow; else in closed form: Johnson,
-    Kotz and Balakrishnan (1994), section 13.10.1, whose differences cancel there."""
-    sd, centre = base.sd(), base.mean()
-    a, b = ((bound - centre) / sd for bound in (lower, upper))
-    width = _where(ew("lt", lower, upper), (upper - lower) / sd, math.nan)
-
-    # From the mode's side, d off the bound there: density exp(-start d - d^2 / 2), start >= 0
-    # where the mode is outside.
-    above = array(ew("le", b, 0.0))
-    start = _where(above, -b, a)
-    outside = array(ew("maximum", start, 0.0))
-    end = ew("minimum", width, 2.0 * FALL / (outside + ew("sqrt", outside**2 + 2.0 * FALL)))
-    nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    total = first = second = array(0.0)
-    for node, weight in zip(0.5 * (1.0 + nodes), weights, strict=True):
-        d = node * end
-        mass = weight * array(ew("exp", -d * (start + 0.5 * d)))
-        total, first, second = total + mass, first + node * mass, second + node**2 * mass
-    share = first / total
-    near = _where(above, upper - sd * end * share, lower + sd * end * share)
-    spread = end**2 * (second / total - share**2)
-
-    # The mode inside.
-    log_mass = base.log_mass(lower, upper)
-    inside = ew("and", ew("lt", a, 0.0), ew("lt", 0.0, b))
-    shift, loss = array(0.0), array(0.0)
-    for bound, sign in ((lower, 1.0), (upper, -1.0)):
-        if not is_infinite(bound):
-            z = ew("minimum", FLAT, ew("maximum", -FLAT, (bound - centre) / sd))
-            ratio = sign * array(ew("exp", -0.5 * z**2 - 0.5 * LOG_2PI - log_mass))
-            shift, loss = shift + ratio, loss - z * ratio
-    closed = ew("and", inside, ew("le", 1.0, width))
-    mean = _where(closed, centre + sd * shift, near)
-    return mean, sd**2 * _where(closed, 1.0 - loss - shift**2, spread)
-
-
-def exponential_moments(
-    base: Exponential, lower: ExprArray, upper: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """Without memory: those of an exponential cut off at upper - lower, moved by lower.
-
-    With h half of that, in units of the scale, they are 1 + h - h coth h and 1 - (h / sinh h)^2;
-    where h is small, their series.
-    """
-    scale = base.mean()
-    if is_infinite(upper):
-        return lower + scale, array(scale**2 + 0.0 * lower)
-    h = _where(ew("lt", lower, upper), 0.5 * (upper - lower) / scale, math.nan)
-    short, s = array(ew("lt", h, 0.1)), h**2
-    cut = array(ew("minimum", h, FLAT))
-    long_mean = 1.0 - 2.0 * cut / ew("expm1", 2.0 * cut)
-    long_variance = 1.0 - (cut / ew("sinh", cut)) ** 2
-    short_mean = h - s * (1 / 3 - s * (1 / 45 - s * (2 / 945 - s / 4725)))
-    short_variance = s / 3 * (1.0 - s * (1 / 5 - s * (2 / 63 - s * (1 / 225 - s * (2 / 3465)))))
-    mean = lower + scale * _where(short, short_mean, long_mean)
-    return mean, scale**2 * _where(short, short_variance, long_variance)
-
-
-def weighted_moments(
-    base: Distribution, lower: ExprArray, upper: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """From the laws with density x f(x) and x^2 f(x): `Distribution.weighted`."""
-    if base.discrete:
-        mean, second = _weighted(base, lower, upper)
-        variance = array(ew("maximum", second - mean * (mean - 1.0), 0.0))
-        return mean, variance * _where(ew("eq", lower, upper), 0.0, 1.0)  # 0 of a single value
-    if isinstance(base, Beta):  # from the nearer end, of which the interval may be a small part
-        flip = array(ew("lt", 0.5, lower))
-        a, b = _where(flip, base.b, base.a), _where(flip, base.a, base.b)
-        ends = _where(flip, 1.0 - upper, lower), _where(flip, 1.0 - lower, upper)
-        mean, variance = _continuous(Beta(a, b), *ends)
-        return _where(flip, 1.0 - mean, mean), variance
-    return _continuous(base, lower, upper)
-
-
-def _weighted(
-    base: Distribution, lower: ExprArray, upper: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """E[X] and E[X^2], of counts E[X (X - 1)]."""
-    mass, moments = base.log_mass(lower, upper), []
-    for power in (1, 2):
-        weighted = base.weighted(power)
-        assert weighted is not None
-        factor, law = weighted
-        if base.discrete:
-            top = upper - float(power)
-            share = ew("exp", law.log_mass(lower - float(power), top) - mass)
-            share = _where(ew("lt", top, 0.0), 0.0, share)
-        else:
-            share = array(ew("exp", law.log_mass(lower, upper) - mass))
-        moments.append(factor * share)
-    return moments[0], moments[1]
-
-
-def _continuous(
-    base: Distribution, lower: ExprArray, upper: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """Of a law from 0 on: E[X^2] - E[X]^2, or by quadrature where that cancels, in an interval that
-    is narrow beside its distance from 0 and has a density of like size throughout."""
-    mean, second = _weighted(base, lower, upper)
-    variance = second - mean**2
-    known = [e.op == "const" and e.data <= 0.0 for e in lower.ravel()]
-    if all(known) or is_infinite(upper):
-        return mean, variance
-    width = upper - lower
-    nodes, weights = np.polynomial.legendre.leggauss(NARROW_NODES)
-    nodes = 0.5 * (1.0 + nodes)
-    logs = [array(base.log_densities(lower + node * width)) for node in nodes]
-    top, low = logs[0], logs[0]
-    for log in logs[1:]:
-        top, low = array(ew("maximum", top, log)), array(ew("minimum", low, log))
-    total = first = square = array(0.0)
-    for node, weight, log in zip(nodes, weights, logs, strict=True):
-        mass = weight * array(ew("exp", log - top))
-        total, first, square = total + mass, first + node * mass, square + node**2 * mass
-    share = first / total
-    narrow = ew("and", ew("lt", 0.0, width), ew("lt", width, NARROW * lower))
-    narrow = ew("and", narrow, ew("lt", top - low, NARROW_FALL))
-    spread = width**2 * (square / total - share**2)
-    return _where(narrow, lower + width * share, mean), _where(narrow, spread, variance)
-
+from ssmppl.language.distributions.truncated_moments import weighted_moments
 
 MOST_COUNTED = 64  # values of a truncated discrete law that are counted one by one
 MOST_SUMMED = 256  # and that its moments are summed over, where they have no formula
@@ -192,8 +40,7 @@ class Truncated(Distribution):
 
     def __init__(self, dist: Distribution, *, lower: Any = None, upper: Any = None):
         name, mixed = type(dist).__name__, isinstance(dist, Mixture)
-        refused = isinstance(dist, (Dirac, Flat, Mixture, VonMises))
-        if not isinstance(dist, Distribution) or dist.joint or refused:
+        if not isinstance(dist, Distribution) or dist.joint or not dist.truncatable:
             raise ModelError(
                 f"Truncated: cannot truncate {name}",
                 fix="truncate each component, with weights in proportion to how much of it lies "
@@ -202,7 +49,7 @@ class Truncated(Distribution):
                 else "truncate a scalar distribution such as Normal, Gamma or Poisson",
                 where=user_location(),
             )
-        if isinstance(dist, Written) and not dist.inverts():
+        if isinstance(dist, UserDefined) and not dist.inverts():
             raise ModelError(
                 f"Truncated: {dist.origin.name} has no distribution function, or no inverse of it",
                 fix=f"declare both, @{dist.origin.name}.cdf and @{dist.origin.name}.quantile; or "
@@ -249,9 +96,15 @@ class Truncated(Distribution):
         values = {**self.parameters, **parameters}
         base = self.base.rebuilt({n: values[f"like_{n}"] for n in self.base.parameters})
         bounds = {n: _as_given(values[n], self.discrete) for n in ("lower", "upper")}
-        kept = {n: b for n, b in bounds.items() if not is_infinite(b)}
-        # one law of several may have infinite bounds alone, which it is given as they are
-        return self._at_place(Truncated(base, **(kept or bounds)))
+        return self._at_place(_between(base, bounds))
+
+    def given_bounds(self) -> dict[str, ExprArray]:
+        """Both as the user gave them, without the whole numbers taken of them."""
+        return {n: _as_given(self.parameters[n], self.discrete) for n in ("lower", "upper")}
+
+    def with_base(self, base: Distribution) -> Distribution:
+        """Another law between the same bounds."""
+        return self._at_place(_between(base, self.given_bounds()))
 
     def _refuse_empty(self) -> None:
         """Numbers that leave (nearly) nothing of the base."""
@@ -297,7 +150,7 @@ class Truncated(Distribution):
         density, mass = super().guarded_log_densities(value), self.base.log_mass(*self._bounds())
         if not any(symbols_of(e) for e in array(mass).ravel()):
             return density  # looked at when the law was made
-        return _where(ew("lt", -math.inf, mass), density, math.nan)
+        return where(ew("lt", -math.inf, mass), density, math.nan)
 
     def _clip(self, value: Any) -> ExprArray:
         lower, upper = self._bounds()
@@ -316,7 +169,7 @@ class Truncated(Distribution):
         value = array(ew("floor", value)) if self.discrete else array(value)
         inside = self._share(lower, array(ew("minimum", upper, value)))
         below = ew("lt" if self.discrete else "le", value, lower)
-        return _where(below, 0.0, _where(ew("le", upper, value), 1.0, inside))
+        return where(below, 0.0, where(ew("le", upper, value), 1.0, inside))
 
     def survival(self, value):
         lower, upper = self._bounds()
@@ -324,7 +177,7 @@ class Truncated(Distribution):
         start = value + 1.0 if self.discrete else value
         inside = self._share(array(ew("maximum", lower, start)), upper)
         below = ew("lt" if self.discrete else "le", value, lower)
-        return _where(below, 1.0, _where(ew("le", upper, value), 0.0, inside))
+        return where(below, 1.0, where(ew("le", upper, value), 0.0, inside))
 
     def _quantile(self, p: ExprArray, q: ExprArray) -> ExprArray:
         width = self._width()
@@ -352,7 +205,7 @@ class Truncated(Distribution):
         below, out = self._full(0.0), lower
         for part in parts[:-1]:
             below = below + part
-            out = out + _where(ew("lt", below, p * total), 1.0, 0.0)
+            out = out + where(ew("lt", below, p * total), 1.0, 0.0)
         return array(out)
 
     def _width(self, most: int = MOST_COUNTED) -> int | None:
@@ -373,8 +226,8 @@ class Truncated(Distribution):
             above = self.base.sample_above(draws, lower)
             if above is not None:
                 return above
-        drawn = self.quantile(_each(self, lambda i: draws.uniform()))
-        return array(within_unit(drawn)) if isinstance(self.base, Beta) else drawn
+        drawn = self.quantile(self._each(lambda i: draws.uniform()))
+        return self.base.rounded_inside(drawn)
 
     # -- moments
     def mean(self):
@@ -388,14 +241,9 @@ class Truncated(Distribution):
         lower, upper = self._bounds()
         if all(self.base.open_sides(lower, upper)):
             return self.base.mean(), self.base.variance()
-        if isinstance(self.base, Normal):
-            return normal_moments(self.base, lower, upper)
-        if isinstance(self.base, HalfNormal):
-            return normal_moments(Normal(self._full(0.0), sd=self.base.sd), lower, upper)
-        if isinstance(self.base, Uniform):
-            return 0.5 * (lower + upper), (upper - lower) ** 2 / 12.0
-        if isinstance(self.base, Exponential):
-            return exponential_moments(self.base, lower, upper)
+        own = self.base.truncated_moments(lower, upper)
+        if own is not None:
+            return own
         if self.base.weighted(1) is not None:
             return weighted_moments(self.base, lower, upper)
         if isinstance(self.base, ZeroInflated):
@@ -407,9 +255,9 @@ class Truncated(Distribution):
         if any(infinite):
             limit = math.inf if infinite[1] else -math.inf
             finite = self.base.has_moment(1)
-            divergent = _where(finite, math.inf, math.nan)
-            mean = _where(finite, mean, limit)
-            variance = _where(self.base.has_moment(2), variance, divergent)
+            divergent = where(finite, math.inf, math.nan)
+            mean = where(finite, mean, limit)
+            variance = where(self.base.has_moment(2), variance, divergent)
         return mean, variance
 
     def _inflated_moments(
@@ -440,8 +288,9 @@ class Truncated(Distribution):
         """
         parts = [(0.0, 1.0, 0.0)]  # where it begins, its width, and what is left above it
         centre = self.quantile(self._full(0.5))
-        if isinstance(self.base, Laplace):
-            at_kink = self.cdf(self.base.loc)
+        kink = self.base.kink()
+        if kink is not None:
+            at_kink = self.cdf(kink)
             parts = [(0.0, at_kink, 1.0 - at_kink), (at_kink, 1.0 - at_kink, 0.0)]
         first = second = self._full(0.0)
         for start, width, rest in parts:
@@ -458,19 +307,19 @@ class Truncated(Distribution):
         Unlike draws, nodes go on to where only one of p and q has digits, and to bounds that are
         far in the tails.
         """
-        base, (lower, upper) = self.base, self._bounds()
+        base, (lower, upper), kink = self.base, self._bounds(), self.base.kink()
         own = type(base).quantile_between is not Distribution.quantile_between
-        if own and not isinstance(base, Laplace):
+        if own and kink is None:
             return self._quantile(p, q)  # by logarithms of its tails
         open_below, open_above = base.open_sides(lower, upper)
         left = q * (0.0 if open_below else base.cdf(lower))
         left = left + p * (1.0 if open_above else base.cdf(upper))
         right = q * (1.0 if open_below else base.survival(lower))
         right = right + p * (0.0 if open_above else base.survival(upper))
-        value = _where(ew("lt", left, 0.5), base.quantile(left), base.survival_quantile(right))
-        if isinstance(base, Laplace):  # by logarithms on one side of the kink only
-            beside = ew("or", ew("le", base.loc, lower), ew("le", upper, base.loc))
-            value = _where(beside, self._quantile(p, q), value)
+        value = where(ew("lt", left, 0.5), base.quantile(left), base.survival_quantile(right))
+        if kink is not None:  # by logarithms on one side of the kink only
+            beside = ew("or", ew("le", kink, lower), ew("le", upper, kink))
+            value = where(beside, self._quantile(p, q), value)
         return self._clip(value)
 
 
@@ -482,6 +331,12 @@ def _double_exponential(step: float = 0.0625, end: float = 6.0) -> list[tuple[fl
         p, q = (1.0 / (1.0 + math.exp(-s)), 1.0 / (1.0 + math.exp(s)))
         out.append((p, q, step * math.pi * math.cosh(t) * p * q))
     return out
+
+
+def _between(base: Distribution, bounds: dict[str, ExprArray]) -> Truncated:
+    """With these bounds but for infinite ones; one law of several may have no others, which it is
+    given as they are."""
+    return Truncated(base, **({n: b for n, b in bounds.items() if not is_infinite(b)} or bounds))
 
 
 def _as_given(bound: Any, discrete: bool) -> ExprArray:

@@ -1,26 +1,14 @@
-"""Calling a user's law on symbols: what it reads, where it returns, and errors at its own lines.
-
-Symbols that a law looks up in a set or a dictionary, which does not have them and says nothing.
-
-`u in {1, 2}` and `TABLE.get(u, 0.0)` ask for the symbol itself, by its hash: there is no operation
-of it that could tell. They are found in the law's own instructions, where an argument goes there
-by its name: not in functions that the law calls, nor under another name.
-
-What is called otherwise elsewhere: names that this language does not have, and what to write.
-
-Of Stan, PyMC, NumPyro, brms, SciPy, TensorFlow Probability and pomp.
-"""
+"""Calling a user's law on symbols: what it reads, where it returns, and errors at its own lines."""
 
 from __future__ import annotations
 
-import difflib
 import dis
 import inspect
 import itertools
 import os
 import re
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import CodeType, TracebackType
 from typing import Any
 
@@ -28,194 +16,15 @@ import numpy as np
 
 from ssmppl.errors import Location, ModelError, SSMError, UnsupportedOperation
 from ssmppl.expressions.expr import INDEX_BY_SYMBOL, topological
-from ssmppl.expressions.numpy_protocols import INSTEAD
+from ssmppl.expressions.numpy_protocols import UNSUPPORTED
 from ssmppl.language.distributions import DISTRIBUTIONS, Distribution
 from ssmppl.language.model.closure_digest import INSTALLED, outer_values, plain_function
+from ssmppl.language.model.lookups import check_lookups, instructions
 from ssmppl.language.model.model import location_of
+from ssmppl.language.model.name_hints import name_hint
 
 Law = Callable[..., Any]
-
-
-def instructions(code: CodeType) -> Iterator[tuple[dis.Instruction, int | None]]:
-    """Those of a function and of the functions inside of it, each with its line."""
-    for instruction in dis.get_instructions(code):
-        yield instruction, instruction.positions.lineno if instruction.positions else None
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            yield from instructions(inner)
-
-
-def check_lookups(function: Law, role: str, arguments: Mapping[str, Any]) -> None:
-    """Refuse them; an argument that went through a call before may be a number, and is let pass."""
-    found = [i for i, _ in instructions(plain_function(function).__code__)]
-    outer, rebound = outer_values(function), _rebound(plain_function(function).__code__, found)
-    for k, instruction in enumerate(found):
-        if instruction.opname == "CONTAINS_OP":
-            whole = _value(found[k - 1], outer)
-            named = _tested(found[: k - 1], instruction)
-        elif instruction.argval == "get" and k + 1 < len(found):
-            whole = _value(found[k - 1], outer)
-            after = [i for i in found[k + 1 : k + 4] if i.opname not in ("PUSH_NULL", "CACHE")]
-            named = _loaded(after[0])[:1] if after else []
-            if len(after) > 1 and _may_be_number(after[1]):
-                named = []
-        else:
-            continue
-        named = [n for n in named if n in arguments and n not in rebound]
-        if named and _by_hash(whole):
-            where = location_of(function)
-            line = instruction.positions.lineno if instruction.positions else None
-            raise ModelError(
-                f"@{role} {function.__name__} looks {named[0]!r}, a symbol, up in a "
-                f"{type(whole).__name__}, which never has it",
-                fix=f"compare it: np.where(({named[0]} == 1) | ({named[0]} == 2), a, b); of a "
-                "table, np.choose(k, values) is values[k] for a symbol k from 0",
-                where=Location(where.file, line or where.line, function.__name__),
-            )
-
-
-def _rebound(code: CodeType, found: list[dis.Instruction]) -> set[str]:
-    """Names that may stand for other things than the law's arguments: assigned anew, or local to a
-    function inside."""
-    names = {n for i in found if i.opname.startswith("STORE_") for n in _names(i)}
-    inner = [c for c in code.co_consts if isinstance(c, CodeType)]
-    for c in inner:
-        names.update(c.co_varnames)
-        inner += [d for d in c.co_consts if isinstance(d, CodeType)]
-    return names
-
-
-def _by_hash(whole: Any) -> bool:
-    return isinstance(whole, (set, frozenset, Mapping)) or (
-        type(whole).__module__.partition(".")[0] == "pandas" and hasattr(whole, "__contains__")
-    )
-
-
-def _value(instruction: dis.Instruction, outer: Mapping[str, Any]) -> Any:
-    """What a constant or a name from outside is; None of others."""
-    if instruction.opname == "LOAD_CONST":
-        return instruction.argval
-    return outer.get(str(instruction.argval)) if instruction.opname.startswith("LOAD_") else None
-
-
-def _tested(before: list[dis.Instruction], contains: dis.Instruction) -> list[str]:
-    """The local names on the left of `in`, from the last; none where it calls something."""
-    names: list[str] = []
-    begun = False  # where the source of the left side begins
-    for instruction in reversed(before):
-        if not _within(instruction, contains):
-            # Python 3.13 loads two at once, and says where the first one was read
-            return names if begun else names + _loaded(instruction)[1:]
-        begun = _start(instruction) == _start(contains)
-        if _may_be_number(instruction):
-            return []
-        names += reversed(_loaded(instruction))
-    return names
-
-
-def _may_be_number(instruction: dis.Instruction) -> bool:
-    return "CALL" in instruction.opname or "ATTR" in instruction.opname
-
-
-def _loaded(instruction: dis.Instruction) -> list[str]:
-    return _names(instruction) if instruction.opname.startswith("LOAD_FAST") else []
-
-
-def _names(instruction: dis.Instruction) -> list[str]:
-    """One, or two where Python 3.13 does two things at once."""
-    names = instruction.argval
-    return list(names) if isinstance(names, tuple) else [names]
-
-
-def _start(instruction: dis.Instruction) -> tuple[int | None, int | None]:
-    at = instruction.positions
-    return (at.lineno, at.col_offset) if at else (None, None)
-
-
-def _within(a: dis.Instruction, b: dis.Instruction) -> bool:
-    """Whether the source of a lies in that of b."""
-    if a.positions is None or b.positions is None or None in (*a.positions, *b.positions):
-        return False
-    (first, last, start, end), (top, bottom, left, right) = a.positions, b.positions
-    return (top, left) <= (first, start) and (last, end) <= (bottom, right)  # type: ignore[operator]
-
-
-_NORMAL = "ssm.Normal(mean, sd=)"
-_VECTOR = "ssm.MvNormal(mean, covariance=)"
-_NEGATIVE = "ssm.NegativeBinomial(mean, dispersion=)"
-_ZEROS = "ssm.ZeroInflated(ssm.{0}, p), p the probability of a structural zero"
-_HURDLE = "ssm.ZeroInflated(ssm.Truncated(ssm.{0}, lower=1), p), p the probability of zero"
-_MIXTURE = "ssm.Mixture(weights, [ssm.Normal(mean, sd=), ...])"
-_POINT = "ssm.Dirac(value) for a state, or a line of Python in the law that needs it"
-# lower case and without underscores -> what is written here
-WRITTEN: dict[str, str] = {
-    **dict.fromkeys(["gauss", "gaussian", "norm"], _NORMAL),
-    **dict.fromkeys(
-        ["multivariatenormal", "multinormal", "multivariatenormalfulltensor", "mvn"], _VECTOR
-    ),
-    **dict.fromkeys(["multivariategaussian", "mvgaussian", "gaussianmultivariate"], _VECTOR),
-    **dict.fromkeys(
-        ["gammapoisson", "negativebinomial2", "negbinomial2", "negbinomial", "nbinom", "negbin"],
-        _NEGATIVE,
-    ),
-    "geometric": "ssm.NegativeBinomial(mean, dispersion=1), failures before a success: mean "
-    "(1 - p) / p",
-    **dict.fromkeys(["zeroinflatedpoisson", "zip"], _ZEROS.format("Poisson(rate)")),
-    **dict.fromkeys(
-        ["zeroinflatednegativebinomial", "zinb", "zeroinflatednegativebinomial2"],
-        _ZEROS.format("NegativeBinomial(mean, dispersion=)"),
-    ),
-    "zeroinflatedbinomial": _ZEROS.format("Binomial(n, p)"),
-    "zeroinflateddistribution": _ZEROS.format("Poisson(rate)"),
-    "hurdlepoisson": _HURDLE.format("Poisson(rate)"),
-    "hurdlenegativebinomial": _HURDLE.format("NegativeBinomial(mean, dispersion=)"),
-    **dict.fromkeys(
-        ["normalmixture", "mixturesamefamily", "mixturegeneral", "gaussianmixture"], _MIXTURE
-    ),
-    "multinomial": "ssm.Binomial for each category, out of those that are left: "
-    "ssm.Binomial(left, p[k] / np.sum(p[k:])), where `left`, the trials that no earlier category "
-    "has, is an input; where the total is random, independent ssm.Poisson",
-    "dirichletmultinomial": "ssm.BetaBinomial(left, a[k], np.sum(a[k + 1:])) for each category but "
-    "the last, where `left`, the trials that no earlier category has, is an input",
-    **dict.fromkeys(["chisquared", "chisquare", "chi2"], "ssm.Gamma(df / 2, rate=1 / 2)"),
-    "erlang": "ssm.Gamma(shape, rate=)",
-    "rayleigh": "ssm.Weibull(2, scale=np.sqrt(2) * sigma)",
-    **dict.fromkeys(
-        ["halfstudentt", "halft"], "ssm.Truncated(ssm.StudentT(df, 0, scale=), lower=0)"
-    ),
-    **dict.fromkeys(
-        ["truncatednormal", "truncnorm"],
-        "ssm.Truncated(ssm.Normal(mean, sd=), lower=, upper=)",
-    ),
-    **dict.fromkeys(["invgamma", "inversegamma2"], "ssm.InverseGamma(shape, scale=)"),
-    **dict.fromkeys(["lognorm"], "ssm.LogNormal(mean, sd=), both of the logarithm"),
-    **dict.fromkeys(["doubleexponential"], "ssm.Laplace(loc, scale=)"),
-    **dict.fromkeys(["t", "student", "studentst"], "ssm.StudentT(df, loc, scale=)"),
-    **dict.fromkeys(["delta", "deterministic", "constant", "degenerate"], _POINT),
-    "discreteuniform": "ssm.Categorical(np.full(n, 1 / n)), whose values begin at 0",
-    "loguniform": "ssm.Uniform(lower, upper) for the logarithm as the parameter, and np.exp of it "
-    "where it acts",
-    "filter": "ssm.particle_filter(model, data, parameters), or ssm.kalman_filter for linear "
-    "Gaussian models",
-    **dict.fromkeys(["mcmc", "nuts"], "ssm.sample(model, data)"),
-    "fit": "ssm.sample(model, data) for a posterior, ssm.maximize(model, data) for an estimate",
-    **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
-    **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
-}
-CLOSE = 0.6  # least similarity of a misspelling
-
-
-def advice(name: str, known: Iterable[str]) -> str:
-    """What to write for a name that is none of `known`; empty where nothing comes near."""
-    plain = name.lower().replace("_", "")
-    if plain in WRITTEN:
-        return f"write {WRITTEN[plain]}"
-    spelled = {k.lower(): k for k in known}
-    near = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=CLOSE)
-    return f"write ssm.{spelled[near[0]]}" if near else ""
-
-
-Known = Mapping[str, str]  # name of a quantity -> its role
+Roles = Mapping[str, str]  # name of a quantity -> its role
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))) + os.sep
 # NumPy's messages about object arrays, which np.array makes of symbols
 _OBJECT_ARRAY = re.compile(r"has no callable|dtype\('O'\)|not supported for the input types")
@@ -267,15 +76,15 @@ _ASKED_OF_SYMBOLS = tuple(
 )  # fmt: skip
 
 
-def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> Any:
+def call(function: Law, role: str, arguments: dict[str, Any], known: Roles) -> Any:
     """What the law returns for these arguments.
 
     It is called twice: a law that is not the same again draws random numbers or changes something,
     and what was drawn would be frozen into the model.
     """
     check_lookups(function, role, arguments)
-    first = once(function, role, arguments, known)
-    again = once(function, role, arguments, known)
+    first = call_once(function, role, arguments, known)
+    again = call_once(function, role, arguments, known)
     if not _same(first, again):
         raise ModelError(
             f"@{role} {function.__name__} gives another law when it is called again",
@@ -286,20 +95,20 @@ def call(function: Law, role: str, arguments: dict[str, Any], known: Known) -> A
     return first
 
 
-def once(function: Law, role: str, arguments: dict[str, Any], known: Known) -> Any:
-    """What the function returns; its errors are told at the user's line."""
+def call_once(function: Law, role: str, arguments: dict[str, Any], known: Roles) -> Any:
+    """What the function returns; its errors are raised at the user's line."""
     try:
         signature = inspect.signature(function)
         bound = signature.bind_partial()
         bound.arguments.update({n: arguments[n] for n in signature.parameters if n in arguments})
         return function(*bound.args, **bound.kwargs)
     except SSMError as error:
-        told = _at_users_line(error, function)
-        if told is error and isinstance(error, UnsupportedOperation):
-            told = _of_a_library(error, function)
-        if told is error:  # not its own cause: what packs errors follows causes to their end
+        moved = _at_users_line(error, function)
+        if moved is error and isinstance(error, UnsupportedOperation):
+            moved = _of_a_library(error, function)
+        if moved is error:  # not its own cause: what packs errors follows causes to their end
             raise
-        raise told from error
+        raise moved from error
     except Exception as error:
         raise _wrapped(error, function, role, arguments, known) from error
 
@@ -332,7 +141,7 @@ def return_location(function: Law) -> Location:
 
 
 # -- names from outside of the law
-def check_outer_names(function: Law, role: str, known: Known) -> None:
+def check_outer_names(function: Law, role: str, known: Roles) -> None:
     """Refuse a law that reads a variable of Python's named as a quantity of the model, itself or
     in a function of the user's that it calls.
 
@@ -407,16 +216,16 @@ def _library_function(function: Law, trace: TracebackType | None) -> str:
 
 
 def _of_a_library(error: UnsupportedOperation, function: Law) -> UnsupportedOperation:
-    """What a library's function for numbers asked of a symbol, told by the function's name."""
+    """What a library's function for numbers asked of a symbol, named by the function."""
     name = _library_function(function, error.__traceback__)
-    if name not in INSTEAD:
+    if name not in UNSUPPORTED:
         return error
     return UnsupportedOperation(f"{name}() of a library takes numbers, not symbols",
-                                fix=f"write {INSTEAD[name]}", where=error.where)  # fmt: skip
+                                fix=f"write {UNSUPPORTED[name]}", where=error.where)  # fmt: skip
 
 
 def _wrapped(
-    error: Exception, function: Law, role: str, arguments: dict[str, Any], known: Known
+    error: Exception, function: Law, role: str, arguments: dict[str, Any], known: Roles
 ) -> ModelError:
     """An exception inside a user's function, at the user's line."""
     frames = _frames(function, error.__traceback__)
@@ -432,11 +241,11 @@ def _wrapped(
     if isinstance(error, NameError) and (role_of := known.get(str(error.name))):
         fix = f"add {error.name!r}, {role_of} of the model, to the arguments of "
         fix += function.__name__
-    elif (called := _library_function(function, error.__traceback__)) in INSTEAD:
+    elif (called := _library_function(function, error.__traceback__)) in UNSUPPORTED:
         found = f"{called}() of a library takes numbers, not symbols"
-        fix = f"write {INSTEAD[called]}"
-    elif told := _of_a_symbol(error):
-        found, fix = f"@{role} {function.__name__} {told[0]}", told[1]
+        fix = f"write {UNSUPPORTED[called]}"
+    elif asked := _of_a_symbol(error):
+        found, fix = f"@{role} {function.__name__} {asked[0]}", asked[1]
     elif _OBJECT_ARRAY.search(str(error)):
         fix = _BUILD
     elif isinstance(error, IndexError) and "only integers, slices" in str(error):
@@ -459,6 +268,6 @@ def _of_a_symbol(error: Exception) -> tuple[str, str] | None:
 
 def _ssm_attribute(error: AttributeError) -> str:
     if inspect.ismodule(error.obj) and error.obj.__name__.startswith("ssmppl"):
-        told = advice(str(error.name), DISTRIBUTIONS)
-        return f"{told}{'; ' if told else ''}the distributions are: {', '.join(DISTRIBUTIONS)}"
+        hint = name_hint(str(error.name), DISTRIBUTIONS)
+        return f"{hint}{'; ' if hint else ''}the distributions are: {', '.join(DISTRIBUTIONS)}"
     return ""

@@ -1,17 +1,16 @@
-"""What laws read from outside while they are traced, as one digest within this process.
+"""What functions are known by: their code, and all that they read from outside.
 
-A trace keeps the numbers that its laws read, and is made anew where the digest differs. Of a module
-or an object those attributes count that the code names, anywhere in the functions that are reached,
-and what the special methods of its class read; all of them where the code has one of the words
-that read all (`WHOLE`). Of a function counts what it reads in its turn; of an object of a library,
-such as a Series of pandas, its pickle. What has no other form goes by which object it is, and
-libraries by their names. It is taken at every call of a verb: `fingerprints`, which are the same in
-every process, spell out more.
+`digest_of_code` is taken at every call of a verb, and holds within this process: a trace keeps the
+numbers that its laws read, and is made anew where the digest differs. Of a module or an object
+those attributes count that the code names, anywhere in the functions that are reached, and what the
+special methods of its class read; all of them where the code has one of the words that read all
+(`WHOLE`). Of a function counts what it reads in its turn; of an object of a library, such as a
+Series of pandas, its pickle. What has no other form goes by which object it is, and libraries by
+their names.
 
-What a function is known by: a digest of its code and of all that it takes from outside.
-
-It is the same in every process, and wherever the function stands: there is no address and no line
-in it. What other installed packages give goes by its name, as their versions are noted elsewhere.
+`fingerprint` spells out more, and is the same in every process and wherever the function stands:
+there is no address and no line in it. What other installed packages give goes by its name, as their
+versions are noted by whoever keeps a fingerprint.
 """
 
 from __future__ import annotations
@@ -42,6 +41,8 @@ import numpy as np
 from ssmppl.errors import Location
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented), range)
+CALLED = ("__init__", "__call__")  # the methods of a class that act without being named
+PACKAGE = "ssmppl"
 _CORE = ("numpy", "numba", "ssmppl", "scipy")
 # Words of code that reads attributes without naming them.
 WHOLE = frozenset((
@@ -103,14 +104,14 @@ def attribute(thing: Any, name: str, otherwise: Any = None) -> Any:
 
 def digest_of_code(functions: Iterable[Callable[..., Any]]) -> str:
     """Changes, within this process, with functions and with what they take from outside."""
-    reading = _Reading()
+    digest = _Digest()
     for function in functions:
-        reading.value(function)
-    reading.named()
-    return reading.text.hexdigest()
+        digest.value(function)
+    digest.named()
+    return digest.text.hexdigest()
 
 
-class _Reading:
+class _Digest:
     """One walk over functions and what they read; each thing is entered once."""
 
     def __init__(self) -> None:
@@ -348,10 +349,7 @@ def _outer_names(code: CodeType) -> frozenset[str]:
     return frozenset(names)
 
 
-CALLED = ("__init__", "__call__")  # the methods of a class that act without being named
-PACKAGE = "ssmppl"
-
-
+# -- the same in every process
 def fingerprint(value: Any) -> str:
     """Changes with the value, and with what the functions in it do: their code, defaults, and the
     numbers and functions that they find in closures, globals and modules of the user's."""

@@ -26,7 +26,7 @@ ROLES = ("prior", "initial", "transition", "observation", "proposal")
 VERBS = ("compile", "diagnose", "evidence", "explain", "forecast", "forward_filter",
          "kalman_filter", "leave_future_out", "log_likelihood", "maximize", "particle_filter",
          "plot_likelihood", "predict", "sample", "score", "simulate", "smooth")  # fmt: skip
-_ELSEWHERE = {  # decorators of other libraries
+_OTHER_NAMES = {  # decorators of other libraries
     **dict.fromkeys(("emission", "emissions", "measurement", "likelihood", "obs"), "observation"),
     **dict.fromkeys(("dynamics", "process", "motion", "state"), "transition"),
     **dict.fromkeys(("init", "start", "initial_state"), "initial"),
@@ -183,8 +183,8 @@ class Model:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # what Python and notebooks ask every object for
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        near = difflib.get_close_matches(name.lower(), [*ROLES, *VERBS, *_ELSEWHERE], 1)
-        meant = _ELSEWHERE.get(near[0], near[0]) if near else ""
+        near = difflib.get_close_matches(name.lower(), [*ROLES, *VERBS, *_OTHER_NAMES], 1)
+        meant = _OTHER_NAMES.get(near[0], near[0]) if near else ""
         if meant in VERBS:
             fix = f"the verbs are functions: write ssm.{meant}(model, ...)"
         elif meant:

@@ -53,7 +53,7 @@ def holder_of(function: Callable[..., Any]) -> Any:
     means nothing to another process.
 
     A decorated function's name stands for what the decorator made. The names of a notebook or a
-    script mean nothing elsewhere: `packed` sends their functions themselves.
+    script mean nothing to others: `packed` sends their functions themselves.
     """
     module = function.__module__
     if module == "__main__" and getattr(_own, "by_value", False):
@@ -61,7 +61,7 @@ def holder_of(function: Callable[..., Any]) -> Any:
     return getattr(sys.modules.get(module), function.__qualname__, None)
 
 
-class Known(Generic[Thing]):
+class UnpackedCache(Generic[Thing]):
     """The last things that were unpacked in this process, by digest."""
 
     def __init__(self, most: int):

@@ -28,7 +28,7 @@ from ssmppl.errors import Location
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.language.distributions import Distribution
-from ssmppl.language.model.pickling import Known, digest_of, packed, unpacked
+from ssmppl.language.model.pickling import UnpackedCache, digest_of, packed, unpacked
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Trace:
         return [s for n, shape in self.inputs.items() for s in symbols("input", n, shape).ravel()]
 
 
-_received: Known[Trace] = Known(most=64)
+_received: UnpackedCache[Trace] = UnpackedCache(most=64)
 
 
 def _receive(content: bytes) -> Trace | None:

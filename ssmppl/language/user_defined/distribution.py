@@ -1,8 +1,6 @@
-"""`@ssm.distribution`: a decorator that makes a law of a log density.
-
-A law of a user's own as it is declared: by its log density, and what else is known of it.
-
-The functions of a law of a user's own, run on place holders: density, draw, moments.
+"""`@ssm.distribution`: a decorator that makes a law of a log density, and of what else is declared:
+sampler, moments, distribution function. The functions are run on placeholders where the law stands
+in a model.
 """
 
 from __future__ import annotations
@@ -20,122 +18,118 @@ import numpy as np
 from ssmppl.errors import Location, ModelError, nearest_first
 from ssmppl.expressions.expr import Expr, as_expr, symbols_of, topological, user_location
 from ssmppl.language.checks.agreement import Agreement, agreement
-from ssmppl.language.distributions.base import INFINITY, Draws, Generator, misfit
+from ssmppl.language.distributions.base import INFINITY, misfit
+from ssmppl.language.distributions.draws import Draws, Generator
 from ssmppl.language.distributions.from_density import (
     VALUE,
     Bounds,
     Forms,
     Origin,
     Pattern,
-    Written,
-    place,
-    written_class,
+    UserDefined,
+    placeholder,
+    user_defined_class,
 )
-from ssmppl.language.model.calling import once, return_location
+from ssmppl.language.model.calling import call_once, return_location
 from ssmppl.language.model.closure_digest import Declared, digest_of_code
 from ssmppl.language.model.model import location_of
 from ssmppl.language.model.pickling import holder_of
-
-
-def form(
-    function: Callable[..., Any], part: str, verb: str, parameters: Sequence[str], pattern: Pattern
-) -> Expr:
-    """What a function gives, in `VALUE` and the `place`s of the arguments that are no numbers.
-
-    It is called twice, as the laws of a model are (`calling.call`).
-
-    Parameters
-    ----------
-    part : "density", "draw", "mean", "variance", "cdf" or "quantile".
-    verb : its decorator, for messages.
-    parameters : names of the law's arguments; pattern: their numbers.
-
-    Raises
-    ------
-    ModelError : it gives no expression of its arguments; names its line.
-    """
-    given: dict[str, Any] = {  # NumPy's numbers, which may be divided by 0
-        n: place(n) if v is None else np.float64(v)
-        for n, v in zip(parameters, pattern, strict=True)
-    }
-    first = next(iter(inspect.signature(function).parameters), "")
-    found: list[Expr] = []
-    for _ in range(2):
-        own = dict(given)
-        if part == "draw":
-            own[first] = Generator(Draws("draw"))
-        elif part not in ("mean", "variance"):
-            own[first] = VALUE
-        with np.errstate(all="ignore"):  # of what is no number the user is told below
-            value = once(function, verb, own, {})
-        found.append(_expression(value, function, verb))
-    told = _fault(part, found, parameters, pattern)
-    if told:
-        raise ModelError(
-            f"@{verb} {function.__name__} {told[0]}", fix=told[1], where=return_location(function)
-        )
-    return found[0]
-
-
-def _expression(value: Any, function: Callable[..., Any], verb: str) -> Expr:
-    if isinstance(value, np.ndarray) and value.ndim == 0:
-        value = value[()]
-    try:
-        return as_expr(value)
-    except TypeError:
-        told = "nothing" if value is None else repr(value)
-        told = f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else told
-        raise ModelError(
-            f"@{verb} {function.__name__} returned {told}",
-            fix="end it by `return` and one expression of its arguments: the function is that of "
-            "one number, and is applied to each component of an array",
-            where=return_location(function),
-        ) from None
-
-
-def _fault(
-    part: str, found: Sequence[Expr], parameters: Sequence[str], pattern: Pattern
-) -> tuple[str, str] | None:
-    """What is wrong with an expression, and the fix. found : of two calls."""
-    nodes = topological(found[:1])
-    if found[0] is not found[1]:
-        return (
-            "gives something else when it is called again",
-            "draw no random numbers but those of a sampler's first argument, and change nothing "
-            "inside of it",
-        )
-    foreign = symbols_of(found[:1]) - {VALUE, *map(place, parameters)}
-    if foreign:
-        name = min(map(repr, foreign))
-        return (
-            f"reads {name} of the model from outside of its arguments",
-            f"give the law an argument for {name}",
-        )
-    if part == "draw" and not any(n.op == "random" for n in nodes):
-        return (
-            f"returned {found[0]!r}, which holds no draw",
-            "make it of the random numbers of its first argument, such as rng.uniform() and "
-            "rng.normal()",
-        )
-    if _is_nan(found[0]) or any(_is_nan(a) for n in nodes if n.op != "where" for a in n.args):
-        given = [f"{n}={v:g}" for n, v in zip(parameters, pattern, strict=True) if v is not None]
-        return (
-            "is nan" + (f" at {', '.join(given)}" if given else ""),
-            "take no logarithm or root of a negative number; what has to be positive is named in "
-            'the declaration, positive=("scale",)',
-        )
-    return None
-
-
-def _is_nan(e: Expr) -> bool:
-    return e.op == "const" and math.isnan(e.data)
-
 
 Function = Callable[..., Any]
 _MISSING: Any = None
 # Of each function beside the density: its first argument in words, "" where there is none
 _FIRST = {"draw": "rng", "cdf": "the value", "quantile": "the probability",
           "mean": "", "variance": ""}  # fmt: skip
+
+
+def distribution(
+    function: Function = _MISSING,
+    *,
+    lower: float | str | None = None,
+    upper: float | str | None = None,
+    discrete: bool = False,
+    closed: bool = False,
+    positive: Iterable[str] = (),
+) -> Any:
+    """Declare a distribution of your own by its log density.
+
+    Parameters
+    ----------
+    function : log density, of discrete laws log probability, at its first argument, in plain NumPy
+        for one number; its further arguments are those of the law. Outside of the support it is
+        not asked. It should be normalised: what is left out of it is missing in every likelihood.
+    lower, upper : bounds of the support, numbers or names of the law's arguments; None: there is
+        none.
+    discrete : whether the values are whole numbers; the bounds are among them.
+    closed : whether the bounds of a continuous law belong to its support.
+    positive : names of arguments that have to be positive: numbers that are not are refused, and
+        where expressions leave that range the density is nan, as that of other laws.
+
+    Returns
+    -------
+    DeclaredDistribution : called with its arguments a law like any other; with the decorators
+        `sampler`, `mean`, `variance`, `cdf` and `quantile`, and `check`.
+
+    Raises
+    ------
+    ModelError : the declaration does not fit the function; names file and line.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ssmppl as ssm
+    >>> @ssm.distribution(lower=0, positive=("shape", "scale"))
+    ... def Lomax(y, shape, scale):
+    ...     return np.log(shape / scale) - (shape + 1) * np.log1p(y / scale)
+    >>> @Lomax.sampler
+    ... def draw(rng, shape, scale):
+    ...     return scale * (rng.uniform() ** (-1 / shape) - 1)
+    >>> Lomax(2.5, scale=3)
+    Lomax(shape=2.5, scale=3)
+    """
+
+    def declare(function: Function) -> DeclaredDistribution:
+        if not inspect.isfunction(function):
+            raise ModelError(
+                f"@ssm.distribution stands on {function!r}, which is no function",
+                fix="write @ssm.distribution(lower=0) on the line above a def",
+                where=user_location(),
+            )
+        where, bounds = location_of(function), Bounds(discrete=discrete, closed=closed)
+        for name, given in (("lower", lower), ("upper", upper)):
+            if given is not None:
+                own: Any = {name: _bound(name, given, function, discrete)}
+                bounds = replace(bounds, **own)
+        if not (isinstance(bounds.lower, str) or isinstance(bounds.upper, str)) and not (
+            bounds.lower < bounds.upper or (discrete and bounds.lower == bounds.upper)
+        ):
+            raise ModelError(
+                f"lower={bounds.lower:g} of @distribution {function.__name__} is not below "
+                f"upper={bounds.upper:g}",
+                fix="give lower < upper",
+                where=where,
+            )
+        names = (positive,) if isinstance(positive, str) else tuple(positive)
+        return DeclaredDistribution(function, bounds, names)
+
+    return declare if function is _MISSING else declare(function)
+
+
+def _bound(keyword: str, value: Any, function: Function, discrete: bool) -> float | str:
+    if isinstance(value, str):
+        return value
+    number = isinstance(value, numbers.Real) and not math.isnan(float(value))
+    infinite = -INFINITY if keyword == "lower" else INFINITY
+    if number and float(value) == -infinite:
+        number = False
+    if not number or (discrete and math.isfinite(value) and value != math.floor(value)):
+        raise ModelError(
+            f"{keyword}={value!r} of @distribution {function.__name__} is no "
+            f"{'whole number' if discrete else 'number'} and no name of an argument",
+            fix=f'give a number, or the name of an argument, {keyword}="loc"',
+            where=location_of(function),
+        )
+    return float(value)
 
 
 class DeclaredDistribution(Declared):
@@ -282,13 +276,13 @@ class DeclaredDistribution(Declared):
         return f"{self.__name__}.{'sampler' if part == 'draw' else part}"
 
     # -- the law
-    def __call__(self, *args: Any, **kwargs: Any) -> Written:
+    def __call__(self, *args: Any, **kwargs: Any) -> UserDefined:
         try:
             bound = self.__signature__.bind(*args, **kwargs)
         except TypeError as error:
             raise misfit(self.__name__, error, args, kwargs, list(self.parameters)) from None
         bound.apply_defaults()
-        law: Written = object.__new__(written_class(self.__name__))
+        law: UserDefined = object.__new__(user_defined_class(self.__name__))
         law._set(**bound.arguments)
         law.discrete, law.closed, law.bounds = self.bounds.discrete, self.bounds.closed, self.bounds
         law.open_above = not (law.discrete or law.closed)
@@ -318,7 +312,7 @@ class DeclaredDistribution(Declared):
             }
         return known[pattern]
 
-    def _check_bounds(self, law: Written) -> None:
+    def _check_bounds(self, law: UserDefined) -> None:
         support = law.support()
         for a, b in zip(support.lower.ravel(), support.upper.ravel(), strict=True):
             if a.op == b.op == "const" and not (
@@ -411,91 +405,96 @@ def _known(name: str, names: Iterable[str]) -> str:
     return f"its arguments are {listed}" if listed else "it has no arguments"
 
 
-def distribution(
-    function: Function = _MISSING,
-    *,
-    lower: float | str | None = None,
-    upper: float | str | None = None,
-    discrete: bool = False,
-    closed: bool = False,
-    positive: Iterable[str] = (),
-) -> Any:
-    """Declare a distribution of your own by its log density.
+# -- the functions, run on placeholders
+def form(
+    function: Callable[..., Any], part: str, verb: str, parameters: Sequence[str], pattern: Pattern
+) -> Expr:
+    """What a function gives, in `VALUE` and placeholders for the arguments that are no numbers.
+
+    It is called twice, as the laws of a model are (`calling.call`).
 
     Parameters
     ----------
-    function : log density, of discrete laws log probability, at its first argument, in plain NumPy
-        for one number; its further arguments are those of the law. Outside of the support it is
-        not asked. It should be normalised: what is left out of it is missing in every likelihood.
-    lower, upper : bounds of the support, numbers or names of the law's arguments; None: there is
-        none.
-    discrete : whether the values are whole numbers; the bounds are among them.
-    closed : whether the bounds of a continuous law belong to its support.
-    positive : names of arguments that have to be positive: numbers that are not are refused, and
-        where expressions leave that range the density is nan, as that of other laws.
-
-    Returns
-    -------
-    DeclaredDistribution : called with its arguments a law like any other; with the decorators
-        `sampler`, `mean`, `variance`, `cdf` and `quantile`, and `check`.
+    part : "density", "draw", "mean", "variance", "cdf" or "quantile".
+    verb : its decorator, for messages.
+    parameters : names of the law's arguments; pattern: their numbers.
 
     Raises
     ------
-    ModelError : the declaration does not fit the function; names file and line.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import ssmppl as ssm
-    >>> @ssm.distribution(lower=0, positive=("shape", "scale"))
-    ... def Lomax(y, shape, scale):
-    ...     return np.log(shape / scale) - (shape + 1) * np.log1p(y / scale)
-    >>> @Lomax.sampler
-    ... def draw(rng, shape, scale):
-    ...     return scale * (rng.uniform() ** (-1 / shape) - 1)
-    >>> Lomax(2.5, scale=3)
-    Lomax(shape=2.5, scale=3)
+    ModelError : it gives no expression of its arguments; names its line.
     """
-
-    def declare(function: Function) -> DeclaredDistribution:
-        if not inspect.isfunction(function):
-            raise ModelError(
-                f"@ssm.distribution stands on {function!r}, which is no function",
-                fix="write @ssm.distribution(lower=0) on the line above a def",
-                where=user_location(),
-            )
-        where, bounds = location_of(function), Bounds(discrete=discrete, closed=closed)
-        for name, given in (("lower", lower), ("upper", upper)):
-            if given is not None:
-                own: Any = {name: _bound(name, given, function, discrete)}
-                bounds = replace(bounds, **own)
-        if not (isinstance(bounds.lower, str) or isinstance(bounds.upper, str)) and not (
-            bounds.lower < bounds.upper or (discrete and bounds.lower == bounds.upper)
-        ):
-            raise ModelError(
-                f"lower={bounds.lower:g} of @distribution {function.__name__} is not below "
-                f"upper={bounds.upper:g}",
-                fix="give lower < upper",
-                where=where,
-            )
-        names = (positive,) if isinstance(positive, str) else tuple(positive)
-        return DeclaredDistribution(function, bounds, names)
-
-    return declare if function is _MISSING else declare(function)
-
-
-def _bound(keyword: str, value: Any, function: Function, discrete: bool) -> float | str:
-    if isinstance(value, str):
-        return value
-    number = isinstance(value, numbers.Real) and not math.isnan(float(value))
-    infinite = -INFINITY if keyword == "lower" else INFINITY
-    if number and float(value) == -infinite:
-        number = False
-    if not number or (discrete and math.isfinite(value) and value != math.floor(value)):
+    given: dict[str, Any] = {  # NumPy's numbers, which may be divided by 0
+        n: placeholder(n) if v is None else np.float64(v)
+        for n, v in zip(parameters, pattern, strict=True)
+    }
+    first = next(iter(inspect.signature(function).parameters), "")
+    found: list[Expr] = []
+    for _ in range(2):
+        own = dict(given)
+        if part == "draw":
+            own[first] = Generator(Draws("draw"))
+        elif part not in ("mean", "variance"):
+            own[first] = VALUE
+        with np.errstate(all="ignore"):  # what is no number is refused below
+            value = call_once(function, verb, own, {})
+        found.append(_expression(value, function, verb))
+    fault = _fault(part, found, parameters, pattern)
+    if fault:
         raise ModelError(
-            f"{keyword}={value!r} of @distribution {function.__name__} is no "
-            f"{'whole number' if discrete else 'number'} and no name of an argument",
-            fix=f'give a number, or the name of an argument, {keyword}="loc"',
-            where=location_of(function),
+            f"@{verb} {function.__name__} {fault[0]}", fix=fault[1], where=return_location(function)
         )
-    return float(value)
+    return found[0]
+
+
+def _expression(value: Any, function: Callable[..., Any], verb: str) -> Expr:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    try:
+        return as_expr(value)
+    except TypeError:
+        given = "nothing" if value is None else repr(value)
+        given = f"an array of shape {value.shape}" if isinstance(value, np.ndarray) else given
+        raise ModelError(
+            f"@{verb} {function.__name__} returned {given}",
+            fix="end it by `return` and one expression of its arguments: the function is that of "
+            "one number, and is applied to each component of an array",
+            where=return_location(function),
+        ) from None
+
+
+def _fault(
+    part: str, found: Sequence[Expr], parameters: Sequence[str], pattern: Pattern
+) -> tuple[str, str] | None:
+    """What is wrong with an expression, and the fix. found : of two calls."""
+    nodes = topological(found[:1])
+    if found[0] is not found[1]:
+        return (
+            "gives something else when it is called again",
+            "draw no random numbers but those of a sampler's first argument, and change nothing "
+            "inside of it",
+        )
+    foreign = symbols_of(found[:1]) - {VALUE, *map(placeholder, parameters)}
+    if foreign:
+        name = min(map(repr, foreign))
+        return (
+            f"reads {name} of the model from outside of its arguments",
+            f"give the law an argument for {name}",
+        )
+    if part == "draw" and not any(n.op == "random" for n in nodes):
+        return (
+            f"returned {found[0]!r}, which holds no draw",
+            "make it of the random numbers of its first argument, such as rng.uniform() and "
+            "rng.normal()",
+        )
+    if _is_nan(found[0]) or any(_is_nan(a) for n in nodes if n.op != "where" for a in n.args):
+        given = [f"{n}={v:g}" for n, v in zip(parameters, pattern, strict=True) if v is not None]
+        return (
+            "is nan" + (f" at {', '.join(given)}" if given else ""),
+            "take no logarithm or root of a negative number; what has to be positive is named in "
+            'the declaration, positive=("scale",)',
+        )
+    return None
+
+
+def _is_nan(e: Expr) -> bool:
+    return e.op == "const" and math.isnan(e.data)

@@ -18,7 +18,7 @@ from ssmppl.expressions.expr import symbol
 from ssmppl.language.trace import trace
 from ssmppl.modelfile import load_model
 from tests.diagnosis.harness import EVERY, differences, offered, traced
-from tests.language.user_defined.written_laws import Gumbel
+from tests.language.user_defined.user_defined_laws import Gumbel
 
 
 def assert_round_trip(t):
@@ -329,7 +329,7 @@ def lawful(law):
 def test_laws_of_ones_own_are_imported_from_the_users_file():
     t = trace(lawful(Gumbel))
     text = model_text(t)
-    assert "from tests.language.user_defined.written_laws import Gumbel" in text
+    assert "from tests.language.user_defined.user_defined_laws import Gumbel" in text
     assert "Gumbel(loc=a*x, scale=0.3)" in text.replace(" * ", "*")
     assert_round_trip(t)
 

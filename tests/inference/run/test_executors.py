@@ -285,7 +285,7 @@ def test_a_worker_says_what_it_does_not_know():
 
 
 def test_a_worker_forgets_what_was_long_unused():
-    known = pickling.Known(most=2)
+    known = pickling.UnpackedCache(most=2)
     for digest in (b"1", b"2", b"1", b"3"):
         known.get(digest, lambda digest=digest: digest)
     assert [known.get(d) for d in (b"1", b"2", b"3")] == [b"1", None, b"3"]
@@ -307,7 +307,7 @@ class Forgetful(ThreadPoolExecutor):
     def there(sent, forget):
         function, args = pickle.loads(sent)
         if forget:
-            executors._functions = pickling.Known(executors.MOST)
+            executors._functions = pickling.UnpackedCache(executors.MOST)
         return function(*args)
 
 

@@ -11,7 +11,7 @@ from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from tests.language.distributions.distribution_table import CASES, JOINT_CASES, NOT_IN_SCIPY, Case
 
 X = symbol("state", "x")

@@ -13,7 +13,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import differentiate, hessian
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.distributions.nested import log_sum
 
 X, P, A, B = (symbol("state", n) for n in "xpab")

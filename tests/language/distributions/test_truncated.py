@@ -12,7 +12,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from tests.language.distributions.distribution_table import TRUNCATED_CASES
 from tests.statistics.checks import some
 

@@ -14,9 +14,9 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.checkpoints.origin import model_digest
-from ssmppl.language.distributions.base import Draws
+from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.trace import trace
-from tests.language.user_defined.written_laws import (
+from tests.language.user_defined.user_defined_laws import (
     NAMES,
     TABLE,
     Gumbel,
@@ -364,7 +364,7 @@ def test_a_trace_travels_without_the_functions():
     before = trace(model)
     digest = model_digest(before)
     content = pickle.dumps(before)
-    assert b"written_laws" in content  # where it was declared, for messages
+    assert b"user_defined_laws" in content  # where it was declared, for messages
     law = pickle.loads(pickle.dumps(before.observations["y"].distribution))
     assert type(law).__name__ == "OwnPoisson"
     assert law.log_density(Y) is before.observations["y"].distribution.log_density(Y)
@@ -459,7 +459,7 @@ def test_check_tells_what_does_not_agree(law, found):
     with pytest.raises(ModelError) as error:
         law.check(2.0, draws=2000)
     assert found in str(error.value)
-    assert "test_written.py" in str(error.value)
+    assert "test_user_defined.py" in str(error.value)
 
 
 def test_check_of_counts_tells_what_does_not_agree():

@@ -8,7 +8,7 @@ import scipy.stats as st
 
 import ssmppl as ssm
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.model.calling import WRITTEN, advice
+from ssmppl.language.model.name_hints import HINTS, name_hint
 
 NAMES = {
     "Weibul": "write ssm.Weibull",
@@ -33,7 +33,7 @@ def test_a_name_that_is_not_there(name):
 def test_nothing_near_is_left_out():
     with pytest.raises(AttributeError, match=r"no attribute 'qqqq'$"):
         ssm.qqqq  # noqa: B018
-    assert advice("qqqq", ssm.__all__) == ""
+    assert name_hint("qqqq", ssm.__all__) == ""
 
 
 def test_in_a_model_the_line_and_the_law():
@@ -45,19 +45,19 @@ def test_in_a_model_the_line_and_the_law():
     text = str(caught.value)
     assert "asks for ssm.Gauss, which does not exist" in text
     assert "Fix: write ssm.Normal(mean, sd=); the distributions are: " in text
-    assert "test_elsewhere.py" in text
+    assert "test_name_hints.py" in text
 
 
 def test_what_is_written_exists():
-    assert not {k for k in WRITTEN if k in {n.lower() for n in ssm.__all__}}
-    for text in WRITTEN.values():
+    assert not {k for k in HINTS if k in {n.lower() for n in ssm.__all__}}
+    for text in HINTS.values():
         names = re.findall(r"ssm\.(\w+)", text)
         assert names, text
         assert set(names) <= set(ssm.__all__), text
 
 
 def test_a_multinomial_of_binomials_and_its_overdispersed_kin():
-    """The masses that the advice composes sum to those of SciPy's laws."""
+    """The masses that the hint composes sum to those of SciPy's laws."""
     counts, p, a = np.array([2.0, 3.0, 1.0]), np.array([0.5, 0.2, 0.3]), np.array([1.0, 2.0, 0.5])
     left = [counts[k:].sum() for k in range(3)]
     by_parts = sum(

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from tests.language.user_defined.written_laws import Gumbel, OwnGamma, Yule
+from tests.language.user_defined.user_defined_laws import Gumbel, OwnGamma, Yule
 from tests.statistics.checks import assert_within, deviations, seed_of
 
 PHI, STEP = 0.7, 0.4

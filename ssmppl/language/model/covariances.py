@@ -17,7 +17,7 @@ import numpy as np
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, constant
-from ssmppl.expressions.test_points import PLAIN, Places, moderate, numbers_at, wide, with_cases
+from ssmppl.expressions.test_points import PLAIN, TestPoints, moderate, numbers_at, wide, with_cases
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.continuous import Normal
 from ssmppl.language.distributions.multivariate import MvNormal
@@ -101,7 +101,9 @@ def _is_root(root: ExprArray, matrix: ExprArray) -> bool:
     return not np.any(differs[valid])
 
 
-def _covariances(entries: list[Expr], points: Places) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _covariances(
+    entries: list[Expr], points: TestPoints
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The matrix at each point, (P, d, d), the roots of its diagonal, (P, d), and whether it is a
     covariance there, (P,)."""
     n = math.isqrt(len(entries))

@@ -1,0 +1,82 @@
+"""Names that this language does not have, and what to write for them: those of Stan, PyMC, NumPyro,
+brms, SciPy, TensorFlow Probability and pomp, and misspellings.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+_NORMAL = "ssm.Normal(mean, sd=)"
+_VECTOR = "ssm.MvNormal(mean, covariance=)"
+_NEGATIVE = "ssm.NegativeBinomial(mean, dispersion=)"
+_ZEROS = "ssm.ZeroInflated(ssm.{0}, p), p the probability of a structural zero"
+_HURDLE = "ssm.ZeroInflated(ssm.Truncated(ssm.{0}, lower=1), p), p the probability of zero"
+_MIXTURE = "ssm.Mixture(weights, [ssm.Normal(mean, sd=), ...])"
+_POINT = "ssm.Dirac(value) for a state, or a line of Python in the law that needs it"
+# lower case and without underscores -> what is written here
+HINTS: dict[str, str] = {
+    **dict.fromkeys(["gauss", "gaussian", "norm"], _NORMAL),
+    **dict.fromkeys(
+        ["multivariatenormal", "multinormal", "multivariatenormalfulltensor", "mvn"], _VECTOR
+    ),
+    **dict.fromkeys(["multivariategaussian", "mvgaussian", "gaussianmultivariate"], _VECTOR),
+    **dict.fromkeys(
+        ["gammapoisson", "negativebinomial2", "negbinomial2", "negbinomial", "nbinom", "negbin"],
+        _NEGATIVE,
+    ),
+    "geometric": "ssm.NegativeBinomial(mean, dispersion=1), failures before a success: mean "
+    "(1 - p) / p",
+    **dict.fromkeys(["zeroinflatedpoisson", "zip"], _ZEROS.format("Poisson(rate)")),
+    **dict.fromkeys(
+        ["zeroinflatednegativebinomial", "zinb", "zeroinflatednegativebinomial2"],
+        _ZEROS.format("NegativeBinomial(mean, dispersion=)"),
+    ),
+    "zeroinflatedbinomial": _ZEROS.format("Binomial(n, p)"),
+    "zeroinflateddistribution": _ZEROS.format("Poisson(rate)"),
+    "hurdlepoisson": _HURDLE.format("Poisson(rate)"),
+    "hurdlenegativebinomial": _HURDLE.format("NegativeBinomial(mean, dispersion=)"),
+    **dict.fromkeys(
+        ["normalmixture", "mixturesamefamily", "mixturegeneral", "gaussianmixture"], _MIXTURE
+    ),
+    "multinomial": "ssm.Binomial for each category, out of those that are left: "
+    "ssm.Binomial(left, p[k] / np.sum(p[k:])), where `left`, the trials that no earlier category "
+    "has, is an input; where the total is random, independent ssm.Poisson",
+    "dirichletmultinomial": "ssm.BetaBinomial(left, a[k], np.sum(a[k + 1:])) for each category but "
+    "the last, where `left`, the trials that no earlier category has, is an input",
+    **dict.fromkeys(["chisquared", "chisquare", "chi2"], "ssm.Gamma(df / 2, rate=1 / 2)"),
+    "erlang": "ssm.Gamma(shape, rate=)",
+    "rayleigh": "ssm.Weibull(2, scale=np.sqrt(2) * sigma)",
+    **dict.fromkeys(
+        ["halfstudentt", "halft"], "ssm.Truncated(ssm.StudentT(df, 0, scale=), lower=0)"
+    ),
+    **dict.fromkeys(
+        ["truncatednormal", "truncnorm"],
+        "ssm.Truncated(ssm.Normal(mean, sd=), lower=, upper=)",
+    ),
+    **dict.fromkeys(["invgamma", "inversegamma2"], "ssm.InverseGamma(shape, scale=)"),
+    **dict.fromkeys(["lognorm"], "ssm.LogNormal(mean, sd=), both of the logarithm"),
+    **dict.fromkeys(["doubleexponential"], "ssm.Laplace(loc, scale=)"),
+    **dict.fromkeys(["t", "student", "studentst"], "ssm.StudentT(df, loc, scale=)"),
+    **dict.fromkeys(["delta", "deterministic", "constant", "degenerate"], _POINT),
+    "discreteuniform": "ssm.Categorical(np.full(n, 1 / n)), whose values begin at 0",
+    "loguniform": "ssm.Uniform(lower, upper) for the logarithm as the parameter, and np.exp of it "
+    "where it acts",
+    "filter": "ssm.particle_filter(model, data, parameters), or ssm.kalman_filter for linear "
+    "Gaussian models",
+    **dict.fromkeys(["mcmc", "nuts"], "ssm.sample(model, data)"),
+    "fit": "ssm.sample(model, data) for a posterior, ssm.maximize(model, data) for an estimate",
+    **dict.fromkeys(["mle", "optimize", "optimise"], "ssm.maximize(model, data)"),
+    **dict.fromkeys(["vonmisesfisher"], "ssm.VonMises(mean, concentration=) for an angle"),
+}
+CLOSE = 0.6  # least similarity of a misspelling
+
+
+def name_hint(name: str, known: Iterable[str]) -> str:
+    """What to write for a name that is none of `known`; empty where nothing comes near."""
+    plain = name.lower().replace("_", "")
+    if plain in HINTS:
+        return f"write {HINTS[plain]}"
+    spelled = {k.lower(): k for k in known}
+    near = difflib.get_close_matches(name.lower(), spelled, n=1, cutoff=CLOSE)
+    return f"write ssm.{spelled[near[0]]}" if near else ""
