@@ -38,7 +38,7 @@ from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
-from ssmppl.inference.maximum.ascent import Chart, Setup
+from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.maximum.newton import Top, climb, information_at
@@ -456,7 +456,7 @@ class Fitter:
         seed: np.random.SeedSequence, quick: bool, climbs: int,
     ) -> Fit:  # fmt: skip
         problem = space.problem
-        setup = Setup(problem, space, "posterior", self.fixed, start, seed)
+        setup = Maximization(problem, space, "posterior", self.fixed, start, seed)
         # The extended filter's is the same here, and needs no matrices to be put together.
         smooth = self._extended(problem) or partial(kalman.log_likelihood, problem.experiments)
         function = density_of(space, smooth)
@@ -491,10 +491,14 @@ class Fitter:
         return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
 
     def gradient(
-        self, space: Space, z: np.ndarray, stream: np.ndarray, chart: Chart | None = None
+        self,
+        space: Space,
+        z: np.ndarray,
+        stream: np.ndarray,
+        transform: UnconstrainedTransform | None = None,
     ) -> tuple[float, np.ndarray] | None:
         """(log p(y) + log prior, its derivatives (F,) in z), estimated; None where none is."""
-        point = (chart or Chart(space)).at(z)
+        point = (transform or UnconstrainedTransform(space)).at(z)
         if point.log_prior == -np.inf:
             return None
         try:
@@ -518,8 +522,8 @@ class Fitter:
         z = space.z[space.where]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
-        chart = Chart(space)
-        found = self.gradient(space, z, stream, chart)
+        transform = UnconstrainedTransform(space)
+        found = self.gradient(space, z, stream, transform)
         if found is None:
             raise SamplingError(
                 f"the model {space.problem.trace.name!r} cannot have produced the data where its "
@@ -528,7 +532,7 @@ class Fitter:
                 "values",
             )
         z, h, distance = noisy_climb(
-            lambda z: self.gradient(space, z, stream, chart), z, found, information
+            lambda z: self.gradient(space, z, stream, transform), z, found, information
         )
         theta = space.parameters(z)[0].copy()
         value, error = self.log_likelihood(space.problem.experiments, theta, seed)
@@ -594,7 +598,7 @@ class Fitter:
             if smooth is not None:
                 found = information_at(density_of(fit.space, smooth), fit.z)
             else:
-                setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
+                setup = Maximization(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
                 found = observed_information(setup, self.kalman, fit.z)
             inside = found[np.ix_(~fit.at_bound, ~fit.at_bound)]  # at a bound it says nothing
             if np.all(np.isfinite(found)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
@@ -606,10 +610,10 @@ class Fitter:
         seed: np.random.SeedSequence,
     ) -> np.ndarray:  # fmt: skip
         """(F, F) in z of a matrix (P, P) in theta, the prior's curvature included."""
-        setup = Setup(space.problem, at(space, theta), "posterior", self.fixed, {}, seed)
+        setup = Maximization(space.problem, at(space, theta), "posterior", self.fixed, {}, seed)
         z = setup.space_at(theta)
-        jacobian = setup.chart.at(z).jacobian
-        curvature = setup.chart.curvature(z, np.zeros(len(theta)))
+        jacobian = setup.transform.at(z).jacobian
+        curvature = setup.transform.curvature(z, np.zeros(len(theta)))
         prior = -curvature.log_prior
         values, vectors = np.linalg.eigh(0.5 * (prior + prior.T))
         return jacobian.T @ information @ jacobian + (vectors * np.maximum(values, 0.0)) @ vectors.T

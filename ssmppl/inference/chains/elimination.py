@@ -25,6 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable
 from ssmppl.analysis.elimination.elimination import Elimination
 from ssmppl.analysis.structure import deterministic_memory
@@ -36,6 +37,7 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, ThetaValues
+from ssmppl.inference.chains.sampling import PlanRows, reason_and_line
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.run.problem import Problem
 
@@ -198,7 +200,7 @@ class Eliminating(ParameterSteps):
             theta[where] = values
 
 
-def asked(
+def requested_elimination(
     problem: Problem, setting: bool | str | tuple[str, ...], held: Mapping[str, np.ndarray],
     proposal: str,
 ) -> Eliminable | NotApplicable:  # fmt: skip
@@ -251,8 +253,19 @@ def _named(problem: Problem, setting: object, held: Mapping[str, np.ndarray]) ->
     return tuple(setting)
 
 
-def describe(found: Eliminable | NotApplicable) -> str:
+def describe_elimination(found: Eliminable | NotApplicable) -> str:
     """What is eliminated, in words."""
     if isinstance(found, NotApplicable):
         return f"none: {found.reason}"
     return "; ".join(f"{', '.join(map(repr, u.components))} ({u.family})" for u in found.updates)
+
+
+def explain_elimination(found: Eliminable) -> PlanRows:
+    """What `explain` says: what can be eliminated, and why others cannot."""
+    rows = [
+        (joined(u.components), "integrated out while trajectories are drawn, each particle "
+         f"carrying its statistics: {u.family}")
+        for u in found.updates
+    ]  # fmt: skip
+    refused = found.refused.items()
+    return [*rows, *((repr(c), f"stays: {reason_and_line(reason)}") for c, reason in refused)]

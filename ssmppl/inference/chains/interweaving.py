@@ -61,7 +61,7 @@ from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains.coordinates import RandomWalk
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.preparation.exact_models import ExactModel
 from ssmppl.inference.preparation.pilot import Pilot
@@ -239,21 +239,25 @@ class Interweaving:
     looking: int
     bounds: list[tuple[float, float]] | None
 
-    def begin(self) -> Tuning:
+    def begin(self) -> InterweavingTuning:
         """What a new chain begins with."""
         if self.looking:
-            return Tuning(0, None, (), None, ())
-        return self._tune(Tuning(0, None, (), None, ()), self.movable)
+            return InterweavingTuning(0, None, (), None, ())
+        return self._tune(InterweavingTuning(0, None, (), None, ()), self.movable)
 
-    def _tune(self, tuning: Tuning, where: np.ndarray) -> Tuning:
+    def _tune(self, tuning: InterweavingTuning, where: np.ndarray) -> InterweavingTuning:
         size = 2.4 / np.sqrt(max(len(where), 1))
         factors = tuple(size * np.diag(self.scale[where]) for _ in self.moves)
         chosen, won = 0 if len(self.moves) == 1 or not self.adapting else None, (0,) * len(factors)
         return replace(tuning, where=where, factors=factors, chosen=chosen, seen=(), won=won)
 
     def step(
-        self, tuning: Tuning, theta: np.ndarray, paths: Paths, generator: np.random.Generator
-    ) -> tuple[Tuning, float]:
+        self,
+        tuning: InterweavingTuning,
+        theta: np.ndarray,
+        paths: Paths,
+        generator: np.random.Generator,
+    ) -> tuple[InterweavingTuning, float]:
         """One sweep's steps; theta and paths in place. Returns the share that was accepted."""
         sweep = tuning.sweep
         if tuning.where is None:
@@ -277,7 +281,7 @@ class Interweaving:
         return replace(tuning, sweep=sweep + 1), accepted / made if made else 0.0
 
     def _propose(
-        self, k: int, tuning: Tuning, theta: np.ndarray, paths: Paths,
+        self, k: int, tuning: InterweavingTuning, theta: np.ndarray, paths: Paths,
         generator: np.random.Generator,
     ) -> tuple[np.ndarray, int]:  # fmt: skip
         """Metropolis steps with one thing held fixed; (adapted factor, number accepted)."""
@@ -332,7 +336,7 @@ class Interweaving:
 
 
 @dataclass(frozen=True)
-class Tuning:
+class InterweavingTuning:
     """What a chain has learned; part of its state.
 
     sweep : how many it has made. where : positions of the numbers that move; None while it looks,
@@ -349,7 +353,7 @@ class Tuning:
     won: tuple[int, ...] = ()
 
 
-def _farthest(tuning: Tuning) -> int:
+def _farthest(tuning: InterweavingTuning) -> int:
     """The move of the greatest accepted steps times their squared size |S|^(2/d), the speed at
     which its walk spreads. All are tuned to one rate of acceptance, so that mostly the widest wins;
     but one that can seldom or never be made, where the guide is no number, stays as wide as it
@@ -367,7 +371,7 @@ def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noise
     return found
 
 
-def asked(
+def requested_noises(
     problem: Problem, setting: str | bool, model: ExactModel | None
 ) -> Noises | NotApplicable:
     if setting is False:
@@ -387,7 +391,7 @@ def _refused(found: NotApplicable) -> ArgumentError:
 
 
 def interweaving(
-    setup: Setup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
+    setup: SamplingSetup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
 ) -> tuple[Interweaving | None, str]:
     """The further steps of a method's chains, and in words what they are or why there are none.
 
@@ -397,7 +401,7 @@ def interweaving(
     ------
     ArgumentError : `interweave` is True and cannot be.
     """
-    found = asked(setup.problem, setting, model)
+    found = requested_noises(setup.problem, setting, model)
     if isinstance(found, NotApplicable):
         return None, f"none: {found.reason}"
     space, adapting = setup.space, setup.warmup * setup.thin

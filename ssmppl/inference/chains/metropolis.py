@@ -15,11 +15,12 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.coordinates import (
+    WALK_STATES,
+    ChainPoint,
+    LikelihoodRun,
     Metropolis,
-    Point,
     Proposal,
     RandomWalk,
-    Run,
     coordinates,
     metropolis_block,
     start_chain,
@@ -27,12 +28,13 @@ from ssmppl.inference.chains.coordinates import (
 from ssmppl.inference.chains.pmmh import (
     STRETCH,
     Langevin,
+    Local,
     adapts,
     given_factor,
     settings_of,
     walk_factor,
 )
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import PreparedChains, SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import MetropolisHastings
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import (
@@ -42,7 +44,7 @@ from ssmppl.inference.preparation.exact_models import (
     filter_of,
 )
 from ssmppl.inference.preparation.exact_score import exact_score
-from ssmppl.inference.preparation.pilot import dispersed, find_mode
+from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.problem import Problem
@@ -85,15 +87,17 @@ class ExactLikelihood:
     states: bool
     scored: np.ndarray | None = None
 
-    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+    def run(
+        self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
         model = needed_model(self.problem, "MetropolisHastings")
         if self.scored is None:
             value, slope = model.log_likelihood(self.problem.experiments, theta), None
         else:
             value, slope = model.score(self.problem.experiments, theta, self.scored)
-        return Run(value, score=slope) if np.isfinite(value) else None
+        return LikelihoodRun(value, score=slope) if np.isfinite(value) else None
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         if not self.states:
             return {}
         model = needed_model(self.problem, "MetropolisHastings")
@@ -102,7 +106,7 @@ class ExactLikelihood:
         return {f"path_{i}": d[0] for i, d in enumerate(drawn)}
 
 
-def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
+def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     """Find the mode and the information there, and start the chains.
 
     Raises
@@ -153,9 +157,16 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
         "walk_covariance": (factor @ factor.T).tolist(),
     }
-    return Sampler(partial(metropolis_block, kernel), states, report)
+    return PreparedChains(partial(metropolis_block, kernel), states, report)
 
 
-def _without_gradient(exact: ExactModel, setup: Setup, free: np.ndarray) -> str:
+def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray) -> str:
     """Why the likelihood has no gradient in closed form; empty where it has."""
     return exact_score(exact, setup.problem.experiments, free, setup.space.theta).differences
+
+
+METHOD = SamplingMethod(
+    prepare,
+    state_classes=(*WALK_STATES, Local, Pilot),
+    where_slow=", or another method, such as ssm.Gibbs()",
+)

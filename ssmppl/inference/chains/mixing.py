@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from ssmppl.inference.methods.methods import PMMH, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
@@ -34,12 +33,13 @@ LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can 
 
 
 def mixing_attributes(
-    labels: list[str], draws: np.ndarray, interrupted: bool, method: Method, warmup: int
+    labels: list[str], draws: np.ndarray, interrupted: bool, advice: str, warmup: int
 ) -> dict[str, str]:
     """What goes to the attributes: nothing, or the warning, which is also given.
 
     labels, draws : of the P free components, (chains, draws, P). Trials of fewer than `FEWEST`
-    draws and runs that were interrupted have none: they are known to be short.
+    draws and runs that were interrupted have none: they are known to be short. advice : what to try
+    besides more draws.
     """
     chains, n, _ = draws.shape
     if interrupted or chains < LEAST_CHAINS or n < FEWEST or not labels:
@@ -59,22 +59,10 @@ def mixing_attributes(
         + ("; one other parameter is like it" if others == 1 else "")
         + f". R-hat has to be below {APART:g} and the ESS at least {FEW:g} before means and "
         f"intervals are used. Take more draws (there were {n} of each chain) and warmup ({warmup})"
-        + _instead(method)
+        + advice
     )
     warnings.warn(text, stacklevel=3)
     return {"mixing_warning": text}
-
-
-def _instead(method: Method) -> str:
-    """What else can be done."""
-    name = type(method).__name__
-    if getattr(method, "interweave", "auto") is False:
-        return f', or ssm.{name}(interweave="auto")'
-    if isinstance(method, (Gibbs, MetropolisHastings)):
-        other = "MetropolisHastings" if isinstance(method, Gibbs) else "Gibbs"
-        return f", or another method, such as ssm.{other}()"
-    other = 'PGAS(interweave="auto")' if isinstance(method, PMMH) else "PMMH()"
-    return f", more particles, or another method, such as ssm.{other}"
 
 
 def rank_r_hat(draws: np.ndarray) -> float:

@@ -49,19 +49,20 @@ from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.coordinates import (
     ADAPTATION_POWER,
+    WALK_STATES,
+    ChainPoint,
     Coordinates,
     Likelihood,
+    LikelihoodRun,
     Metropolis,
-    Point,
     Proposal,
     RandomWalk,
-    Run,
-    chart,
     coordinates,
+    local_derivatives,
     metropolis_block,
     start_chain,
 )
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import PreparedChains, SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import PMMH, MetropolisHastings
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.particles.marginal import draw_given, is_marginal
@@ -69,14 +70,14 @@ from ssmppl.inference.preparation.pilot import (
     SCALE_REPEATS,
     TUNING_REPEATS,
     Pilot,
-    Tuning,
+    TunedParticles,
     averaged_density,
     dispersed,
     find_mode,
     particles_for,
     tune_particles,
 )
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import Choice, choose
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.ranges import total_of
@@ -92,7 +93,9 @@ class ParticleLikelihood:
     settings: FilterSettings
     states: bool = True
 
-    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+    def run(
+        self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
         if self.settings.rescue:
             return self._rescued(theta, stream)
         entry = self.problem.program.entry(f"filtered_path_{self.settings.proposal}")
@@ -111,9 +114,9 @@ class ParticleLikelihood:
             total += log_z
             paths.append(path)
             increments.append(increment)
-        return Run(total, tuple(paths), tuple(increments))
+        return LikelihoodRun(total, tuple(paths), tuple(increments))
 
-    def _rescued(self, theta: np.ndarray, stream: np.ndarray) -> Run | None:
+    def _rescued(self, theta: np.ndarray, stream: np.ndarray) -> LikelihoodRun | None:
         """By the alive particle filter; Del Moral et al. (2015), section 4, on its use here."""
         carried = len(self.problem.program.carried(self.settings.proposal))
         total, paths, increments, n = 0.0, [], [], self.settings.particles
@@ -136,9 +139,9 @@ class ParticleLikelihood:
             total += total_of(increment)
             paths.append(path)
             increments.append(increment)
-        return Run(total, tuple(paths), tuple(increments))
+        return LikelihoodRun(total, tuple(paths), tuple(increments))
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         return kept_of(point, self.states)
 
 
@@ -146,7 +149,7 @@ class ParticleLikelihood:
 class MarginalLikelihood(ParticleLikelihood):
     """A Rao-Blackwellised filter; what it integrates out is drawn for the kept draws."""
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         found = kept_of(point, self.states)
         for i, e in enumerate(self.problem.experiments):
             path = point.run.paths[i][None]
@@ -191,7 +194,9 @@ class ScoredLikelihood(_WithFilter):
             )
         return made
 
-    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+    def run(
+        self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
         entry, p = self.filter.module.filter_with_score, len(self.wanted)
         total, paths, increments = 0.0, [], []
         slope, curvature = np.zeros(p), np.zeros((p, p))
@@ -214,9 +219,9 @@ class ScoredLikelihood(_WithFilter):
         score, information = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
         score[list(self.wanted)] = slope
         information[np.ix_(self.wanted, self.wanted)] = curvature
-        return Run(total, tuple(paths), tuple(increments), score, information)
+        return LikelihoodRun(total, tuple(paths), tuple(increments), score, information)
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         return kept_of(point, self.states)
 
 
@@ -245,7 +250,9 @@ class CorrelatedLikelihood(_WithFilter):
             )
         return made
 
-    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+    def run(
+        self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
         old = None if before is None else before.numbers
         total, paths, increments, numbers = 0.0, [], [], []
         made, n = self.filter, self.settings.particles
@@ -266,7 +273,7 @@ class CorrelatedLikelihood(_WithFilter):
             paths.append(path)
             increments.append(increment)
             numbers.append(own)
-        return Run(total, tuple(paths), tuple(increments), numbers=numbers)
+        return LikelihoodRun(total, tuple(paths), tuple(increments), numbers=numbers)
 
     def _moved(
         self, shape: tuple[int, ...], old: np.ndarray | None, stream: np.ndarray
@@ -279,11 +286,11 @@ class CorrelatedLikelihood(_WithFilter):
         rho = self.correlation
         return rho * old + np.sqrt(1.0 - rho * rho) * new.reshape(shape)
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         return kept_of(point, self.states)
 
 
-def kept_of(point: Point, states: bool) -> dict[str, np.ndarray]:
+def kept_of(point: ChainPoint, states: bool) -> dict[str, np.ndarray]:
     """The increments of the run and, of the states, its path, by the names of the draws."""
     named = {f"path_{i}": path for i, path in enumerate(point.run.paths if states else ())}
     return named | {f"increment_{i}": v for i, v in enumerate(point.run.increments)}
@@ -379,12 +386,12 @@ class Langevin:
     factor: np.ndarray
     newton: bool
 
-    def local(self, w: np.ndarray, run: Run) -> Local:
+    def local(self, w: np.ndarray, run: LikelihoodRun) -> Local:
         d, root = len(w), self.factor
         slope = np.zeros(d)
         if run.score is not None and d:
             sd = np.sqrt(np.sum(self.factor**2, axis=1))
-            near = chart(self.coordinates, w, sd, self.newton)
+            near = local_derivatives(self.coordinates, w, sd, self.newton)
             slope = near.jacobian.T @ run.score + near.slope
             if self.newton and run.information is not None:
                 information = near.jacobian.T @ run.information @ near.jacobian - near.curvature
@@ -397,14 +404,14 @@ class Langevin:
         return Local(root, inverse, log_det, 0.5 * root.T @ slope)
 
     def propose(
-        self, point: Point, tuning: float, generator: np.random.Generator
+        self, point: ChainPoint, tuning: float, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         normals = generator.standard_normal(len(point.w))
         step = np.exp(tuning)
         move = point.local.root @ (_drift(point.local, step) + normals)
         return point.w + step * move, normals
 
-    def log_ratio(self, old: Point, new: Point, tuning: float) -> float:
+    def log_ratio(self, old: ChainPoint, new: ChainPoint, tuning: float) -> float:
         step = np.exp(tuning)
         return _log_density(new, old, step) - _log_density(old, new, step)
 
@@ -431,7 +438,7 @@ def _drift(local: Local, step: float) -> np.ndarray:
     return drift if length <= LONGEST else drift * (LONGEST / length)
 
 
-def _log_density(origin: Point, end: Point, step: float) -> float:
+def _log_density(origin: ChainPoint, end: ChainPoint, step: float) -> float:
     """log q(end | origin) up to a constant."""
     local = origin.local
     residual = local.inverse @ (end.w - origin.w) / step - _drift(local, step)
@@ -441,7 +448,7 @@ def _log_density(origin: Point, end: Point, step: float) -> float:
 STRETCH = 2.562  # of a random walk's steps, over sqrt(d): Sherlock et al. (2015)
 
 
-def prepare(setup: Setup, method: PMMH) -> Sampler:
+def prepare(setup: SamplingSetup, method: PMMH) -> PreparedChains:
     """Find a mode, choose proposal and number of particles there, and start the chains.
 
     Raises
@@ -504,10 +511,10 @@ def prepare(setup: Setup, method: PMMH) -> Sampler:
     }
     if tuned is not None:
         report["pilot_sd_of_log_likelihood"] = tuned.sd
-    return Sampler(partial(metropolis_block, kernel), states, report)
+    return PreparedChains(partial(metropolis_block, kernel), states, report)
 
 
-def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelihood:
+def _likelihood(setup: SamplingSetup, method: PMMH, settings: FilterSettings) -> Likelihood:
     """The particle filter in the form that the method needs, compiled to find out if it applies."""
     problem = setup.problem
     if method.correlation:
@@ -527,7 +534,7 @@ def _likelihood(setup: Setup, method: PMMH, settings: FilterSettings) -> Likelih
     return ParticleLikelihood(problem, settings, setup.states)
 
 
-def _tuned(setup: Setup, method: PMMH, theta: np.ndarray, proposal: str) -> Tuning:
+def _tuned(setup: SamplingSetup, method: PMMH, theta: np.ndarray, proposal: str) -> TunedParticles:
     """The number of particles by the spread of log Z, or of the difference of correlated ones."""
     if not method.correlation:
         return tune_particles(
@@ -553,7 +560,7 @@ def adapts(method: PMMH | MetropolisHastings) -> bool:
 
 
 def walk_factor(
-    setup: Setup, method: PMMH | MetropolisHastings, where: Coordinates, pilot: Pilot,
+    setup: SamplingSetup, method: PMMH | MetropolisHastings, where: Coordinates, pilot: Pilot,
     proposal: str,
 ) -> np.ndarray:  # fmt: skip
     """Cholesky factor (d, d) of the walk's covariance, as given or from the pilot.
@@ -572,7 +579,7 @@ def walk_factor(
 
 
 def pilot_covariance(
-    setup: Setup, where: Coordinates, pilot: Pilot, proposal: str, rescue: int = 0
+    setup: SamplingSetup, where: Coordinates, pilot: Pilot, proposal: str, rescue: int = 0
 ) -> np.ndarray:
     """The inverse information at the pilot's mode, (d, d) in the coordinates."""
     w = where.at(pilot.z)
@@ -617,3 +624,11 @@ def settings_of(method: Any) -> dict[str, Any]:
     if settings.get("transform") is not None:
         settings["transform"] = dict(settings["transform"])
     return settings
+
+
+METHOD = SamplingMethod(
+    prepare,
+    state_classes=(*WALK_STATES, Local, Pilot, TunedParticles, Choice),
+    by_row=lambda method: True,
+    where_slow=', more particles, or another method, such as ssm.PGAS(interweave="auto")',
+)

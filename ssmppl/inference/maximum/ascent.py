@@ -42,7 +42,7 @@ STEP = 1e-5  # of the central differences where a prior has no derivative in clo
 
 
 @dataclass(frozen=True)
-class Point:
+class TransformedPoint:
     """A place on the unconstrained scale: P parameters, F free numbers.
 
     theta : (P,). log_prior : log density of theta on its own scale; -inf outside the support, or
@@ -81,7 +81,7 @@ class Curvature:
     log_jacobian: np.ndarray
 
 
-class Chart:
+class UnconstrainedTransform:
     """The map from z to theta of a `Space`, with its derivatives."""
 
     def __init__(self, space: Space):
@@ -103,7 +103,7 @@ class Chart:
         self._second: list[list[list[Expr]]] | None = None
         self._second_prior: list[list[Expr]] | None = None
 
-    def at(self, z: np.ndarray) -> Point:
+    def at(self, z: np.ndarray) -> TransformedPoint:
         """Values and first derivatives at z (F,)."""
         z = np.asarray(z, dtype=float)
         theta, total = self.space.parameters(z)
@@ -117,7 +117,7 @@ class Chart:
                 d_log_prior = _differences(self._log_prior_at, z)
             log_jacobian = float(evaluate(self.log_jacobian, values))
         log_prior = total - log_jacobian if total > -np.inf else -np.inf
-        return Point(theta.copy(), log_prior, log_jacobian, jacobian, d_log_prior, slope)
+        return TransformedPoint(theta.copy(), log_prior, log_jacobian, jacobian, d_log_prior, slope)
 
     def without_slope(self, value: float, theta: np.ndarray, gradient: np.ndarray) -> str:
         """Says in what a function of theta (P,) that has a value there has no slope (P,); else
@@ -204,7 +204,7 @@ class Ascent:
 
 
 @dataclass(frozen=True)
-class Setup:
+class Maximization:
     """The question: a problem, its free parameters, and what is to be maximised.
 
     objective : "likelihood", or "posterior" for log likelihood + log prior density of theta.
@@ -221,9 +221,9 @@ class Setup:
     progress: bool = False
 
     @cached_property
-    def chart(self) -> Chart:
+    def transform(self) -> UnconstrainedTransform:
         """Derivatives through the unconstrained scale."""
-        return Chart(self.space)
+        return UnconstrainedTransform(self.space)
 
     @cached_property
     def exact(self) -> ExactModel | NotApplicable:
@@ -266,7 +266,7 @@ class Setup:
         """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""
         value = self.exact_at(z)
         if self.with_prior and value > -np.inf:
-            value += self.chart.at(z).log_prior
+            value += self.transform.at(z).log_prior
         return value
 
     def space_at(self, theta: np.ndarray) -> np.ndarray:
@@ -279,11 +279,11 @@ class Setup:
 
         The gradient of the likelihood is zero there, or minus that of the log prior.
         """
-        point = self.chart.at(z)
+        point = self.transform.at(z)
         inverse = point.inverse()
         if self.with_prior:
             slope = -inverse.T @ point.d_log_prior
-            information = information + self.chart.curvature(z, slope).theta
+            information = information + self.transform.curvature(z, slope).theta
         with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
             return inverse.T @ information @ inverse
 

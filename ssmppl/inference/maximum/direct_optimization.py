@@ -30,7 +30,7 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Setup
+from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Maximization
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
@@ -79,7 +79,7 @@ class SmoothLikelihood:
 class SmoothClimb:
     """Ascent of the averaged likelihood, in units of its own width."""
 
-    def __init__(self, setup: Setup, method: DirectOptimization, pool: ThreadPoolExecutor):
+    def __init__(self, setup: Maximization, method: DirectOptimization, pool: ThreadPoolExecutor):
         self.setup, self.method, self.pool = setup, method, pool
         self.likelihood = SmoothLikelihood(
             setup.problem, method.particles, method.averages, setup.seed(3)
@@ -114,7 +114,7 @@ class SmoothClimb:
                 "the likelihood of the continuous particle filter is zero at the start",
                 fix="give start={name: value} near plausible values, or more particles",
             )
-        theta = self.setup.chart.at(self.best).theta
+        theta = self.setup.transform.at(self.best).theta
         report = {
             "converged": bool(gap < CLOSE), "evaluations": self.evaluations,
             "likelihood": f"particle filter continuous in the parameters (Malik and Pitt 2011), "
@@ -143,7 +143,7 @@ class SmoothClimb:
         return value
 
     def _prior(self, z: np.ndarray) -> float:
-        return self.setup.chart.at(z).log_prior if self.setup.with_prior else 0.0
+        return self.setup.transform.at(z).log_prior if self.setup.with_prior else 0.0
 
     def _slope(self, function: Any, z: np.ndarray) -> np.ndarray:
         """Central differences in units of the width, last axis F."""
@@ -208,13 +208,13 @@ class SmoothClimb:
 
     def _prior_curve(self, z: np.ndarray) -> np.ndarray:
         """Second derivatives of the log prior in z."""
-        return self.setup.chart.curvature(z, np.zeros(len(self.setup.space.theta))).log_prior
+        return self.setup.transform.curvature(z, np.zeros(len(self.setup.space.theta))).log_prior
 
     def _natural(self, information: np.ndarray | None) -> np.ndarray | None:
         return None if information is None else self.setup.natural(self.best, information)
 
     def _natural_error(self, error: np.ndarray | None) -> np.ndarray | None:
-        jacobian = self.setup.chart.at(self.best).jacobian
+        jacobian = self.setup.transform.at(self.best).jacobian
         with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
             return None if error is None else jacobian @ error @ jacobian.T
 
@@ -224,7 +224,7 @@ def _log_mean(log_z: np.ndarray) -> float:
     return top if not np.isfinite(top) else top + float(np.log(np.mean(np.exp(log_z - top))))
 
 
-def climb_smooth(setup: Setup, method: DirectOptimization) -> Ascent:
+def climb_smooth(setup: Maximization, method: DirectOptimization) -> Ascent:
     """Maximise over the continuous filter, on threads: it runs without Python's lock."""
     with ThreadPoolExecutor() as pool:
         return SmoothClimb(setup, method, pool).run()
@@ -236,7 +236,7 @@ EXACT_RESTARTS = 2
 FLATS = 3  # that a climb leaves
 
 
-def climb(setup: Setup, method: DirectOptimization) -> Ascent:
+def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
     """Maximise; see the module.
 
     Raises
@@ -265,7 +265,7 @@ class _WithoutMaximum(Exception):
 class ExactClimb:
     """Ascent of an exact log-likelihood with its exact score."""
 
-    def __init__(self, setup: Setup, model: ExactModel, method: DirectOptimization):
+    def __init__(self, setup: Maximization, model: ExactModel, method: DirectOptimization):
         self.setup, self.model, self.method = setup, model, method
         self.experiments = setup.problem.experiments
         free = free_components(setup.problem.trace, setup.held)
@@ -291,7 +291,7 @@ class ExactClimb:
                     start = centre + rng.standard_normal(len(start))
                 stopped = self._quasi_newton(start)
                 if len(self.best):
-                    self._check(self.setup.chart.at(self.best).theta)
+                    self._check(self.setup.transform.at(self.best).theta)
             if len(self.best):
                 self._leave_flats()
                 gap = self._polish()
@@ -312,7 +312,7 @@ class ExactClimb:
             )
         if not np.isfinite(gap) and not (interrupted or unbounded):
             stopped = "the climb ran to the edge of what the parameters can be: no maximum inside"
-        point = self.setup.chart.at(self.best)
+        point = self.setup.transform.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
             "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
@@ -331,7 +331,7 @@ class ExactClimb:
         """The objective and its gradient (F,) at z; -inf and zeros where there is none."""
         self.evaluations += 1
         nothing = -np.inf, np.zeros(len(z))
-        point = self.setup.chart.at(z)
+        point = self.setup.transform.at(z)
         if point.log_prior == -np.inf:
             return nothing
         try:
@@ -344,7 +344,8 @@ class ExactClimb:
             value, slope = value + point.log_prior, slope + point.d_log_prior
         if not np.isfinite(value) or not np.all(np.isfinite(slope)):
             self.without_slope = (
-                self.setup.chart.without_slope(value, point.theta, gradient) or self.without_slope
+                self.setup.transform.without_slope(value, point.theta, gradient)
+                or self.without_slope
             )
             return nothing
         self.known[z.tobytes()] = value
@@ -392,7 +393,7 @@ class ExactClimb:
         Parameters whose maximum is at an edge of their support stay where the climb left them.
         """
         gap = np.inf
-        theta = self.setup.chart.at(self.best).theta
+        theta = self.setup.transform.at(self.best).theta
         found = edges(self.setup, theta, self.exact.information(theta))
         kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
         free = self.exact.free.copy()
@@ -431,17 +432,17 @@ class ExactClimb:
         self.known.clear()
 
 
-def observed_information(setup: Setup, model: ExactModel, z: np.ndarray) -> np.ndarray:
+def observed_information(setup: Maximization, model: ExactModel, z: np.ndarray) -> np.ndarray:
     """Minus the second derivatives of the objective in z (F,), (F, F), by the exact score."""
     free = free_components(setup.problem.trace, setup.held)
-    theta = setup.chart.at(z).theta
+    theta = setup.transform.at(z).theta
     return _curvature(setup, exact_score(model, setup.problem.experiments, free, theta), z)
 
 
-def _curvature(setup: Setup, exact: Any, z: np.ndarray) -> np.ndarray:
-    point = setup.chart.at(z)
+def _curvature(setup: Maximization, exact: Any, z: np.ndarray) -> np.ndarray:
+    point = setup.transform.at(z)
     _, gradient = exact.score(point.theta)
-    second = setup.chart.curvature(z, gradient)
+    second = setup.transform.curvature(z, gradient)
     out = point.jacobian.T @ exact.information(point.theta) @ point.jacobian - second.theta
     return out - second.log_prior if setup.with_prior else out
 

@@ -37,7 +37,7 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.methods.methods import IF2
 from ssmppl.inference.particles.filtering import FilterSettings, log_of_mean, repeated_estimates
 from ssmppl.inference.preparation.pilot import scale_of
@@ -52,7 +52,7 @@ LEAST_SHARE = 1e-4  # of a step that is taken, and of what it promises
 
 
 @dataclass(frozen=True)
-class Fit:
+class LocalQuadratic:
     """q(u) = a + b'u - u'Hu/2 + (c'u) |u|^2.
 
     b, c : (F,). h : (F, F). covariance : of all coefficients, in the order of `monomials`.
@@ -115,7 +115,7 @@ def slopes_of_monomials(u: np.ndarray, skew: bool) -> np.ndarray:
     return np.hstack(parts)
 
 
-def fitted(u: np.ndarray, log_z: np.ndarray, skew: bool) -> Fit | None:
+def fit_quadratic(u: np.ndarray, log_z: np.ndarray, skew: bool) -> LocalQuadratic | None:
     """The fit to log Z (n,) at points u (n, F), -inf where an estimate is zero.
 
     None where too few are finite, or the scoring does not come to rest.
@@ -138,7 +138,7 @@ def fitted(u: np.ndarray, log_z: np.ndarray, skew: bool) -> Fit | None:
     h = np.zeros((d, d))
     i, j = np.tril_indices(d)
     h[i, j] = -beta[1 + d : 1 + d + len(i)]
-    return Fit(
+    return LocalQuadratic(
         beta[1 : 1 + d], h + h.T, beta[1 + d + len(i) :] if skew else np.zeros(d),
         off.T @ off, float(np.mean(rest**2)),
     )  # fmt: skip
@@ -193,7 +193,7 @@ TOGETHER = 8  # points of a task
 
 
 @dataclass(frozen=True)
-class Hilltop:
+class LocalMaximum:
     """z : (F,) the top. error : (F, F) its Monte Carlo covariance. information : (F, F) minus the
     second derivatives of the log-likelihood in z there. points, runs : of the last round, and
     filters at each of them. moved : from where the search began, in standard deviations."""
@@ -215,7 +215,7 @@ class Hilltop:
 class _Search:
     """How far a search has come; settings : of the filters, None where the likelihood is exact."""
 
-    setup: Setup
+    setup: Maximization
     settings: FilterSettings | None
     centre: np.ndarray
     factor: np.ndarray
@@ -226,7 +226,7 @@ class _Search:
     hopeless: int = 0
     seen: tuple[np.ndarray, ...] = ()
 
-    def look(self, n: int, skew: bool) -> Fit | None:
+    def look(self, n: int, skew: bool) -> LocalQuadratic | None:
         """A fit to n points round the centre."""
         self.done += 1
         rng = np.random.default_rng(self.setup.seed(8, self.done))
@@ -238,7 +238,7 @@ class _Search:
         inside = ~np.isnan(log_z)
         pair = np.tile(np.arange(len(half)), 2)
         self.seen = u[inside], log_z[inside], pair[inside]
-        fit = fitted(u[inside], log_z[inside], skew)
+        fit = fit_quadratic(u[inside], log_z[inside], skew)
         if fit is not None and self.settings is not None:
             self.misfit = fit.misfit
             self.hopeless += self.runs == MOST_RUNS and fit.misfit > HOPELESS
@@ -254,7 +254,7 @@ class _Search:
             return False
         return self.move(fit)
 
-    def move(self, fit: Fit) -> bool:
+    def move(self, fit: LocalQuadratic) -> bool:
         """Centre and shape to those of a fit, as far as its noise allows; whether they rest."""
         values, errors, vectors = fit.shape()
         surely = 1.0 + np.sign(values - 1.0) * np.maximum(np.abs(values - 1.0) - errors, 0.0)
@@ -267,7 +267,7 @@ class _Search:
         self.factor = np.linalg.cholesky(self.factor @ root @ root.T @ self.factor.T)
         return bool(distance < NEAR and usable.min() > ALIKE and usable.max() < 1.0 / ALIKE)
 
-    def error(self, fit: Fit, u: np.ndarray) -> np.ndarray | None:
+    def error(self, fit: LocalQuadratic, u: np.ndarray) -> np.ndarray | None:
         """(F, F) Monte Carlo covariance of the top u: the larger of the delta method's and of the
         jackknife's over groups of pairs, which knows what noise in the curvature does to a top.
         None where the fit without a group has no top."""
@@ -275,7 +275,7 @@ class _Search:
         tops = []
         for g in range(GROUPS):
             rest = pair % GROUPS != g
-            without = fitted(points[rest], log_z[rest], True)
+            without = fit_quadratic(points[rest], log_z[rest], True)
             top = None if without is None else self.top(without, surely=0.0)
             if top is None:
                 return None
@@ -285,7 +285,7 @@ class _Search:
         delta = fit.error(u)
         return jackknife if np.trace(jackknife) > np.trace(delta) else delta
 
-    def top(self, fit: Fit, surely: float = SURELY) -> np.ndarray | None:
+    def top(self, fit: LocalQuadratic, surely: float = SURELY) -> np.ndarray | None:
         """(F,) where the fit has its top, in its own coordinates; None where it has none near, or
         where its information is not so many standard errors above zero in every direction."""
         u = np.zeros(len(self.centre))
@@ -322,7 +322,9 @@ def check_points(method: IF2, d: int) -> None:
         )
 
 
-def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop | NotApplicable:
+def local_maximum(
+    setup: Maximization, method: IF2, z: np.ndarray, noise: float
+) -> LocalMaximum | NotApplicable:
     """The top near z (F,), where `noise` is the relative error of one estimate of the likelihood.
 
     Raises
@@ -368,14 +370,14 @@ def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop |
         information = inverse.T @ fit.information(u) @ inverse
         if setup.with_prior:
             nothing = np.zeros(len(setup.space.theta))
-            information = information + setup.chart.curvature(top, nothing).log_prior
+            information = information + setup.transform.curvature(top, nothing).log_prior
         moved = float(np.linalg.norm(np.linalg.solve(f, top - z)))
-        return Hilltop(top, f @ error @ f.T, information, points, runs, moved)
+        return LocalMaximum(top, f @ error @ f.T, information, points, runs, moved)
     return NotApplicable("the likelihood has no top within reach of the points round the end")
 
 
 def log_densities(
-    setup: Setup, settings: FilterSettings | None, points: np.ndarray, runs: int,
+    setup: Maximization, settings: FilterSettings | None, points: np.ndarray, runs: int,
     path: tuple[int, ...],
 ) -> np.ndarray:  # fmt: skip
     """(n,) log of what is to be maximised at points (n, F), from the mean of `runs` estimates.
@@ -394,7 +396,7 @@ def log_densities(
         task = partial(_estimates, setup.space, settings)
         log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
     if setup.with_prior:
-        log_z = log_z + np.array([setup.chart.at(z).log_prior for z in points])
+        log_z = log_z + np.array([setup.transform.at(z).log_prior for z in points])
     return log_z
 
 
@@ -416,7 +418,7 @@ def _estimates(
     return np.array(out)
 
 
-def scales(setup: Setup, settings: FilterSettings | None, z: np.ndarray) -> np.ndarray:
+def scales(setup: Maximization, settings: FilterSettings | None, z: np.ndarray) -> np.ndarray:
     """(F,) how far to scatter points in each coordinate, a first guess."""
     if settings is None:
         return scale_of(z, lambda point: float(_finite(setup.exact_at(point))))

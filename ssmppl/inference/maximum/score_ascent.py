@@ -25,12 +25,12 @@ import scipy
 
 from ssmppl.data import spelled
 from ssmppl.errors import SamplingError
-from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.methods.methods import ScoreAscent
 from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import choose_kernel
 from ssmppl.inference.particles.scores import (
-    Run,
+    SmootherRun,
     Smoothing,
     combine,
     complete_scores,
@@ -77,7 +77,7 @@ class _Way:
     b: np.ndarray | None = None
 
 
-def climb(setup: Setup, method: ScoreAscent) -> Ascent:
+def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
     """Maximise; see the module.
 
     Raises
@@ -102,7 +102,7 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     )  # fmt: skip
     smoothing = Smoothing(settings, counts["trajectories"], kernel)
 
-    def runs(z: np.ndarray, k: int) -> list[Run]:
+    def runs(z: np.ndarray, k: int) -> list[SmootherRun]:
         theta, log_prior = setup.space.parameters(z)
         if log_prior == -np.inf:
             raise SamplingError("the parameters left their support")
@@ -120,11 +120,16 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     return ascent
 
 
-Runs = Callable[[np.ndarray, int], list[Run]]
+Runs = Callable[[np.ndarray, int], list[SmootherRun]]
 
 
 def _newton(
-    setup: Setup, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int, bar: Progress
+    setup: Maximization,
+    method: ScoreAscent,
+    start: np.ndarray,
+    runs: Runs,
+    most: int,
+    bar: Progress,
 ) -> Ascent:
     way = _Way()
     z, interrupted, share = np.array(start), False, np.inf
@@ -152,7 +157,7 @@ def _newton(
 
 
 def _safe_slope(
-    setup: Setup, way: _Way, z: np.ndarray, runs: Runs, k: int
+    setup: Maximization, way: _Way, z: np.ndarray, runs: Runs, k: int
 ) -> tuple[np.ndarray, Slope]:
     """(z, slope there); where the filter fails, at a point on the way back to the last iterate."""
     for _ in range(6):
@@ -166,7 +171,7 @@ def _safe_slope(
     return z, _slope(setup, z, runs(z, k))
 
 
-def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
+def _slope(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Slope:
     with np.errstate(over="ignore", invalid="ignore"):
         slope = _combined(setup, z, runs)
     if not all(
@@ -175,20 +180,20 @@ def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
     ):
         raise SamplingError(
             "the log joint density has no finite second derivative at "
-            f"{spelled(setup.problem.trace, setup.chart.at(z).theta)}",
+            f"{spelled(setup.problem.trace, setup.transform.at(z).theta)}",
             fix="give start={name: value} off the edges of the laws, or use IF2",
         )
     return slope
 
 
-def _combined(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
-    point, found = setup.chart.at(z), combine(runs)
+def _combined(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Slope:
+    point, found = setup.transform.at(z), combine(runs)
     j = point.jacobian
     log_z = np.array([r.log_z for r in runs])
     w = run_weights(log_z)
     each = point.pull(np.stack([r.mean for r in runs]))
     hessian = np.tensordot(w, np.stack([r.hessian for r in runs if r.hessian is not None]), axes=1)
-    second = setup.chart.curvature(z, found.gradient)
+    second = setup.transform.curvature(z, found.gradient)
     gradient, prior = point.pull(found.gradient), np.zeros_like(second.theta)
     if setup.with_prior:
         gradient, prior = gradient + point.d_log_prior, second.log_prior
@@ -243,7 +248,7 @@ def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 
 
 def _answer(
-    setup: Setup, method: ScoreAscent, way: _Way, share: float, interrupted: bool
+    setup: Maximization, method: ScoreAscent, way: _Way, share: float, interrupted: bool
 ) -> Ascent:
     iterates = np.array([setup.space.parameters(z)[0].copy() for z in way.iterates])
     converged = share < method.tolerance
@@ -256,7 +261,7 @@ def _answer(
         theta = iterates[-1]
         return Ascent(theta, None, iterates, report, interrupted=interrupted)
     top, error, _, _ = _average(way)
-    point = setup.chart.at(top)
+    point = setup.transform.at(top)
     natural = np.mean([s.natural for s in way.near], axis=0)
     return Ascent(
         point.theta, None, iterates, report, natural,
@@ -265,13 +270,18 @@ def _answer(
 
 
 def _paper(
-    setup: Setup, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int, bar: Progress
+    setup: Maximization,
+    method: ScoreAscent,
+    start: np.ndarray,
+    runs: Runs,
+    most: int,
+    bar: Progress,
 ) -> Ascent:
     metric = paper_metric(setup)
     way, z, interrupted = _Way([np.array(start)]), np.array(start), False
     try:
         for k in range(1, most + 1):
-            point = setup.chart.at(z)
+            point = setup.transform.at(z)
             batch = runs(z, k)
             gradient = point.pull(np.mean([r.mean for r in batch], axis=0))
             if setup.with_prior:
@@ -288,7 +298,7 @@ def _paper(
     return Ascent(iterates[-1], None, iterates, report, interrupted=interrupted)
 
 
-def paper_metric(setup: Setup) -> np.ndarray:
+def paper_metric(setup: Maximization) -> np.ndarray:
     """(F,) what turns a step in z into one of the paper's parameters: 4 for a logit, else 1.
 
     A logit is twice the paper's atanh, whose gradient is twice that in the logit.

@@ -197,7 +197,7 @@ class Smoothing:
 
 
 @dataclass(frozen=True)
-class Run:
+class SmootherRun:
     """One run: log Z, mean (P,) and mean square (P, P) of S, mean (P, P) of H or None."""
 
     log_z: float
@@ -226,7 +226,7 @@ class ParticleScore:
 def one_run(
     scores: CompleteScores, theta: np.ndarray, smoothing: Smoothing, second: bool,
     seed: np.random.SeedSequence, number: int,
-) -> Run:  # fmt: skip
+) -> SmootherRun:  # fmt: skip
     """A run of the filter and the backward pass; `number` tells the runs of one seed apart.
 
     Raises
@@ -255,26 +255,26 @@ def one_run(
         )
     hessian = scores.hessian(theta, paths).mean(axis=0) if second else None
     with np.errstate(over="ignore", invalid="ignore"):  # as in `combine`
-        return Run(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
+        return SmootherRun(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
 
 
 def several_runs(
     scores: CompleteScores, theta: np.ndarray, smoothing: Smoothing, second: bool,
     seed: np.random.SeedSequence, numbers: Sequence[int], executor: Executor | None = None,
-) -> list[Run]:  # fmt: skip
+) -> list[SmootherRun]:  # fmt: skip
     """Independent runs over an executor."""
     _ = scores.program  # generated once, before threads ask for it
     task = partial(one_run, scores, theta, smoothing, second, seed)
     return run_tasks(task, list(numbers), executor=executor)
 
 
-def combine(runs: Sequence[Run]) -> ParticleScore:
+def combine(runs: Sequence[SmootherRun]) -> ParticleScore:
     """Weighted averages of at least two runs, with their errors."""
     with np.errstate(over="ignore", invalid="ignore"):  # the squares of some scores have no number
         return _combined(runs)
 
 
-def _combined(runs: Sequence[Run]) -> ParticleScore:
+def _combined(runs: Sequence[SmootherRun]) -> ParticleScore:
     n = len(runs)
     log_z = np.array([r.log_z for r in runs])
     share = np.exp(log_z - log_z.max())
@@ -307,7 +307,7 @@ def run_weights(log_z: np.ndarray) -> np.ndarray:
     return w if 1.0 / (w @ w) >= least else np.full(len(w), 1.0 / len(w))
 
 
-def _louis(runs: Sequence[Run], w: np.ndarray) -> np.ndarray:
+def _louis(runs: Sequence[SmootherRun], w: np.ndarray) -> np.ndarray:
     """E[-H] - E[SS'] + E[S]E[S]', the last one from pairs of different runs."""
     means = np.stack([r.mean for r in runs])
     total = w @ means

@@ -13,16 +13,16 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.analysis.proposals.perturbed import perturbed
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.iterated_filtering import (
+    PerturbedFilter,
     State,
-    Swarms,
     climb,
+    if2_block,
     perturbed_model,
     step_scales,
-    swarm_block,
 )
-from ssmppl.inference.maximum.noisy_maximum import Hilltop, hilltop
+from ssmppl.inference.maximum.noisy_maximum import LocalMaximum, local_maximum
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -74,13 +74,15 @@ def setup_of(model, data, fixed=None, start=None, objective="likelihood", seed=1
     problem = pose(model, data)
     held = {k: np.asarray(v, dtype=float) for k, v in (fixed or {}).items()}
     near = {k: np.asarray(v, dtype=float) for k, v in (start or {}).items()}
-    return Setup(problem, space_of(problem, held, near), objective, held, near, seed_sequence(seed))
+    return Maximization(
+        problem, space_of(problem, held, near), objective, held, near, seed_sequence(seed)
+    )
 
 
 def swarms_of(setup, method):
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
-    return Swarms(setup.space, setup.with_prior, scales, model.moving, method.cooling)
+    return PerturbedFilter(setup.space, setup.with_prior, scales, model.moving, method.cooling)
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
@@ -92,14 +94,16 @@ def test_each_particle_carries_its_own_parameters(with_prior):
     objective = "posterior" if with_prior else "likelihood"
     setup = setup_of(series, data, {"a": 0.5, "h": 1.0}, VALUES, objective)
     swarms = swarms_of(setup, ssm.IF2())
-    swarms = Swarms(swarms.space, with_prior, 0.0 * swarms.perturbation, swarms.moving, 0.5)
+    swarms = PerturbedFilter(
+        swarms.space, with_prior, 0.0 * swarms.perturbation, swarms.moving, 0.5
+    )
     one = setup.space.z[setup.space.where]
     atoms = [one, one + np.array([0.3, 0.4, -0.3, 0.5])]  # m, phi, q, r
     exact = []
     for z in atoms:
         theta, _ = setup.space.parameters(z)
         log_p = setup.exact.log_likelihood(setup.problem.experiments, theta.copy())
-        exact.append(log_p + (setup.chart.at(z).log_prior if with_prior else 0.0))
+        exact.append(log_p + (setup.transform.at(z).log_prior if with_prior else 0.0))
     assert abs(exact[0] - exact[1]) < 3.0  # both count
     stream, n = random_state(setup.seed(1)), 40
     whole, part = [], []
@@ -123,14 +127,14 @@ def test_the_steps_cool_as_they_should():
     setup = setup_of(series, data, {"a": 0.5, "h": 1.0, "phi": 0.5, "r": 1.0})
     swarms = swarms_of(setup, ssm.IF2(cooling=cooling, perturbation=scale))
     state = State(np.zeros((2, n)), random_state(setup.seed(2)), 0)
-    state, _ = swarm_block(swarms, state, 10)
-    state, _ = swarm_block(swarms, state, passes - 10)
+    state, _ = if2_block(swarms, state, 10)
+    state, _ = if2_block(swarms, state, passes - 10)
     m, q = np.arange(passes)[:, None], np.arange(rows + 3)[None]
     factor = cooling ** ((m + q / (rows + 3)) / 50.0)
     first = np.zeros(rows + 3)
     first[[0, rows]] = 1.0
     variance = [np.sum((0.3 * factor * first) ** 2), np.sum((0.05 * factor) ** 2)]
-    assert [s.data[1] for s in setup.chart.z] == ["m", "q"]
+    assert [s.data[1] for s in setup.transform.z] == ["m", "q"]
     low, high = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], n) / n
     for drawn, expected in zip(state.swarm, variance, strict=True):
         assert low < np.mean(drawn**2) / expected < high
@@ -316,13 +320,13 @@ def tops_of_walk(objective, count, particles=300):
         seed = seed_of("walk", k)
         setup = setup_of(OPAQUE, data, start=exact.parameters, objective=objective, seed=seed)
         z = setup.space.z[setup.space.where]
-        inverse = np.linalg.pinv(setup.chart.at(z).jacobian)
+        inverse = np.linalg.pinv(setup.transform.at(z).jacobian)
         inner = inverse @ exact.covariance.to_numpy() @ inverse.T
         rng = np.random.default_rng(seed)
         beside = rng.standard_normal(2)
         beside *= 2.0 / np.linalg.norm(beside)
         begin = z + np.linalg.cholesky(inner) @ beside
-        out.append(hilltop(setup, ssm.IF2(particles=particles), begin, 0.5))
+        out.append(local_maximum(setup, ssm.IF2(particles=particles), begin, 0.5))
     return z, inner, out
 
 
@@ -333,7 +337,7 @@ def test_the_top_is_found_from_beside_it(objective):
     """From where all swarms may lag: within its own Monte Carlo error of the exact top, and that
     error is small beside the standard error."""
     z, inner, found = tops_of_walk(objective, 6 if objective == "likelihood" else 12)
-    assert all(isinstance(f, Hilltop) for f in found)
+    assert all(isinstance(f, LocalMaximum) for f in found)
     lengths = [(f.z - z) @ np.linalg.solve(f.error, f.z - z) for f in found]
     low, high = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], 2 * len(found))
     assert low < np.sum(lengths) < 1.2**2 * high  # errors that are 1.2 times too small at most
@@ -401,7 +405,7 @@ def test_filters_run_side_by_side():
 
     data = simulated(30, "workers", parameters=WALK, model=PLAIN)
     setup = replace(setup_of(OPAQUE, data, start=WALK), executor=Counting(1))
-    hilltop(setup, ssm.IF2(particles=50, points=160), setup.space.z[setup.space.where], 0.5)
+    local_maximum(setup, ssm.IF2(particles=50, points=160), setup.space.z[setup.space.where], 0.5)
     assert setup.executor.most > 10
 
 
@@ -440,14 +444,14 @@ def test_a_row_that_no_particle_can_produce_is_counted():
     setup = setup_of(model, data)
     swarms = swarms_of(setup, ssm.IF2())
     state = State(np.zeros((1, 50)), random_state(setup.seed(1)), 0)
-    _, block = swarm_block(swarms, state, 2)
+    _, block = if2_block(swarms, state, 2)
     assert block.stats["impossible"].tolist() == [1, 1]
     assert np.all(np.isfinite(block.draws["z"]))
     assert np.all(block.stats["perturbed_log_likelihood"] == -np.inf)
 
 
 def test_an_interrupt_keeps_the_passes_made(monkeypatch):
-    plain, seen = Swarms.one_pass, []
+    plain, seen = PerturbedFilter.one_pass, []
 
     def one_pass(self, swarm, iteration, stream):
         seen.append(iteration)
@@ -455,7 +459,7 @@ def test_an_interrupt_keeps_the_passes_made(monkeypatch):
             raise KeyboardInterrupt
         return plain(self, swarm, iteration, stream)
 
-    monkeypatch.setattr(Swarms, "one_pass", one_pass)
+    monkeypatch.setattr(PerturbedFilter, "one_pass", one_pass)
     setup = setup_of(models.lgss, LGSS, {"c": 0.5}, {"theta": 1.0})
     found = climb(setup, ssm.IF2(particles=50, starts=2, iterations=1000))
     assert found.interrupted
@@ -468,8 +472,8 @@ def test_swarms_travel_to_other_processes():
     setup = setup_of(models.lgss, LGSS)
     swarms = swarms_of(setup, ssm.IF2())
     state = State(np.zeros((2, 50)), random_state(setup.seed(1)), 0)
-    here = swarm_block(swarms, state, 2)[1].draws["z"]
-    there = swarm_block(pickle.loads(pickle.dumps(swarms)), state, 2)[1].draws["z"]
+    here = if2_block(swarms, state, 2)[1].draws["z"]
+    there = if2_block(pickle.loads(pickle.dumps(swarms)), state, 2)[1].draws["z"]
     np.testing.assert_array_equal(here, there)
 
 
