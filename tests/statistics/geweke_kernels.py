@@ -25,7 +25,7 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.data import unpack_parameters
-from ssmppl.inference.chains.coordinates import Metropolis, Point, WalkState
+from ssmppl.inference.chains.coordinates import ChainPoint, Metropolis, WalkState
 from ssmppl.inference.chains.gibbs import GibbsState
 from ssmppl.inference.chains.interweaving import NoiseMove
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, log_joint
@@ -103,7 +103,7 @@ class Transitions:
         self.state, block = self.sampler.step_block(begin, 1)
         return block.draws["theta"][0], np.ascontiguousarray(block.draws["path_0"][0])
 
-    def _point(self, state: WalkState, theta: np.ndarray) -> Point:
+    def _point(self, state: WalkState, theta: np.ndarray) -> ChainPoint:
         kernel: Metropolis = self.sampler.step_block.args[0]  # type: ignore[attr-defined]
         w = kernel.coordinates.at(self.free(theta))
         theta, log_density = kernel.coordinates.parameters(w)
@@ -117,7 +117,7 @@ class Transitions:
             if run is None or -np.log(self.rng.uniform()) > change:
                 run = new
         assert run is not None, "no particle survives at parameters and data drawn jointly"
-        return Point(w, theta, log_density, run, kernel.proposal.local(w, run))
+        return ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run))
 
     def free(self, theta: np.ndarray) -> np.ndarray:
         """The parameters on the unconstrained scale."""

@@ -41,8 +41,8 @@ from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
-from ssmppl.inference.maximum.newton import Top, climb, information_at
 from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.newton import Top, climb, information_at, newton_step
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
@@ -137,7 +137,7 @@ def noisy_climb(
     value, g = found
     size = 1.0
     for _ in range(MOST_STEPS):
-        step = _step(h, g)
+        step = newton_step(g, h)
         if 0.5 * g @ step < NEAR:
             break
         step *= size * _shortened(step)
@@ -151,7 +151,7 @@ def noisy_climb(
         z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
     distance, size = np.inf, 1.0
     for k in range(AVERAGED):
-        step = _step(h, g)
+        step = newton_step(g, h)
         distance = 0.5 * float(g @ step)
         step *= size * _shortened(step) / (k + 1.0)
         new = gradient(z + step)
@@ -166,14 +166,6 @@ def _shortened(step: np.ndarray) -> float:
     """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
     coordinate at all."""
     return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
-
-
-def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """H^-1 g, with the small eigenvalues of the scaled H lifted."""
-    scale = np.sqrt(np.maximum(np.diagonal(h), 1e-12))
-    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
-    values = np.maximum(values, 1e-3)
-    return (vectors @ ((vectors.T @ (g / scale)) / values)) / scale
 
 
 def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:

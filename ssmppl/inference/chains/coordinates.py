@@ -1,14 +1,13 @@
-"""The coordinates in which a Metropolis chain moves, with their Jacobian.
-
-Each parameter keeps to the unconstrained scale of `language/model/transforms.py`, or is moved
-itself, or its logarithm or reciprocal is. A proposal outside the support has density zero there.
-
-Metropolis-Hastings chains over parameters, whatever the likelihood and the proposal.
+"""Metropolis-Hastings chains over parameters, whatever the likelihood and the proposal.
 
 Metropolis et al. (1953), Hastings (1970); Schön et al. (2015), algorithms 1 and 4. With an unbiased
 estimate in place of the likelihood it is kept with the point it was made for (Andrieu and Roberts
 2009), and so is whatever else of that run the proposal goes by, so that the chain on point and run
 has the posterior for its marginal. The random walk adapts during warmup and is then held fixed.
+
+A chain moves in coordinates: each parameter keeps to the unconstrained scale of
+`language/model/transforms.py`, or is moved itself, or its logarithm or reciprocal is. A proposal
+outside the support has density zero there.
 """
 
 from __future__ import annotations
@@ -32,6 +31,8 @@ from ssmppl.language.model.transforms import transforms
 
 SCALES = ("unconstrained", "natural", "log", "reciprocal")
 STEP = 1e-3  # of finite differences, in standard deviations
+ADAPTATION_POWER = 0.66
+STARTS = 50  # runs of the likelihood at a start until one is positive
 
 
 @dataclass(frozen=True)
@@ -234,10 +235,6 @@ def local_derivatives(
     return LocalDerivatives(jacobian, twice, slope, curvature)
 
 
-ADAPTATION_POWER = 0.66
-STARTS = 50  # runs of the likelihood at a start until one is positive
-
-
 @dataclass(frozen=True)
 class LikelihoodRun:
     """What a likelihood gave at a point.
@@ -363,9 +360,7 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
         stats["log_likelihood"].append(float(point.run.log_likelihood))
         stats["lp"].append(float(point.run.log_likelihood + point.log_density))
         stats["acceptance_rate"].append(accepted)
-    return state, Block(
-        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
-    )
+    return state, Block.of(draws, stats)
 
 
 def _iterate(kernel: Metropolis, state: WalkState) -> tuple[WalkState, float]:

@@ -127,10 +127,7 @@ def gibbs_block(
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
         if further is not None:
             stats["interweaved"].append(interweaved)
-    block = Block(
-        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
-    )
-    return GibbsState(theta, generator, stream, tuning), block
+    return GibbsState(theta, generator, stream, tuning), Block.of(draws, stats)
 
 
 def draw_paths(

@@ -8,8 +8,6 @@ states follow given each kept draw by backward sampling.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -18,21 +16,13 @@ from ssmppl.inference.chains.coordinates import (
     WALK_STATES,
     ChainPoint,
     LikelihoodRun,
-    Metropolis,
-    Proposal,
-    RandomWalk,
     coordinates,
-    metropolis_block,
-    start_chain,
 )
 from ssmppl.inference.chains.pmmh import (
-    STRETCH,
-    Langevin,
     Local,
-    adapts,
     given_factor,
+    prepared_walk,
     settings_of,
-    walk_factor,
 )
 from ssmppl.inference.chains.sampling import PreparedChains, SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import MetropolisHastings
@@ -44,7 +34,7 @@ from ssmppl.inference.preparation.exact_models import (
     filter_of,
 )
 from ssmppl.inference.preparation.exact_score import exact_score
-from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.preparation.pilot import Pilot, find_mode
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.problem import Problem
@@ -121,14 +111,7 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
-    factor = walk_factor(setup, method, where, pilot, kind)
-    d = len(where)
-    tuning: Any = factor
-    move: Proposal = RandomWalk()
-    scored: np.ndarray | None = None
-    usual = 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
-    free = free_components(problem.trace, setup.held)
-    order = method.order
+    d, free, order = len(where), free_components(problem.trace, setup.held), method.order
     if order is None:
         cheap = isinstance(exact, Deterministic) and d > 2
         order = int(cheap and not _without_gradient(exact, setup, free))
@@ -136,28 +119,15 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
         raise ArgumentError(
             f"order=1 does not apply: {reason}", fix="use ssm.MetropolisHastings(order=0)"
         )
-    if order:
-        scored = free
-        if method.covariance is None:
-            factor = factor * np.sqrt(max(d, 1)) / STRETCH  # steps of one standard deviation
-        move, tuning, usual = Langevin(where, factor, newton=False), 0.0, 0.574
-    kernel = Metropolis(
-        where, ExactLikelihood(problem, setup.states, scored), move, setup.warmup,
-        setup.warmup if adapts(method) else 0,
-        usual if method.target_acceptance is None else method.target_acceptance, setup.thin,
-    )  # fmt: skip
-    starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
-    states = []
-    for chain, z in enumerate(starts):
-        generator, stream = setup.streams(chain)
-        states.append(start_chain(kernel, where.at(z), tuning, generator, stream))
+    usual = 0.574 if order else 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
+    likelihood = ExactLikelihood(problem, setup.states, free if order else None)
+    chains = prepared_walk(setup, method, likelihood, where, pilot, kind, order, usual)
     report = {
         "settings": settings_of(replace(method, order=order)),
         "likelihood": f"exact, by {filter_name(exact)}",
-        "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
-        "walk_covariance": (factor @ factor.T).tolist(),
+        **chains.report,
     }
-    return PreparedChains(partial(metropolis_block, kernel), states, report)
+    return replace(chains, report=report)
 
 
 def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray) -> str:

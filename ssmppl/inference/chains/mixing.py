@@ -1,15 +1,15 @@
-"""Whether the chains of the parameters have mixed, and a warning where they have not.
+"""Whether chains have mixed, parameters and trajectories, and a warning where they have not.
 
-A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner, "Rank-normalization, folding, and
-localization: an improved R-hat for assessing convergence of MCMC", *Bayesian Analysis* 16 (2021):
-R-hat of split chains, equations (1) to (4), of the ranks and of those of distances from the median
-(section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8) to (11)).
+Parameters: A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner, "Rank-normalization,
+folding, and localization: an improved R-hat for assessing convergence of MCMC", *Bayesian Analysis*
+16 (2021): R-hat of split chains, equations (1) to (4), of the ranks and of those of distances from
+the median (section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8)
+to (11)).
 
-How often the states of a chain change, row by row, and a warning where they hardly do.
-
-Particle Gibbs leaves the right law invariant whatever its update rate, but a row that never changes
-has not been sampled: paths of a conditional particle filter meet in the reference, the earlier the
-row the likelier (Lindsten, Jordan and Schön 2014, section 3). The rate by row is their diagnostic.
+Trajectories: particle Gibbs leaves the right law invariant whatever its update rate, but a row that
+never changes has not been sampled: paths of a conditional particle filter meet in the reference,
+the earlier the row the likelier (Lindsten, Jordan and Schön 2014, section 3). How often the states
+change, row by row, is their diagnostic.
 """
 
 from __future__ import annotations
@@ -30,6 +30,11 @@ from ssmppl.language.model.traced import Site
 APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
 FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
 LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be told
+LOW = 0.02  # share of draws at which a row changes, below which there is a warning
+STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
+Paths = tuple[np.ndarray, ...]
+PIECE = 2**25  # bytes of draws that are looked at together
+FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
 
 
 def mixing_attributes(
@@ -115,13 +120,6 @@ def _r_hat(z: np.ndarray) -> float:
     within, between = z.var(axis=1, ddof=1).mean(), n * z.mean(axis=1).var(ddof=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return float(np.sqrt((between / within + n - 1.0) / n))
-
-
-LOW = 0.02  # share of draws at which a row changes, below which there is a warning
-STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
-Paths = tuple[np.ndarray, ...]
-PIECE = 2**25  # bytes of draws that are looked at together
-FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
 
 
 @dataclass(frozen=True)

@@ -223,10 +223,8 @@ def pgas_block(
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
         if further is not None:
             stats["interweaved"].append(interweaved)
-    block = Block(
-        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
-    )
-    return PGASState(theta, tuple(paths), generator, stream, tuning, learned, watch), block
+    state = PGASState(theta, tuple(paths), generator, stream, tuning, learned, watch)
+    return state, Block.of(draws, stats)
 
 
 def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:

@@ -193,10 +193,8 @@ def rows_block(filters: Filters, state: SMC2State, n: int) -> tuple[SMC2State, B
         ess.append(share)
         rates.append(rate)
         sizes.append(state.size)
-    stats = {"ess": ess, "acceptance_rate": rates, "particles": sizes}
-    return state, Block(
-        {"log_evidence": np.array(evidence)}, {k: np.array(v) for k, v in stats.items()}
-    )
+    stats: dict[str, list[Any]] = {"ess": ess, "acceptance_rate": rates, "particles": sizes}
+    return state, Block.of({"log_evidence": evidence}, stats)
 
 
 def one_row(filters: Filters, state: SMC2State) -> tuple[SMC2State, float, float]:

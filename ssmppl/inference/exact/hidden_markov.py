@@ -1,21 +1,13 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
-The laws of data sets of one shape (`histories.py`) are handed all at once to the compiled passes.
-
-The laws of a model of finitely many values, as tables over these.
-
-They may depend on parameters, inputs, time and observations before. The densities are evaluated by
-the interpreter, over all values, rows and data sets of one shape at once.
-
-The passes over finitely many values: in ordinary numbers, or by logarithms where these will not
-do.
+The laws of the model are tables over the values; they may depend on parameters, inputs, time and
+observations before. Their densities are evaluated by the interpreter, over all values, rows and
+data sets of one shape (`histories.py`) at once, and handed to the compiled passes.
 
 A value that the data have made 1e-300 times as likely as another is no number any more, and yet it
 may be the only one that later rows leave: before a change from which no way leads back. The pass in
 ordinary numbers tells where that may have happened, and then everything is done by logarithms, at
 several times the cost.
-
-Quantiles of mixtures by their distribution functions.
 """
 
 from __future__ import annotations
@@ -45,6 +37,9 @@ from ssmppl.inference.run.ranges import without_density
 from ssmppl.language.model.traced import Trace, once_per_trace, previous
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
+HALVINGS = 200  # of an interval between any two floats that differ in size by less than 1e40
+ROUNDING = 1e-12  # by which sums of probabilities may miss a level
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -195,10 +190,6 @@ def forward(
     return Filtered(*found, log_move, logs=True), stopped
 
 
-MOST = 200  # halvings: of an interval between any two floats that differ in size by less than 1e40
-ROUNDING = 1e-12  # by which sums of probabilities may miss a level
-
-
 def inverted(
     below: Callable[[np.ndarray], np.ndarray], level: float, low: np.ndarray, high: np.ndarray,
     whole: bool,
@@ -210,7 +201,7 @@ def inverted(
         numbers.
     """
     low, high = low.copy(), high.copy()
-    for _ in range(MOST):
+    for _ in range(HALVINGS):
         middle = 0.5 * low + 0.5 * high
         if whole:
             middle = np.floor(middle)
@@ -488,9 +479,6 @@ class HiddenMarkov(FiniteLaws):
 def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(T, D, D) sums over K of products of a and b (T, K, D)."""
     return a.transpose(0, 2, 1) @ b
-
-
-T = TypeVar("T")
 
 
 def _in_order(each: Sequence[tuple[Histories, Sequence[T]]]) -> list[T]:

@@ -1,13 +1,12 @@
 """What the methods of maximum likelihood share: the question that they are set, and the answer.
 
-The module of each method has `climb(setup, method) -> Ascent`. A climb that is interrupted by
-Ctrl-C (KeyboardInterrupt) returns the best that it has, marked so, and lets the interrupt pass
-where it has nothing yet.
+The module of each method has `climb(setup, method) -> Ascent`, which `verbs/maximize.py` registers.
+A climb that is interrupted by Ctrl-C (KeyboardInterrupt) returns the best that it has, marked so,
+and lets the interrupt pass where it has nothing yet.
 
-Derivatives through the unconstrained scale: theta, log prior and log Jacobian as functions of z.
-
-Everything is derived once from `language/model/transforms.py` by symbolic differentiation. For a
-function l of theta with gradient g (P,) and Hessian H (P, P), on the unconstrained scale
+Climbs are on the unconstrained scale z (`UnconstrainedTransform`): theta, log prior and log
+Jacobian are differentiated once, as expressions, from `language/model/transforms.py`. For a
+function l of theta with gradient g (P,) and Hessian H (P, P)
 
     dl/dz = J' g,    d2l/dz2 = J' H J + sum_p g_p d2 theta_p / dz2,    J = d theta / dz.
 """

@@ -2,16 +2,13 @@
 
 Schön et al. (2015), section on direct optimisation. On linear Gaussian models, on those of
 finitely many states and on those without noise in their states the likelihood and its score are
-exact, and Newton steps with the observed information polish the result; for one scalar state see
-`py`.
+exact, and Newton steps with the observed information polish the result.
 
-Direct optimisation over a likelihood that is continuous in the parameters.
-
-The particle filter of Malik and Pitt (2011; see `codegen/kernels/particle/continuous_filters.py`)
-with common random numbers: one continuous function for each seed. Several are averaged, as
-likelihoods, which takes away most of the bias of log Z; slopes are central differences over a small
-share of the likelihood's own width, and the scatter of the seeds' slopes at the top gives the
-estimate's Monte Carlo error.
+For one scalar state the particle filter of Malik and Pitt (2011; see
+`codegen/kernels/particle/continuous_filters.py`) with common random numbers is one continuous
+function for each seed. Several are averaged, as likelihoods, which takes away most of the bias of
+log Z; slopes are central differences over a small share of the likelihood's own width, and the
+scatter of the seeds' slopes at the top gives the estimate's Monte Carlo error.
 """
 
 from __future__ import annotations
@@ -46,6 +43,10 @@ SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of th
 CURVE_STEP = 0.5  # of those for second derivatives
 FAR = 1e30
 CLOSE = 0.05  # standard deviations from the top: where the climb has arrived; counted in the error
+NEWTON_STEPS = 8
+GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
+EXACT_RESTARTS = 2
+FLATS = 3  # that a climb leaves
 
 
 class SmoothLikelihood:
@@ -228,12 +229,6 @@ def climb_smooth(setup: Maximization, method: DirectOptimization) -> Ascent:
     """Maximise over the continuous filter, on threads: it runs without Python's lock."""
     with ThreadPoolExecutor() as pool:
         return SmoothClimb(setup, method, pool).run()
-
-
-NEWTON_STEPS = 8
-GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
-EXACT_RESTARTS = 2
-FLATS = 3  # that a climb leaves
 
 
 def climb(setup: Maximization, method: DirectOptimization) -> Ascent:

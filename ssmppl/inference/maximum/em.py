@@ -1,10 +1,11 @@
 """Expectation maximisation where the smoother is exact, and so every step.
 
 Dempster, Laird and Rubin (1977); Shumway and Stoffer (1982); Schön et al. (2015), section on EM.
-The E-step takes the smoother's moments (`analysis/conjugacy/m_step.py`; for finite states sums over
-their values), the M-step is derived (`analysis/conjugacy/m_step.py`). Where the densities do not
-separate, Q is climbed as it stands, by BFGS with its symbolic gradient, evaluated over all rows at
-once.
+The E-step takes the smoother's moments; where the states take few values, sums over the values of
+x_t and over the pairs of x_{t-1} and x_t (L. Baum, T. Petrie, G. Soules and N. Weiss, *Annals of
+Mathematical Statistics* 41 (1970)). The M-step is derived (`analysis/conjugacy/m_step.py`). Where
+the densities do not separate, the expected density Q is climbed as it stands, by BFGS with its
+symbolic gradient, evaluated over all rows at once.
 
 EM nears its limit by a constant factor at each step, close to one where the states tell much more
 of the parameters than the data do. So its steps are extrapolated by SQUAREM (Varadhan and Roland
@@ -13,14 +14,6 @@ algorithm", scheme S3) on the unconstrained scale, followed by an EM step, and w
 is kept only where the exact log-likelihood is at least that of two plain steps: it never falls. The
 same extrapolation tells how far the limit still is, which, and not the length of a step, decides
 when to stop.
-
-EM where the states take few values.
-
-L. Baum, T. Petrie, G. Soules and N. Weiss, *Annals of Mathematical Statistics* 41 (1970). The
-expectations are sums over the values of x_t and over the pairs of x_{t-1} and x_t; the M-step is
-derived (`analysis/conjugacy/m_step.py`), or the expected density is climbed.
-
-The M-step of a complete-data density that does not separate: the expected density climbed.
 """
 
 from __future__ import annotations

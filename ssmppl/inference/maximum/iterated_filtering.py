@@ -59,6 +59,11 @@ from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 
+HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
+USUAL = 0.02  # standard deviation of a step
+MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row
+SWITCHED_OFF = "IF2(points=0) asks for none, nor for the Monte Carlo error"
+
 
 @dataclass(frozen=True)
 class PerturbedFilter:
@@ -156,9 +161,6 @@ def perturbed_model(space: Space, with_prior: bool) -> Perturbed:
     return perturbed(problem.trace, problem.program.missing, space.free.tolist(), with_prior)
 
 
-HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
-
-
 @dataclass(frozen=True)
 class BestEnd:
     """The best of S ends, or the mean of those that agree with it.
@@ -231,11 +233,6 @@ def _estimates(
         return repeated_estimates(problem, theta, settings, seed, range(repeats))
     except SamplingError as error:
         return error
-
-
-USUAL = 0.02  # standard deviation of a step
-MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row
-SWITCHED_OFF = "IF2(points=0) asks for none, nor for the Monte Carlo error"
 
 
 def climb(setup: Maximization, method: IF2) -> Ascent:

@@ -49,6 +49,7 @@ MEMORY = 0.3  # weight of the newest information in B
 NEAR = 3.0  # squared length of a step, in noise, below which the approach is over
 LEAST_APPROACH, LEAST_AVERAGE = 3, 10  # iterations
 GAIN = 0.6
+Runs = Callable[[np.ndarray, int], list[SmootherRun]]
 
 
 @dataclass(frozen=True)
@@ -118,9 +119,6 @@ def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
     if scores.differences:
         ascent.report["central_differences"] = scores.differences
     return ascent
-
-
-Runs = Callable[[np.ndarray, int], list[SmootherRun]]
 
 
 def _newton(

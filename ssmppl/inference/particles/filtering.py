@@ -30,6 +30,13 @@ SCHEMES = {
     "residual": RESIDUAL,
     "multinomial": MULTINOMIAL,
 }
+Arrays = tuple[np.ndarray, ...]
+Moments = tuple[np.ndarray | Arrays, ...]
+_WHAT = {
+    ALL_ZERO: "all weights are zero",
+    NAN: "a weight is nan",
+    INFINITE: "a weight is infinite",
+}
 
 
 @dataclass(frozen=True)
@@ -87,10 +94,6 @@ def filter_settings(
     return FilterSettings(
         int(particles), proposal, SCHEMES[resampling], float(ess_threshold), int(rescue)
     )
-
-
-Arrays = tuple[np.ndarray, ...]
-Moments = tuple[np.ndarray | Arrays, ...]
 
 
 def run_filter(
@@ -227,13 +230,6 @@ def full_run(
     if status != OK:
         raise failure(problem, theta, status, t, experiment)
     return out
-
-
-_WHAT = {
-    ALL_ZERO: "all weights are zero",
-    NAN: "a weight is nan",
-    INFINITE: "a weight is infinite",
-}
 
 
 def failure(

@@ -1,18 +1,17 @@
 """Score and observed information by particle smoothing.
 
 Fisher's identity: the score is the smoothed mean of the complete-data score S (Fisher 1925; Schön
-et al. 2015, section on direct optimisation); Louis' identity: the observed information is
-E[-H] - Cov(S), H the second derivatives of the complete-data log density (Louis 1982; Poyiadjis,
-Doucet and Singh 2011). Trajectories come from backward simulation; several independent runs give
-the Monte Carlo error, and pairs of them E[S]E[S]' without bias by noise.
+et al. 2015, section on direct optimisation), the derivatives of log p(x, y | theta) along a
+trajectory; Louis' identity: the observed information is E[-H] - Cov(S), H the second derivatives of
+the complete-data log density (Louis 1982; Poyiadjis, Doucet and Singh 2011). Trajectories come from
+backward simulation; several independent runs give the Monte Carlo error, and pairs of them
+E[S]E[S]' without bias by noise.
 
 The mean over a run's trajectories has a bias of order 1 / N. Times that run's estimate of the
 likelihood it is unbiased for the smoothed mean times the likelihood (P. Del Moral, A. Doucet and
 S. S. Singh, "A backward particle interpretation of Feynman-Kac formulae", *ESAIM: M2AN* 44, 2010),
 so the runs are weighted by those estimates, and the bias falls to order 1 / (N runs); not where
 the estimates scatter so much that few runs would be left.
-
-Derivatives of log p(x, y | theta) along trajectories, in numbers.
 """
 
 from __future__ import annotations
@@ -40,6 +39,8 @@ FIRST, SECOND = 6e-6, 1e-4  # steps of central differences, relative to the para
 LEAST = 1e-3  # parameters nearer to zero count as this large for a step
 
 Function = Callable[[np.ndarray, list[np.ndarray]], np.ndarray]
+LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
+LEAST_RUNS = 1.1  # of one run alone nothing is known about products of different ones
 
 
 class CompleteScores:
@@ -181,10 +182,6 @@ def complete_scores(problem: Problem, held: Collection[str] = ()) -> CompleteSco
                 where=reason.where,
             )
     return CompleteScores(problem, derived)
-
-
-LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
-LEAST_RUNS = 1.1  # of one run alone nothing is known about products of different ones
 
 
 @dataclass(frozen=True)

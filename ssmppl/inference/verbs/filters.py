@@ -1,6 +1,5 @@
-"""The verb `particle_filter`, and the form of what a filter tells.
-
-The verbs `kalman_filter` and `forward_filter`: filters that are exact.
+"""The verbs `particle_filter`, `kalman_filter` and `forward_filter`, and the form of what a filter
+tells.
 """
 
 from __future__ import annotations

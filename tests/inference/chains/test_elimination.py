@@ -19,7 +19,12 @@ from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, symbol, symbols_of, topological
-from ssmppl.inference.chains.elimination import Eliminating, Learned, asked, describe
+from ssmppl.inference.chains.elimination import (
+    Eliminating,
+    Learned,
+    describe_elimination,
+    requested_elimination,
+)
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
@@ -418,14 +423,18 @@ SHORT = {"chains": 2, "progress": False, "seed": 1}
 Y = np.exp(np.linspace(1, 2, 6))
 
 
+def described(problem, setting, held, proposal):
+    return describe_elimination(requested_elimination(problem, setting, held, proposal))
+
+
 def test_what_is_eliminated():
     problem = pose(models.scale, {"y": Y})
     for setting in (True, "auto", ("tau",), ["tau"]):
-        assert describe(asked(problem, setting, {}, "bootstrap")) == "tau (Gamma)"
-    assert describe(asked(problem, False, {}, "bootstrap")) == "none: eliminate=False"
-    held = describe(asked(problem, "auto", {"tau": np.array(2.0)}, "bootstrap"))
+        assert described(problem, setting, {}, "bootstrap") == "tau (Gamma)"
+    assert described(problem, False, {}, "bootstrap") == "none: eliminate=False"
+    held = described(problem, "auto", {"tau": np.array(2.0)}, "bootstrap")
     assert held.startswith("none: the initial law of x leaves log(1 - phi**2)")
-    better = describe(asked(problem, "auto", {}, "auxiliary"))
+    better = described(problem, "auto", {}, "auxiliary")
     assert better == "none: particles move by the proposal 'auxiliary'"
 
 

@@ -14,8 +14,8 @@ import scipy.stats as st
 
 import ssmppl as ssm
 from ssmppl.inference.chains.coordinates import coordinates, local_derivatives
-from ssmppl.inference.chains.pmmh import fitted_covariance
 from ssmppl.inference.chains.smc2 import _factor
+from ssmppl.inference.optimisation.quadratic import fitted_covariance
 from ssmppl.inference.preparation.pilot import find_mode, scale_of
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose

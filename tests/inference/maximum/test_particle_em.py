@@ -15,7 +15,7 @@ from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.m_step import fixed_point, maximiser, ratio_weights
 from ssmppl.inference.maximum.particle_em import climb as climb_particle_em
 from ssmppl.inference.maximum.psaem import (
-    State,
+    PSAEMState,
     averaged_sweep,
     climb,
     conditional_settings,
@@ -113,7 +113,7 @@ def test_blocks_neither_depend_on_their_borders_nor_on_the_process():
     maximum, settings = maximiser(setup, "PSAEM"), conditional_settings(setup, method)
     theta = np.array([2.0, 1.0])
     paths, stream = started(setup, theta, settings, "blocks")
-    state = State(theta, paths, stream, np.empty(0), 0)
+    state = PSAEMState(theta, paths, stream, np.empty(0), 0)
     whole, block = saem_block(maximum, settings, method, state, 9)
     task = pickle.loads(pickle.dumps(partial(saem_block, maximum, settings, method)))
     half, first = task(state, 4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.inference.maximum.noisy_maximum import (
+from ssmppl.inference.optimisation.quadratic import (
     LocalQuadratic,
     count,
     fit_quadratic,
