@@ -46,7 +46,7 @@ FORGETTING = 0.6  # the warmup's mean takes in sweep k with weight k^-FORGETTING
 
 
 @dataclass(frozen=True)
-class Learned:
+class EliminationState:
     """sweep : how many were made. rate : (K,) mean increment of a row."""
 
     sweep: int
@@ -89,14 +89,14 @@ class Eliminating(ParameterSteps):
     def horizon(self) -> int:
         return deterministic_memory(self.problem.trace) or 0
 
-    def begin(self, theta: np.ndarray, paths: tuple[np.ndarray, ...]) -> Learned:
+    def begin(self, theta: np.ndarray, paths: tuple[np.ndarray, ...]) -> EliminationState:
         """What a new chain begins with."""
-        return Learned(0, self._mean_increment(self._totals(theta, list(paths))))
+        return EliminationState(0, self._mean_increment(self._totals(theta, list(paths))))
 
     def sweep(
-        self, learned: Learned, theta: np.ndarray, paths: list[np.ndarray], stream: np.ndarray,
-        generator: np.random.Generator,
-    ) -> tuple[Learned, tuple[float, float]]:  # fmt: skip
+        self, learned: EliminationState, theta: np.ndarray, paths: list[np.ndarray],
+        stream: np.ndarray, generator: np.random.Generator,
+    ) -> tuple[EliminationState, tuple[float, float]]:  # fmt: skip
         """New trajectories and eliminated parameters, in place; (share of steps that changed,
         ESS / N)."""
         experiments, figures = self.problem.experiments, np.zeros(2)
@@ -123,8 +123,8 @@ class Eliminating(ParameterSteps):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """A new trajectory of one experiment (T, D), its statistics (K,), the sweep's figures.
 
-        base : statistics of the prior and the other experiments. rate : of `Learned`. rows : of
-        the old trajectory `path`.
+        base : statistics of the prior and the other experiments. rate : of `EliminationState`.
+        rows : of the old trajectory `path`.
         """
         found, module = self.made
         steps, d = path.shape

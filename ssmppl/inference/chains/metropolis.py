@@ -19,7 +19,7 @@ from ssmppl.inference.chains.coordinates import (
     coordinates,
 )
 from ssmppl.inference.chains.pmmh import (
-    Local,
+    LocalProposal,
     given_factor,
     prepared_walk,
     settings_of,
@@ -137,6 +137,6 @@ def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray)
 
 METHOD = SamplingMethod(
     prepare,
-    state_classes=(*WALK_STATES, Local, Pilot),
+    state_classes=(*WALK_STATES, LocalProposal, Pilot),
     where_slow=", or another method, such as ssm.Gibbs()",
 )

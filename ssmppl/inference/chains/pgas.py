@@ -18,7 +18,7 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.elimination import (
     Eliminating,
-    Learned,
+    EliminationState,
     describe_elimination,
     explain_elimination,
     requested_elimination,
@@ -31,7 +31,6 @@ from ssmppl.inference.chains.interweaving import (
     requested_noises,
     with_states,
 )
-from ssmppl.inference.chains.mixing import Watch, update_rate_attributes
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
@@ -56,6 +55,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.mixing import PathMovement, update_rate_attributes
 from ssmppl.inference.run.problem import Problem
 
 PARTICLES = 25
@@ -100,7 +100,7 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
         generator, stream = setup.streams(chain)
         theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
         begun = start_chain(sweeper, theta, generator, stream)
-        states.append(begun if setup.states else replace(begun, watch=Watch(setup.warmup)))
+        states.append(begun if setup.states else replace(begun, watch=PathMovement(setup.warmup)))
     report = {
         "particles": settings.particles,
         "proposal": proposal,
@@ -150,8 +150,8 @@ class PGASState:
     generator: np.random.Generator
     stream: np.ndarray
     tuning: InterweavingTuning | None = None
-    learned: Learned | None = None
-    watch: Watch | None = None
+    learned: EliminationState | None = None
+    watch: PathMovement | None = None
 
 
 def start_chain(
@@ -299,7 +299,7 @@ def _trajectories_of(plan: Derived) -> str:
 
 METHOD = SamplingMethod(
     prepare,
-    state_classes=(PGASState, InterweavingTuning, Learned, Watch, Pilot),
+    state_classes=(PGASState, InterweavingTuning, EliminationState, PathMovement, Pilot),
     by_row=lambda method: method.log_likelihood,
     attributes=update_rate_attributes,
     where_slow=", more particles, or another method, such as ssm.PMMH()",

@@ -276,7 +276,7 @@ class CorrelatedLikelihood(_KeepsPaths):
 
 
 @dataclass(frozen=True)
-class Local:
+class LocalProposal:
     """What the proposal goes by at a point: M = R R'.
 
     root, inverse : R (d, d) and its inverse. log_det : log |R|. drift : (d,) R' S / 2.
@@ -299,7 +299,7 @@ class Langevin:
     factor: np.ndarray
     newton: bool
 
-    def local(self, w: np.ndarray, run: LikelihoodRun) -> Local:
+    def local(self, w: np.ndarray, run: LikelihoodRun) -> LocalProposal:
         d, root = len(w), self.factor
         slope = np.zeros(d)
         if run.score is not None and d:
@@ -314,7 +314,7 @@ class Langevin:
             slope = np.zeros(d)
         inverse = np.linalg.inv(root)
         log_det = float(np.linalg.slogdet(root)[1])
-        return Local(root, inverse, log_det, 0.5 * root.T @ slope)
+        return LocalProposal(root, inverse, log_det, 0.5 * root.T @ slope)
 
     def propose(
         self, point: ChainPoint, tuning: float, generator: np.random.Generator
@@ -344,7 +344,7 @@ def regular_root(information: np.ndarray, factor: np.ndarray) -> np.ndarray:
     return factor @ (vectors / np.sqrt(np.clip(np.abs(values), LEAST_EIGENVALUE, MOST_EIGENVALUE)))
 
 
-def _drift(local: Local, step: float) -> np.ndarray:
+def _drift(local: LocalProposal, step: float) -> np.ndarray:
     """eps R' S / 2, cut to its longest."""
     drift = step * local.drift
     length = float(np.linalg.norm(drift))
@@ -550,7 +550,7 @@ def settings_of(method: Any) -> dict[str, Any]:
 
 METHOD = SamplingMethod(
     prepare,
-    state_classes=(*WALK_STATES, Local, Pilot, TunedParticles, Choice),
+    state_classes=(*WALK_STATES, LocalProposal, Pilot, TunedParticles, Choice),
     by_row=lambda method: True,
     where_slow=', more particles, or another method, such as ssm.PGAS(interweave="auto")',
 )

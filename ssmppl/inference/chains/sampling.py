@@ -27,7 +27,7 @@ from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.model.traced import Trace
 
 Result = TypeVar("Result")
-Chains = Sequence[ChainDraws[Any]]
+DrawnChains = Sequence[ChainDraws[Any]]
 PlanRows = list[tuple[str, str]]
 
 # Titles of what `explain` says of the methods.
@@ -115,7 +115,7 @@ def _nothing_to_say(plan: Derived) -> Mapping[str, PlanRows]:
     return {}
 
 
-def _no_attributes(problem: Problem, chains: Chains) -> dict[str, Any]:
+def _no_attributes(problem: Problem, chains: DrawnChains) -> dict[str, Any]:
     return {}
 
 
@@ -146,7 +146,7 @@ class SamplingMethod:
     state_classes: tuple[type, ...] = ()
     complete: Callable[[Any, int], Any] = lambda settings, draws: settings
     by_row: Callable[[Any], bool] = lambda settings: False
-    attributes: Callable[[Problem, Chains], dict[str, Any]] = _no_attributes
+    attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = _no_attributes
     where_slow: str = ""
     explain: Callable[[Derived], Mapping[str, PlanRows]] = _nothing_to_say
 

@@ -70,7 +70,7 @@ class Slope:
 
 
 @dataclass
-class _Way:
+class _Iterations:
     """How far a climb has come."""
 
     iterates: list[np.ndarray] = field(default_factory=list)
@@ -129,7 +129,7 @@ def _newton(
     most: int,
     bar: Progress,
 ) -> Ascent:
-    way = _Way()
+    way = _Iterations()
     z, interrupted, share = np.array(start), False, np.inf
     try:
         for k in range(most):
@@ -155,7 +155,7 @@ def _newton(
 
 
 def _safe_slope(
-    setup: Maximization, way: _Way, z: np.ndarray, runs: Runs, k: int
+    setup: Maximization, way: _Iterations, z: np.ndarray, runs: Runs, k: int
 ) -> tuple[np.ndarray, Slope]:
     """(z, slope there); where the filter fails, at a point on the way back to the last iterate."""
     for _ in range(6):
@@ -222,7 +222,7 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
     return (vectors * values) @ vectors.T
 
 
-def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _average(way: _Iterations) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """(top, Monte Carlo covariance, information, largest error in standard errors), in z."""
     information = np.mean([s.information for s in way.near], axis=0)
     complete = _positive(np.mean([s.complete for s in way.near], axis=0))
@@ -246,7 +246,7 @@ def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 
 
 def _answer(
-    setup: Maximization, method: ScoreAscent, way: _Way, share: float, interrupted: bool
+    setup: Maximization, method: ScoreAscent, way: _Iterations, share: float, interrupted: bool
 ) -> Ascent:
     iterates = np.array([setup.space.parameters(z)[0].copy() for z in way.iterates])
     converged = share < method.tolerance
@@ -276,7 +276,7 @@ def _paper(
     bar: Progress,
 ) -> Ascent:
     metric = paper_metric(setup)
-    way, z, interrupted = _Way([np.array(start)]), np.array(start), False
+    way, z, interrupted = _Iterations([np.array(start)]), np.array(start), False
     try:
         for k in range(1, most + 1):
             point = setup.transform.at(z)

@@ -147,7 +147,7 @@ def evidence(
         return _by_smc2(setup, method, executor, progress)
     chosen = _chosen(problem, method)
     if isinstance(chosen, PMMH):
-        chosen = _settled(problem, space, chosen, root)
+        chosen = _with_filter(problem, space, chosen, root)
     d = space.where.size
     if not d:
         return _without_parameters(problem, space, chosen, root)
@@ -249,8 +249,10 @@ def _chosen(
     return method
 
 
-def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedSequence) -> PMMH:
-    """The method with proposal and particles settled, as the sampler and the bridge share them."""
+def _with_filter(
+    problem: Problem, space: Space, method: PMMH, root: np.random.SeedSequence
+) -> PMMH:
+    """The method with its proposal and particles, which the sampler and the bridge share."""
     proposal, particles = method.proposal, method.particles
     if proposal == "auto" or particles is None:
         theta, _ = space.parameters(find_mode(space, root, rescue=method.rescue).z)

@@ -48,7 +48,7 @@ from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
 
 # The methods: what climbs under each class of settings.
-CLIMBS: dict[type, Callable[[Maximization, Any], Ascent]] = {
+METHODS: dict[type, Callable[[Maximization, Any], Ascent]] = {
     DirectOptimization: direct_optimization.climb,
     EM: em.climb,
     ParticleEM: particle_em.climb,
@@ -105,11 +105,11 @@ def maximize(
         raise ArgumentError(
             f"objective={objective!r}", fix=f"use one of: {listing(str(objective), OBJECTIVES)}"
         )
-    if method is not None and type(method) not in CLIMBS:
-        names = ", ".join(f"ssm.{c.__name__}(...)" for c in CLIMBS)
+    if method is not None and type(method) not in METHODS:
+        names = ", ".join(f"ssm.{c.__name__}(...)" for c in METHODS)
         raise ArgumentError(
             f"method={method!r} is no method of maximisation",
-            fix=written_as(method, CLIMBS) or f"use {names} or None",
+            fix=written_as(method, METHODS) or f"use {names} or None",
         )
     check_executor(executor)
     check_settings(method)
@@ -129,7 +129,7 @@ def maximize(
         ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
     else:
         chosen, reason = (method, "by the user") if method is not None else choose_method(setup)
-        ascent = CLIMBS[type(chosen)](setup, chosen)
+        ascent = METHODS[type(chosen)](setup, chosen)
     attrs: dict[str, Any] = {
         "model": problem.trace.name,
         "method": type(chosen).__name__ if chosen is not None else NO_METHOD,

@@ -16,7 +16,6 @@ from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
-from ssmppl.inference.chains.mixing import mixing_attributes
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
 from ssmppl.inference.checkpoints.chains import ChainFile
@@ -31,6 +30,7 @@ from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, observes
+from ssmppl.inference.run.mixing import mixing_attributes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.language.model.model import Model

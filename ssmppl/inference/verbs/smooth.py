@@ -1,7 +1,7 @@
 """The verb `smooth`: states given all of the data, at known parameters.
 
-A method finds draws from the joint law of the states, or moments of the marginal ones (`Found`);
-`METHODS` has the function of each, under the class of its settings.
+A method finds draws from the joint law of the states, or moments of the marginal ones
+(`SmoothedStates`); `METHODS` has the function of each, under the class of its settings.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class SmoothingSetup:
 
 
 @dataclass(frozen=True)
-class Found:
+class SmoothedStates:
     """What a method gives for one experiment: draws (M, T, D), or moments; and its report.
 
     moments : mean (T, D), covariance (T, D, D), cross (T, D, D), quantiles (T, P, D).
@@ -88,7 +88,7 @@ class Found:
     over_time: Mapping[str, np.ndarray] | None = None
 
 
-def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[Found]:
+def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[SmoothedStates]:
     """Exact moments, or exact draws, of a linear Gaussian model."""
     _without_particles(setup, method)
     model = kalman_model(setup.problem.trace)
@@ -104,7 +104,7 @@ def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[Found]:
     return _exact_moments(moments, spreads)
 
 
-def by_forward_backward(setup: SmoothingSetup, method: ForwardBackward) -> list[Found]:
+def by_forward_backward(setup: SmoothingSetup, method: ForwardBackward) -> list[SmoothedStates]:
     """Exact moments, or exact draws, where states take finitely many values."""
     _without_particles(setup, method)
     model = hidden_markov(setup.problem.trace)
@@ -129,19 +129,21 @@ def _without_particles(setup: SmoothingSetup, method: SmoothingMethod) -> None:
 
 def _exact_draws(
     setup: SmoothingSetup, model: KalmanModel | HiddenMarkov, log_likelihoods: Sequence[float]
-) -> list[Found]:
+) -> list[SmoothedStates]:
     experiments = setup.problem.experiments
     streams = [random_state(setup.root, i) for i in range(len(experiments))]
     drawn = model.draw_each(experiments, setup.theta, streams, setup.trajectories or 0)
     pairs = zip(drawn, log_likelihoods, strict=True)
-    return [Found({"log_likelihood": v}, paths=paths) for paths, v in pairs]
+    return [SmoothedStates({"log_likelihood": v}, paths=paths) for paths, v in pairs]
 
 
 def _exact_moments(
     moments: Sequence[SmoothedMoments], spreads: Sequence[np.ndarray]
-) -> list[Found]:
+) -> list[SmoothedStates]:
     return [
-        Found({"log_likelihood": m.log_likelihood}, moments=(m.mean, m.covariance, m.cross, s))
+        SmoothedStates(
+            {"log_likelihood": m.log_likelihood}, moments=(m.mean, m.covariance, m.cross, s)
+        )
         for m, s in zip(moments, spreads, strict=True)
     ]
 
@@ -179,7 +181,7 @@ def _check_draws(setup: SmoothingSetup, draws: int) -> None:
     check_room(f"{draws} trajectories of {rows} rows", numbers, "give fewer trajectories")
 
 
-def by_ffbsi(setup: SmoothingSetup, method: FFBSi) -> list[Found]:
+def by_ffbsi(setup: SmoothingSetup, method: FFBSi) -> list[SmoothedStates]:
     """Independent draws, given a particle filter's particles."""
     if method.kernel != "genealogy":
         need_density(setup.problem.trace, f'FFBSi(kernel="{method.kernel}")', "smooth")
@@ -203,11 +205,11 @@ def by_ffbsi(setup: SmoothingSetup, method: FFBSi) -> list[Found]:
         over_time = {"distinct": distinct(paths), "ess": system.ess}
         if not marginal:
             report |= collapse(over_time["distinct"], system, draws, e, COLLAPSED)
-        out.append(Found(report, paths=paths, over_time=over_time))
+        out.append(SmoothedStates(report, paths=paths, over_time=over_time))
     return out
 
 
-def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[Found]:
+def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[SmoothedStates]:
     """Moments, each row's from the ancestors of particles some rows later."""
     if setup.trajectories is not None:
         raise ArgumentError(
@@ -230,11 +232,11 @@ def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[Found]:
         over_time = {"distinct": m.distinct, "ess": system.ess}
         n = settings.particles
         report |= collapse(m.distinct, system, n, e, COLLAPSED)
-        out.append(Found(report, moments=moments, over_time=over_time))
+        out.append(SmoothedStates(report, moments=moments, over_time=over_time))
     return out
 
 
-def by_pgas(setup: SmoothingSetup, method: PGAS) -> list[Found]:
+def by_pgas(setup: SmoothingSetup, method: PGAS) -> list[SmoothedStates]:
     """Successive trajectories of one chain at fixed parameters."""
     draws = TRAJECTORIES if setup.trajectories is None else setup.trajectories
     if method.particles is None and setup.particles is not None:
@@ -252,12 +254,12 @@ def by_pgas(setup: SmoothingSetup, method: PGAS) -> list[Found]:
     out = []
     for i in range(len(setup.problem.experiments)):
         paths = chain.draws[f"path_{i}"]
-        out.append(Found(report, paths=paths, over_time={"distinct": distinct(paths)}))
+        out.append(SmoothedStates(report, paths=paths, over_time={"distinct": distinct(paths)}))
     return out
 
 
 # The methods, under the classes of their settings, and what they may be called by.
-METHODS: dict[type, Callable[[SmoothingSetup, Any], list[Found]]] = {
+METHODS: dict[type, Callable[[SmoothingSetup, Any], list[SmoothedStates]]] = {
     KalmanSmoother: by_kalman,
     ForwardBackward: by_forward_backward,
     FFBSi: by_ffbsi,
@@ -385,7 +387,7 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
 
 
 def _dataset(
-    setup: SmoothingSetup, experiment: Experiment, found: Found, attrs: dict[str, Any]
+    setup: SmoothingSetup, experiment: Experiment, found: SmoothedStates, attrs: dict[str, Any]
 ) -> xr.Dataset:
     trace = setup.problem.trace
     dims: dict[str, list[str]] = {}

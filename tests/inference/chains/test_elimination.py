@@ -21,7 +21,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, symbol, symbols_of, topological
 from ssmppl.inference.chains.elimination import (
     Eliminating,
-    Learned,
+    EliminationState,
     describe_elimination,
     requested_elimination,
 )
@@ -253,7 +253,7 @@ def changes(name, kind, draws=2000, sweeps=6, names=None):
     rng, stream, rows = np.random.default_rng(5), random_state(np.random.SeedSequence(3)), []
     first, theta, paths = posed(name, 3, kind, names)
     # fixed numbers, of another draw; particles are few and the base is worth much, to show faults
-    learned = Learned(0, first.begin(theta, tuple(paths)).rate)
+    learned = EliminationState(0, first.begin(theta, tuple(paths)).rate)
     first = replace(first, particles=4, worth=4.0)
     made = first.made
     for i in range(draws):

@@ -10,6 +10,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.inference.methods import methods
 from ssmppl.inference.methods.settings import rules_of
+from ssmppl.inference.verbs.sample import METHODS
 
 model = ssm.Model("level")
 
@@ -86,7 +87,6 @@ def goes_on(method, name, value):
     return any(value == fine for fine in FINE.get((type(method).__name__, name), []))
 
 
-SAMPLERS = ("MetropolisHastings", "Gibbs", "PMMH", "PGAS", "SMC2")
 CALLS = [
     pytest.param(
         method,
@@ -103,7 +103,7 @@ CALLS = [
 
 def run(method):
     kind = type(method).__name__
-    if kind in SAMPLERS:
+    if type(method) in METHODS:
         few = {"draws": 4, "warmup": 4, "chains": 1}
         return ssm.sample(model, DATA, method, **few, seed=1, progress=False)
     if kind in ("FFBSi", "FixedLag"):

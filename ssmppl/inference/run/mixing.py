@@ -123,7 +123,7 @@ def _r_hat(z: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class Watch:
+class PathMovement:
     """How the trajectories of a chain have moved, for one whose draws leave them out.
 
     waiting : draws of the warmup to come. draws : n since then. Of these for each experiment,
@@ -140,21 +140,21 @@ class Watch:
     square: Paths = ()
 
     @np.errstate(invalid="ignore", over="ignore")  # as in `movement`
-    def after(self, paths: Sequence[np.ndarray]) -> Watch:
+    def after(self, paths: Sequence[np.ndarray]) -> PathMovement:
         """With one more draw (Welford 1962)."""
         if self.waiting:
             return replace(self, waiting=self.waiting - 1)
         new, n = tuple(p.copy() for p in paths), self.draws + 1
         if n == 1:
             none = tuple(np.zeros_like(p) for p in new)
-            return Watch(0, 1, new, new, none, new, none)
+            return PathMovement(0, 1, new, new, none, new, none)
         off = [x - m for x, m in zip(new, self.mean, strict=True)]
         mean = tuple(m + o / n for m, o in zip(self.mean, off, strict=True))
         apart = [x - m for x, m in zip(new, mean, strict=True)]
         square = tuple(s + o * a for s, o, a in zip(self.square, off, apart, strict=True))
         pairs = zip(self.changed, new, self.last, strict=True)
         changed = tuple(c + (x != before) for c, x, before in pairs)
-        return Watch(0, n, self.first, new, changed, mean, square)
+        return PathMovement(0, n, self.first, new, changed, mean, square)
 
 
 def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
@@ -244,7 +244,9 @@ def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def watched_movement(watches: Sequence[Watch], i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def watched_movement(
+    watches: Sequence[PathMovement], i: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `movement`, of experiment i of chains that were watched."""
     changed = np.stack([w.changed[i] for w in watches])
     start = watches[0].first[i]
