@@ -238,6 +238,10 @@ class Maximization:
     def with_prior(self) -> bool:
         return self.objective == "posterior"
 
+    def log_prior(self, z: np.ndarray) -> float:
+        """What the prior adds to the objective at z (F,)."""
+        return self.transform.at(z).log_prior if self.with_prior else 0.0
+
     @cached_property
     def pilot(self) -> Pilot:
         """A mode found by a particle filter from the space's own point."""
@@ -264,9 +268,7 @@ class Maximization:
     def exact_objective(self, z: np.ndarray) -> float:
         """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""
         value = self.exact_at(z)
-        if self.with_prior and value > -np.inf:
-            value += self.transform.at(z).log_prior
-        return value
+        return value + self.log_prior(z) if value > -np.inf else value
 
     def space_at(self, theta: np.ndarray) -> np.ndarray:
         """(F,) the unconstrained place of theta (P,)."""
@@ -285,6 +287,12 @@ class Maximization:
             information = information + self.transform.curvature(z, slope).theta
         with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
             return inverse.T @ information @ inverse
+
+    def natural_error(self, z: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """(P, P) the covariance of an estimate in theta, from that in z (F, F)."""
+        jacobian = self.transform.at(z).jacobian
+        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
+            return jacobian @ error @ jacobian.T
 
     def exact_at(self, z: np.ndarray) -> float:
         """The exact log-likelihood at z (F,); -inf off the support, and where there is none."""

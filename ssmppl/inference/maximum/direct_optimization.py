@@ -124,7 +124,8 @@ class SmoothClimb:
         }  # fmt: skip
         return Ascent(
             theta, None, np.array(self.iterates), report,
-            self._natural(information), self._natural_error(error), interrupted,
+            None if information is None else self.setup.natural(self.best, information),
+            None if error is None else self.setup.natural_error(self.best, error), interrupted,
         )  # fmt: skip
 
     def log_z(self, z: np.ndarray) -> np.ndarray:
@@ -138,13 +139,10 @@ class SmoothClimb:
 
     def value(self, z: np.ndarray) -> float:
         """The objective: log of the mean likelihood, with the prior where it counts."""
-        value = _log_mean(self.log_z(z)) + self._prior(z)
+        value = _log_mean(self.log_z(z)) + self.setup.log_prior(z)
         if value > self.best_value:
             self.best, self.best_value = np.array(z), value
         return value
-
-    def _prior(self, z: np.ndarray) -> float:
-        return self.setup.transform.at(z).log_prior if self.setup.with_prior else 0.0
 
     def _slope(self, function: Any, z: np.ndarray) -> np.ndarray:
         """Central differences in units of the width, last axis F."""
@@ -186,7 +184,7 @@ class SmoothClimb:
                                     - self._at(z - a + b) + self._at(z - a - b))  # fmt: skip
                 curvature[i, j] = curvature[j, i] = -total / CURVE_STEP**2
         slopes = self._slope(self.log_z, z)  # (S, F)
-        whole_slope = self._slope(lambda v: _log_mean(self.log_z(v)) + self._prior(v), z)
+        whole_slope = self._slope(lambda v: _log_mean(self.log_z(v)) + self.setup.log_prior(v), z)
         if not (np.all(np.isfinite(curvature)) and np.all(np.isfinite(slopes))):
             return np.inf, None, None
         scale = np.outer(self.unit, self.unit)
@@ -210,14 +208,6 @@ class SmoothClimb:
     def _prior_curve(self, z: np.ndarray) -> np.ndarray:
         """Second derivatives of the log prior in z."""
         return self.setup.transform.curvature(z, np.zeros(len(self.setup.space.theta))).log_prior
-
-    def _natural(self, information: np.ndarray | None) -> np.ndarray | None:
-        return None if information is None else self.setup.natural(self.best, information)
-
-    def _natural_error(self, error: np.ndarray | None) -> np.ndarray | None:
-        jacobian = self.setup.transform.at(self.best).jacobian
-        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
-            return None if error is None else jacobian @ error @ jacobian.T
 
 
 def _log_mean(log_z: np.ndarray) -> float:

@@ -185,12 +185,8 @@ def best_end(setup: Maximization, method: IF2, ends: np.ndarray) -> BestEnd:
     Ends agree where their log-likelihoods differ by less than half the width of a 0.95 interval of
     a profile, and two standard errors.
     """
-
-    def prior(z: np.ndarray) -> float:
-        return setup.transform.at(z).log_prior if setup.with_prior else 0.0
-
     values, errors = evaluate(setup, method, ends, 0)
-    heights = values + np.array([prior(z) for z in ends])
+    heights = values + np.array([setup.log_prior(z) for z in ends])
     best = int(np.argmax(heights))
     with np.errstate(invalid="ignore"):  # none is near where all likelihoods are zero
         near = heights[best] - heights <= HALF_INTERVAL + 2.0 * np.hypot(errors, errors[best])
@@ -198,7 +194,7 @@ def best_end(setup: Maximization, method: IF2, ends: np.ndarray) -> BestEnd:
     if near.sum() > 1:
         middle = ends[near].mean(axis=0)
         (own,), (own_noise,) = evaluate(setup, method, middle[None], len(ends))
-        if own + prior(middle) >= heights[best]:
+        if own + setup.log_prior(middle) >= heights[best]:
             z, value, noise, pooled = middle, own, own_noise, True
     return BestEnd(z, float(value), float(noise), values, errors, best, near, pooled)
 
@@ -274,9 +270,7 @@ def climb(setup: Maximization, method: IF2) -> Ascent:
     by_particles = isinstance(setup.exact, NotApplicable)
     if isinstance(found, LocalMaximum):
         z = found.z
-        jacobian = setup.transform.at(z).jacobian
-        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
-            error = jacobian @ found.error @ jacobian.T
+        error = setup.natural_error(z, found.error)
         report |= {"beyond_the_swarms": found.moved, "estimate": f"{found}, the search for which "
                    f"began at the {report['estimate']}"}  # fmt: skip
         if by_particles:
@@ -326,9 +320,7 @@ def maximum_near(
         (value,), (error,) = evaluate(setup, method, found.z[None], number + 1)
     except SamplingError:
         value, error = -np.inf, 0.0
-    gain = value - ends.value
-    if setup.with_prior:
-        gain += setup.transform.at(found.z).log_prior - setup.transform.at(ends.z).log_prior
+    gain = value - ends.value + (setup.log_prior(found.z) - setup.log_prior(ends.z))
     if not gain > -HALF_INTERVAL - 2.0 * np.hypot(error, ends.noise):
         return NotApplicable("where the fitted quadratic has its top, the likelihood is low")
     return found

@@ -249,9 +249,7 @@ def log_densities(
         ]
         task = partial(_estimates, setup.space, settings)
         log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
-    if setup.with_prior:
-        log_z = log_z + np.array([setup.transform.at(z).log_prior for z in points])
-    return log_z
+    return log_z + np.array([setup.log_prior(z) for z in points])
 
 
 def _estimates(

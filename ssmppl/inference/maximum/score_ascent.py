@@ -259,11 +259,10 @@ def _answer(
         theta = iterates[-1]
         return Ascent(theta, None, iterates, report, interrupted=interrupted)
     top, error, _, _ = _average(way)
-    point = setup.transform.at(top)
     natural = np.mean([s.natural for s in way.near], axis=0)
     return Ascent(
-        point.theta, None, iterates, report, natural,
-        point.jacobian @ error @ point.jacobian.T, interrupted,
+        setup.transform.at(top).theta, None, iterates, report, natural,
+        setup.natural_error(top, error), interrupted,
     )  # fmt: skip
 
 

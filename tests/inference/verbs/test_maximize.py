@@ -356,7 +356,7 @@ def test_an_ascent_may_know_its_likelihood_and_its_error(monkeypatch):
         error[0, 0] = 0.25
         return Ascent(theta, -7.0, theta[None], {"converged": True}, np.diag([4.0, 0.0]), error)
 
-    monkeypatch.setitem(verb.CLIMBS, ssm.DirectOptimization, climb)
+    monkeypatch.setitem(verb.METHODS, ssm.DirectOptimization, climb)
     data = {"y": datasets.load("lgss_main_text")["y"]}
     estimate = ssm.maximize(models.lgss, data, fixed={"c": 0.5}, progress=False)
     assert estimate.log_likelihood == -7.0
