@@ -43,89 +43,6 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class FiniteLaws(Scored):
-    """A traced model as one of finitely many values (K, D)."""
-
-    form: FiniteStates
-    _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
-
-    @property
-    def values(self) -> np.ndarray:
-        return self.form.values
-
-    def histories_of(self, experiments: Iterable[Experiment]) -> tuple[Histories, ...]:
-        entries = max(1, ENTRIES // len(self.values) ** 2)
-        return histories(self.trace, tuple(experiments), entries)
-
-    def density(self, role: str, h: Histories, by: Expr | None = None) -> Expr:
-        """The log density of a role, or its derivative by a parameter."""
-        missing = Missing(partial=h.partial)
-        key = f"{role} {sorted(h.partial)}"
-        if key not in self._densities:
-            total = constant(0.0)
-            for t in terms(self.trace, role, missing):
-                total = total + t.guarded()
-            self._densities[key] = total
-        if by is None:
-            return self._densities[key]
-        slope = f"{key} by {by!r}"
-        if slope not in self._densities:
-            self._densities[slope] = differentiate([self._densities[key]], by)[0]
-        return self._densities[slope]
-
-    def expected(
-        self, h: Histories, theta: np.ndarray, role: str, expressions: Sequence[Expr],
-        law: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """Sums over data sets, rows and values of each expression, weighed by a law of `laws`: of
-        pairs for "transition". What has no weight does not count, be it infinite."""
-        out = np.zeros(len(expressions))
-        law = law * h.weights.reshape(-1, *(1,) * (law.ndim - 1))
-        for rows, found in self._by_rows(expressions, h, theta, role):
-            own = law[:, rows]
-            out += [np.sum(own * np.where(own > 0.0, values, 0.0)) for values in found]
-        return out
-
-    def over_values(
-        self, expression: Expr, h: Histories, theta: np.ndarray, role: str
-    ) -> np.ndarray:
-        """(Q, R, K), or (Q, R, K, K) over x_{t-1} and x_t for "transition"; Q is S, or 1 where it
-        is the same for all histories, and R is T, or 1 where it is the same in all rows (and for
-        "initial")."""
-        parts = []
-        for _, (found,) in self._by_rows([expression], h, theta, role):
-            parts.append(found)
-            if found.shape[1] == 1:
-                break
-        return np.ascontiguousarray(np.concatenate(parts, axis=1) if parts[1:] else parts[0])
-
-    def _by_rows(
-        self, expressions: Sequence[Expr], h: Histories, theta: np.ndarray, role: str
-    ) -> Iterator[tuple[slice, list[np.ndarray]]]:
-        """The rows of a role, and each expression over them as of `over_values`, as many rows at a
-        time as memory allows."""
-        size, pair = len(self.values), role == "transition"
-        given: dict[Expr, np.ndarray] = dict(zip(self.trace.parameter_symbols, theta, strict=True))
-        for s, column in zip(self.trace.state_symbols, self.values.T, strict=True):
-            given[s] = column
-            if pair:
-                given[previous(s)] = column[:, None]
-        shape = (size, size) if pair else (size,)
-        last = 1 if role == "initial" else h.steps
-        step = max(2, ENTRIES // (h.size * int(np.prod(shape)) * max(1, len(expressions))))
-        for a in range(0, last, step):
-            rows = slice(a, min(a + step, last))
-            own = {s: v[:, rows].reshape(len(v), -1, *(1,) * len(shape))
-                   for s, v in h.rows.items()}  # fmt: skip
-            found = []
-            for values in evaluate(expressions, {**given, **own}):
-                values = np.asarray(values, dtype=float)
-                values = values.reshape((1,) * (2 + len(shape) - values.ndim) + values.shape)
-                found.append(np.broadcast_to(values, (*values.shape[:2], *shape)))
-            yield rows, found
-
-
-@dataclass(frozen=True)
 class Filtered:
     """What the forward pass tells of one experiment (T rows, K values).
 
@@ -217,8 +134,88 @@ def inverted(
 
 
 @dataclass(frozen=True)
-class HiddenMarkov(FiniteLaws):
-    """A traced model as one of finitely many values (K, D), and its exact passes."""
+class HiddenMarkov(Scored):
+    """A traced model as one of finitely many values (K, D): its laws as tables over these, and its
+    exact passes."""
+
+    form: FiniteStates
+    _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
+
+    # -- tables
+    @property
+    def values(self) -> np.ndarray:
+        return self.form.values
+
+    def histories_of(self, experiments: Iterable[Experiment]) -> tuple[Histories, ...]:
+        entries = max(1, ENTRIES // len(self.values) ** 2)
+        return histories(self.trace, tuple(experiments), entries)
+
+    def density(self, role: str, h: Histories, by: Expr | None = None) -> Expr:
+        """The log density of a role, or its derivative by a parameter."""
+        missing = Missing(partial=h.partial)
+        key = f"{role} {sorted(h.partial)}"
+        if key not in self._densities:
+            total = constant(0.0)
+            for t in terms(self.trace, role, missing):
+                total = total + t.guarded()
+            self._densities[key] = total
+        if by is None:
+            return self._densities[key]
+        slope = f"{key} by {by!r}"
+        if slope not in self._densities:
+            self._densities[slope] = differentiate([self._densities[key]], by)[0]
+        return self._densities[slope]
+
+    def expected(
+        self, h: Histories, theta: np.ndarray, role: str, expressions: Sequence[Expr],
+        law: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
+        """Sums over data sets, rows and values of each expression, weighed by a law of `laws`: of
+        pairs for "transition". What has no weight does not count, be it infinite."""
+        out = np.zeros(len(expressions))
+        law = law * h.weights.reshape(-1, *(1,) * (law.ndim - 1))
+        for rows, found in self._by_rows(expressions, h, theta, role):
+            own = law[:, rows]
+            out += [np.sum(own * np.where(own > 0.0, values, 0.0)) for values in found]
+        return out
+
+    def over_values(
+        self, expression: Expr, h: Histories, theta: np.ndarray, role: str
+    ) -> np.ndarray:
+        """(Q, R, K), or (Q, R, K, K) over x_{t-1} and x_t for "transition"; Q is S, or 1 where it
+        is the same for all histories, and R is T, or 1 where it is the same in all rows (and for
+        "initial")."""
+        parts = []
+        for _, (found,) in self._by_rows([expression], h, theta, role):
+            parts.append(found)
+            if found.shape[1] == 1:
+                break
+        return np.ascontiguousarray(np.concatenate(parts, axis=1) if parts[1:] else parts[0])
+
+    def _by_rows(
+        self, expressions: Sequence[Expr], h: Histories, theta: np.ndarray, role: str
+    ) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """The rows of a role, and each expression over them as of `over_values`, as many rows at a
+        time as memory allows."""
+        size, pair = len(self.values), role == "transition"
+        given: dict[Expr, np.ndarray] = dict(zip(self.trace.parameter_symbols, theta, strict=True))
+        for s, column in zip(self.trace.state_symbols, self.values.T, strict=True):
+            given[s] = column
+            if pair:
+                given[previous(s)] = column[:, None]
+        shape = (size, size) if pair else (size,)
+        last = 1 if role == "initial" else h.steps
+        step = max(2, ENTRIES // (h.size * int(np.prod(shape)) * max(1, len(expressions))))
+        for a in range(0, last, step):
+            rows = slice(a, min(a + step, last))
+            own = {s: v[:, rows].reshape(len(v), -1, *(1,) * len(shape))
+                   for s, v in h.rows.items()}  # fmt: skip
+            found = []
+            for values in evaluate(expressions, {**given, **own}):
+                values = np.asarray(values, dtype=float)
+                values = values.reshape((1,) * (2 + len(shape) - values.ndim) + values.shape)
+                found.append(np.broadcast_to(values, (*values.shape[:2], *shape)))
+            yield rows, found
 
     # -- likelihood and laws
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
