@@ -25,9 +25,9 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.data import unpack_parameters
-from ssmppl.inference.chains.coordinates import ChainPoint, Metropolis, WalkState
 from ssmppl.inference.chains.gibbs import GibbsState
 from ssmppl.inference.chains.interweaving import NoiseMove
+from ssmppl.inference.chains.metropolis_kernel import ChainPoint, Metropolis, WalkState
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, log_joint
 from ssmppl.inference.chains.pgas import PGASState
 from ssmppl.inference.chains.sampling import PreparedChains, SamplingSetup

@@ -52,7 +52,7 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.chains.coordinates import RandomWalk
+from ssmppl.inference.chains.metropolis_kernel import RandomWalk
 from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.preparation.exact_models import ExactModel

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.coordinates import (
+from ssmppl.inference.chains.metropolis_kernel import (
     WALK_STATES,
     ChainPoint,
     LikelihoodRun,

@@ -36,7 +36,7 @@ from ssmppl.codegen.modules.filter_variants import (
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.coordinates import (
+from ssmppl.inference.chains.metropolis_kernel import (
     ADAPTATION_POWER,
     WALK_STATES,
     ChainPoint,

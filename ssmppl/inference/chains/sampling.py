@@ -150,6 +150,11 @@ class SamplingMethod:
     where_slow: str = ""
     explain: Callable[[Derived], Mapping[str, PlanRows]] = _nothing_to_say
 
+    @property
+    def markov(self) -> bool:
+        """Whether its draws are Markov chains, which need warmup and draw the states too."""
+        return self.prepare is not None
+
     def draw(
         self, setup: SamplingSetup, settings: Any, draws: int, executor: Executor | None,
         progress: bool,

@@ -241,7 +241,7 @@ def _from_prior(
     check_drawable(traced)
     check_names(traced, experiments)
     theta = draw_prior(
-        traced, np.random.default_rng(root), draws, instead="or posterior draws by idata="
+        traced, np.random.default_rng(root), draws, alternative="or posterior draws by idata="
     )
     prior = {n: v[None] for n, v in unpack_parameters(traced, theta).items()}
     over_time: list[str] = []

@@ -142,14 +142,13 @@ def sample(
             f"method={method!r} is no method of sampling",
             fix=written_as(method, METHODS) or f"use {names} or None",
         )
-    if kind.prepare is None:  # no Markov chains, which need warmup and draw the states
+    if not kind.markov:
         states, warmup, thin = False, 0, 1
     chosen = kind.complete(chosen, draws)
     if not states and all(name in held for name in problem.trace.parameters):
-        alone = f"{type(chosen).__name__} draws parameters only"
+        what = "states=False" if kind.markov else f"{type(chosen).__name__} draws parameters only"
         raise ArgumentError(
-            "there is nothing to draw: no parameter is free, and "
-            + (alone if kind.prepare is None else "states=False"),
+            f"there is nothing to draw: no parameter is free, and {what}",
             fix="draw the states, by another method than SMC2 and without states=False, or leave a "
             "parameter out of fixed=",
         )
@@ -176,7 +175,7 @@ def sample(
     }  # fmt: skip
     attrs |= kind.attributes(problem, result)
     whole = stack(result) if kept is None else kept.stack(result)
-    if kind.prepare is not None:
+    if kind.markov:
         free = free_components(problem.trace, held)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
         theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])

@@ -13,7 +13,7 @@ import pytest
 import scipy.stats as st
 
 import ssmppl as ssm
-from ssmppl.inference.chains.coordinates import coordinates, local_derivatives
+from ssmppl.inference.chains.metropolis_kernel import coordinates, local_derivatives
 from ssmppl.inference.chains.smc2 import _factor
 from ssmppl.inference.optimisation.quadratic import fitted_covariance
 from ssmppl.inference.preparation.pilot import find_mode, scale_of
