@@ -67,16 +67,10 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     """Derive the updates, find a mode, and start the chains from particle filters."""
     problem, space = setup.problem, setup.space
     need_density(problem.trace, "PGAS", "sample")
-    memory = deterministic_memory(problem.trace)
-    usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
-    particles = usual if method.particles is None else method.particles
-    proposal = method.proposal
-    if proposal == "auto":
-        by_transition = method.eliminate not in (False, "auto")
-        proposal = "bootstrap" if by_transition else pgas_proposal(problem)
-    problem.proposal(proposal)
-    eliminated = requested_elimination(problem, method.eliminate, setup.held, proposal)
-    settings = FilterSettings(int(particles), proposal)
+    by_transition = method.proposal == "auto" and method.eliminate not in (False, "auto")
+    proposal = "bootstrap" if by_transition else method.proposal
+    settings = conditional_settings(problem, method.particles, proposal)
+    eliminated = requested_elimination(problem, method.eliminate, setup.held, settings.proposal)
     requested_noises(problem, method.interweave, None)  # refused before anything is compiled
     if space.where.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root))
@@ -103,9 +97,9 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
         states.append(begun if setup.states else replace(begun, watch=PathMovement(setup.warmup)))
     report = {
         "particles": settings.particles,
-        "proposal": proposal,
+        "proposal": settings.proposal,
         "settings": asdict(method),
-        "ancestor_sampling": memory is not None,
+        "ancestor_sampling": deterministic_memory(problem.trace) is not None,
         "plan": plan,
         "eliminated": describe_elimination(eliminated),
         "interweaving": interweaved,
@@ -113,6 +107,17 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     }
     step = partial(pgas_block, sweeper, setup.thin, method.log_likelihood)
     return PreparedChains(step, states, report)
+
+
+def conditional_settings(problem: Problem, particles: int | None, proposal: str) -> FilterSettings:
+    """Of the conditional particle filter: what was asked for, else what suits the model."""
+    if proposal == "auto":
+        proposal = pgas_proposal(problem)
+    problem.proposal(proposal)
+    if particles is None:
+        joined = deterministic_memory(problem.trace) is not None
+        particles = PARTICLES if joined else PARTICLES_WITHOUT_ANCESTORS
+    return FilterSettings(int(particles), proposal)
 
 
 def pgas_proposal(problem: Problem) -> str:

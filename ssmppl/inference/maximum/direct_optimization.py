@@ -49,6 +49,29 @@ EXACT_RESTARTS = 2
 FLATS = 3  # that a climb leaves
 
 
+def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
+    """Maximise; see the module.
+
+    Raises
+    ------
+    ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
+    """
+    if isinstance(setup.exact, NotApplicable):
+        reason = smooth_filter_applies(setup.problem.trace)
+        if reason is not None:
+            raise ArgumentError(
+                f"DirectOptimization needs a linear Gaussian model, or one scalar state: "
+                f"{setup.exact.reason}; {reason.reason}",
+                fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
+                where=reason.where or setup.exact.where,
+            )
+    with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
+        if isinstance(setup.exact, NotApplicable):
+            with ThreadPoolExecutor() as pool:  # the filter runs without Python's lock
+                return SmoothClimb(setup, method, pool).run()
+        return ExactClimb(setup, setup.exact, method).run()
+
+
 class SmoothLikelihood:
     """log Z of S seeds as continuous functions of theta (P,)."""
 
@@ -213,34 +236,6 @@ class SmoothClimb:
 def _log_mean(log_z: np.ndarray) -> float:
     top = float(np.max(log_z))
     return top if not np.isfinite(top) else top + float(np.log(np.mean(np.exp(log_z - top))))
-
-
-def climb_smooth(setup: Maximization, method: DirectOptimization) -> Ascent:
-    """Maximise over the continuous filter, on threads: it runs without Python's lock."""
-    with ThreadPoolExecutor() as pool:
-        return SmoothClimb(setup, method, pool).run()
-
-
-def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
-    """Maximise; see the module.
-
-    Raises
-    ------
-    ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
-    """
-    if isinstance(setup.exact, NotApplicable):
-        reason = smooth_filter_applies(setup.problem.trace)
-        if reason is not None:
-            raise ArgumentError(
-                f"DirectOptimization needs a linear Gaussian model, or one scalar state: "
-                f"{setup.exact.reason}; {reason.reason}",
-                fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
-                where=reason.where or setup.exact.where,
-            )
-    with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
-        if isinstance(setup.exact, NotApplicable):
-            return climb_smooth(setup, method)
-        return ExactClimb(setup, setup.exact, method).run()
 
 
 class _WithoutMaximum(Exception):

@@ -23,14 +23,11 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
-    PARTICLES,
-    PARTICLES_WITHOUT_ANCESTORS,
     Sweeper,
-    pgas_proposal,
+    conditional_settings,
     start_chain,
 )
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
@@ -53,7 +50,7 @@ def climb(setup: Maximization, method: PSAEM) -> Ascent:
     """
     need_density(setup.problem.trace, "PSAEM", "maximize")
     maximum = _by_statistics(setup)
-    settings = conditional_settings(setup, method)
+    settings = conditional_settings(setup.problem, method.particles, method.proposal)
     states = []
     for chain, theta in enumerate(starts(setup, method.chains)):
         seed = setup.seed(2, chain)
@@ -89,17 +86,6 @@ def _by_statistics(setup: Maximization) -> Maximiser:
             where=maximum.step.where,
         )
     return maximum
-
-
-def conditional_settings(setup: Maximization, method: PSAEM) -> FilterSettings:
-    """Particles and proposal of the conditional filter, as PGAS takes them."""
-    problem = setup.problem
-    memory = deterministic_memory(problem.trace)
-    usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
-    particles = usual if method.particles is None else method.particles
-    proposal = pgas_proposal(problem) if method.proposal == "auto" else method.proposal
-    problem.proposal(proposal)
-    return FilterSettings(int(particles), proposal)
 
 
 def step_size(k: int, method: PSAEM) -> float:
