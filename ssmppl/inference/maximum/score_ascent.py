@@ -53,7 +53,7 @@ Runs = Callable[[np.ndarray, int], list[SmootherRun]]
 
 
 @dataclass(frozen=True)
-class Slope:
+class ScoreEstimate:
     """What is estimated at z, in z: gradient (F,), its noise, information and that of the complete
     data (F, F); natural : the information in theta (P, P). each : (R, F) gradients of the runs, and
     their log_z (R,).
@@ -74,7 +74,7 @@ class _Iterations:
     """How far a climb has come."""
 
     iterates: list[np.ndarray] = field(default_factory=list)
-    near: list[Slope] = field(default_factory=list)
+    near: list[ScoreEstimate] = field(default_factory=list)
     b: np.ndarray | None = None
 
 
@@ -156,7 +156,7 @@ def _newton(
 
 def _safe_slope(
     setup: Maximization, way: _Iterations, z: np.ndarray, runs: Runs, k: int
-) -> tuple[np.ndarray, Slope]:
+) -> tuple[np.ndarray, ScoreEstimate]:
     """(z, slope there); where the filter fails, at a point on the way back to the last iterate."""
     for _ in range(6):
         try:
@@ -169,7 +169,7 @@ def _safe_slope(
     return z, _slope(setup, z, runs(z, k))
 
 
-def _slope(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Slope:
+def _slope(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> ScoreEstimate:
     with np.errstate(over="ignore", invalid="ignore"):
         slope = _combined(setup, z, runs)
     if not all(
@@ -184,7 +184,7 @@ def _slope(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Slope
     return slope
 
 
-def _combined(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Slope:
+def _combined(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> ScoreEstimate:
     point, found = setup.transform.at(z), combine(runs)
     j = point.jacobian
     log_z = np.array([r.log_z for r in runs])
@@ -198,13 +198,13 @@ def _combined(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> Sl
         each = each + point.d_log_prior
     natural = found.information if found.information is not None else np.zeros_like(hessian)
     rest = -second.theta - prior
-    return Slope(
+    return ScoreEstimate(
         z, gradient, each, log_z, j.T @ found.gradient_covariance @ j,
         j.T @ natural @ j + rest, -j.T @ hessian @ j + rest, natural,
     )  # fmt: skip
 
 
-def _preconditioner(b: np.ndarray | None, slope: Slope) -> np.ndarray:
+def _preconditioner(b: np.ndarray | None, slope: ScoreEstimate) -> np.ndarray:
     """B with the newest information in it, positive definite: between a share of the complete
     data's information and the whole of it, in every direction."""
     complete = _positive(slope.complete)

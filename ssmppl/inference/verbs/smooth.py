@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
@@ -45,7 +44,7 @@ from ssmppl.inference.run.labels import component_dims, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.inference.verbs.filters import LEVELS, quantile_levels
+from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_levels
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Trace
 from ssmppl.results import to_dataset
@@ -97,10 +96,10 @@ def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[SmoothedSta
     if setup.trajectories is not None:
         return _exact_draws(setup, model, [model.log_likelihood([e], theta) for e in experiments])
     moments = [model.smooth(e, theta) for e in experiments]
-    spreads = []
-    for m in moments:
-        sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
-        spreads.append(m.mean[:, None, :] + ndtri(setup.levels)[None, :, None] * sd[:, None, :])
+    sds = [np.sqrt(np.maximum(np.diagonal(m.covariance, 0, 1, 2), 0.0)) for m in moments]
+    spreads = [
+        normal_quantiles(m.mean, sd, setup.levels) for m, sd in zip(moments, sds, strict=True)
+    ]
     return _exact_moments(moments, spreads)
 
 
