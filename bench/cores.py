@@ -32,7 +32,7 @@ import ssmppl as ssm
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.datasets import ice_varves
 from ssmppl.inference.chains import pgas, pmmh
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.particles.blocks import run_in_blocks
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
@@ -69,7 +69,7 @@ def chains(prepare: Callable, method: object, draws: int) -> Callable[[Executor]
     """Two chains from fixed states, without what `sample` does before them on one core."""
     problem = pose(varves, DATA)
     root = np.random.SeedSequence(1)
-    setup = Setup(problem, space_of(problem, {}, THETA), {}, WORKERS, 0, 1, root, False)
+    setup = SamplingSetup(problem, space_of(problem, {}, THETA), {}, WORKERS, 0, 1, root, False)
     sampler = prepare(setup, method)
     return lambda executor: run_chains(
         sampler.step_block, sampler.states, draws, executor=executor, progress=False

@@ -19,6 +19,7 @@ from ssmppl.cli.group import Argument, Option
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.inference.particles.filtering import SCHEMES
 from ssmppl.inference.verbs.filters import LEVELS
+from ssmppl.inference.verbs.sample import METHODS
 from ssmppl.modelfile import parse_settings
 
 Decorator = Callable[..., Any]
@@ -205,9 +206,8 @@ PARTICLE_FILTER = apply(
 
 
 SAMPLERS: dict[str, type] = {
-    "mh": ssm.MetropolisHastings, "gibbs": ssm.Gibbs, "pmmh": ssm.PMMH, "pgas": ssm.PGAS,
-    "smc2": ssm.SMC2,
-}  # fmt: skip
+    "mh" if kind is ssm.MetropolisHastings else kind.__name__.lower(): kind for kind in METHODS
+}
 CLIMBERS: dict[str, type] = {
     "do": ssm.DirectOptimization, "score": ssm.ScoreAscent, "em": ssm.EM,
     "particle-em": ssm.ParticleEM, "psaem": ssm.PSAEM, "if2": ssm.IF2,

@@ -12,7 +12,7 @@ import ssmppl as ssm
 from ssmppl.diagnosis.model.scales import Scale
 from ssmppl.inference.chains.bridge import Student
 from ssmppl.inference.chains.parameter_steps import log_joint
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.direct_optimization import SmoothLikelihood
 from ssmppl.inference.particles import backward
 from ssmppl.inference.preparation.space import space_of
@@ -234,7 +234,9 @@ def test_the_information_at_an_infinite_parameter_is_no_number(objective):
     model.transition(lambda x, s: {"x": ssm.Normal(np.sin(x), sd=s)})
     model.observation(lambda x, p: {"y": ssm.Normal(p * x, sd=1)})
     problem = pose(model, {"y": np.zeros(3)})
-    setup = Setup(problem, space_of(problem, {}, {}), objective, {}, {}, np.random.SeedSequence(0))
+    setup = Maximization(
+        problem, space_of(problem, {}, {}), objective, {}, {}, np.random.SeedSequence(0)
+    )
     assert np.isnan(setup.natural(np.array([800.0, 0.0]), np.eye(2))).all()
     assert np.isfinite(setup.natural(np.array([1.0, 0.0]), np.eye(2))).all()
 

@@ -25,17 +25,17 @@ import numpy as np
 
 import ssmppl as ssm
 from ssmppl.data import unpack_parameters
-from ssmppl.inference.chains.coordinates import Metropolis, Point, WalkState
 from ssmppl.inference.chains.gibbs import GibbsState
 from ssmppl.inference.chains.interweaving import NoiseMove
+from ssmppl.inference.chains.metropolis_kernel import ChainPoint, Metropolis, WalkState
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, log_joint
 from ssmppl.inference.chains.pgas import PGASState
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import PreparedChains, SamplingSetup
 from ssmppl.inference.exact import histories
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.inference.verbs.sample import PREPARE
+from ssmppl.inference.verbs.sample import METHODS
 from ssmppl.language.model.transforms import transforms, unconstrain
 
 RUNS = 20  # independence steps that draw a run of the particle filter given (theta, y)
@@ -54,7 +54,7 @@ class Transitions:
     """
 
     problem: Problem
-    sampler: Sampler
+    sampler: PreparedChains
     state: Any
     rng: np.random.Generator
     stream: np.ndarray
@@ -103,7 +103,7 @@ class Transitions:
         self.state, block = self.sampler.step_block(begin, 1)
         return block.draws["theta"][0], np.ascontiguousarray(block.draws["path_0"][0])
 
-    def _point(self, state: WalkState, theta: np.ndarray) -> Point:
+    def _point(self, state: WalkState, theta: np.ndarray) -> ChainPoint:
         kernel: Metropolis = self.sampler.step_block.args[0]  # type: ignore[attr-defined]
         w = kernel.coordinates.at(self.free(theta))
         theta, log_density = kernel.coordinates.parameters(w)
@@ -117,7 +117,7 @@ class Transitions:
             if run is None or -np.log(self.rng.uniform()) > change:
                 run = new
         assert run is not None, "no particle survives at parameters and data drawn jointly"
-        return Point(w, theta, log_density, run, kernel.proposal.local(w, run))
+        return ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run))
 
     def free(self, theta: np.ndarray) -> np.ndarray:
         """The parameters on the unconstrained scale."""
@@ -136,8 +136,8 @@ def prepare(
     """A sampler made ready on its first data; it adapts in its first `warmup` transitions."""
     problem = pose(model, data)
     root = np.random.SeedSequence(seed)
-    setup = Setup(problem, space_of(problem, {}, {}), {}, 1, warmup, 1, root)
-    sampler = PREPARE[type(method)](setup, method)
+    setup = SamplingSetup(problem, space_of(problem, {}, {}), {}, 1, warmup, 1, root)
+    sampler = METHODS[type(method)].prepare(setup, method)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(77,)))
     stream = random_state(root, 78)
     return Transitions(problem, sampler, sampler.states[0], rng, stream, renew)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.inference.chains import coordinates, elimination, gibbs, parameter_steps, pgas
+from ssmppl.inference.chains import elimination, gibbs, metropolis_kernel, parameter_steps, pgas
 from ssmppl.inference.chains.interweaving import NoiseMove
 from ssmppl.inference.preparation.space import Space
 
@@ -235,9 +235,9 @@ MUTANTS = {
                ((Space, "parameters", no_jacobian),)),
         Mutant("no Jacobian of the noises", "growth PGAS interweaved",
                ((NoiseMove, "stand", stand_without), (NoiseMove, "at", at_without))),
-        Mutant("states of before", "counts PMMH", ((coordinates, "_iterate", states_kept),)),
+        Mutant("states of before", "counts PMMH", ((metropolis_kernel, "_iterate", states_kept),)),
         Mutant("no prior in the ratio", "counts PMMH",
-               ((coordinates, "_iterate", ratio_without_prior),)),
+               ((metropolis_kernel, "_iterate", ratio_without_prior),)),
         Mutant("prior counted twice", "two_states PGAS eliminated",
                ((elimination.Eliminating, "_draw", prior_twice),)),
     )

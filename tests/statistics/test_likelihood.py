@@ -17,9 +17,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
-from ssmppl.inference.chains.pmmh import run_filters
+from ssmppl.inference.chains.pmmh import ParticleLikelihood
 from ssmppl.inference.particles.filtering import FilterSettings
-from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 
@@ -220,7 +219,7 @@ def test_very_few_particles(proposal, particles, repeats):
 def test_filters_inside_of_pmmh(proposal):
     """The kernel that keeps a path makes the same estimate as the one behind `log_likelihood`."""
     problem = pose(models.varves, {"y": CALM})
-    space, settings = space_of(problem, {}, {}), FilterSettings(10, proposal)
+    likelihood = ParticleLikelihood(problem, FilterSettings(10, proposal))
     table = Table(len(FEW_POINTS) * len(FILTERS))
     for parameters in FEW_POINTS:
         name = f"path of {proposal} {parameters}"
@@ -228,8 +227,9 @@ def test_filters_inside_of_pmmh(proposal):
         stream = random_state(np.random.SeedSequence(seed_of(name)))
         log_z = np.empty(5000)
         for i in range(len(log_z)):
-            log_z[i], _, increments = run_filters(space, theta, settings, stream)
-            assert log_z[i] == pytest.approx(sum(v.sum() for v in increments))
+            run = likelihood.run(theta, None, stream)
+            log_z[i] = run.log_likelihood
+            assert log_z[i] == pytest.approx(sum(v.sum() for v in run.increments))
         table.cell(name, log_z, varve_log_likelihood(CALM, **parameters), 10, len(CALM))
     table.judge()
 

@@ -38,11 +38,11 @@ from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
-from ssmppl.inference.maximum.ascent import Chart, Setup
+from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
-from ssmppl.inference.maximum.newton import Top, climb, information_at
 from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.newton import Top, climb, information_at, newton_step
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
@@ -137,7 +137,7 @@ def noisy_climb(
     value, g = found
     size = 1.0
     for _ in range(MOST_STEPS):
-        step = _step(h, g)
+        step = newton_step(g, h)
         if 0.5 * g @ step < NEAR:
             break
         step *= size * _shortened(step)
@@ -151,7 +151,7 @@ def noisy_climb(
         z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
     distance, size = np.inf, 1.0
     for k in range(AVERAGED):
-        step = _step(h, g)
+        step = newton_step(g, h)
         distance = 0.5 * float(g @ step)
         step *= size * _shortened(step) / (k + 1.0)
         new = gradient(z + step)
@@ -166,14 +166,6 @@ def _shortened(step: np.ndarray) -> float:
     """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
     coordinate at all."""
     return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
-
-
-def _step(h: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """H^-1 g, with the small eigenvalues of the scaled H lifted."""
-    scale = np.sqrt(np.maximum(np.diagonal(h), 1e-12))
-    values, vectors = np.linalg.eigh(h / np.outer(scale, scale))
-    values = np.maximum(values, 1e-3)
-    return (vectors @ ((vectors.T @ (g / scale)) / values)) / scale
 
 
 def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -456,7 +448,7 @@ class Fitter:
         seed: np.random.SeedSequence, quick: bool, climbs: int,
     ) -> Fit:  # fmt: skip
         problem = space.problem
-        setup = Setup(problem, space, "posterior", self.fixed, start, seed)
+        setup = Maximization(problem, space, "posterior", self.fixed, start, seed)
         # The extended filter's is the same here, and needs no matrices to be put together.
         smooth = self._extended(problem) or partial(kalman.log_likelihood, problem.experiments)
         function = density_of(space, smooth)
@@ -491,10 +483,14 @@ class Fitter:
         return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
 
     def gradient(
-        self, space: Space, z: np.ndarray, stream: np.ndarray, chart: Chart | None = None
+        self,
+        space: Space,
+        z: np.ndarray,
+        stream: np.ndarray,
+        transform: UnconstrainedTransform | None = None,
     ) -> tuple[float, np.ndarray] | None:
         """(log p(y) + log prior, its derivatives (F,) in z), estimated; None where none is."""
-        point = (chart or Chart(space)).at(z)
+        point = (transform or UnconstrainedTransform(space)).at(z)
         if point.log_prior == -np.inf:
             return None
         try:
@@ -518,8 +514,8 @@ class Fitter:
         z = space.z[space.where]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
-        chart = Chart(space)
-        found = self.gradient(space, z, stream, chart)
+        transform = UnconstrainedTransform(space)
+        found = self.gradient(space, z, stream, transform)
         if found is None:
             raise SamplingError(
                 f"the model {space.problem.trace.name!r} cannot have produced the data where its "
@@ -528,7 +524,7 @@ class Fitter:
                 "values",
             )
         z, h, distance = noisy_climb(
-            lambda z: self.gradient(space, z, stream, chart), z, found, information
+            lambda z: self.gradient(space, z, stream, transform), z, found, information
         )
         theta = space.parameters(z)[0].copy()
         value, error = self.log_likelihood(space.problem.experiments, theta, seed)
@@ -594,7 +590,7 @@ class Fitter:
             if smooth is not None:
                 found = information_at(density_of(fit.space, smooth), fit.z)
             else:
-                setup = Setup(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
+                setup = Maximization(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
                 found = observed_information(setup, self.kalman, fit.z)
             inside = found[np.ix_(~fit.at_bound, ~fit.at_bound)]  # at a bound it says nothing
             if np.all(np.isfinite(found)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
@@ -606,10 +602,10 @@ class Fitter:
         seed: np.random.SeedSequence,
     ) -> np.ndarray:  # fmt: skip
         """(F, F) in z of a matrix (P, P) in theta, the prior's curvature included."""
-        setup = Setup(space.problem, at(space, theta), "posterior", self.fixed, {}, seed)
+        setup = Maximization(space.problem, at(space, theta), "posterior", self.fixed, {}, seed)
         z = setup.space_at(theta)
-        jacobian = setup.chart.at(z).jacobian
-        curvature = setup.chart.curvature(z, np.zeros(len(theta)))
+        jacobian = setup.transform.at(z).jacobian
+        curvature = setup.transform.curvature(z, np.zeros(len(theta)))
         prior = -curvature.log_prior
         values, vectors = np.linalg.eigh(0.5 * (prior + prior.T))
         return jacobian.T @ information @ jacobian + (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -21,7 +21,7 @@ from ssmppl.diagnosis.screening.screen import Question, Screen
 from ssmppl.diagnosis.selection.augmented_models import Workshop
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.errors import NotApplicable, SSMError
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
@@ -90,8 +90,10 @@ def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, floa
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if len(values) and values[0] <= LEAST_INFORMATION:
         return nothing
-    setup = Setup(fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0))
-    jacobian = setup.chart.at(fit.z).jacobian
+    setup = Maximization(
+        fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0)
+    )
+    jacobian = setup.transform.at(fit.z).jacobian
     root = (jacobian[:, free] / scale) @ (vectors / np.sqrt(values))
     spread = np.sqrt(np.sum(root**2, axis=1))
     held = np.any(jacobian[:, fit.at_bound] != 0.0, axis=1)

@@ -25,6 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable
 from ssmppl.analysis.elimination.elimination import Elimination
 from ssmppl.analysis.structure import deterministic_memory
@@ -36,6 +37,7 @@ from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.chains.parameter_steps import ParameterSteps, ThetaValues
+from ssmppl.inference.chains.sampling import PlanRows, reason_and_line
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.run.problem import Problem
 
@@ -44,7 +46,7 @@ FORGETTING = 0.6  # the warmup's mean takes in sweep k with weight k^-FORGETTING
 
 
 @dataclass(frozen=True)
-class Learned:
+class EliminationState:
     """sweep : how many were made. rate : (K,) mean increment of a row."""
 
     sweep: int
@@ -87,14 +89,14 @@ class Eliminating(ParameterSteps):
     def horizon(self) -> int:
         return deterministic_memory(self.problem.trace) or 0
 
-    def begin(self, theta: np.ndarray, paths: tuple[np.ndarray, ...]) -> Learned:
+    def begin(self, theta: np.ndarray, paths: tuple[np.ndarray, ...]) -> EliminationState:
         """What a new chain begins with."""
-        return Learned(0, self._mean_increment(self._totals(theta, list(paths))))
+        return EliminationState(0, self._mean_increment(self._totals(theta, list(paths))))
 
     def sweep(
-        self, learned: Learned, theta: np.ndarray, paths: list[np.ndarray], stream: np.ndarray,
-        generator: np.random.Generator,
-    ) -> tuple[Learned, tuple[float, float]]:  # fmt: skip
+        self, learned: EliminationState, theta: np.ndarray, paths: list[np.ndarray],
+        stream: np.ndarray, generator: np.random.Generator,
+    ) -> tuple[EliminationState, tuple[float, float]]:  # fmt: skip
         """New trajectories and eliminated parameters, in place; (share of steps that changed,
         ESS / N)."""
         experiments, figures = self.problem.experiments, np.zeros(2)
@@ -121,8 +123,8 @@ class Eliminating(ParameterSteps):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
         """A new trajectory of one experiment (T, D), its statistics (K,), the sweep's figures.
 
-        base : statistics of the prior and the other experiments. rate : of `Learned`. rows : of
-        the old trajectory `path`.
+        base : statistics of the prior and the other experiments. rate : of `EliminationState`.
+        rows : of the old trajectory `path`.
         """
         found, module = self.made
         steps, d = path.shape
@@ -198,7 +200,7 @@ class Eliminating(ParameterSteps):
             theta[where] = values
 
 
-def asked(
+def requested_elimination(
     problem: Problem, setting: bool | str | tuple[str, ...], held: Mapping[str, np.ndarray],
     proposal: str,
 ) -> Eliminable | NotApplicable:  # fmt: skip
@@ -251,8 +253,19 @@ def _named(problem: Problem, setting: object, held: Mapping[str, np.ndarray]) ->
     return tuple(setting)
 
 
-def describe(found: Eliminable | NotApplicable) -> str:
+def describe_elimination(found: Eliminable | NotApplicable) -> str:
     """What is eliminated, in words."""
     if isinstance(found, NotApplicable):
         return f"none: {found.reason}"
     return "; ".join(f"{', '.join(map(repr, u.components))} ({u.family})" for u in found.updates)
+
+
+def explain_elimination(found: Eliminable) -> PlanRows:
+    """What `explain` says: what can be eliminated, and why others cannot."""
+    rows = [
+        (joined(u.components), "integrated out while trajectories are drawn, each particle "
+         f"carrying its statistics: {u.family}")
+        for u in found.updates
+    ]  # fmt: skip
+    refused = found.refused.items()
+    return [*rows, *((repr(c), f"stays: {reason_and_line(reason)}") for c, reason in refused)]

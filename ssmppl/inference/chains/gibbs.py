@@ -9,12 +9,19 @@ derived updates.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
 
-from ssmppl.inference.chains.interweaving import Interweaving, Tuning, interweaving
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.chains.interweaving import (
+    Interweaving,
+    InterweavingTuning,
+    applicable,
+    interweaving,
+)
 from ssmppl.inference.chains.metropolis import needed_model
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
@@ -22,10 +29,17 @@ from ssmppl.inference.chains.parameter_steps import (
     log_joint,
     plan_updates,
 )
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import (
+    INTERWEAVED,
+    Derived,
+    PlanRows,
+    PreparedChains,
+    SamplingMethod,
+    SamplingSetup,
+)
 from ssmppl.inference.methods.methods import Gibbs
 from ssmppl.inference.methods.requirements import need_density
-from ssmppl.inference.preparation.exact_models import ExactModel, filter_of
+from ssmppl.inference.preparation.exact_models import ExactModel, exact_model, filter_of
 from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.draws import Block
@@ -39,7 +53,7 @@ class GibbsState:
     theta: np.ndarray
     generator: np.random.Generator
     stream: np.ndarray
-    tuning: Tuning | None = None
+    tuning: InterweavingTuning | None = None
 
 
 @dataclass(frozen=True)
@@ -49,7 +63,7 @@ class GibbsSteps(ParameterSteps):
     interweaving: Interweaving | None = None
 
 
-def prepare(setup: Setup, method: Gibbs) -> Sampler:
+def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     """Derive the updates, find the mode, and start the chains round it.
 
     Raises
@@ -82,7 +96,7 @@ def prepare(setup: Setup, method: Gibbs) -> Sampler:
         "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
-    return Sampler(partial(gibbs_block, steps, setup.thin, setup.states), states, report)
+    return PreparedChains(partial(gibbs_block, steps, setup.thin, setup.states), states, report)
 
 
 def gibbs_block(
@@ -113,10 +127,7 @@ def gibbs_block(
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
         if further is not None:
             stats["interweaved"].append(interweaved)
-    block = Block(
-        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
-    )
-    return GibbsState(theta, generator, stream, tuning), block
+    return GibbsState(theta, generator, stream, tuning), Block.of(draws, stats)
 
 
 def draw_paths(
@@ -128,3 +139,26 @@ def draw_paths(
     paths = [np.ascontiguousarray(d[0]) for d in drawn]
     log_joint(steps, theta, paths)  # sets deterministic components to the last digit
     return paths
+
+
+def explain(plan: Derived) -> Mapping[str, PlanRows]:
+    """What the plan says of further steps, where the states can be drawn exactly."""
+    exact = exact_model(plan.trace)
+    if isinstance(exact, NotApplicable):
+        return {}
+    found = applicable(plan.noises, exact)
+    if isinstance(found, NotApplicable):
+        return {}
+    how = (
+        f"{', '.join(found.tied)}: moved with the states integrated out, if the warmup finds a "
+        "parameter slow given the states"
+    )
+    return {INTERWEAVED: [("Gibbs", how)]}
+
+
+METHOD = SamplingMethod(
+    prepare,
+    state_classes=(GibbsState, InterweavingTuning, Pilot),
+    where_slow=", or another method, such as ssm.MetropolisHastings()",
+    explain=explain,
+)

@@ -3,13 +3,12 @@
 Given the states, a parameter is known much better than given the data alone where the states carry
 what the data tell of it: the scale of their noise above all. Gibbs sampling then crawls, however
 well the states mix. So each sweep has further steps, in which theta moves while not the states x
-are held but what drives them (Yu and Meng 2011, "To center or not to center: that is not the
-question - an ancillarity-sufficiency interweaving strategy (ASIS)", *JCGS* 20; Kastner and
-Frühwirth-Schnatter 2014 for state space models):
+are held but their noises (Yu and Meng 2011, "To center or not to center: that is not the question -
+an ancillarity-sufficiency interweaving strategy (ASIS)", *JCGS* 20; Kastner and Frühwirth-Schnatter
+2014 for state space models):
 
 1. e = T_theta(x), the noises of the trajectory (`codegen/kernels/twisted/interweaving.py`), T_theta
-   one to
-   one for every theta;
+   one to one for every theta;
 2. theta' by a symmetric random walk on the unconstrained scale z, x' = T_theta'^{-1}(e);
 3. accepted with probability min(1, pi(theta', x') / pi(theta, x)), where
 
@@ -22,24 +21,17 @@ with it; step 1 and its inverse change variables only. (It is a group move in th
 Sabatti 2000, "Generalised Gibbs sampler", *Biometrika* 87, with Metropolis in place of a draw.) The
 map may depend on data and on anything fixed before the chains start, but on no state of a chain.
 
-Two maps are at hand. The noises of the model's laws are plain non-centring. Those of a Gaussian
-approximation to p(x | y, theta) take the data into the map: on a linear Gaussian model, where it is
-exact, pi(theta, x) is p(theta | y) times a function of e alone, a Metropolis step on the marginal;
-elsewhere nearly so. (Compare Murray and Adams 2010, "Slice sampling covariance hyperparameters of
-latent Gaussian models"; Tan 2023, "Efficient data augmentation techniques for some classes of state
-space models", *Statistical Science* 38, where the data choose location and scale of the states.)
-Where the states can be drawn exactly, the step is on p(theta | y) itself, before they are drawn.
+Two maps are at hand (`NoiseMove`). The noises of the model's laws are plain non-centring. Those of
+a Gaussian approximation to p(x | y, theta) take the data into the map: on a linear Gaussian model,
+where it is exact, pi(theta, x) is p(theta | y) times a function of e alone, a Metropolis step on
+the marginal; elsewhere nearly so. (Compare Murray and Adams 2010, "Slice sampling covariance
+hyperparameters of latent Gaussian models"; Tan 2023, "Efficient data augmentation techniques for
+some classes of state space models", *Statistical Science* 38, where the data choose location and
+scale of the states.) Where the states can be drawn exactly, the step is on p(theta | y) itself,
+before they are drawn (`Collapsed`).
 
 All choices are made in the warmup: which parameters move (those slow in the plain chain at its
 beginning), the walk's covariance, which of the maps; afterwards the kernel is fixed.
-
-What a move of the parameters takes along: the trajectory by its noises, or nothing.
-
-`stand` gives the log density of where a chain is, `at` that of where a proposal would lead. Both
-are densities of theta on its own scale given what is held fixed, up to one constant:
-
-    NoiseMove   log p(theta, x, y) + log |dx / de|, the noises e held
-    Collapsed   log p(theta, y), the states integrated out
 """
 
 from __future__ import annotations
@@ -60,8 +52,8 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.chains.coordinates import RandomWalk
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.metropolis_kernel import RandomWalk
+from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.preparation.exact_models import ExactModel
 from ssmppl.inference.preparation.pilot import Pilot
@@ -70,10 +62,23 @@ from ssmppl.inference.run.problem import Problem
 from ssmppl.language.model.transforms import constant_bounds, free_number, transforms, unconstrain
 
 Paths = list[np.ndarray]
+_NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
+PROPOSALS = 4  # a sweep
+LEAST_WARMUP = 200  # sweeps, below which "auto" has no time to look and to tune
+LOOK = 0.25  # share of the warmup in which "auto" looks at the plain chain
+LONGEST_LOOK = 400  # sweeps
+FEW = 6  # numbers that a random walk moves at once without trouble
+SLOW = 0.5  # lag-1 autocorrelation from which a parameter moves
+WALK = RandomWalk()
 
 
 class Move(Protocol):
-    """How a proposal of theta is weighed and what it takes along."""
+    """How a proposal of theta is weighed and what it takes along: the trajectory by its noises, or
+    nothing. Both log densities are of theta on its own scale given what is held, up to a constant:
+
+        NoiseMove   log p(theta, x, y) + log |dx / de|, the noises e held
+        Collapsed   log p(theta, y), the states integrated out
+    """
 
     def stand(self, theta: np.ndarray, paths: Paths) -> tuple[float, Any]:
         """(log density, what is held fixed); nothing can be moved from where it is not finite."""
@@ -194,9 +199,6 @@ class NoiseMove:
         return any(s.data[0] == "parameter" for s in symbols_of(self.found.guide.observed))
 
 
-_NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
-
-
 @dataclass(frozen=True)
 class Collapsed:
     """The states are integrated out by the exact likelihood, and drawn anew after the move."""
@@ -209,16 +211,6 @@ class Collapsed:
 
     def at(self, theta: np.ndarray, held: None, paths: Paths) -> tuple[float, Paths]:
         return self.stand(theta, paths)[0], paths
-
-
-PROPOSALS = 4  # a sweep
-LEAST_WARMUP = 200  # sweeps, below which "auto" has no time to look and to tune
-LOOK = 0.25  # share of the warmup in which "auto" looks at the plain chain
-LONGEST_LOOK = 400  # sweeps
-FEW = 6  # numbers that a random walk moves at once without trouble
-SLOW = 0.5  # lag-1 autocorrelation from which a parameter moves
-
-WALK = RandomWalk()
 
 
 @dataclass(frozen=True)
@@ -239,21 +231,25 @@ class Interweaving:
     looking: int
     bounds: list[tuple[float, float]] | None
 
-    def begin(self) -> Tuning:
+    def begin(self) -> InterweavingTuning:
         """What a new chain begins with."""
         if self.looking:
-            return Tuning(0, None, (), None, ())
-        return self._tune(Tuning(0, None, (), None, ()), self.movable)
+            return InterweavingTuning(0, None, (), None, ())
+        return self._tune(InterweavingTuning(0, None, (), None, ()), self.movable)
 
-    def _tune(self, tuning: Tuning, where: np.ndarray) -> Tuning:
+    def _tune(self, tuning: InterweavingTuning, where: np.ndarray) -> InterweavingTuning:
         size = 2.4 / np.sqrt(max(len(where), 1))
         factors = tuple(size * np.diag(self.scale[where]) for _ in self.moves)
         chosen, won = 0 if len(self.moves) == 1 or not self.adapting else None, (0,) * len(factors)
         return replace(tuning, where=where, factors=factors, chosen=chosen, seen=(), won=won)
 
     def step(
-        self, tuning: Tuning, theta: np.ndarray, paths: Paths, generator: np.random.Generator
-    ) -> tuple[Tuning, float]:
+        self,
+        tuning: InterweavingTuning,
+        theta: np.ndarray,
+        paths: Paths,
+        generator: np.random.Generator,
+    ) -> tuple[InterweavingTuning, float]:
         """One sweep's steps; theta and paths in place. Returns the share that was accepted."""
         sweep = tuning.sweep
         if tuning.where is None:
@@ -277,7 +273,7 @@ class Interweaving:
         return replace(tuning, sweep=sweep + 1), accepted / made if made else 0.0
 
     def _propose(
-        self, k: int, tuning: Tuning, theta: np.ndarray, paths: Paths,
+        self, k: int, tuning: InterweavingTuning, theta: np.ndarray, paths: Paths,
         generator: np.random.Generator,
     ) -> tuple[np.ndarray, int]:  # fmt: skip
         """Metropolis steps with one thing held fixed; (adapted factor, number accepted)."""
@@ -332,7 +328,7 @@ class Interweaving:
 
 
 @dataclass(frozen=True)
-class Tuning:
+class InterweavingTuning:
     """What a chain has learned; part of its state.
 
     sweep : how many it has made. where : positions of the numbers that move; None while it looks,
@@ -349,7 +345,7 @@ class Tuning:
     won: tuple[int, ...] = ()
 
 
-def _farthest(tuning: Tuning) -> int:
+def _farthest(tuning: InterweavingTuning) -> int:
     """The move of the greatest accepted steps times their squared size |S|^(2/d), the speed at
     which its walk spreads. All are tuned to one rate of acceptance, so that mostly the widest wins;
     but one that can seldom or never be made, where the guide is no number, stays as wide as it
@@ -367,7 +363,7 @@ def applicable(found: Noises | NotApplicable, model: ExactModel | None) -> Noise
     return found
 
 
-def asked(
+def requested_noises(
     problem: Problem, setting: str | bool, model: ExactModel | None
 ) -> Noises | NotApplicable:
     if setting is False:
@@ -387,7 +383,7 @@ def _refused(found: NotApplicable) -> ArgumentError:
 
 
 def interweaving(
-    setup: Setup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
+    setup: SamplingSetup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
 ) -> tuple[Interweaving | None, str]:
     """The further steps of a method's chains, and in words what they are or why there are none.
 
@@ -397,7 +393,7 @@ def interweaving(
     ------
     ArgumentError : `interweave` is True and cannot be.
     """
-    found = asked(setup.problem, setting, model)
+    found = requested_noises(setup.problem, setting, model)
     if isinstance(found, NotApplicable):
         return None, f"none: {found.reason}"
     space, adapting = setup.space, setup.warmup * setup.thin
@@ -432,10 +428,10 @@ def interweaving(
     steps = Interweaving(space, tuple(moves), movable, pilot.scale, adapting, looking, bounds)
     moved = ", ".join(dict.fromkeys(owner[space.where[k]] for k in movable))
     who = f"those slow in the plain chain, of {moved}" if looking else moved
-    return steps, f"{who}: moved with {describe(found, model)}"
+    return steps, f"{who}: moved with {describe_interweaving(found, model)}"
 
 
-def describe(found: Noises, model: ExactModel | None) -> str:
+def describe_interweaving(found: Noises, model: ExactModel | None) -> str:
     """What is held fixed, in words."""
     if model is not None:
         return "the states integrated out"
@@ -455,7 +451,7 @@ def with_states(found: Noises) -> str:
     text = (
         f"{who}: may mix slowly given the states, which carry what the data tell of them; if the "
     )
-    text += f"warmup finds it so, moved with the trajectory, {describe(found, None)}"
+    text += f"warmup finds it so, moved with the trajectory, {describe_interweaving(found, None)}"
     if isinstance(found.guide, NotApplicable):
         text += f" (no approximation: {found.guide.reason})"
     stays = dict.fromkeys((*found.initial.stays, *found.transition.stays))

@@ -8,31 +8,23 @@ states follow given each kept draw by backward sampling.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.coordinates import (
-    Metropolis,
-    Point,
-    Proposal,
-    RandomWalk,
-    Run,
+from ssmppl.inference.chains.metropolis_kernel import (
+    WALK_STATES,
+    ChainPoint,
+    LikelihoodRun,
     coordinates,
-    metropolis_block,
-    start_chain,
 )
 from ssmppl.inference.chains.pmmh import (
-    STRETCH,
-    Langevin,
-    adapts,
+    LocalProposal,
     given_factor,
+    prepared_walk,
     settings_of,
-    walk_factor,
 )
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import PreparedChains, SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import MetropolisHastings
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import (
@@ -42,7 +34,7 @@ from ssmppl.inference.preparation.exact_models import (
     filter_of,
 )
 from ssmppl.inference.preparation.exact_score import exact_score
-from ssmppl.inference.preparation.pilot import dispersed, find_mode
+from ssmppl.inference.preparation.pilot import Pilot, find_mode
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.problem import Problem
@@ -85,15 +77,17 @@ class ExactLikelihood:
     states: bool
     scored: np.ndarray | None = None
 
-    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+    def run(
+        self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
         model = needed_model(self.problem, "MetropolisHastings")
         if self.scored is None:
             value, slope = model.log_likelihood(self.problem.experiments, theta), None
         else:
             value, slope = model.score(self.problem.experiments, theta, self.scored)
-        return Run(value, score=slope) if np.isfinite(value) else None
+        return LikelihoodRun(value, score=slope) if np.isfinite(value) else None
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         if not self.states:
             return {}
         model = needed_model(self.problem, "MetropolisHastings")
@@ -102,7 +96,7 @@ class ExactLikelihood:
         return {f"path_{i}": d[0] for i, d in enumerate(drawn)}
 
 
-def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
+def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     """Find the mode and the information there, and start the chains.
 
     Raises
@@ -117,14 +111,7 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
-    factor = walk_factor(setup, method, where, pilot, kind)
-    d = len(where)
-    tuning: Any = factor
-    move: Proposal = RandomWalk()
-    scored: np.ndarray | None = None
-    usual = 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
-    free = free_components(problem.trace, setup.held)
-    order = method.order
+    d, free, order = len(where), free_components(problem.trace, setup.held), method.order
     if order is None:
         cheap = isinstance(exact, Deterministic) and d > 2
         order = int(cheap and not _without_gradient(exact, setup, free))
@@ -132,30 +119,24 @@ def prepare(setup: Setup, method: MetropolisHastings) -> Sampler:
         raise ArgumentError(
             f"order=1 does not apply: {reason}", fix="use ssm.MetropolisHastings(order=0)"
         )
-    if order:
-        scored = free
-        if method.covariance is None:
-            factor = factor * np.sqrt(max(d, 1)) / STRETCH  # steps of one standard deviation
-        move, tuning, usual = Langevin(where, factor, newton=False), 0.0, 0.574
-    kernel = Metropolis(
-        where, ExactLikelihood(problem, setup.states, scored), move, setup.warmup,
-        setup.warmup if adapts(method) else 0,
-        usual if method.target_acceptance is None else method.target_acceptance, setup.thin,
-    )  # fmt: skip
-    starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
-    states = []
-    for chain, z in enumerate(starts):
-        generator, stream = setup.streams(chain)
-        states.append(start_chain(kernel, where.at(z), tuning, generator, stream))
+    usual = 0.574 if order else 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
+    likelihood = ExactLikelihood(problem, setup.states, free if order else None)
+    chains = prepared_walk(setup, method, likelihood, where, pilot, kind, order, usual)
     report = {
         "settings": settings_of(replace(method, order=order)),
         "likelihood": f"exact, by {filter_name(exact)}",
-        "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
-        "walk_covariance": (factor @ factor.T).tolist(),
+        **chains.report,
     }
-    return Sampler(partial(metropolis_block, kernel), states, report)
+    return replace(chains, report=report)
 
 
-def _without_gradient(exact: ExactModel, setup: Setup, free: np.ndarray) -> str:
+def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray) -> str:
     """Why the likelihood has no gradient in closed form; empty where it has."""
     return exact_score(exact, setup.problem.experiments, free, setup.space.theta).differences
+
+
+METHOD = SamplingMethod(
+    prepare,
+    state_classes=(*WALK_STATES, LocalProposal, Pilot),
+    where_slow=", or another method, such as ssm.Gibbs()",
+)

@@ -7,31 +7,55 @@ integrated out of the first of these (`elimination.py`).
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory
+from ssmppl.analysis.structure import deterministic_memory, without_density
 from ssmppl.codegen.kernels.particle.weights import OK
-from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.inference.chains.elimination import Eliminating, Learned, describe
-from ssmppl.inference.chains.elimination import asked as asked_to_eliminate
-from ssmppl.inference.chains.interweaving import Interweaving, Tuning, asked, interweaving
-from ssmppl.inference.chains.mixing import Watch
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.chains.elimination import (
+    Eliminating,
+    EliminationState,
+    describe_elimination,
+    explain_elimination,
+    requested_elimination,
+)
+from ssmppl.inference.chains.interweaving import (
+    Interweaving,
+    InterweavingTuning,
+    applicable,
+    interweaving,
+    requested_noises,
+    with_states,
+)
 from ssmppl.inference.chains.parameter_steps import (
     ParameterSteps,
     draw_parameters,
     log_joint,
     plan_updates,
 )
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import (
+    ELIMINATED,
+    INTERWEAVED,
+    TRAJECTORIES,
+    Derived,
+    PlanRows,
+    PreparedChains,
+    SamplingMethod,
+    SamplingSetup,
+    reason_and_line,
+)
 from ssmppl.inference.methods.methods import PGAS
 from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.particles.filtering import FilterSettings, failure
+from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.mixing import PathMovement, update_rate_attributes
 from ssmppl.inference.run.problem import Problem
 
 PARTICLES = 25
@@ -39,21 +63,15 @@ PARTICLES_WITHOUT_ANCESTORS = 200
 PREDICTIVE_PARTICLES = 500
 
 
-def prepare(setup: Setup, method: PGAS) -> Sampler:
+def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     """Derive the updates, find a mode, and start the chains from particle filters."""
     problem, space = setup.problem, setup.space
     need_density(problem.trace, "PGAS", "sample")
-    memory = deterministic_memory(problem.trace)
-    usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
-    particles = usual if method.particles is None else method.particles
-    proposal = method.proposal
-    if proposal == "auto":
-        by_transition = method.eliminate not in (False, "auto")
-        proposal = "bootstrap" if by_transition else pgas_proposal(problem)
-    problem.proposal(proposal)
-    eliminated = asked_to_eliminate(problem, method.eliminate, setup.held, proposal)
-    settings = FilterSettings(int(particles), proposal)
-    asked(problem, method.interweave, None)  # refused before anything is compiled
+    by_transition = method.proposal == "auto" and method.eliminate not in (False, "auto")
+    proposal = "bootstrap" if by_transition else method.proposal
+    settings = conditional_settings(problem, method.particles, proposal)
+    eliminated = requested_elimination(problem, method.eliminate, setup.held, settings.proposal)
+    requested_noises(problem, method.interweave, None)  # refused before anything is compiled
     if space.where.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root))
     else:
@@ -76,19 +94,30 @@ def prepare(setup: Setup, method: PGAS) -> Sampler:
         generator, stream = setup.streams(chain)
         theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
         begun = start_chain(sweeper, theta, generator, stream)
-        states.append(begun if setup.states else replace(begun, watch=Watch(setup.warmup)))
+        states.append(begun if setup.states else replace(begun, watch=PathMovement(setup.warmup)))
     report = {
         "particles": settings.particles,
-        "proposal": proposal,
+        "proposal": settings.proposal,
         "settings": asdict(method),
-        "ancestor_sampling": memory is not None,
+        "ancestor_sampling": deterministic_memory(problem.trace) is not None,
         "plan": plan,
-        "eliminated": describe(eliminated),
+        "eliminated": describe_elimination(eliminated),
         "interweaving": interweaved,
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]) if len(pilot.z) else {},
     }
     step = partial(pgas_block, sweeper, setup.thin, method.log_likelihood)
-    return Sampler(step, states, report)
+    return PreparedChains(step, states, report)
+
+
+def conditional_settings(problem: Problem, particles: int | None, proposal: str) -> FilterSettings:
+    """Of the conditional particle filter: what was asked for, else what suits the model."""
+    if proposal == "auto":
+        proposal = pgas_proposal(problem)
+    problem.proposal(proposal)
+    if particles is None:
+        joined = deterministic_memory(problem.trace) is not None
+        particles = PARTICLES if joined else PARTICLES_WITHOUT_ANCESTORS
+    return FilterSettings(int(particles), proposal)
 
 
 def pgas_proposal(problem: Problem) -> str:
@@ -125,9 +154,9 @@ class PGASState:
     paths: tuple[np.ndarray, ...]
     generator: np.random.Generator
     stream: np.ndarray
-    tuning: Tuning | None = None
-    learned: Learned | None = None
-    watch: Watch | None = None
+    tuning: InterweavingTuning | None = None
+    learned: EliminationState | None = None
+    watch: PathMovement | None = None
 
 
 def start_chain(
@@ -199,10 +228,8 @@ def pgas_block(
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
         if further is not None:
             stats["interweaved"].append(interweaved)
-    block = Block(
-        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
-    )
-    return PGASState(theta, tuple(paths), generator, stream, tuning, learned, watch), block
+    state = PGASState(theta, tuple(paths), generator, stream, tuning, learned, watch)
+    return state, Block.of(draws, stats)
 
 
 def _predictive(sweeper: Sweeper, theta: np.ndarray, stream: np.ndarray) -> list[np.ndarray]:
@@ -238,4 +265,48 @@ def _trajectories(
     return float(figures[0]), float(figures[1])
 
 
-__all__ = ["PGASState", "SamplingError", "Sweeper", "pgas_block", "plan_updates", "start_chain"]
+def explain(plan: Derived) -> Mapping[str, PlanRows]:
+    """What the plan says of trajectories, and of what else can move with or without them."""
+    exact = exact_model(plan.trace)
+    found = applicable(plan.noises, None if isinstance(exact, NotApplicable) else exact)
+    if isinstance(found, NotApplicable):
+        interweaved = [("nothing", reason_and_line(found))]
+    else:
+        interweaved = [("PGAS", with_states(found))]
+    return {
+        TRAJECTORIES: [("PGAS", _trajectories_of(plan))],
+        INTERWEAVED: interweaved,
+        ELIMINATED: explain_elimination(plan.eliminable),
+    }
+
+
+def _trajectories_of(plan: Derived) -> str:
+    singular = without_density(plan.trace)
+    if singular is not None:
+        return f"does not apply: {reason_and_line(singular)}"
+    flat = [s.name for s in plan.trace.initial.values() if not s.distribution.proper]
+    if flat:
+        return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"
+    if plan.memory is None:
+        return (
+            "conditional SMC without ancestor sampling: a deterministic component never "
+            "forgets its past, so a path cannot be joined to another ancestor; take more "
+            "particles, or PMMH"
+        )
+    if plan.memory == 0:
+        return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
+    return (
+        "conditional SMC with ancestor sampling, over the noisy components: deterministic "
+        f"ones forget their past in {plan.memory} step{'s' * (plan.memory > 1)}, whose "
+        "densities enter the ancestor weights"
+    )
+
+
+METHOD = SamplingMethod(
+    prepare,
+    state_classes=(PGASState, InterweavingTuning, EliminationState, PathMovement, Pilot),
+    by_row=lambda method: method.log_likelihood,
+    attributes=update_rate_attributes,
+    where_slow=", more particles, or another method, such as ssm.PMMH()",
+    explain=explain,
+)

@@ -1,35 +1,55 @@
-"""What `sample` hands to a method, and what a method made ready hands back.
+"""What `sample` hands to a method, and what a method tells `sample` of itself.
 
-The module of each method has a function `prepare(setup, method) -> Sampler`, and `sample` runs the
-chains of whatever it gets.
+The module of each method has a `METHOD`, of the class `SamplingMethod`, which `verbs/sample.py`
+registers under the class of its settings. Everything in which methods differ, for `sample`, its
+checkpoints and `explain`, is in there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from ssmppl.analysis.elimination.eliminable import Eliminable
+from ssmppl.analysis.proposals.noises import Noises
 from ssmppl.data import unpack_parameters
+from ssmppl.errors import NotApplicable
 from ssmppl.inference.preparation.space import Space
-from ssmppl.inference.run.draws import Block, Keep
+from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.draws import Block, ChainDraws, Keep
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import random_state
+from ssmppl.language.model.traced import Trace
 
 Result = TypeVar("Result")
+DrawnChains = Sequence[ChainDraws[Any]]
+PlanRows = list[tuple[str, str]]
+
+# Titles of what `explain` says of the methods.
+TRAJECTORIES = "Trajectories"
+INTERWEAVED = "Interweaved with these, where parameters mix slowly"
+ELIMINATED = "Eliminated in PGAS, where asked for"
 
 
 class Memory(Keep, Protocol):
-    """Outlives the process: `ChainFile`."""
+    """Outlives the process: `ChainFile`. report : of the chains, once they were made ready."""
+
+    report: dict[str, Any] | None
 
     def once(self, name: str, make: Callable[[], Any]) -> Any:
         """What `make` gives, or gave in an earlier process."""
 
+    def finished(self, draws: int) -> bool:
+        """Whether every chain has so many draws, those of the warmup included."""
+
 
 @dataclass(frozen=True)
-class Setup:
+class SamplingSetup:
     """A call of `sample`, checked.
 
     space : the free parameters, at the values near which to begin. held : the fixed ones.
@@ -66,8 +86,8 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Sampler:
-    """A method made ready: how a block of draws is made, where chains start, what to report.
+class PreparedChains:
+    """Markov chains made ready: how a block of draws is made, where chains start, what to report.
 
     step_block, states : as in `run_chains`. A block's draws hold theta (n, P), path_<i> (n, T, D)
     for each experiment (unless the call wants no states), and possibly increment_<i> (n, T).
@@ -76,3 +96,98 @@ class Sampler:
     step_block: Callable[[Any, int], tuple[Any, Block]]
     states: list[Any]
     report: dict[str, Any]
+
+
+class Derived(Protocol):
+    """What `explain` has derived of a model: its `Plan`."""
+
+    @property
+    def trace(self) -> Trace: ...
+    @property
+    def noises(self) -> Noises | NotApplicable: ...
+    @property
+    def memory(self) -> int | None: ...
+    @property
+    def eliminable(self) -> Eliminable: ...
+
+
+def _nothing_to_say(plan: Derived) -> Mapping[str, PlanRows]:
+    return {}
+
+
+def _no_attributes(problem: Problem, chains: DrawnChains) -> dict[str, Any]:
+    return {}
+
+
+@dataclass(frozen=True)
+class SamplingMethod:
+    """What `sample` and `explain` know of a method, whose settings are of the class it is
+    registered under.
+
+    prepare : (setup, settings) -> its Markov chains, made ready; None where it has none.
+    independent : of a method without Markov chains, (setup, settings, draws, executor, progress) ->
+    independent draws of parameters alone, as chains, and what to report.
+    state_classes : the dataclasses that its checkpoints are made of.
+    complete : (settings, draws) -> settings, with what depends on the number of draws.
+    by_row : settings -> whether draws come with a log-likelihood of each row.
+    attributes : (problem, chains) -> what else goes to the attributes of the result.
+    where_slow : what to try where parameters mix slowly: ", or ...".
+    explain : plan -> the rows that `explain` shows, by title.
+    """
+
+    prepare: Callable[[SamplingSetup, Any], PreparedChains] | None
+    independent: (
+        Callable[
+            [SamplingSetup, Any, int, Executor | None, bool],
+            tuple[list[ChainDraws[Any]], dict[str, Any]],
+        ]
+        | None
+    ) = None
+    state_classes: tuple[type, ...] = ()
+    complete: Callable[[Any, int], Any] = lambda settings, draws: settings
+    by_row: Callable[[Any], bool] = lambda settings: False
+    attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = _no_attributes
+    where_slow: str = ""
+    explain: Callable[[Derived], Mapping[str, PlanRows]] = _nothing_to_say
+
+    @property
+    def markov(self) -> bool:
+        """Whether its draws are Markov chains, which need warmup and draw the states too."""
+        return self.prepare is not None
+
+    def draw(
+        self, setup: SamplingSetup, settings: Any, draws: int, executor: Executor | None,
+        progress: bool,
+    ) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:  # fmt: skip
+        """The chains, and what to report of them."""
+        if self.prepare is None:
+            assert self.independent is not None
+            return self.independent(setup, settings, draws, executor, progress)
+        title, memory = type(settings).__name__, setup.memory
+        if memory is None or memory.report is None or not memory.finished(setup.warmup + draws):
+            with announced(title, "preparing", shown=progress):
+                chains = self.prepare(setup, settings)
+            if memory is not None:
+                memory.report = chains.report
+        else:  # nothing is left to draw, and nothing needs to be compiled for it
+            chains = PreparedChains(_finished, [None] * setup.chains, memory.report)
+        result = run_chains(
+            chains.step_block, chains.states, draws, setup.warmup, executor=executor,
+            progress=progress, title=title, keep=memory,
+        )  # fmt: skip
+        return result, chains.report
+
+    def advice(self, settings: Any) -> str:
+        """What to try, besides more draws, where parameters mix slowly."""
+        if getattr(settings, "interweave", "auto") is False:
+            return f', or ssm.{type(settings).__name__}(interweave="auto")'
+        return self.where_slow
+
+
+def _finished(state: Any, n: int) -> tuple[Any, Block]:
+    raise AssertionError("a finished chain draws no more")
+
+
+def reason_and_line(found: NotApplicable) -> str:
+    """Why something does not apply, and the user's line, as `explain` shows it."""
+    return found.reason + (f"\n{found.where.short}" if found.where else "")

@@ -33,10 +33,10 @@ from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import SMC2
 from ssmppl.inference.particles.filtering import failure, log_of_mean
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import Choice, choose
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import Block, ChainDraws
@@ -113,7 +113,7 @@ class Particles:
 
 
 @dataclass(frozen=True)
-class State:
+class SMC2State:
     """Where a run stands, before row `row` of an experiment.
 
     z (M, F), theta (M, P), log_prior (M,) with the Jacobian; log_w (M,); log_z (M,) of the filters
@@ -143,7 +143,7 @@ class State:
         w = np.exp(self.log_w - top) if top > -np.inf else np.ones(len(self.log_w))
         return w / w.sum()
 
-    def weighted(self, log_factor: np.ndarray) -> State:
+    def weighted(self, log_factor: np.ndarray) -> SMC2State:
         """With these factors in the weights, and their mean in the evidence."""
         top = np.max(log_factor)
         if not top > -np.inf:
@@ -154,7 +154,7 @@ class State:
         )
 
 
-def begin(filters: Filters, setup: Setup, run: int) -> State:
+def begin(filters: Filters, setup: SamplingSetup, run: int) -> SMC2State:
     """M draws from the prior, given the fixed parameters; the priors of fixed ones that depend on
     free ones are their first data."""
     method, trace, space = filters.method, setup.problem.trace, setup.space
@@ -166,7 +166,7 @@ def begin(filters: Filters, setup: Setup, run: int) -> State:
     z = np.array([unconstrain(trace, t, unpack_parameters(trace, t), made) for t in theta])
     log_prior = np.array([space.parameters(v)[1] for v in z])
     m = len(theta)
-    state = State(
+    state = SMC2State(
         z, theta, log_prior, np.zeros(m), np.zeros(m),
         tuple(filters.particles(method.particles) for _ in range(m)), 0.0, 0, 0, generator, stream,
     )  # fmt: skip
@@ -179,7 +179,7 @@ def begin(filters: Filters, setup: Setup, run: int) -> State:
     return state
 
 
-def rows_block(filters: Filters, state: State, n: int) -> tuple[State, Block]:
+def rows_block(filters: Filters, state: SMC2State, n: int) -> tuple[SMC2State, Block]:
     """n rows of one run."""
     state = replace(
         state, generator=copy.deepcopy(state.generator), stream=state.stream.copy(),
@@ -193,13 +193,11 @@ def rows_block(filters: Filters, state: State, n: int) -> tuple[State, Block]:
         ess.append(share)
         rates.append(rate)
         sizes.append(state.size)
-    stats = {"ess": ess, "acceptance_rate": rates, "particles": sizes}
-    return state, Block(
-        {"log_evidence": np.array(evidence)}, {k: np.array(v) for k, v in stats.items()}
-    )
+    stats: dict[str, list[Any]] = {"ess": ess, "acceptance_rate": rates, "particles": sizes}
+    return state, Block.of({"log_evidence": evidence}, stats)
 
 
-def one_row(filters: Filters, state: State) -> tuple[State, float, float]:
+def one_row(filters: Filters, state: SMC2State) -> tuple[SMC2State, float, float]:
     """(the state after the next row, ESS / M before any move, acceptance rate or nan)."""
     k, t, method = state.experiment, state.row, filters.method
     increments = np.full(len(state.theta), -np.inf)
@@ -226,7 +224,7 @@ def one_row(filters: Filters, state: State) -> tuple[State, float, float]:
     return state, share, rate
 
 
-def rejuvenate(filters: Filters, state: State) -> tuple[State, float]:
+def rejuvenate(filters: Filters, state: SMC2State) -> tuple[SMC2State, float]:
     """Resample, and move each parameter by particle Metropolis-Hastings; (state, acceptance)."""
     w, m, f = state.weights(), len(state.theta), state.z.shape[1]
     factor = _factor(state.z, w)
@@ -258,7 +256,7 @@ def rejuvenate(filters: Filters, state: State) -> tuple[State, float]:
     ), rate  # fmt: skip
 
 
-def exchange(filters: Filters, state: State, n: int) -> State:
+def exchange(filters: Filters, state: SMC2State, n: int) -> SMC2State:
     """New filters of n particles for the old ones, with weights Z_new / Z_old."""
     made = [
         filters.anew(theta, n, state.experiment, state.row, state.stream) for theta in state.theta
@@ -288,7 +286,7 @@ class Runs:
     report: dict[str, Any]
 
 
-def run_smc2(setup: Setup, method: SMC2, executor: Any, progress: bool) -> Runs:
+def run_smc2(setup: SamplingSetup, method: SMC2, executor: Any, progress: bool) -> Runs:
     """Independent runs through all rows.
 
     Raises
@@ -303,7 +301,7 @@ def run_smc2(setup: Setup, method: SMC2, executor: Any, progress: bool) -> Runs:
     filters = Filters(setup.space, method, _proposal(setup, method))
     states = [begin(filters, setup, r) for r in range(setup.chains)]
     rows = setup.problem.rows
-    chains: Sequence[ChainDraws[State]] = run_chains(
+    chains: Sequence[ChainDraws[SMC2State]] = run_chains(
         partial(rows_block, filters), states, rows, executor=executor, progress=progress,
         title="SMC2", describe=_describe, keep=setup.memory,
     )  # fmt: skip
@@ -329,7 +327,7 @@ def _describe(recent: Sequence[Mapping[str, np.ndarray]]) -> str:
     return f"{max(int(stats['particles'][-1]) for stats in recent)} particles, ESS {share:.2f}"
 
 
-def settled(method: SMC2, draws: int) -> SMC2:
+def with_parameters(method: SMC2, draws: int) -> SMC2:
     """With its number of parameters.
 
     Raises
@@ -347,15 +345,16 @@ def settled(method: SMC2, draws: int) -> SMC2:
 
 
 def drawn(
-    setup: Setup, method: SMC2, draws: int, executor: Any, progress: bool
+    setup: SamplingSetup, method: SMC2, draws: int, executor: Any, progress: bool
 ) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:
-    """The runs of a settled method as chains of `draws` draws, and what to report."""
+    """The runs of a method whose number of parameters is known, as chains of `draws` draws, and
+    what to report."""
     found = run_smc2(setup, method, executor, progress)
     chains = [ChainDraws({"theta": theta[:draws]}, {}, {}, None) for theta in found.theta]
     return chains, found.report
 
 
-def _proposal(setup: Setup, method: SMC2) -> str:
+def _proposal(setup: SamplingSetup, method: SMC2) -> str:
     """The proposal of the filters, one without look-ahead."""
     name = method.proposal
     if name == "auto":
@@ -368,3 +367,8 @@ def _proposal(setup: Setup, method: SMC2) -> str:
             fix='use "auto", "bootstrap" or "guided"',
         )
     return name
+
+
+METHOD = SamplingMethod(
+    None, drawn, state_classes=(SMC2State, Particles, Choice), complete=with_parameters
+)

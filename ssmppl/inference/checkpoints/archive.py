@@ -38,10 +38,10 @@ def write(file: Path, members: Iterable[tuple[str, np.ndarray]]) -> None:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
-    settle(file.parent)
+    sync_folder(file.parent)
 
 
-def settle(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Force new names in a folder to the disk, where folders can be opened for that."""
     try:
         handle = os.open(folder, os.O_RDONLY)

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+BIT_GENERATORS = {"PCG64": np.random.PCG64}  # what np.random.default_rng gives
+
 
 class Store:
     """Arrays of all shapes in few: one after the other, those of a type in one.
@@ -52,9 +54,6 @@ class Store:
     def members(self) -> dict[str, np.ndarray]:
         """All that was put, by type."""
         return {kind: np.concatenate(parts) for kind, parts in self._parts.items()}
-
-
-BIT_GENERATORS = {"PCG64": np.random.PCG64}  # what np.random.default_rng gives
 
 
 class Codec:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.checkpoints.archive import settle
+from ssmppl.inference.checkpoints.archive import sync_folder
 
 PIECE = 2**24  # bytes that are read at once
 
@@ -56,7 +56,7 @@ class Spool:
         try:
             if not self.folder.is_dir():
                 self.folder.mkdir()
-                settle(self.folder.parent)
+                sync_folder(self.folder.parent)
             if max(after) > self.room:
                 self._make_room(draws if max(after) <= draws else max(*after, 2 * self.room))
             for name in dict.fromkeys(name for own in chains for name in own):
@@ -72,7 +72,7 @@ class Spool:
                     places.append(((i * self.room + before[i]) * size, content))
                     entry[2][i] = zlib.crc32(content, entry[2][i])
                 self._put(name, places, len(chains) * self.room * size)
-            settle(self.folder)
+            sync_folder(self.folder)
         except OSError:
             if not any(before):
                 self.clear()

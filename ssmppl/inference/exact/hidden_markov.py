@@ -1,21 +1,13 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
-The laws of data sets of one shape (`histories.py`) are handed all at once to the compiled passes.
-
-The laws of a model of finitely many values, as tables over these.
-
-They may depend on parameters, inputs, time and observations before. The densities are evaluated by
-the interpreter, over all values, rows and data sets of one shape at once.
-
-The passes over finitely many values: in ordinary numbers, or by logarithms where these will not
-do.
+The laws of the model are tables over the values; they may depend on parameters, inputs, time and
+observations before. Their densities are evaluated by the interpreter, over all values, rows and
+data sets of one shape (`histories.py`) at once, and handed to the compiled passes.
 
 A value that the data have made 1e-300 times as likely as another is no number any more, and yet it
 may be the only one that later rows leave: before a change from which no way leads back. The pass in
 ordinary numbers tells where that may have happened, and then everything is done by logarithms, at
 several times the cost.
-
-Quantiles of mixtures by their distribution functions.
 """
 
 from __future__ import annotations
@@ -45,15 +37,111 @@ from ssmppl.inference.run.ranges import without_density
 from ssmppl.language.model.traced import Trace, once_per_trace, previous
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
+HALVINGS = 200  # of an interval between any two floats that differ in size by less than 1e40
+ROUNDING = 1e-12  # by which sums of probabilities may miss a level
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class FiniteLaws(Scored):
-    """A traced model as one of finitely many values (K, D)."""
+class Filtered:
+    """What the forward pass tells of one experiment (T rows, K values).
+
+    log_increments : (T,) log p(y_t | y_{1:t-1}). predicted, filtered : (T, K) laws of x_t given
+    y_{1:t-1} and y_{1:t}, or their logarithms if `logs`. move : (T or 1, K, K), as of the kernels,
+    likewise.
+
+    Of S histories at once every array has one axis more, the first.
+    """
+
+    log_increments: np.ndarray
+    _predicted: np.ndarray
+    _filtered: np.ndarray
+    _move: np.ndarray
+    logs: bool
+
+    @property
+    def predicted(self) -> np.ndarray:
+        return np.exp(self._predicted) if self.logs else self._predicted
+
+    @property
+    def filtered(self) -> np.ndarray:
+        return np.exp(self._filtered) if self.logs else self._filtered
+
+    def of(self, s: int) -> Filtered:
+        """What it tells of history s."""
+        move = self._move[s if len(self._move) > 1 else 0]
+        own = self.log_increments[s], self._predicted[s], self._filtered[s]
+        return Filtered(*own, move, self.logs)
+
+    def smoothed(self, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Laws (S, T, K) of x_t given all data, and (S, T, K, K) of (x_{t-1}, x_t), row 0 zero;
+        without pairs the latter is empty."""
+        shape = self._filtered.shape
+        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
+        entry = exact_entry("finite_backward_logs" if self.logs else "finite_backward")
+        entry(self._move, self._predicted, self._filtered, law, both)
+        return law, both
+
+    def paths(self, which: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
+        """(M, T) indices of values drawn given all data, path m of history which[m], by uniforms
+        (M, T)."""
+        found = np.empty(uniforms.shape, dtype=np.int64)
+        entry = exact_entry("finite_draw_logs" if self.logs else "finite_draw")
+        entry(self._move, self._filtered, which, uniforms, found)
+        return found
+
+
+def forward(
+    log_start: np.ndarray, log_move: np.ndarray, log_g: np.ndarray
+) -> tuple[Filtered, np.ndarray]:
+    """The forward pass, and (S,) the row at which it came to an end, -1 if at none; arguments as of
+    the kernels."""
+    shape = log_g.shape
+    found = np.empty(shape[:2]), np.empty(shape), np.empty(shape)
+    stopped = np.empty(len(log_g), dtype=np.int64)
+    move = np.exp(log_move)
+    exact_entry("finite_forward")(move, log_start, log_move, log_g, *found, stopped)
+    if not np.any(stopped == UNSURE):
+        return Filtered(*found, move, logs=False), stopped
+    exact_entry("finite_forward_logs")(log_start, log_move, log_g, *found, stopped)
+    return Filtered(*found, log_move, logs=True), stopped
+
+
+def inverted(
+    below: Callable[[np.ndarray], np.ndarray], level: float, low: np.ndarray, high: np.ndarray,
+    whole: bool,
+) -> np.ndarray:  # fmt: skip
+    """The smallest values at which distribution functions reach a level, by bisection.
+
+    below : values -> P(Y <= value), in the shape of low and high, between which they lie: of a
+        mixture the least and the largest quantile of its parts. whole : whether values are whole
+        numbers.
+    """
+    low, high = low.copy(), high.copy()
+    for _ in range(HALVINGS):
+        middle = 0.5 * low + 0.5 * high
+        if whole:
+            middle = np.floor(middle)
+            open_ = low < high
+        else:
+            open_ = high - low > 2.0**-52 * np.maximum(np.abs(low), np.abs(high))
+        if not open_.any():
+            break
+        reached = below(middle) >= level - ROUNDING * whole
+        high = np.where(open_ & reached, middle, high)
+        low = np.where(open_ & ~reached, middle + 1.0 if whole else middle, low)
+    return high
+
+
+@dataclass(frozen=True)
+class HiddenMarkov(Scored):
+    """A traced model as one of finitely many values (K, D): its laws as tables over these, and its
+    exact passes."""
 
     form: FiniteStates
     _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
 
+    # -- tables
     @property
     def values(self) -> np.ndarray:
         return self.form.values
@@ -128,106 +216,6 @@ class FiniteLaws(Scored):
                 values = values.reshape((1,) * (2 + len(shape) - values.ndim) + values.shape)
                 found.append(np.broadcast_to(values, (*values.shape[:2], *shape)))
             yield rows, found
-
-
-@dataclass(frozen=True)
-class Filtered:
-    """What the forward pass tells of one experiment (T rows, K values).
-
-    log_increments : (T,) log p(y_t | y_{1:t-1}). predicted, filtered : (T, K) laws of x_t given
-    y_{1:t-1} and y_{1:t}, or their logarithms if `logs`. move : (T or 1, K, K), as of the kernels,
-    likewise.
-
-    Of S histories at once every array has one axis more, the first.
-    """
-
-    log_increments: np.ndarray
-    _predicted: np.ndarray
-    _filtered: np.ndarray
-    _move: np.ndarray
-    logs: bool
-
-    @property
-    def predicted(self) -> np.ndarray:
-        return np.exp(self._predicted) if self.logs else self._predicted
-
-    @property
-    def filtered(self) -> np.ndarray:
-        return np.exp(self._filtered) if self.logs else self._filtered
-
-    def of(self, s: int) -> Filtered:
-        """What it tells of history s."""
-        move = self._move[s if len(self._move) > 1 else 0]
-        own = self.log_increments[s], self._predicted[s], self._filtered[s]
-        return Filtered(*own, move, self.logs)
-
-    def smoothed(self, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Laws (S, T, K) of x_t given all data, and (S, T, K, K) of (x_{t-1}, x_t), row 0 zero;
-        without pairs the latter is empty."""
-        shape = self._filtered.shape
-        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
-        entry = exact_entry("finite_backward_logs" if self.logs else "finite_backward")
-        entry(self._move, self._predicted, self._filtered, law, both)
-        return law, both
-
-    def paths(self, which: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-        """(M, T) indices of values drawn given all data, path m of history which[m], by uniforms
-        (M, T)."""
-        found = np.empty(uniforms.shape, dtype=np.int64)
-        entry = exact_entry("finite_draw_logs" if self.logs else "finite_draw")
-        entry(self._move, self._filtered, which, uniforms, found)
-        return found
-
-
-def forward(
-    log_start: np.ndarray, log_move: np.ndarray, log_g: np.ndarray
-) -> tuple[Filtered, np.ndarray]:
-    """The forward pass, and (S,) the row at which it came to an end, -1 if at none; arguments as of
-    the kernels."""
-    shape = log_g.shape
-    found = np.empty(shape[:2]), np.empty(shape), np.empty(shape)
-    stopped = np.empty(len(log_g), dtype=np.int64)
-    move = np.exp(log_move)
-    exact_entry("finite_forward")(move, log_start, log_move, log_g, *found, stopped)
-    if not np.any(stopped == UNSURE):
-        return Filtered(*found, move, logs=False), stopped
-    exact_entry("finite_forward_logs")(log_start, log_move, log_g, *found, stopped)
-    return Filtered(*found, log_move, logs=True), stopped
-
-
-MOST = 200  # halvings: of an interval between any two floats that differ in size by less than 1e40
-ROUNDING = 1e-12  # by which sums of probabilities may miss a level
-
-
-def inverted(
-    below: Callable[[np.ndarray], np.ndarray], level: float, low: np.ndarray, high: np.ndarray,
-    whole: bool,
-) -> np.ndarray:  # fmt: skip
-    """The smallest values at which distribution functions reach a level, by bisection.
-
-    below : values -> P(Y <= value), in the shape of low and high, between which they lie: of a
-        mixture the least and the largest quantile of its parts. whole : whether values are whole
-        numbers.
-    """
-    low, high = low.copy(), high.copy()
-    for _ in range(MOST):
-        middle = 0.5 * low + 0.5 * high
-        if whole:
-            middle = np.floor(middle)
-            open_ = low < high
-        else:
-            open_ = high - low > 2.0**-52 * np.maximum(np.abs(low), np.abs(high))
-        if not open_.any():
-            break
-        reached = below(middle) >= level - ROUNDING * whole
-        high = np.where(open_ & reached, middle, high)
-        low = np.where(open_ & ~reached, middle + 1.0 if whole else middle, low)
-    return high
-
-
-@dataclass(frozen=True)
-class HiddenMarkov(FiniteLaws):
-    """A traced model as one of finitely many values (K, D), and its exact passes."""
 
     # -- likelihood and laws
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
@@ -488,9 +476,6 @@ class HiddenMarkov(FiniteLaws):
 def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(T, D, D) sums over K of products of a and b (T, K, D)."""
     return a.transpose(0, 2, 1) @ b
-
-
-T = TypeVar("T")
 
 
 def _in_order(each: Sequence[tuple[Histories, Sequence[T]]]) -> list[T]:

@@ -1,20 +1,16 @@
-"""The exact filter of linear Gaussian models (Kalman 1960), and what follows from it.
+"""The exact filter of linear Gaussian models (Kalman 1960), its start, and its score.
 
 Applies where `structure.linear_gaussian` does. The matrices are evaluated by the interpreter, all
 time steps at once, and handed to the compiled filter of `codegen/kernels/kalman/square_root.py`;
 the smoother and the sampler are in `kalman_matrices.py`.
 
-Flat components of x_1 in a linear Gaussian model: the start that smoother and score go from.
+Flat components of x_1 (`codegen/kernels/kalman/diffuse.py`): given the flat part the model is an
+ordinary one, and given the data the flat part is Gaussian; so everything but the filter runs on the
+ordinary model from the mean of that Gaussian, with its root in further columns.
 
-See `codegen/kernels/kalman/diffuse.py`. Given the flat part the model is an ordinary one, and given
-the data the flat part is Gaussian; so everything but the filter runs on the ordinary model from the
-mean of that Gaussian, with its root in further columns.
-
-The exact score of a linear Gaussian model: derivatives of its matrices times their adjoints.
-
-The matrices are differentiated as expressions, once for each model; their derivatives are evaluated
-as the matrices themselves are, and meet what one backward pass of the filter says about every entry
-(`codegen/kernels/kalman/adjoint.py`). No parameter costs another pass.
+The score: the matrices are differentiated as expressions, once for each model; their derivatives
+are evaluated as the matrices themselves are, and meet what one backward pass of the filter says
+about every entry (`codegen/kernels/kalman/adjoint.py`). No parameter costs another pass.
 """
 
 from __future__ import annotations
@@ -53,6 +49,8 @@ from ssmppl.language.model.traced import Trace, once_per_trace
 __all__ = ["Disturbances", "Matrices", "SmoothedMoments"]
 
 AGREEMENT = 1e-6  # of log p(y) by two roads; what is worse was lost to rounding
+LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",
+        "C": "observation", "d": "observation", "R": "observation"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -141,10 +139,6 @@ def check_agreement(trace: Trace, start: Start, log_given: float) -> None:
         fix="give it a proper law in @initial, or its transition some noise",
         where=site.distribution.location,
     )
-
-
-LAWS = {"m": "initial", "P": "initial", "A": "transition", "b": "transition", "Q": "transition",
-        "C": "observation", "d": "observation", "R": "observation"}  # fmt: skip
 
 
 class Slope(NamedTuple):

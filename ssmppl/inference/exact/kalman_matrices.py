@@ -1,8 +1,6 @@
-"""A linear Gaussian model in numbers, and what to say where its laws have no density.
-
-Smoothed moments, disturbances and draws of a linear Gaussian model; the kernels' results.
-
-See `codegen/kernels/kalman/smoother.py` for the methods.
+"""A linear Gaussian model in numbers: its matrices, and what the kernels make of them, smoothed
+moments, disturbances and draws (`codegen/kernels/kalman/smoother.py`); and what to say where its
+laws have no density.
 """
 
 from __future__ import annotations

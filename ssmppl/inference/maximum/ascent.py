@@ -1,13 +1,12 @@
 """What the methods of maximum likelihood share: the question that they are set, and the answer.
 
-The module of each method has `climb(setup, method) -> Ascent`. A climb that is interrupted by
-Ctrl-C (KeyboardInterrupt) returns the best that it has, marked so, and lets the interrupt pass
-where it has nothing yet.
+The module of each method has `climb(setup, method) -> Ascent`, which `verbs/maximize.py` registers.
+A climb that is interrupted by Ctrl-C (KeyboardInterrupt) returns the best that it has, marked so,
+and lets the interrupt pass where it has nothing yet.
 
-Derivatives through the unconstrained scale: theta, log prior and log Jacobian as functions of z.
-
-Everything is derived once from `language/model/transforms.py` by symbolic differentiation. For a
-function l of theta with gradient g (P,) and Hessian H (P, P), on the unconstrained scale
+Climbs are on the unconstrained scale z (`UnconstrainedTransform`): theta, log prior and log
+Jacobian are differentiated once, as expressions, from `language/model/transforms.py`. For a
+function l of theta with gradient g (P,) and Hessian H (P, P)
 
     dl/dz = J' g,    d2l/dz2 = J' H J + sum_p g_p d2 theta_p / dz2,    J = d theta / dz.
 """
@@ -42,7 +41,7 @@ STEP = 1e-5  # of the central differences where a prior has no derivative in clo
 
 
 @dataclass(frozen=True)
-class Point:
+class TransformedPoint:
     """A place on the unconstrained scale: P parameters, F free numbers.
 
     theta : (P,). log_prior : log density of theta on its own scale; -inf outside the support, or
@@ -81,7 +80,7 @@ class Curvature:
     log_jacobian: np.ndarray
 
 
-class Chart:
+class UnconstrainedTransform:
     """The map from z to theta of a `Space`, with its derivatives."""
 
     def __init__(self, space: Space):
@@ -103,7 +102,7 @@ class Chart:
         self._second: list[list[list[Expr]]] | None = None
         self._second_prior: list[list[Expr]] | None = None
 
-    def at(self, z: np.ndarray) -> Point:
+    def at(self, z: np.ndarray) -> TransformedPoint:
         """Values and first derivatives at z (F,)."""
         z = np.asarray(z, dtype=float)
         theta, total = self.space.parameters(z)
@@ -117,7 +116,7 @@ class Chart:
                 d_log_prior = _differences(self._log_prior_at, z)
             log_jacobian = float(evaluate(self.log_jacobian, values))
         log_prior = total - log_jacobian if total > -np.inf else -np.inf
-        return Point(theta.copy(), log_prior, log_jacobian, jacobian, d_log_prior, slope)
+        return TransformedPoint(theta.copy(), log_prior, log_jacobian, jacobian, d_log_prior, slope)
 
     def without_slope(self, value: float, theta: np.ndarray, gradient: np.ndarray) -> str:
         """Says in what a function of theta (P,) that has a value there has no slope (P,); else
@@ -204,7 +203,7 @@ class Ascent:
 
 
 @dataclass(frozen=True)
-class Setup:
+class Maximization:
     """The question: a problem, its free parameters, and what is to be maximised.
 
     objective : "likelihood", or "posterior" for log likelihood + log prior density of theta.
@@ -221,9 +220,9 @@ class Setup:
     progress: bool = False
 
     @cached_property
-    def chart(self) -> Chart:
+    def transform(self) -> UnconstrainedTransform:
         """Derivatives through the unconstrained scale."""
-        return Chart(self.space)
+        return UnconstrainedTransform(self.space)
 
     @cached_property
     def exact(self) -> ExactModel | NotApplicable:
@@ -238,6 +237,10 @@ class Setup:
     @property
     def with_prior(self) -> bool:
         return self.objective == "posterior"
+
+    def log_prior(self, z: np.ndarray) -> float:
+        """What the prior adds to the objective at z (F,)."""
+        return self.transform.at(z).log_prior if self.with_prior else 0.0
 
     @cached_property
     def pilot(self) -> Pilot:
@@ -265,9 +268,7 @@ class Setup:
     def exact_objective(self, z: np.ndarray) -> float:
         """What is maximised, at z (F,); -inf where there is nothing, or no exact likelihood."""
         value = self.exact_at(z)
-        if self.with_prior and value > -np.inf:
-            value += self.chart.at(z).log_prior
-        return value
+        return value + self.log_prior(z) if value > -np.inf else value
 
     def space_at(self, theta: np.ndarray) -> np.ndarray:
         """(F,) the unconstrained place of theta (P,)."""
@@ -279,13 +280,19 @@ class Setup:
 
         The gradient of the likelihood is zero there, or minus that of the log prior.
         """
-        point = self.chart.at(z)
+        point = self.transform.at(z)
         inverse = point.inverse()
         if self.with_prior:
             slope = -inverse.T @ point.d_log_prior
-            information = information + self.chart.curvature(z, slope).theta
+            information = information + self.transform.curvature(z, slope).theta
         with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
             return inverse.T @ information @ inverse
+
+    def natural_error(self, z: np.ndarray, error: np.ndarray) -> np.ndarray:
+        """(P, P) the covariance of an estimate in theta, from that in z (F, F)."""
+        jacobian = self.transform.at(z).jacobian
+        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
+            return jacobian @ error @ jacobian.T
 
     def exact_at(self, z: np.ndarray) -> float:
         """The exact log-likelihood at z (F,); -inf off the support, and where there is none."""

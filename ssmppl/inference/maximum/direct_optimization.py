@@ -2,16 +2,13 @@
 
 Schön et al. (2015), section on direct optimisation. On linear Gaussian models, on those of
 finitely many states and on those without noise in their states the likelihood and its score are
-exact, and Newton steps with the observed information polish the result; for one scalar state see
-`py`.
+exact, and Newton steps with the observed information polish the result.
 
-Direct optimisation over a likelihood that is continuous in the parameters.
-
-The particle filter of Malik and Pitt (2011; see `codegen/kernels/particle/continuous_filters.py`)
-with common random numbers: one continuous function for each seed. Several are averaged, as
-likelihoods, which takes away most of the bias of log Z; slopes are central differences over a small
-share of the likelihood's own width, and the scatter of the seeds' slopes at the top gives the
-estimate's Monte Carlo error.
+For one scalar state the particle filter of Malik and Pitt (2011; see
+`codegen/kernels/particle/continuous_filters.py`) with common random numbers is one continuous
+function for each seed. Several are averaged, as likelihoods, which takes away most of the bias of
+log Z; slopes are central differences over a small share of the likelihood's own width, and the
+scatter of the seeds' slopes at the top gives the estimate's Monte Carlo error.
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Setup
+from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Maximization
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
@@ -46,6 +43,33 @@ SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of th
 CURVE_STEP = 0.5  # of those for second derivatives
 FAR = 1e30
 CLOSE = 0.05  # standard deviations from the top: where the climb has arrived; counted in the error
+NEWTON_STEPS = 8
+GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
+EXACT_RESTARTS = 2
+FLATS = 3  # that a climb leaves
+
+
+def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
+    """Maximise; see the module.
+
+    Raises
+    ------
+    ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
+    """
+    if isinstance(setup.exact, NotApplicable):
+        reason = smooth_filter_applies(setup.problem.trace)
+        if reason is not None:
+            raise ArgumentError(
+                f"DirectOptimization needs a linear Gaussian model, or one scalar state: "
+                f"{setup.exact.reason}; {reason.reason}",
+                fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
+                where=reason.where or setup.exact.where,
+            )
+    with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
+        if isinstance(setup.exact, NotApplicable):
+            with ThreadPoolExecutor() as pool:  # the filter runs without Python's lock
+                return SmoothClimb(setup, method, pool).run()
+        return ExactClimb(setup, setup.exact, method).run()
 
 
 class SmoothLikelihood:
@@ -79,7 +103,7 @@ class SmoothLikelihood:
 class SmoothClimb:
     """Ascent of the averaged likelihood, in units of its own width."""
 
-    def __init__(self, setup: Setup, method: DirectOptimization, pool: ThreadPoolExecutor):
+    def __init__(self, setup: Maximization, method: DirectOptimization, pool: ThreadPoolExecutor):
         self.setup, self.method, self.pool = setup, method, pool
         self.likelihood = SmoothLikelihood(
             setup.problem, method.particles, method.averages, setup.seed(3)
@@ -114,7 +138,7 @@ class SmoothClimb:
                 "the likelihood of the continuous particle filter is zero at the start",
                 fix="give start={name: value} near plausible values, or more particles",
             )
-        theta = self.setup.chart.at(self.best).theta
+        theta = self.setup.transform.at(self.best).theta
         report = {
             "converged": bool(gap < CLOSE), "evaluations": self.evaluations,
             "likelihood": f"particle filter continuous in the parameters (Malik and Pitt 2011), "
@@ -123,7 +147,8 @@ class SmoothClimb:
         }  # fmt: skip
         return Ascent(
             theta, None, np.array(self.iterates), report,
-            self._natural(information), self._natural_error(error), interrupted,
+            None if information is None else self.setup.natural(self.best, information),
+            None if error is None else self.setup.natural_error(self.best, error), interrupted,
         )  # fmt: skip
 
     def log_z(self, z: np.ndarray) -> np.ndarray:
@@ -137,13 +162,10 @@ class SmoothClimb:
 
     def value(self, z: np.ndarray) -> float:
         """The objective: log of the mean likelihood, with the prior where it counts."""
-        value = _log_mean(self.log_z(z)) + self._prior(z)
+        value = _log_mean(self.log_z(z)) + self.setup.log_prior(z)
         if value > self.best_value:
             self.best, self.best_value = np.array(z), value
         return value
-
-    def _prior(self, z: np.ndarray) -> float:
-        return self.setup.chart.at(z).log_prior if self.setup.with_prior else 0.0
 
     def _slope(self, function: Any, z: np.ndarray) -> np.ndarray:
         """Central differences in units of the width, last axis F."""
@@ -185,7 +207,7 @@ class SmoothClimb:
                                     - self._at(z - a + b) + self._at(z - a - b))  # fmt: skip
                 curvature[i, j] = curvature[j, i] = -total / CURVE_STEP**2
         slopes = self._slope(self.log_z, z)  # (S, F)
-        whole_slope = self._slope(lambda v: _log_mean(self.log_z(v)) + self._prior(v), z)
+        whole_slope = self._slope(lambda v: _log_mean(self.log_z(v)) + self.setup.log_prior(v), z)
         if not (np.all(np.isfinite(curvature)) and np.all(np.isfinite(slopes))):
             return np.inf, None, None
         scale = np.outer(self.unit, self.unit)
@@ -208,54 +230,12 @@ class SmoothClimb:
 
     def _prior_curve(self, z: np.ndarray) -> np.ndarray:
         """Second derivatives of the log prior in z."""
-        return self.setup.chart.curvature(z, np.zeros(len(self.setup.space.theta))).log_prior
-
-    def _natural(self, information: np.ndarray | None) -> np.ndarray | None:
-        return None if information is None else self.setup.natural(self.best, information)
-
-    def _natural_error(self, error: np.ndarray | None) -> np.ndarray | None:
-        jacobian = self.setup.chart.at(self.best).jacobian
-        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
-            return None if error is None else jacobian @ error @ jacobian.T
+        return self.setup.transform.curvature(z, np.zeros(len(self.setup.space.theta))).log_prior
 
 
 def _log_mean(log_z: np.ndarray) -> float:
     top = float(np.max(log_z))
     return top if not np.isfinite(top) else top + float(np.log(np.mean(np.exp(log_z - top))))
-
-
-def climb_smooth(setup: Setup, method: DirectOptimization) -> Ascent:
-    """Maximise over the continuous filter, on threads: it runs without Python's lock."""
-    with ThreadPoolExecutor() as pool:
-        return SmoothClimb(setup, method, pool).run()
-
-
-NEWTON_STEPS = 8
-GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
-EXACT_RESTARTS = 2
-FLATS = 3  # that a climb leaves
-
-
-def climb(setup: Setup, method: DirectOptimization) -> Ascent:
-    """Maximise; see the module.
-
-    Raises
-    ------
-    ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
-    """
-    if isinstance(setup.exact, NotApplicable):
-        reason = smooth_filter_applies(setup.problem.trace)
-        if reason is not None:
-            raise ArgumentError(
-                f"DirectOptimization needs a linear Gaussian model, or one scalar state: "
-                f"{setup.exact.reason}; {reason.reason}",
-                fix="use ssm.ScoreAscent(), ssm.PSAEM() or ssm.ParticleEM()",
-                where=reason.where or setup.exact.where,
-            )
-    with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
-        if isinstance(setup.exact, NotApplicable):
-            return climb_smooth(setup, method)
-        return ExactClimb(setup, setup.exact, method).run()
 
 
 class _WithoutMaximum(Exception):
@@ -265,7 +245,7 @@ class _WithoutMaximum(Exception):
 class ExactClimb:
     """Ascent of an exact log-likelihood with its exact score."""
 
-    def __init__(self, setup: Setup, model: ExactModel, method: DirectOptimization):
+    def __init__(self, setup: Maximization, model: ExactModel, method: DirectOptimization):
         self.setup, self.model, self.method = setup, model, method
         self.experiments = setup.problem.experiments
         free = free_components(setup.problem.trace, setup.held)
@@ -291,7 +271,7 @@ class ExactClimb:
                     start = centre + rng.standard_normal(len(start))
                 stopped = self._quasi_newton(start)
                 if len(self.best):
-                    self._check(self.setup.chart.at(self.best).theta)
+                    self._check(self.setup.transform.at(self.best).theta)
             if len(self.best):
                 self._leave_flats()
                 gap = self._polish()
@@ -312,7 +292,7 @@ class ExactClimb:
             )
         if not np.isfinite(gap) and not (interrupted or unbounded):
             stopped = "the climb ran to the edge of what the parameters can be: no maximum inside"
-        point = self.setup.chart.at(self.best)
+        point = self.setup.transform.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
             "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
@@ -331,7 +311,7 @@ class ExactClimb:
         """The objective and its gradient (F,) at z; -inf and zeros where there is none."""
         self.evaluations += 1
         nothing = -np.inf, np.zeros(len(z))
-        point = self.setup.chart.at(z)
+        point = self.setup.transform.at(z)
         if point.log_prior == -np.inf:
             return nothing
         try:
@@ -344,7 +324,8 @@ class ExactClimb:
             value, slope = value + point.log_prior, slope + point.d_log_prior
         if not np.isfinite(value) or not np.all(np.isfinite(slope)):
             self.without_slope = (
-                self.setup.chart.without_slope(value, point.theta, gradient) or self.without_slope
+                self.setup.transform.without_slope(value, point.theta, gradient)
+                or self.without_slope
             )
             return nothing
         self.known[z.tobytes()] = value
@@ -392,7 +373,7 @@ class ExactClimb:
         Parameters whose maximum is at an edge of their support stay where the climb left them.
         """
         gap = np.inf
-        theta = self.setup.chart.at(self.best).theta
+        theta = self.setup.transform.at(self.best).theta
         found = edges(self.setup, theta, self.exact.information(theta))
         kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
         free = self.exact.free.copy()
@@ -431,17 +412,17 @@ class ExactClimb:
         self.known.clear()
 
 
-def observed_information(setup: Setup, model: ExactModel, z: np.ndarray) -> np.ndarray:
+def observed_information(setup: Maximization, model: ExactModel, z: np.ndarray) -> np.ndarray:
     """Minus the second derivatives of the objective in z (F,), (F, F), by the exact score."""
     free = free_components(setup.problem.trace, setup.held)
-    theta = setup.chart.at(z).theta
+    theta = setup.transform.at(z).theta
     return _curvature(setup, exact_score(model, setup.problem.experiments, free, theta), z)
 
 
-def _curvature(setup: Setup, exact: Any, z: np.ndarray) -> np.ndarray:
-    point = setup.chart.at(z)
+def _curvature(setup: Maximization, exact: Any, z: np.ndarray) -> np.ndarray:
+    point = setup.transform.at(z)
     _, gradient = exact.score(point.theta)
-    second = setup.chart.curvature(z, gradient)
+    second = setup.transform.curvature(z, gradient)
     out = point.jacobian.T @ exact.information(point.theta) @ point.jacobian - second.theta
     return out - second.log_prior if setup.with_prior else out
 

@@ -20,7 +20,7 @@ from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.language.model.traced import Site
 from ssmppl.language.model.transforms import Transform, transforms, unconstrain
 
@@ -79,14 +79,14 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
     return out
 
 
-def edges(setup: Setup, theta: np.ndarray, information: np.ndarray) -> Edges | None:
+def edges(setup: Maximization, theta: np.ndarray, information: np.ndarray) -> Edges | None:
     """Which components of theta (P,) are at an edge; None where none is.
 
     information : (P, P), NaN where it does not exist; where it is plain in all of z, nothing is
     asked of the likelihood.
     """
     z = _inside(setup, theta)
-    jacobian = setup.chart.at(z).jacobian
+    jacobian = setup.transform.at(z).jacobian
     with np.errstate(all="ignore"):
         if np.all(np.einsum("pf,pq,qf->f", jacobian, information, jacobian) > FLAT):
             return None
@@ -164,7 +164,7 @@ def _edge(lower: float, upper: float, sign: float) -> float:
     return lower if sign < 0.0 else upper
 
 
-def _inside(setup: Setup, theta: np.ndarray) -> np.ndarray:
+def _inside(setup: Maximization, theta: np.ndarray) -> np.ndarray:
     """(F,) the place of theta; of shares of zero, of shares next to it."""
     trace, values = setup.problem.trace, {}
     for name, value in unpack_parameters(trace, theta).items():

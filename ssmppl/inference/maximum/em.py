@@ -1,10 +1,11 @@
 """Expectation maximisation where the smoother is exact, and so every step.
 
 Dempster, Laird and Rubin (1977); Shumway and Stoffer (1982); Schön et al. (2015), section on EM.
-The E-step takes the smoother's moments (`analysis/conjugacy/m_step.py`; for finite states sums over
-their values), the M-step is derived (`analysis/conjugacy/m_step.py`). Where the densities do not
-separate, Q is climbed as it stands, by BFGS with its symbolic gradient, evaluated over all rows at
-once.
+The E-step takes the smoother's moments; where the states take few values, sums over the values of
+x_t and over the pairs of x_{t-1} and x_t (L. Baum, T. Petrie, G. Soules and N. Weiss, *Annals of
+Mathematical Statistics* 41 (1970)). The M-step is derived (`analysis/conjugacy/m_step.py`). Where
+the densities do not separate, the expected density Q is climbed as it stands, by BFGS with its
+symbolic gradient, evaluated over all rows at once.
 
 EM nears its limit by a constant factor at each step, close to one where the states tell much more
 of the parameters than the data do. So its steps are extrapolated by SQUAREM (Varadhan and Roland
@@ -13,14 +14,6 @@ algorithm", scheme S3) on the unconstrained scale, followed by an EM step, and w
 is kept only where the exact log-likelihood is at least that of two plain steps: it never falls. The
 same extrapolation tells how far the limit still is, which, and not the length of a step, decides
 when to stop.
-
-EM where the states take few values.
-
-L. Baum, T. Petrie, G. Soules and N. Weiss, *Annals of Mathematical Statistics* 41 (1970). The
-expectations are sums over the values of x_t and over the pairs of x_{t-1} and x_t; the M-step is
-derived (`analysis/conjugacy/m_step.py`), or the expected density is climbed.
-
-The M-step of a complete-data density that does not separate: the expected density climbed.
 """
 
 from __future__ import annotations
@@ -48,7 +41,7 @@ from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman import KalmanModel
-from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Setup
+from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Maximization
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.methods.methods import EM
 from ssmppl.inference.methods.requirements import need_density
@@ -58,9 +51,9 @@ from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.language.model.traced import Trace, previous, seen
 
 
-def climbed(
-    setup: Setup, theta: np.ndarray, expected: Callable[[np.ndarray], tuple[float, np.ndarray]],
-    with_slope: bool,
+def maximise_expectation(
+    setup: Maximization, theta: np.ndarray,
+    expected: Callable[[np.ndarray], tuple[float, np.ndarray]], with_slope: bool,
 ) -> np.ndarray:  # fmt: skip
     """Where theta' -> (Q, its derivatives (P,)) has its top near theta, by BFGS on the
     unconstrained scale; Nelder and Mead's simplex where the derivatives are not there.
@@ -69,11 +62,11 @@ def climbed(
     ------
     SamplingError : Q has a value and no slope at theta itself.
     """
-    chart = setup.chart
+    transform = setup.transform
 
     def at(z: np.ndarray) -> tuple[float, np.ndarray]:
         """-Q and its derivatives in z."""
-        point = chart.at(z)
+        point = transform.at(z)
         if not np.all(np.isfinite(point.theta)):
             return np.inf, np.zeros(len(z))
         total, gradient = expected(point.theta)
@@ -83,7 +76,7 @@ def climbed(
 
     z = setup.space_at(theta)
     value, gradient = expected(theta)
-    if with_slope and (reason := chart.without_slope(value, theta, gradient)):
+    if with_slope and (reason := transform.without_slope(value, theta, gradient)):
         raise SamplingError(f"the expected log density cannot be climbed: {reason}", fix=ELSEWHERE)
     before = at(z)[0]
     found = scipy.optimize.minimize(
@@ -91,13 +84,13 @@ def climbed(
         method="BFGS" if with_slope else "Nelder-Mead",
         options={"gtol": 1e-7} if with_slope else {"xatol": 1e-9, "fatol": 1e-12},
     )  # fmt: skip
-    return chart.at(found.x).theta if found.fun <= before else theta
+    return transform.at(found.x).theta if found.fun <= before else theta
 
 
 class FiniteSteps:
     """theta -> theta after one E-step and one M-step."""
 
-    def __init__(self, setup: Setup, model: HiddenMarkov):
+    def __init__(self, setup: Maximization, model: HiddenMarkov):
         self.setup, self.model = setup, model
         self.step: MStep | NotApplicable = maximiser(setup, "EM").step
         self.free = [
@@ -107,7 +100,7 @@ class FiniteSteps:
     def __call__(self, theta: np.ndarray) -> np.ndarray:
         laws = self.model.laws(self.setup.problem.experiments, theta)
         if not isinstance(self.step, MStep):
-            return climbed(self.setup, theta, lambda at: self._density(laws, at), True)
+            return maximise_expectation(self.setup, theta, lambda at: self._density(laws, at), True)
         total = np.array(self.step.prior(theta.tolist()), dtype=float)
         for role, summands in self.step.update.coefficients.items():
             if role in IN_TIME:
@@ -146,7 +139,7 @@ ROUNDING = 1e-13  # of the log-likelihood, relative
 CALM = 2  # cycles in a row that have to find the limit near
 
 
-def climb(setup: Setup, method: EM) -> Ascent:
+def climb(setup: Maximization, method: EM) -> Ascent:
     """Maximise; see the module.
 
     Raises
@@ -175,7 +168,7 @@ def climb(setup: Setup, method: EM) -> Ascent:
 class ExactSteps:
     """theta -> theta after one E-step and one M-step."""
 
-    def __init__(self, setup: Setup, kalman: KalmanModel):
+    def __init__(self, setup: Maximization, kalman: KalmanModel):
         self.setup, self.kalman = setup, kalman
         trace = setup.problem.trace
         self.step: MStep | NotApplicable = maximiser(setup, "EM").step
@@ -247,7 +240,7 @@ class ExactSteps:
                     gradient[place] += found[1:] if len(found) > 1 else 0.0
             return total, gradient
 
-        return climbed(self.setup, theta, expected, isinstance(slopes, dict))
+        return maximise_expectation(self.setup, theta, expected, isinstance(slopes, dict))
 
 
 def row_values(trace: Trace, experiment: Experiment) -> dict[Expr, np.ndarray]:
@@ -284,7 +277,7 @@ def summed(
 class _Climb:
     """The iteration; `best` never has a smaller objective than what came before it."""
 
-    def __init__(self, setup: Setup, model: KalmanModel | HiddenMarkov, method: EM):
+    def __init__(self, setup: Maximization, model: KalmanModel | HiddenMarkov, method: EM):
         self.setup, self.model, self.method = setup, model, method
         self.map = (
             FiniteSteps(setup, model)

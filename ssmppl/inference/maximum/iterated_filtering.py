@@ -7,24 +7,21 @@ parameters of a particle take a random step before it moves at row t, of standar
     s a^(m - 1 + (t - 1) / T),    a = cooling^(1/50),
 
 on the unconstrained scale; parameters and states are resampled together, and the parameters that
-are left begin the next pass. As the steps vanish the swarm settles where the likelihood is highest.
+are left begin the next pass. As the steps vanish the particles gather where the likelihood is
+highest.
 
 Numbers that act in the initial law alone step at the first row only, which the model itself tells
 (`analysis/proposals/perturbed.py`); those that act nowhere stay. Several experiments are passed
-over one after another with one swarm, whose parameters all of them share.
+over one after another with the same particles, whose parameters all of them share.
 
-At the end of a pass the swarm leans to the last rows. Averaged over all rows of a pass it does not,
-to first order: the filtered mean of a random walk is a weighted mean of what the rows say whose
-weights, over a whole period, are the same for each row. So the iterates are means over rows; those
-of the initial law's numbers are the swarm's means at the end.
+At the end of a pass the particles lean to the last rows. Averaged over all rows of a pass they do
+not, to first order: the filtered mean of a random walk is a weighted mean of what the rows say
+whose weights, over a whole period, are the same for each row. So the iterates are means over rows;
+those of the initial law's numbers are the particles' means at the end.
 
-What is left, all swarms may share: steps that have not vanished, a ridge not yet climbed. How the
+What is left, all runs may share: steps that have not vanished, a ridge not yet climbed. How the
 ends differ does not tell it. So from the ends the top itself is looked for, by estimates of the
 likelihood round it (`noisy_maximum.py`); their noise is the error of the estimate.
-
-Swarms of iterated filtering: how a pass over the data moves them; see iterated_filtering.py.
-
-The ends of several noisy climbs: which is the highest, and which agree with it.
 """
 
 from __future__ import annotations
@@ -42,9 +39,9 @@ from ssmppl.codegen.modules.filter_variants import compile_iterated_filter
 from ssmppl.compiling import once_property
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
-from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.m_step import starts
-from ssmppl.inference.maximum.noisy_maximum import Hilltop, check_points, hilltop
+from ssmppl.inference.maximum.noisy_maximum import LocalMaximum, check_points, local_maximum
 from ssmppl.inference.methods.methods import IF2
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
@@ -62,10 +59,15 @@ from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 
+HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
+USUAL = 0.02  # standard deviation of a step
+MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row
+SWITCHED_OFF = "IF2(points=0) asks for none, nor for the Monte Carlo error"
+
 
 @dataclass(frozen=True)
-class Swarms:
-    """What all swarms of a call share; other processes generate the filter again.
+class PerturbedFilter:
+    """What all runs of IF2 in a call share; other processes generate the filter again.
 
     perturbation : (F,) standard deviation of the first step. moving : (F,) see `Perturbed`.
     cooling : factor of the standard deviation over 50 passes.
@@ -99,15 +101,16 @@ class Swarms:
         return out
 
     def one_pass(
-        self, swarm: np.ndarray, iteration: int, stream: np.ndarray
+        self, particles: np.ndarray, iteration: int, stream: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Move the swarm (F, N) over all experiments; (iterate (F,), log_increment of all rows).
+        """Move the particles (F, N) over all experiments; (iterate (F,), log_increment of all
+        rows).
 
         Raises
         ------
         SamplingError : a weight is infinite.
         """
-        every, sums = [], np.zeros(len(swarm))
+        every, sums = [], np.zeros(len(particles))
         for k, (e, steps) in enumerate(
             zip(self.problem.experiments, self.steps(iteration), strict=True)
         ):
@@ -118,38 +121,38 @@ class Swarms:
                 parts.append(counts)
             increment, means = np.empty(e.steps), np.empty(steps.shape)
             status, t = self.run(
-                self.space.theta, e.y, e.seen, np.hstack(parts), stream, swarm, increment, means
+                self.space.theta, e.y, e.seen, np.hstack(parts), stream, particles, increment, means
             )
             if status != OK:
-                theta, _ = self.space.parameters(swarm.mean(axis=1))
+                theta, _ = self.space.parameters(particles.mean(axis=1))
                 raise failure(self.problem, theta, status, t, e)
             every.append(increment)
             sums += means.sum(axis=0)
         log_increment = np.concatenate(every)
-        mean = np.where(self.moving, sums / len(log_increment), swarm.mean(axis=1))
+        mean = np.where(self.moving, sums / len(log_increment), particles.mean(axis=1))
         return mean, log_increment
 
 
 @dataclass(frozen=True)
-class State:
-    """Where a swarm stands: (F, N), the kernels' random state, passes made."""
+class IF2State:
+    """Where a run stands: its particles (F, N), the kernels' random state, passes made."""
 
-    swarm: np.ndarray
+    particles: np.ndarray
     stream: np.ndarray
     done: int
 
 
-def swarm_block(swarms: Swarms, state: State, n: int) -> tuple[State, Block]:
-    """n passes of one swarm."""
-    swarm, stream = state.swarm.copy(), state.stream.copy()
+def if2_block(perturbed_filter: PerturbedFilter, state: IF2State, n: int) -> tuple[IF2State, Block]:
+    """n passes of one run."""
+    particles, stream = state.particles.copy(), state.stream.copy()
     z, totals, impossible = [], [], []
     for k in range(state.done + 1, state.done + n + 1):
-        mean, log_increment = swarms.one_pass(swarm, k, stream)
+        mean, log_increment = perturbed_filter.one_pass(particles, k, stream)
         z.append(mean)
         totals.append(total_of(log_increment))
         impossible.append(np.sum(log_increment == -np.inf))
     stats = {"perturbed_log_likelihood": np.array(totals), "impossible": np.array(impossible)}
-    return State(swarm, stream, state.done + n), Block({"z": np.array(z)}, stats)
+    return IF2State(particles, stream, state.done + n), Block({"z": np.array(z)}, stats)
 
 
 def perturbed_model(space: Space, with_prior: bool) -> Perturbed:
@@ -158,11 +161,8 @@ def perturbed_model(space: Space, with_prior: bool) -> Perturbed:
     return perturbed(problem.trace, problem.program.missing, space.free.tolist(), with_prior)
 
 
-HALF_INTERVAL = 1.92  # half of the 0.95 quantile of chi-square with one degree of freedom
-
-
 @dataclass(frozen=True)
-class Summit:
+class BestEnd:
     """The best of S ends, or the mean of those that agree with it.
 
     z : (F,) the estimate. value, noise : log-likelihood there and its standard error. values,
@@ -179,18 +179,14 @@ class Summit:
     pooled: bool
 
 
-def summit(setup: Setup, method: IF2, ends: np.ndarray) -> Summit:
-    """Where the likelihood is highest out of the ends (S, F) of the swarms and their mean.
+def best_end(setup: Maximization, method: IF2, ends: np.ndarray) -> BestEnd:
+    """Where the likelihood is highest out of the ends (S, F) of the runs and their mean.
 
     Ends agree where their log-likelihoods differ by less than half the width of a 0.95 interval of
     a profile, and two standard errors.
     """
-
-    def prior(z: np.ndarray) -> float:
-        return setup.chart.at(z).log_prior if setup.with_prior else 0.0
-
     values, errors = evaluate(setup, method, ends, 0)
-    heights = values + np.array([prior(z) for z in ends])
+    heights = values + np.array([setup.log_prior(z) for z in ends])
     best = int(np.argmax(heights))
     with np.errstate(invalid="ignore"):  # none is near where all likelihoods are zero
         near = heights[best] - heights <= HALF_INTERVAL + 2.0 * np.hypot(errors, errors[best])
@@ -198,13 +194,13 @@ def summit(setup: Setup, method: IF2, ends: np.ndarray) -> Summit:
     if near.sum() > 1:
         middle = ends[near].mean(axis=0)
         (own,), (own_noise,) = evaluate(setup, method, middle[None], len(ends))
-        if own + prior(middle) >= heights[best]:
+        if own + setup.log_prior(middle) >= heights[best]:
             z, value, noise, pooled = middle, own, own_noise, True
-    return Summit(z, float(value), float(noise), values, errors, best, near, pooled)
+    return BestEnd(z, float(value), float(noise), values, errors, best, near, pooled)
 
 
 def evaluate(
-    setup: Setup, method: IF2, ends: np.ndarray, first: int
+    setup: Maximization, method: IF2, ends: np.ndarray, first: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(log-likelihood, its standard error) at each end (S, F), numbered from `first`; exact where
     that can be. An end at which the filter fails has -inf.
@@ -235,51 +231,46 @@ def _estimates(
         return error
 
 
-USUAL = 0.02  # standard deviation of a step
-MOST_FOR_INITIAL = 10.0  # times that of a number that steps at every row
-SWITCHED_OFF = "IF2(points=0) asks for none, nor for the Monte Carlo error"
-
-
-def climb(setup: Setup, method: IF2) -> Ascent:
+def climb(setup: Maximization, method: IF2) -> Ascent:
     """Maximise; see the module.
 
     Raises
     ------
     ArgumentError : a setting does not apply; no particle can be drawn from the initial law.
-    SamplingError : the likelihood cannot be evaluated where any of the swarms ended.
+    SamplingError : the likelihood cannot be evaluated where any of the runs ended.
     """
     setup.problem.proposal("bootstrap")
     check_points(method, len(setup.space.where))
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
-    swarms = Swarms(setup.space, setup.with_prior, scales, model.moving, method.cooling)
+    perturbed_filter = PerturbedFilter(
+        setup.space, setup.with_prior, scales, model.moving, method.cooling
+    )
     points = begin(setup, method)
     states = [
-        State(np.tile(z[:, None], (1, method.particles)), random_state(setup.seed(6, k)), 0)
+        IF2State(np.tile(z[:, None], (1, method.particles)), random_state(setup.seed(6, k)), 0)
         for k, z in enumerate(points)
     ]
     chains = run_chains(
-        partial(swarm_block, swarms), states, method.iterations, executor=setup.executor,
+        partial(if2_block, perturbed_filter), states, method.iterations, executor=setup.executor,
         progress=setup.progress, title="IF2", describe=_describe,
     )  # fmt: skip
     drawn, stats = stack(chains)
     averaged = min(method.averaged, drawn["z"].shape[1])
     ends = drawn["z"][:, -averaged:].mean(axis=1)
     interrupted = cut_short = any(c.interrupted for c in chains)
-    top = summit(setup, method, ends)
+    top = best_end(setup, method, ends)
     found, interrupted = _beyond(setup, method, top, len(ends), interrupted)
     report = _report(setup, model, scales, ends, top, averaged)
-    if cut_short:  # swarms that have hardly left their starts agree by these
+    if cut_short:  # runs that have hardly left their starts agree by these
         report["converged"] = None
     if stats["impossible"][top.best, -averaged:].any():
         report["impossible_rows"] = int(stats["impossible"][top.best, -averaged:].sum())
     z, error, information, none = top.z, None, None, ""
     by_particles = isinstance(setup.exact, NotApplicable)
-    if isinstance(found, Hilltop):
+    if isinstance(found, LocalMaximum):
         z = found.z
-        jacobian = setup.chart.at(z).jacobian
-        with np.errstate(over="ignore", invalid="ignore"):  # as far out as floating point goes
-            error = jacobian @ found.error @ jacobian.T
+        error = setup.natural_error(z, found.error)
         report |= {"beyond_the_swarms": found.moved, "estimate": f"{found}, the search for which "
                    f"began at the {report['estimate']}"}  # fmt: skip
         if by_particles:
@@ -293,7 +284,7 @@ def climb(setup: Setup, method: IF2) -> Ascent:
     way = np.concatenate([np.array(points)[:, None], drawn["z"]], axis=1)
     log_p = stats["perturbed_log_likelihood"]
     return Ascent(
-        setup.chart.at(z).theta, None,
+        setup.transform.at(z).theta, None,
         np.array([[setup.space.parameters(z)[0] for z in c] for c in way]),
         report, information, error, interrupted,
         {"perturbed_log_likelihood": np.hstack([np.full((len(log_p), 1), np.nan), log_p])}, none,
@@ -301,35 +292,35 @@ def climb(setup: Setup, method: IF2) -> Ascent:
 
 
 def _beyond(
-    setup: Setup, method: IF2, top: Summit, number: int, interrupted: bool
-) -> tuple[Hilltop | NotApplicable, bool]:
-    """The top beyond the ends of `number` swarms, and whether Ctrl-C was pressed by now."""
+    setup: Maximization, method: IF2, top: BestEnd, number: int, interrupted: bool
+) -> tuple[LocalMaximum | NotApplicable, bool]:
+    """The top beyond the ends of `number` runs, and whether Ctrl-C was pressed by now."""
     if method.points == 0:
         return NotApplicable(SWITCHED_OFF), interrupted
     if not interrupted:
         try:
-            return highest(setup, method, top, number), False
+            return maximum_near(setup, method, top, number), False
         except KeyboardInterrupt:
             pass
     return NotApplicable("interrupted before the top was looked for"), True
 
 
-def highest(setup: Setup, method: IF2, ends: Summit, number: int) -> Hilltop | NotApplicable:
-    """The top near where `number` swarms ended, unless the likelihood there is below theirs."""
+def maximum_near(
+    setup: Maximization, method: IF2, ends: BestEnd, number: int
+) -> LocalMaximum | NotApplicable:
+    """The top near where `number` runs ended, unless the likelihood there is below theirs."""
     if not ends.value > -np.inf:
         return NotApplicable("the likelihood is zero where the swarms ended")
     noise = ends.noise * np.sqrt(method.evaluations)
     with announced("IF2", "looking for the top", shown=setup.progress):
-        found = hilltop(setup, method, ends.z, noise)
+        found = local_maximum(setup, method, ends.z, noise)
     if isinstance(found, NotApplicable):
         return found
     try:
         (value,), (error,) = evaluate(setup, method, found.z[None], number + 1)
     except SamplingError:
         value, error = -np.inf, 0.0
-    gain = value - ends.value
-    if setup.with_prior:
-        gain += setup.chart.at(found.z).log_prior - setup.chart.at(ends.z).log_prior
+    gain = value - ends.value + (setup.log_prior(found.z) - setup.log_prior(ends.z))
     if not gain > -HALF_INTERVAL - 2.0 * np.hypot(error, ends.noise):
         return NotApplicable("where the fitted quadratic has its top, the likelihood is low")
     return found
@@ -340,7 +331,7 @@ def _describe(recent: Sequence[Mapping[str, np.ndarray]]) -> str:
     return f"perturbed log-likelihood {best:.2f}"
 
 
-def step_scales(setup: Setup, method: IF2, model: Perturbed) -> np.ndarray:
+def step_scales(setup: Maximization, method: IF2, model: Perturbed) -> np.ndarray:
     """(F,) standard deviations of the first steps: as asked for, 0 for what acts nowhere.
 
     Raises
@@ -365,13 +356,13 @@ def step_scales(setup: Setup, method: IF2, model: Perturbed) -> np.ndarray:
     return np.where(model.acting, out, 0.0)
 
 
-def _owners(setup: Setup) -> list[str]:
+def _owners(setup: Maximization) -> list[str]:
     """(F,) the parameter that each unconstrained number belongs to."""
-    return [s.data[1] for s in setup.chart.z]
+    return [s.data[1] for s in setup.transform.z]
 
 
-def begin(setup: Setup, method: IF2) -> list[np.ndarray]:
-    """(F,) where each swarm begins."""
+def begin(setup: Maximization, method: IF2) -> list[np.ndarray]:
+    """(F,) where each run begins."""
     wanted = method.starts
     if isinstance(wanted, Sequence) and not isinstance(wanted, str):
         out = []
@@ -385,7 +376,7 @@ def begin(setup: Setup, method: IF2) -> list[np.ndarray]:
 
 
 def _report(
-    setup: Setup, model: Perturbed, scales: np.ndarray, ends: np.ndarray, top: Summit,
+    setup: Maximization, model: Perturbed, scales: np.ndarray, ends: np.ndarray, top: BestEnd,
     averaged: int,
 ) -> dict[str, Any]:  # fmt: skip
     names, agree = _owners(setup), int(top.near.sum())
@@ -416,11 +407,11 @@ def _report(
     return report
 
 
-def _labels(setup: Setup) -> list[str]:
+def _labels(setup: Maximization) -> list[str]:
     """(F,) the unconstrained numbers by name, with an index where a parameter has several."""
     names = _owners(setup)
     return [
-        n if names.count(n) == 1 else repr(s) for n, s in zip(names, setup.chart.z, strict=True)
+        n if names.count(n) == 1 else repr(s) for n, s in zip(names, setup.transform.z, strict=True)
     ]
 
 

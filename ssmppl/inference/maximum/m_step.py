@@ -26,7 +26,12 @@ from ssmppl.analysis.conjugacy.sufficient import complete_data, restricted
 from ssmppl.codegen.modules.trajectories import compile_statistics
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference.maximum.ascent import ELSEWHERE, Chart, Point, Setup
+from ssmppl.inference.maximum.ascent import (
+    ELSEWHERE,
+    Maximization,
+    TransformedPoint,
+    UnconstrainedTransform,
+)
 from ssmppl.inference.particles.scores import CompleteScores, complete_scores
 from ssmppl.inference.preparation.pilot import dispersed
 from ssmppl.inference.preparation.space import Space, at
@@ -43,37 +48,37 @@ LAST_STEP = 1e-6  # squared length, in standard errors of the complete data; wha
 class _Height:
     """The mean log density at a point: its value, its slope in z (F,) and in theta (P,)."""
 
-    point: Point
+    point: TransformedPoint
     value: float
     slope: np.ndarray
     gradient: np.ndarray
 
 
-def climbed(
-    chart: Chart, scores: CompleteScores, paths: Sequence[np.ndarray], weights: np.ndarray,
-    z: np.ndarray, posterior: bool,
+def maximise_over_paths(
+    transform: UnconstrainedTransform, scores: CompleteScores, paths: Sequence[np.ndarray],
+    weights: np.ndarray, z: np.ndarray, posterior: bool,
 ) -> np.ndarray:  # fmt: skip
     """theta (P,) where the weighted mean of log p(x, y | theta) has its top, going up from z (F,).
 
     paths : for each experiment (M, T, D). weights : (M,). posterior : whether the prior counts.
     """
-    mean = _Mean(chart, scores, paths, weights, posterior)
-    return chart.at(mean.newton(z) if scores.twice else mean.bfgs(z)).theta
+    mean = _Mean(transform, scores, paths, weights, posterior)
+    return transform.at(mean.newton(z) if scores.twice else mean.bfgs(z)).theta
 
 
 class _Mean:
     """The weighted mean of the log density over trajectories, as a function of z."""
 
     def __init__(
-        self, chart: Chart, scores: CompleteScores, paths: Sequence[np.ndarray],
-        weights: np.ndarray, posterior: bool,
+        self, transform: UnconstrainedTransform, scores: CompleteScores,
+        paths: Sequence[np.ndarray], weights: np.ndarray, posterior: bool,
     ):  # fmt: skip
-        self.chart, self.scores, self.posterior = chart, scores, posterior
+        self.transform, self.scores, self.posterior = transform, scores, posterior
         self.paths, self.weights = paths, weights
 
     def at(self, z: np.ndarray) -> _Height | None:
         """None outside of the support, or where nothing is finite."""
-        point = self.chart.at(z)
+        point = self.transform.at(z)
         if point.log_prior == -np.inf:
             return None
         values, gradients = self.scores.value_and_gradient(point.theta, self.paths)
@@ -93,10 +98,10 @@ class _Mean:
         """
         here = self.at(z)
         if here is None:
-            point = self.chart.at(z)
+            point = self.transform.at(z)
             values, gradients = self.scores.value_and_gradient(point.theta, self.paths)
             value, gradient = float(self.weights @ values), self.weights @ gradients
-            if reason := self.chart.without_slope(value, point.theta, gradient):
+            if reason := self.transform.without_slope(value, point.theta, gradient):
                 raise SamplingError(
                     f"the log density of the states cannot be climbed: {reason}", fix=ELSEWHERE
                 )
@@ -108,7 +113,7 @@ class _Mean:
         second = np.tensordot(
             self.weights, self.scores.hessian(height.point.theta, self.paths), axes=1
         )
-        bent = self.chart.curvature(z, height.gradient)
+        bent = self.transform.curvature(z, height.gradient)
         out = j.T @ second @ j + bent.theta
         return out + bent.log_prior if self.posterior else out
 
@@ -188,8 +193,8 @@ class Maximiser:
         return compile_statistics(self.step)
 
     @cached_property
-    def chart(self) -> Chart:
-        return Chart(self.space)
+    def transform(self) -> UnconstrainedTransform:
+        return UnconstrainedTransform(self.space)
 
     @cached_property
     def scores(self) -> CompleteScores:
@@ -220,8 +225,8 @@ class Maximiser:
             weights = [np.repeat(ratio_weights(row) / m, m) for row in log_z]
             return self.step.maximise(self.statistics(theta, paths, weights), theta)
         w = np.repeat(ratio_weights(log_z.sum(axis=0)) / m, m)
-        return climbed(
-            self.chart, self.scores, paths, w, self._unconstrained(theta), self.posterior
+        return maximise_over_paths(
+            self.transform, self.scores, paths, w, self._unconstrained(theta), self.posterior
         )
 
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
@@ -243,7 +248,7 @@ def ratio_weights(log_z: np.ndarray) -> np.ndarray:
     return share if r == 1 else (r * share - 1.0 / r) / (r - 1.0)
 
 
-def maximiser(setup: Setup, method: str) -> Maximiser:
+def maximiser(setup: Maximization, method: str) -> Maximiser:
     """The M-step of a question.
 
     Raises
@@ -269,7 +274,7 @@ def maximiser(setup: Setup, method: str) -> Maximiser:
     return Maximiser(setup.space, tuple(setup.held), setup.with_prior)
 
 
-def starts(setup: Setup, chains: int) -> list[np.ndarray]:
+def starts(setup: Maximization, chains: int) -> list[np.ndarray]:
     """theta (P,) for each chain, dispersed round the start on the scale of the pilot's mode.
 
     So a climb that has not forgotten where it began shows in how the chains differ.
@@ -292,7 +297,7 @@ class Chains:
 
 
 def run_to_estimate(
-    setup: Setup, step_block: Callable[[Any, int], tuple[Any, Block]], states: Sequence[Any],
+    setup: Maximization, step_block: Callable[[Any, int], tuple[Any, Block]], states: Sequence[Any],
     iterations: int, left_out: int, title: str, by_regression: bool = False,
 ) -> Chains:  # fmt: skip
     """Run chains whose blocks hold "theta" (n, P), and pool what comes after `left_out`."""
@@ -339,7 +344,7 @@ class Pooled:
     how: str
 
 
-def pool(setup: Setup, iterates: np.ndarray, by_regression: bool = False) -> Pooled:
+def pool(setup: Maximization, iterates: np.ndarray, by_regression: bool = False) -> Pooled:
     """One estimate from iterates (R, K, P), on the unconstrained scale.
 
     by_regression : the fixed point of the regression of iterates on those before, instead of their
@@ -351,7 +356,7 @@ def pool(setup: Setup, iterates: np.ndarray, by_regression: bool = False) -> Poo
     chains = len(z)
     centre, how = z.mean(axis=(0, 1)), "mean"
     if chains == 1:
-        return Pooled(setup.chart.at(centre).theta, None, np.nan, how)
+        return Pooled(setup.transform.at(centre).theta, None, np.nan, how)
     left_out = [np.delete(z, r, axis=0) for r in range(chains)]
     points = np.array([some.mean(axis=(0, 1)) for some in left_out])
     if by_regression:
@@ -367,7 +372,7 @@ def pool(setup: Setup, iterates: np.ndarray, by_regression: bool = False) -> Poo
     error = change.std(axis=0, ddof=1) / np.sqrt(chains)
     with np.errstate(invalid="ignore", divide="ignore"):
         drift = np.nanmax(np.abs(change.mean(axis=0)) / error, initial=0.0)
-    point = setup.chart.at(centre)
+    point = setup.transform.at(centre)
     return Pooled(point.theta, point.jacobian @ spread @ point.jacobian.T, float(drift), how)
 
 

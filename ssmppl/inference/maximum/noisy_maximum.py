@@ -1,32 +1,11 @@
-"""From where the swarms of iterated filtering ended to the top of the likelihood there.
+"""From where iterated filtering ended to the maximum of the likelihood there.
 
-Ends can share one bias: along a ridge on which the likelihood is almost flat all swarms lag, and
+Ends can share one bias: along a ridge on which the likelihood is almost flat all runs lag, and
 steps that have not vanished move all of them alike. So the end is only where the search for the
 top begins. Points are scattered round it, the likelihood is estimated at each by filters of its
-own, and a quadratic is fitted. First in rounds, each of which moves the centre to
-the top that the quadratic has and takes on its shape, until both rest; then once with more points,
-whose noise is no part of how their centre was chosen.
-
-The top of a function of which only noisy values are known: a quadratic fitted round it.
-
-E. L. Ionides, C. Bretó, J. Park, R. A. Smith and A. A. King, "Monte Carlo profile confidence
-intervals for dynamic systems", *J. R. Soc. Interface* 14 (2017), take the top of a quadratic fitted
-to estimates of a log-likelihood, and its error from that of the coefficients. Here it is a function
-of all F parameters, and three things are different.
-
-Estimates Z of a likelihood are unbiased; their logs are too low by half their variance, which is
-not the same everywhere and would move the top. So the quadratic q is fitted to Z itself, by the
-estimating equation of a law whose standard deviation is in proportion to its mean,
-
-    sum_j x_j (Z_j / exp(q(u_j)) - 1) = 0,    x_j the monomials at u_j,
-
-which has mean zero at the truth whatever the noise (P. McCullagh and J. A. Nelder, *Generalized
-Linear Models*, 2nd edition 1989, chapters 8 and 9). The coefficients' covariance is the sandwich of
-the same terms, in which what the quadratic misses counts as noise.
-
-A likelihood is skew. Third derivatives bend the slope of a quadratic fitted over a region: over
-points scattered evenly in all directions by s, slope i is off by s^2 / 2 times the sum over j of
-the derivatives i, j, j. So q has terms u_i |u|^2 too, which take just this part.
+own, and a quadratic is fitted (`inference/optimisation/quadratic.py`). First in rounds, each of
+which moves the centre to the top that the quadratic has and takes on its shape, until both rest;
+then once with more points, whose noise is no part of how their centre was chosen.
 """
 
 from __future__ import annotations
@@ -37,139 +16,14 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.methods.methods import IF2
+from ssmppl.inference.optimisation.quadratic import LocalQuadratic, count, fit_quadratic
 from ssmppl.inference.particles.filtering import FilterSettings, log_of_mean, repeated_estimates
 from ssmppl.inference.preparation.pilot import scale_of
 from ssmppl.inference.preparation.proposal_choice import choose
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.tasks import run_tasks
-
-NEWTON_STEPS = 100  # of Newton's steps
-AT_REST = 1e-12  # fall of the loss that is promised, after which there are no more
-SAFE = 0.1  # share of the expected second derivatives that is added to the observed ones
-LEAST_SHARE = 1e-4  # of a step that is taken, and of what it promises
-
-
-@dataclass(frozen=True)
-class Fit:
-    """q(u) = a + b'u - u'Hu/2 + (c'u) |u|^2.
-
-    b, c : (F,). h : (F, F). covariance : of all coefficients, in the order of `monomials`.
-    misfit : mean square of (Z - exp(q)) / exp(q).
-    """
-
-    b: np.ndarray
-    h: np.ndarray
-    c: np.ndarray
-    covariance: np.ndarray
-    misfit: float
-
-    def slope(self, u: np.ndarray) -> np.ndarray:
-        """(F,) of q at u (F,)."""
-        return self.b - self.h @ u + self.c * (u @ u) + 2.0 * (self.c @ u) * u
-
-    def information(self, u: np.ndarray) -> np.ndarray:
-        """(F, F) minus the second derivatives at u (F,)."""
-        mixed = np.outer(self.c, u)
-        return self.h - 2.0 * (mixed + mixed.T + (self.c @ u) * np.eye(len(u)))
-
-    def shape(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Eigenvalues (F,) of H, their standard errors, and eigenvectors."""
-        values, vectors = np.linalg.eigh(self.h)
-        d = len(values)
-        i, j = np.tril_indices(d)
-        rows = -(vectors[i] * vectors[j]).T * 2.0  # of v'Hv in the coefficients of u_i u_j
-        part = self.covariance[1 + d : 1 + d + len(i), 1 + d : 1 + d + len(i)]
-        return values, np.sqrt(np.einsum("fk,kl,fl->f", rows, part, rows)), vectors
-
-    def error(self, u: np.ndarray) -> np.ndarray:
-        """(F, F) covariance of a top at u, by the delta method."""
-        skew = len(self.covariance) > count(len(u), skew=False)
-        inverse = np.linalg.inv(self.information(u))
-        rows = inverse @ slopes_of_monomials(u, skew)
-        return rows @ self.covariance @ rows.T
-
-
-def count(d: int, skew: bool) -> int:
-    """How many coefficients q has in d dimensions."""
-    return 1 + d + d * (d + 1) // 2 + (d if skew else 0)
-
-
-def monomials(u: np.ndarray, skew: bool) -> np.ndarray:
-    """(n, K) of points u (n, F): 1, u_i, u_i u_j (j <= i), and u_i |u|^2 if skew."""
-    i, j = np.tril_indices(u.shape[1])
-    columns = [np.ones((len(u), 1)), u, u[:, i] * u[:, j]]
-    if skew:
-        columns.append(u * np.sum(u**2, axis=1, keepdims=True))
-    return np.hstack(columns)
-
-
-def slopes_of_monomials(u: np.ndarray, skew: bool) -> np.ndarray:
-    """(F, K) derivatives of the monomials at one point u (F,)."""
-    one = np.eye(len(u))
-    i, j = np.tril_indices(len(u))
-    parts = [np.zeros((len(u), 1)), one, one[:, i] * u[j] + one[:, j] * u[i]]
-    if skew:
-        parts.append((u @ u) * one + 2.0 * np.outer(u, u))
-    return np.hstack(parts)
-
-
-def fitted(u: np.ndarray, log_z: np.ndarray, skew: bool) -> Fit | None:
-    """The fit to log Z (n,) at points u (n, F), -inf where an estimate is zero.
-
-    None where too few are finite, or the scoring does not come to rest.
-    """
-    d, x = u.shape[1], monomials(u, skew)
-    finite = np.isfinite(log_z)
-    if finite.sum() <= x.shape[1]:
-        return None
-    log_z = log_z - log_z[finite].max()  # a matter of the constant, and of rounding
-    with np.errstate(all="ignore"):
-        near = np.exp(0.125 * np.minimum(log_z[finite] + d, 0.0))  # far points are not quadratic
-        begin = np.linalg.lstsq(x[finite] * near[:, None], log_z[finite] * near, rcond=None)[0]
-        beta = _solved(x, log_z, begin)
-        if beta is None:
-            return None
-        rest = np.exp(log_z - x @ beta) - 1.0
-    inverse = np.linalg.inv(x.T @ x)
-    leverage = np.einsum("nk,kl,nl->n", x, inverse, x)
-    off = (x * (rest / np.maximum(1.0 - leverage, 0.1))[:, None]) @ inverse
-    h = np.zeros((d, d))
-    i, j = np.tril_indices(d)
-    h[i, j] = -beta[1 + d : 1 + d + len(i)]
-    return Fit(
-        beta[1 : 1 + d], h + h.T, beta[1 + d + len(i) :] if skew else np.zeros(d),
-        off.T @ off, float(np.mean(rest**2)),
-    )  # fmt: skip
-
-
-def _solved(x: np.ndarray, log_z: np.ndarray, beta: np.ndarray) -> np.ndarray | None:
-    """(K,) the root of the estimating equation: by damped Newton steps to the minimum of the convex
-    sum_j Z_j / exp(x_j beta) + x_j beta, whose derivative it is."""
-
-    def loss(beta: np.ndarray) -> float:
-        return float(np.sum(np.exp(log_z - x @ beta) + x @ beta))
-
-    value = loss(beta)
-    for _ in range(NEWTON_STEPS):
-        ratio = np.exp(log_z - x @ beta)
-        try:
-            step = np.linalg.solve((x.T * (ratio + SAFE)) @ x, x.T @ (ratio - 1.0))
-        except np.linalg.LinAlgError:
-            return None
-        share, fall = 1.0, float(step @ (x.T @ (ratio - 1.0)))
-        if not np.isfinite(fall):
-            return None
-        if fall < AT_REST:
-            return beta
-        while not (new := loss(beta + share * step)) < value - LEAST_SHARE * share * fall:
-            share *= 0.5
-            if share < LEAST_SHARE:
-                return None
-        beta, value = beta + share * step, new
-    return None
-
 
 REACH = 0.9  # standard deviations by which points are scattered
 EXACT_REACH = 0.1  # where the likelihood has no noise
@@ -193,7 +47,7 @@ TOGETHER = 8  # points of a task
 
 
 @dataclass(frozen=True)
-class Hilltop:
+class LocalMaximum:
     """z : (F,) the top. error : (F, F) its Monte Carlo covariance. information : (F, F) minus the
     second derivatives of the log-likelihood in z there. points, runs : of the last round, and
     filters at each of them. moved : from where the search began, in standard deviations."""
@@ -215,7 +69,7 @@ class Hilltop:
 class _Search:
     """How far a search has come; settings : of the filters, None where the likelihood is exact."""
 
-    setup: Setup
+    setup: Maximization
     settings: FilterSettings | None
     centre: np.ndarray
     factor: np.ndarray
@@ -226,7 +80,7 @@ class _Search:
     hopeless: int = 0
     seen: tuple[np.ndarray, ...] = ()
 
-    def look(self, n: int, skew: bool) -> Fit | None:
+    def look(self, n: int, skew: bool) -> LocalQuadratic | None:
         """A fit to n points round the centre."""
         self.done += 1
         rng = np.random.default_rng(self.setup.seed(8, self.done))
@@ -238,7 +92,7 @@ class _Search:
         inside = ~np.isnan(log_z)
         pair = np.tile(np.arange(len(half)), 2)
         self.seen = u[inside], log_z[inside], pair[inside]
-        fit = fitted(u[inside], log_z[inside], skew)
+        fit = fit_quadratic(u[inside], log_z[inside], skew)
         if fit is not None and self.settings is not None:
             self.misfit = fit.misfit
             self.hopeless += self.runs == MOST_RUNS and fit.misfit > HOPELESS
@@ -254,7 +108,7 @@ class _Search:
             return False
         return self.move(fit)
 
-    def move(self, fit: Fit) -> bool:
+    def move(self, fit: LocalQuadratic) -> bool:
         """Centre and shape to those of a fit, as far as its noise allows; whether they rest."""
         values, errors, vectors = fit.shape()
         surely = 1.0 + np.sign(values - 1.0) * np.maximum(np.abs(values - 1.0) - errors, 0.0)
@@ -267,7 +121,7 @@ class _Search:
         self.factor = np.linalg.cholesky(self.factor @ root @ root.T @ self.factor.T)
         return bool(distance < NEAR and usable.min() > ALIKE and usable.max() < 1.0 / ALIKE)
 
-    def error(self, fit: Fit, u: np.ndarray) -> np.ndarray | None:
+    def error(self, fit: LocalQuadratic, u: np.ndarray) -> np.ndarray | None:
         """(F, F) Monte Carlo covariance of the top u: the larger of the delta method's and of the
         jackknife's over groups of pairs, which knows what noise in the curvature does to a top.
         None where the fit without a group has no top."""
@@ -275,7 +129,7 @@ class _Search:
         tops = []
         for g in range(GROUPS):
             rest = pair % GROUPS != g
-            without = fitted(points[rest], log_z[rest], True)
+            without = fit_quadratic(points[rest], log_z[rest], True)
             top = None if without is None else self.top(without, surely=0.0)
             if top is None:
                 return None
@@ -285,7 +139,7 @@ class _Search:
         delta = fit.error(u)
         return jackknife if np.trace(jackknife) > np.trace(delta) else delta
 
-    def top(self, fit: Fit, surely: float = SURELY) -> np.ndarray | None:
+    def top(self, fit: LocalQuadratic, surely: float = SURELY) -> np.ndarray | None:
         """(F,) where the fit has its top, in its own coordinates; None where it has none near, or
         where its information is not so many standard errors above zero in every direction."""
         u = np.zeros(len(self.centre))
@@ -322,7 +176,9 @@ def check_points(method: IF2, d: int) -> None:
         )
 
 
-def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop | NotApplicable:
+def local_maximum(
+    setup: Maximization, method: IF2, z: np.ndarray, noise: float
+) -> LocalMaximum | NotApplicable:
     """The top near z (F,), where `noise` is the relative error of one estimate of the likelihood.
 
     Raises
@@ -368,14 +224,14 @@ def hilltop(setup: Setup, method: IF2, z: np.ndarray, noise: float) -> Hilltop |
         information = inverse.T @ fit.information(u) @ inverse
         if setup.with_prior:
             nothing = np.zeros(len(setup.space.theta))
-            information = information + setup.chart.curvature(top, nothing).log_prior
+            information = information + setup.transform.curvature(top, nothing).log_prior
         moved = float(np.linalg.norm(np.linalg.solve(f, top - z)))
-        return Hilltop(top, f @ error @ f.T, information, points, runs, moved)
+        return LocalMaximum(top, f @ error @ f.T, information, points, runs, moved)
     return NotApplicable("the likelihood has no top within reach of the points round the end")
 
 
 def log_densities(
-    setup: Setup, settings: FilterSettings | None, points: np.ndarray, runs: int,
+    setup: Maximization, settings: FilterSettings | None, points: np.ndarray, runs: int,
     path: tuple[int, ...],
 ) -> np.ndarray:  # fmt: skip
     """(n,) log of what is to be maximised at points (n, F), from the mean of `runs` estimates.
@@ -393,9 +249,7 @@ def log_densities(
         ]
         task = partial(_estimates, setup.space, settings)
         log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
-    if setup.with_prior:
-        log_z = log_z + np.array([setup.chart.at(z).log_prior for z in points])
-    return log_z
+    return log_z + np.array([setup.log_prior(z) for z in points])
 
 
 def _estimates(
@@ -416,7 +270,7 @@ def _estimates(
     return np.array(out)
 
 
-def scales(setup: Setup, settings: FilterSettings | None, z: np.ndarray) -> np.ndarray:
+def scales(setup: Maximization, settings: FilterSettings | None, z: np.ndarray) -> np.ndarray:
     """(F,) how far to scatter points in each coordinate, a first guess."""
     if settings is None:
         return scale_of(z, lambda point: float(_finite(setup.exact_at(point))))

@@ -28,7 +28,7 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods.methods import ParticleEM
 from ssmppl.inference.methods.requirements import need_density
@@ -40,7 +40,7 @@ from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.seeds import random_state
 
 
-def climb(setup: Setup, method: ParticleEM) -> Ascent:
+def climb(setup: Maximization, method: ParticleEM) -> Ascent:
     """Maximise; see the module.
 
     Raises
@@ -71,7 +71,7 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
     else:
         m_step = str(maximum.step)
     states = [
-        State(start, random_state(setup.seed(3, chain)))
+        ParticleEMState(start, random_state(setup.seed(3, chain)))
         for chain, start in enumerate(starts(setup, method.chains))
     ]
     task = partial(em_block, maximum, settings, int(method.runs), each, kernel)
@@ -94,7 +94,7 @@ def climb(setup: Setup, method: ParticleEM) -> Ascent:
 
 
 @dataclass(frozen=True)
-class State:
+class ParticleEMState:
     """Where a chain stands: theta (P,) and the kernels' random state."""
 
     theta: np.ndarray
@@ -102,9 +102,9 @@ class State:
 
 
 def em_block(
-    maximum: Maximiser, settings: FilterSettings, runs: int, each: int, kernel: str, state: State,
-    n: int,
-) -> tuple[State, Block]:  # fmt: skip
+    maximum: Maximiser, settings: FilterSettings, runs: int, each: int, kernel: str,
+    state: ParticleEMState, n: int,
+) -> tuple[ParticleEMState, Block]:  # fmt: skip
     """n iterations of one chain."""
     stream, theta = state.stream.copy(), state.theta
     thetas, spreads = [], []
@@ -114,7 +114,7 @@ def em_block(
         thetas.append(theta)
         spreads.append(log_z.sum(axis=0).std())
     block = Block({"theta": np.array(thetas)}, {"log_z_sd": np.array(spreads)})
-    return State(theta, stream), block
+    return ParticleEMState(theta, stream), block
 
 
 def smoothed(

@@ -23,17 +23,14 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
-    PARTICLES,
-    PARTICLES_WITHOUT_ANCESTORS,
     Sweeper,
-    pgas_proposal,
+    conditional_settings,
     start_chain,
 )
-from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.m_step import Maximiser, maximiser, run_to_estimate, starts
 from ssmppl.inference.methods.methods import PSAEM
 from ssmppl.inference.methods.requirements import need_density
@@ -43,7 +40,7 @@ from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.seeds import random_state
 
 
-def climb(setup: Setup, method: PSAEM) -> Ascent:
+def climb(setup: Maximization, method: PSAEM) -> Ascent:
     """Maximise; see the module.
 
     Raises
@@ -53,7 +50,7 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
     """
     need_density(setup.problem.trace, "PSAEM", "maximize")
     maximum = _by_statistics(setup)
-    settings = conditional_settings(setup, method)
+    settings = conditional_settings(setup.problem, method.particles, method.proposal)
     states = []
     for chain, theta in enumerate(starts(setup, method.chains)):
         seed = setup.seed(2, chain)
@@ -61,7 +58,7 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
             Sweeper(setup.problem, (), settings), theta, np.random.default_rng(seed),
             random_state(seed),
         )  # fmt: skip
-        states.append(State(theta, begun.paths, begun.stream, np.empty(0), 0))
+        states.append(PSAEMState(theta, begun.paths, begun.stream, np.empty(0), 0))
     found = run_to_estimate(
         setup, partial(saem_block, maximum, settings, method), states, method.iterations,
         averaged_from(method), "PSAEM",
@@ -80,7 +77,7 @@ def climb(setup: Setup, method: PSAEM) -> Ascent:
     )  # fmt: skip
 
 
-def _by_statistics(setup: Setup) -> Maximiser:
+def _by_statistics(setup: Maximization) -> Maximiser:
     maximum = maximiser(setup, "PSAEM")
     if isinstance(maximum.step, NotApplicable):
         raise ArgumentError(
@@ -89,17 +86,6 @@ def _by_statistics(setup: Setup) -> Maximiser:
             where=maximum.step.where,
         )
     return maximum
-
-
-def conditional_settings(setup: Setup, method: PSAEM) -> FilterSettings:
-    """Particles and proposal of the conditional filter, as PGAS takes them."""
-    problem = setup.problem
-    memory = deterministic_memory(problem.trace)
-    usual = PARTICLES if memory is not None else PARTICLES_WITHOUT_ANCESTORS
-    particles = usual if method.particles is None else method.particles
-    proposal = pgas_proposal(problem) if method.proposal == "auto" else method.proposal
-    problem.proposal(proposal)
-    return FilterSettings(int(particles), proposal)
 
 
 def step_size(k: int, method: PSAEM) -> float:
@@ -113,7 +99,7 @@ def averaged_from(method: PSAEM) -> int:
 
 
 @dataclass(frozen=True)
-class State:
+class PSAEMState:
     """Where a chain stands: theta (P,), a path (T, D) per experiment, the kernels' random state,
     the statistics S, and the number of iterations made."""
 
@@ -125,8 +111,8 @@ class State:
 
 
 def saem_block(
-    maximum: Maximiser, settings: FilterSettings, method: PSAEM, state: State, n: int
-) -> tuple[State, Block]:
+    maximum: Maximiser, settings: FilterSettings, method: PSAEM, state: PSAEMState, n: int
+) -> tuple[PSAEMState, Block]:
     """n iterations of one chain."""
     stream, theta, paths, total = state.stream.copy(), state.theta, state.paths, state.statistics
     thetas, rates = [], []
@@ -139,7 +125,7 @@ def saem_block(
         thetas.append(theta)
         rates.append(rate)
     block = Block({"theta": np.array(thetas)}, {"update_rate": np.array(rates)})
-    return State(theta, paths, stream, total, state.done + n), block
+    return PSAEMState(theta, paths, stream, total, state.done + n), block
 
 
 def averaged_sweep(

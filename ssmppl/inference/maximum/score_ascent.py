@@ -25,12 +25,12 @@ import scipy
 
 from ssmppl.data import spelled
 from ssmppl.errors import SamplingError
-from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.methods.methods import ScoreAscent
 from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import choose_kernel
 from ssmppl.inference.particles.scores import (
-    Run,
+    SmootherRun,
     Smoothing,
     combine,
     complete_scores,
@@ -49,10 +49,11 @@ MEMORY = 0.3  # weight of the newest information in B
 NEAR = 3.0  # squared length of a step, in noise, below which the approach is over
 LEAST_APPROACH, LEAST_AVERAGE = 3, 10  # iterations
 GAIN = 0.6
+Runs = Callable[[np.ndarray, int], list[SmootherRun]]
 
 
 @dataclass(frozen=True)
-class Slope:
+class ScoreEstimate:
     """What is estimated at z, in z: gradient (F,), its noise, information and that of the complete
     data (F, F); natural : the information in theta (P, P). each : (R, F) gradients of the runs, and
     their log_z (R,).
@@ -69,15 +70,15 @@ class Slope:
 
 
 @dataclass
-class _Way:
+class _Iterations:
     """How far a climb has come."""
 
     iterates: list[np.ndarray] = field(default_factory=list)
-    near: list[Slope] = field(default_factory=list)
+    near: list[ScoreEstimate] = field(default_factory=list)
     b: np.ndarray | None = None
 
 
-def climb(setup: Setup, method: ScoreAscent) -> Ascent:
+def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
     """Maximise; see the module.
 
     Raises
@@ -102,7 +103,7 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     )  # fmt: skip
     smoothing = Smoothing(settings, counts["trajectories"], kernel)
 
-    def runs(z: np.ndarray, k: int) -> list[Run]:
+    def runs(z: np.ndarray, k: int) -> list[SmootherRun]:
         theta, log_prior = setup.space.parameters(z)
         if log_prior == -np.inf:
             raise SamplingError("the parameters left their support")
@@ -120,13 +121,15 @@ def climb(setup: Setup, method: ScoreAscent) -> Ascent:
     return ascent
 
 
-Runs = Callable[[np.ndarray, int], list[Run]]
-
-
 def _newton(
-    setup: Setup, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int, bar: Progress
+    setup: Maximization,
+    method: ScoreAscent,
+    start: np.ndarray,
+    runs: Runs,
+    most: int,
+    bar: Progress,
 ) -> Ascent:
-    way = _Way()
+    way = _Iterations()
     z, interrupted, share = np.array(start), False, np.inf
     try:
         for k in range(most):
@@ -152,8 +155,8 @@ def _newton(
 
 
 def _safe_slope(
-    setup: Setup, way: _Way, z: np.ndarray, runs: Runs, k: int
-) -> tuple[np.ndarray, Slope]:
+    setup: Maximization, way: _Iterations, z: np.ndarray, runs: Runs, k: int
+) -> tuple[np.ndarray, ScoreEstimate]:
     """(z, slope there); where the filter fails, at a point on the way back to the last iterate."""
     for _ in range(6):
         try:
@@ -166,7 +169,7 @@ def _safe_slope(
     return z, _slope(setup, z, runs(z, k))
 
 
-def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
+def _slope(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> ScoreEstimate:
     with np.errstate(over="ignore", invalid="ignore"):
         slope = _combined(setup, z, runs)
     if not all(
@@ -175,33 +178,33 @@ def _slope(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
     ):
         raise SamplingError(
             "the log joint density has no finite second derivative at "
-            f"{spelled(setup.problem.trace, setup.chart.at(z).theta)}",
+            f"{spelled(setup.problem.trace, setup.transform.at(z).theta)}",
             fix="give start={name: value} off the edges of the laws, or use IF2",
         )
     return slope
 
 
-def _combined(setup: Setup, z: np.ndarray, runs: list[Run]) -> Slope:
-    point, found = setup.chart.at(z), combine(runs)
+def _combined(setup: Maximization, z: np.ndarray, runs: list[SmootherRun]) -> ScoreEstimate:
+    point, found = setup.transform.at(z), combine(runs)
     j = point.jacobian
     log_z = np.array([r.log_z for r in runs])
     w = run_weights(log_z)
     each = point.pull(np.stack([r.mean for r in runs]))
     hessian = np.tensordot(w, np.stack([r.hessian for r in runs if r.hessian is not None]), axes=1)
-    second = setup.chart.curvature(z, found.gradient)
+    second = setup.transform.curvature(z, found.gradient)
     gradient, prior = point.pull(found.gradient), np.zeros_like(second.theta)
     if setup.with_prior:
         gradient, prior = gradient + point.d_log_prior, second.log_prior
         each = each + point.d_log_prior
     natural = found.information if found.information is not None else np.zeros_like(hessian)
     rest = -second.theta - prior
-    return Slope(
+    return ScoreEstimate(
         z, gradient, each, log_z, j.T @ found.gradient_covariance @ j,
         j.T @ natural @ j + rest, -j.T @ hessian @ j + rest, natural,
     )  # fmt: skip
 
 
-def _preconditioner(b: np.ndarray | None, slope: Slope) -> np.ndarray:
+def _preconditioner(b: np.ndarray | None, slope: ScoreEstimate) -> np.ndarray:
     """B with the newest information in it, positive definite: between a share of the complete
     data's information and the whole of it, in every direction."""
     complete = _positive(slope.complete)
@@ -219,7 +222,7 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
     return (vectors * values) @ vectors.T
 
 
-def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _average(way: _Iterations) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """(top, Monte Carlo covariance, information, largest error in standard errors), in z."""
     information = np.mean([s.information for s in way.near], axis=0)
     complete = _positive(np.mean([s.complete for s in way.near], axis=0))
@@ -243,7 +246,7 @@ def _average(way: _Way) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 
 
 def _answer(
-    setup: Setup, method: ScoreAscent, way: _Way, share: float, interrupted: bool
+    setup: Maximization, method: ScoreAscent, way: _Iterations, share: float, interrupted: bool
 ) -> Ascent:
     iterates = np.array([setup.space.parameters(z)[0].copy() for z in way.iterates])
     converged = share < method.tolerance
@@ -256,22 +259,26 @@ def _answer(
         theta = iterates[-1]
         return Ascent(theta, None, iterates, report, interrupted=interrupted)
     top, error, _, _ = _average(way)
-    point = setup.chart.at(top)
     natural = np.mean([s.natural for s in way.near], axis=0)
     return Ascent(
-        point.theta, None, iterates, report, natural,
-        point.jacobian @ error @ point.jacobian.T, interrupted,
+        setup.transform.at(top).theta, None, iterates, report, natural,
+        setup.natural_error(top, error), interrupted,
     )  # fmt: skip
 
 
 def _paper(
-    setup: Setup, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int, bar: Progress
+    setup: Maximization,
+    method: ScoreAscent,
+    start: np.ndarray,
+    runs: Runs,
+    most: int,
+    bar: Progress,
 ) -> Ascent:
     metric = paper_metric(setup)
-    way, z, interrupted = _Way([np.array(start)]), np.array(start), False
+    way, z, interrupted = _Iterations([np.array(start)]), np.array(start), False
     try:
         for k in range(1, most + 1):
-            point = setup.chart.at(z)
+            point = setup.transform.at(z)
             batch = runs(z, k)
             gradient = point.pull(np.mean([r.mean for r in batch], axis=0))
             if setup.with_prior:
@@ -288,7 +295,7 @@ def _paper(
     return Ascent(iterates[-1], None, iterates, report, interrupted=interrupted)
 
 
-def paper_metric(setup: Setup) -> np.ndarray:
+def paper_metric(setup: Maximization) -> np.ndarray:
     """(F,) what turns a step in z into one of the paper's parameters: 4 for a logit, else 1.
 
     A logit is twice the paper's atanh, whose gradient is twice that in the logit.

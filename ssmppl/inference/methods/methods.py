@@ -1,6 +1,6 @@
-"""Methods of estimation as settings: small frozen dataclasses, named by the field.
+"""Methods of estimation and of smoothing as settings: small frozen dataclasses, named by the field.
 
-Methods of smoothing as settings: small frozen dataclasses, named by the field.
+Each setting is declared with the rule that its values follow (`settings.py`).
 """
 
 from __future__ import annotations
@@ -8,6 +8,33 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from ssmppl.counts import check_count
+from ssmppl.errors import ArgumentError
+from ssmppl.inference.methods.settings import (
+    POSITIVE,
+    RATE,
+    SHARE,
+    a_name,
+    count,
+    count_or_starts,
+    finite_matrix,
+    flag,
+    flag_auto_or_names,
+    flag_or_auto,
+    number,
+    one_of,
+    optional,
+    rescue_factor,
+    scales_by_name,
+    setting,
+    step_sizes,
+    whole_number_to,
+)
+
+# Rules of settings that several methods have.
+ACCEPTANCE = optional(number(lambda v: 0.0 < v < 1.0, RATE))
+ESS = number(lambda v: 0.0 <= v <= 1.0, "give a number from 0 (never resample) to 1 (always)")
 
 
 @dataclass(frozen=True)
@@ -30,12 +57,15 @@ class MetropolisHastings:
         noise, so that the gradient costs little, and more than two numbers are free; else 0.
     """
 
-    covariance: Any = None
-    scale: str = "unconstrained"
-    transform: Mapping[str, str] | None = None
-    adapt: bool | None = None
-    target_acceptance: float | None = None
-    order: int | None = None
+    covariance: Any = setting(None, optional(finite_matrix))  # noqa: RUF009
+    scale: str = setting("unconstrained", a_name)
+    transform: Mapping[str, str] | None = setting(None, optional(scales_by_name))
+    adapt: bool | None = setting(None, optional(flag))
+    target_acceptance: float | None = setting(None, ACCEPTANCE)
+    order: int | None = setting(
+        None,
+        optional(whole_number_to(1, "use 0 (random walk), 1 (Langevin, by the gradient) or None")),
+    )
 
 
 @dataclass(frozen=True)
@@ -50,7 +80,7 @@ class Gibbs:
         random walk on the exact likelihood: True, False, or "auto", as in `PGAS`.
     """
 
-    interweave: bool | str = False
+    interweave: bool | str = setting(False, flag_or_auto)
 
 
 @dataclass(frozen=True)
@@ -92,18 +122,44 @@ class PMMH:
         nor `correlation`.
     """
 
-    particles: int | None = None
-    proposal: str = "auto"
-    target_sd: float = 1.2
-    target_acceptance: float | None = None
-    covariance: Any = None
-    scale: str = "unconstrained"
-    transform: Mapping[str, str] | None = None
-    adapt: bool | None = None
-    order: int = 0
-    lag: int = 12
-    correlation: float = 0.0
-    rescue: int = 0
+    particles: int | None = setting(None, optional(count(1)))
+    proposal: str = setting("auto", a_name)
+    target_sd: float = setting(1.2, number(lambda v: v > 0.0, POSITIVE))
+    target_acceptance: float | None = setting(None, ACCEPTANCE)
+    covariance: Any = setting(None, optional(finite_matrix))  # noqa: RUF009
+    scale: str = setting("unconstrained", a_name)
+    transform: Mapping[str, str] | None = setting(None, optional(scales_by_name))
+    adapt: bool | None = setting(None, optional(flag))
+    order: int = setting(
+        0, whole_number_to(2, "use 0 (random walk), 1 (gradient) or 2 (gradient and information)")
+    )
+    lag: int = setting(12, count(0))
+    correlation: float = setting(
+        0.0,
+        number(
+            lambda v: 0.0 <= v < 1.0,
+            "give a number from 0 (fresh random numbers) to below 1, as 0.99",
+        ),
+    )
+    rescue: int = setting(0, rescue_factor)
+
+    def _check_together(self) -> None:
+        """The filters of some settings exclude those of others."""
+        if self.rescue and (self.order or self.correlation):
+            raise ArgumentError(
+                f"rescue={self.rescue} together with order={self.order}, correlation="
+                f"{self.correlation}: the filters of these draw a fixed number of particles",
+                fix="use ssm.PMMH(rescue=...) with order=0 and correlation=0.0",
+            )
+        if self.rescue and self.proposal == "tempered":
+            raise ArgumentError(
+                f'rescue={self.rescue} together with proposal="tempered"', fix="use one of them"
+            )
+        if self.order and self.correlation:
+            raise ArgumentError(
+                f"order={self.order} together with correlation={self.correlation}",
+                fix="use one of them: the sorted filter of the correlated method keeps no scores",
+            )
 
 
 @dataclass(frozen=True)
@@ -131,11 +187,11 @@ class PGAS:
         tells which can be and why others cannot. Particles then move by the transition.
     """
 
-    particles: int | None = None
-    proposal: str = "auto"
-    log_likelihood: bool = False
-    interweave: bool | str = False
-    eliminate: bool | str | tuple[str, ...] = False
+    particles: int | None = setting(None, optional(count(2)))
+    proposal: str = setting("auto", a_name)
+    log_likelihood: bool = setting(False, flag)
+    interweave: bool | str = setting(False, flag_or_auto)
+    eliminate: bool | str | tuple[str, ...] = setting(False, flag_auto_or_names)
 
 
 @dataclass(frozen=True)
@@ -156,10 +212,10 @@ class DirectOptimization:
     steps : most iterations of a climb.
     """
 
-    particles: int = 1000
-    averages: int = 8
-    restarts: int | None = None
-    steps: int = 200
+    particles: int = setting(1000, count(2))
+    averages: int = setting(8, count(2))
+    restarts: int | None = setting(None, optional(count(0)))
+    steps: int = setting(200, count(1))
 
 
 @dataclass(frozen=True)
@@ -177,9 +233,9 @@ class EM:
         log-likelihood never falls, with or without.
     """
 
-    iterations: int = 2000
-    tolerance: float = 1e-8
-    accelerate: bool = True
+    iterations: int = setting(2000, count(1))
+    tolerance: float = setting(1e-8, number(lambda v: v > 0.0, POSITIVE))
+    accelerate: bool = setting(True, flag)
 
 
 @dataclass(frozen=True)
@@ -202,14 +258,18 @@ class ParticleEM:
         tells its error.
     """
 
-    particles: int = 1000
-    runs: int = 2
-    trajectories: int = 200
-    proposal: str = "auto"
-    kernel: str = "auto"
-    iterations: int = 100
-    burn_in: int = 30
-    chains: int = 8
+    particles: int = setting(1000, count(2))
+    runs: int = setting(2, count(1))
+    trajectories: int = setting(200, count(1))
+    proposal: str = setting("auto", a_name)
+    kernel: str = setting("auto", a_name)
+    iterations: int = setting(100, count(1))
+    burn_in: int = setting(30, count(0))
+    chains: int = setting(8, count(1))
+
+    def _check_together(self) -> None:
+        """Some iterations are left for the estimate."""
+        check_count("iterations", self.iterations, self.burn_in + 1)
 
 
 @dataclass(frozen=True)
@@ -230,12 +290,18 @@ class PSAEM:
         tells its error.
     """
 
-    particles: int | None = None
-    proposal: str = "auto"
-    iterations: int = 1000
-    burn_in: int = 150
-    exponent: float = 0.7
-    chains: int = 8
+    particles: int | None = setting(None, optional(count(2)))
+    proposal: str = setting("auto", a_name)
+    iterations: int = setting(1000, count(1))
+    burn_in: int = setting(150, count(1))
+    exponent: float = setting(
+        0.7, number(lambda v: 0.5 < v <= 1.0, "give a number above 0.5 and at most 1")
+    )
+    chains: int = setting(8, count(1))
+
+    def _check_together(self) -> None:
+        """Some iterations are left for the estimate."""
+        check_count("iterations", self.iterations, self.burn_in + 1)
 
 
 @dataclass(frozen=True)
@@ -258,16 +324,23 @@ class ScoreAscent:
     proposal, kernel : of the filter and of the backward pass, as in `score`.
     """
 
-    steps: str = "newton"
-    particles: int | None = None
-    trajectories: int | None = None
-    runs: int | None = None
-    iterations: int | None = None
-    tolerance: float = 0.04
-    gamma: float = 0.01
-    exponent: float = -2.0 / 3.0
-    proposal: str = "auto"
-    kernel: str = "auto"
+    steps: str = setting("newton", one_of(("newton", "paper")))
+    particles: int | None = setting(None, optional(count(1)))
+    trajectories: int | None = setting(None, optional(count(1)))
+    runs: int | None = setting(None, optional(count(1)))
+    iterations: int | None = setting(None, optional(count(1)))
+    tolerance: float = setting(0.04, number(lambda v: v > 0.0, POSITIVE))
+    gamma: float = setting(0.01, number(lambda v: v > 0.0, POSITIVE))
+    exponent: float = setting(
+        -2.0 / 3.0, number(lambda v: v <= 0.0, "give a number of at most 0, as -2/3")
+    )
+    proposal: str = setting("auto", a_name)
+    kernel: str = setting("auto", a_name)
+
+    def _check_together(self) -> None:
+        """The spread of the runs tells the noise of the score."""
+        if self.steps != "paper" and self.runs is not None:
+            check_count("runs", self.runs, 2)
 
 
 @dataclass(frozen=True)
@@ -303,14 +376,20 @@ class IF2:
         an exact likelihood gives standard errors.
     """
 
-    particles: int = 2000
-    iterations: int = 100
-    cooling: float = 0.5
-    perturbation: float | Mapping[str, float] = 0.02
-    starts: int | Sequence[Mapping[str, Any]] = 4
-    averaged: int = 25
-    evaluations: int = 10
-    points: int | None = None
+    particles: int = setting(2000, count(2))
+    iterations: int = setting(100, count(1))
+    cooling: float = setting(
+        0.5,
+        number(
+            lambda v: 0.0 < v <= 1.0,
+            "give what is left of the steps after 50 iterations: above 0, at most 1",
+        ),
+    )
+    perturbation: float | Mapping[str, float] = setting(0.02, step_sizes)
+    starts: int | Sequence[Mapping[str, Any]] = setting(4, count_or_starts)
+    averaged: int = setting(25, count(1))
+    evaluations: int = setting(10, count(2))
+    points: int | None = setting(None, optional(count(0)))
 
 
 @dataclass(frozen=True)
@@ -334,12 +413,12 @@ class SMC2:
     proposal : of the filters: "auto", "bootstrap", "guided" or "user".
     """
 
-    parameters: int | None = None
-    particles: int = 100
-    ess_threshold: float = 0.5
-    moves: int = 3
-    acceptance: float = 0.15
-    proposal: str = "auto"
+    parameters: int | None = setting(None, optional(count(2)))
+    particles: int = setting(100, count(1))
+    ess_threshold: float = setting(0.5, number(lambda v: 0.0 <= v <= 1.0, SHARE))
+    moves: int = setting(3, count(1))
+    acceptance: float = setting(0.15, number(lambda v: 0.0 <= v <= 1.0, SHARE))
+    proposal: str = setting("auto", a_name)
 
 
 Method = MetropolisHastings | Gibbs | PMMH | PGAS | SMC2
@@ -372,12 +451,12 @@ class FFBSi:
     proposal, resampling, ess_threshold, rescue : of the particle filter, as in `log_likelihood`.
     """
 
-    kernel: str = "auto"
-    moves: int = 20
-    proposal: str = "auto"
-    resampling: str = "systematic"
-    ess_threshold: float = 1.0
-    rescue: int = 0
+    kernel: str = setting("auto", a_name)
+    moves: int = setting(20, count(0))
+    proposal: str = setting("auto", a_name)
+    resampling: str = setting("systematic", a_name)
+    ess_threshold: float = setting(1.0, ESS)
+    rescue: int = setting(0, rescue_factor)
 
 
 @dataclass(frozen=True)
@@ -392,10 +471,10 @@ class FixedLag:
     proposal, resampling, ess_threshold : of the particle filter, as in `log_likelihood`.
     """
 
-    lag: int | None = None
-    proposal: str = "auto"
-    resampling: str = "systematic"
-    ess_threshold: float = 1.0
+    lag: int | None = setting(None, optional(count(0)))
+    proposal: str = setting("auto", a_name)
+    resampling: str = setting("systematic", a_name)
+    ess_threshold: float = setting(1.0, ESS)
 
 
 SmoothingMethod = KalmanSmoother | ForwardBackward | FFBSi | FixedLag | PGAS

@@ -35,7 +35,7 @@ from ssmppl.language.model.traced import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
-class Run:
+class NoiselessRun:
     """log_increments : (T,) log p(y_t | y_{1:t-1}). path : (T, D), the states."""
 
     log_increments: np.ndarray
@@ -61,7 +61,7 @@ class Deterministic(Scored):
         """(T, D) the states."""
         return self._run(self._problem([experiment]), experiment, theta)[1]
 
-    def filter(self, experiment: Experiment, theta: np.ndarray) -> Run:
+    def filter(self, experiment: Experiment, theta: np.ndarray) -> NoiselessRun:
         """The states, and the log density of each row given those before it.
 
         Raises
@@ -78,7 +78,7 @@ class Deterministic(Scored):
         )  # fmt: skip
         if status != OK:
             raise failure(problem, theta, status, t, experiment)
-        return Run(increments, self._run(problem, experiment, theta)[1])
+        return NoiselessRun(increments, self._run(problem, experiment, theta)[1])
 
     def smooth(self, experiment: Experiment, theta: np.ndarray) -> SmoothedMoments:
         """The states, as moments without spread.

@@ -17,6 +17,7 @@ from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, Location, SamplingError, listing
+from ssmppl.inference.methods.settings import rescue_factor
 from ssmppl.inference.particles.blocks import LEAST, run_in_blocks
 from ssmppl.inference.particles.on_device import run_on_device
 from ssmppl.inference.run.problem import Problem
@@ -28,6 +29,13 @@ SCHEMES = {
     "stratified": STRATIFIED,
     "residual": RESIDUAL,
     "multinomial": MULTINOMIAL,
+}
+Arrays = tuple[np.ndarray, ...]
+Moments = tuple[np.ndarray | Arrays, ...]
+_WHAT = {
+    ALL_ZERO: "all weights are zero",
+    NAN: "a weight is nan",
+    INFINITE: "a weight is infinite",
 }
 
 
@@ -69,7 +77,7 @@ def filter_settings(
         "ess_threshold", ess_threshold, lambda v: 0.0 <= v <= 1.0,
         "give a share of the particles, from 0 (never resample) to 1 (always)",
     )  # fmt: skip
-    check_rescue(rescue)
+    rescue_factor("rescue", rescue)
     if rescue and (resampling not in ("systematic", "multinomial") or ess_threshold < 1.0):
         raise ArgumentError(
             f"rescue={rescue} together with resampling={resampling!r}, ess_threshold="
@@ -86,20 +94,6 @@ def filter_settings(
     return FilterSettings(
         int(particles), proposal, SCHEMES[resampling], float(ess_threshold), int(rescue)
     )
-
-
-def check_rescue(rescue: Any) -> None:
-    """Refuse what is neither 0 nor a whole number that leaves room for more particles."""
-    check_count("rescue", rescue, 0)
-    if rescue == 1:
-        raise ArgumentError(
-            "rescue=1 allows a row the N particles that it has anyway",
-            fix="give how many times N particles a row may take, as rescue=100; 0: no rescue",
-        )
-
-
-Arrays = tuple[np.ndarray, ...]
-Moments = tuple[np.ndarray | Arrays, ...]
 
 
 def run_filter(
@@ -236,13 +230,6 @@ def full_run(
     if status != OK:
         raise failure(problem, theta, status, t, experiment)
     return out
-
-
-_WHAT = {
-    ALL_ZERO: "all weights are zero",
-    NAN: "a weight is nan",
-    INFINITE: "a weight is infinite",
-}
 
 
 def failure(

@@ -1,11 +1,10 @@
-"""Fixed-lag smoothing: marginals of x_t from the genealogy of a particle filter.
+"""Fixed-lag smoothing, marginals of x_t from the genealogy of a particle filter; and a warning
+where a particle smoother has collapsed, its draws of a state sharing a few values.
 
 Kitagawa (1996), section 3; Olsson, Cappé, Douc and Moulines (2008) for bias against degeneracy:
 p(x_t | y_{1:T}) is approximated by p(x_t | y_{1:t+L}), from the ancestors at t of the weighted
 particles at t + L. It costs O(N) for each step and lag, needs no transition density, and gives
 marginals only.
-
-A warning where a particle smoother has collapsed: its draws of a state share a few values.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from ssmppl.data.times import label_text
 from ssmppl.inference.particles.backward import ParticleSystem
 
 LAG = 20
+FEW = 0.01  # of the values that there could be, below which the spread of the draws means little
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,6 @@ def lag_moments(system: ParticleSystem, lag: int, levels: np.ndarray) -> LagMome
             z_before = before - (before @ w)[:, None]
             out.cross[t] = (z * w) @ z_before.T
     return out
-
-
-FEW = 0.01  # of the values that there could be, below which the spread of the draws means little
 
 
 def distinct(paths: np.ndarray) -> np.ndarray:

@@ -1,11 +1,9 @@
-"""Runs of the Rao-Blackwellised particle filter, told in the model's own states.
+"""The Rao-Blackwellised particle filter, and backward simulation over it, in the model's states.
 
 The filter carries the states x that are sampled and the moments of the linear ones, z
 (`analysis/elimination/marginal.py`). What is known of z_t is a mixture of Gaussians, one of each
 particle: its mean and covariance are exact given the particles, its quantiles come from one draw of
 each. Given a path of x, z is drawn by the backward sampler of the Kalman filter.
-
-Backward simulation over a Rao-Blackwellised particle filter.
 
 Paths of x and z together are drawn backwards (F. Lindsten and T. Schön, "Backward simulation
 methods for Monte Carlo statistical inference", *Foundations and Trends in Machine Learning* 6,
@@ -45,6 +43,12 @@ from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.traced import previous, seen
 
 MOST_VALUES = 100_000  # particles times steps whose moments are computed at a time
+MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time
+# Particles without weight may lie where the laws are infinite or undefined, and others so far from
+# what follows them that their density is zero.
+WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}
+NEGLIGIBLE = 1e-12  # of a variance, what rounding leaves of it
+ROUNDING, TINY = 1e-13, 1e-300  # of a value, likewise; a variance, so that none is zero
 
 
 def is_marginal(proposal: str) -> bool:
@@ -237,14 +241,6 @@ def _draw_part(
         out[i][:, list(columns.linear)] = z[0][:, len(exact) :]
     for own, theirs in columns.sampled:
         out[:, :, own] = paths[:, :, theirs]
-
-
-MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time
-WITHOUT_WEIGHT: dict[str, Any] = {"divide": "ignore", "invalid": "ignore", "over": "ignore"}
-"""Particles without weight may lie where the laws are infinite or undefined, and others so far from
-what follows them that their density is zero."""
-NEGLIGIBLE = 1e-12  # of a variance, what rounding leaves of it
-ROUNDING, TINY = 1e-13, 1e-300  # of a value, likewise; a variance, so that none is zero
 
 
 def may_integrate(problem: Problem, method: FFBSi) -> bool:

@@ -1,18 +1,17 @@
 """Score and observed information by particle smoothing.
 
 Fisher's identity: the score is the smoothed mean of the complete-data score S (Fisher 1925; Schön
-et al. 2015, section on direct optimisation); Louis' identity: the observed information is
-E[-H] - Cov(S), H the second derivatives of the complete-data log density (Louis 1982; Poyiadjis,
-Doucet and Singh 2011). Trajectories come from backward simulation; several independent runs give
-the Monte Carlo error, and pairs of them E[S]E[S]' without bias by noise.
+et al. 2015, section on direct optimisation), the derivatives of log p(x, y | theta) along a
+trajectory; Louis' identity: the observed information is E[-H] - Cov(S), H the second derivatives of
+the complete-data log density (Louis 1982; Poyiadjis, Doucet and Singh 2011). Trajectories come from
+backward simulation; several independent runs give the Monte Carlo error, and pairs of them
+E[S]E[S]' without bias by noise.
 
 The mean over a run's trajectories has a bias of order 1 / N. Times that run's estimate of the
 likelihood it is unbiased for the smoothed mean times the likelihood (P. Del Moral, A. Doucet and
 S. S. Singh, "A backward particle interpretation of Feynman-Kac formulae", *ESAIM: M2AN* 44, 2010),
 so the runs are weighted by those estimates, and the bias falls to order 1 / (N runs); not where
 the estimates scatter so much that few runs would be left.
-
-Derivatives of log p(x, y | theta) along trajectories, in numbers.
 """
 
 from __future__ import annotations
@@ -40,6 +39,8 @@ FIRST, SECOND = 6e-6, 1e-4  # steps of central differences, relative to the para
 LEAST = 1e-3  # parameters nearer to zero count as this large for a step
 
 Function = Callable[[np.ndarray, list[np.ndarray]], np.ndarray]
+LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
+LEAST_RUNS = 1.1  # of one run alone nothing is known about products of different ones
 
 
 class CompleteScores:
@@ -183,10 +184,6 @@ def complete_scores(problem: Problem, held: Collection[str] = ()) -> CompleteSco
     return CompleteScores(problem, derived)
 
 
-LEAST_SHARE = 0.3  # of the runs, in effective number, that their weights must leave
-LEAST_RUNS = 1.1  # of one run alone nothing is known about products of different ones
-
-
 @dataclass(frozen=True)
 class Smoothing:
     """How trajectories are drawn: the filter, their number M, the backward kernel."""
@@ -197,7 +194,7 @@ class Smoothing:
 
 
 @dataclass(frozen=True)
-class Run:
+class SmootherRun:
     """One run: log Z, mean (P,) and mean square (P, P) of S, mean (P, P) of H or None."""
 
     log_z: float
@@ -226,7 +223,7 @@ class ParticleScore:
 def one_run(
     scores: CompleteScores, theta: np.ndarray, smoothing: Smoothing, second: bool,
     seed: np.random.SeedSequence, number: int,
-) -> Run:  # fmt: skip
+) -> SmootherRun:  # fmt: skip
     """A run of the filter and the backward pass; `number` tells the runs of one seed apart.
 
     Raises
@@ -255,26 +252,26 @@ def one_run(
         )
     hessian = scores.hessian(theta, paths).mean(axis=0) if second else None
     with np.errstate(over="ignore", invalid="ignore"):  # as in `combine`
-        return Run(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
+        return SmootherRun(log_z, s.mean(axis=0), s.T @ s / len(s), hessian)
 
 
 def several_runs(
     scores: CompleteScores, theta: np.ndarray, smoothing: Smoothing, second: bool,
     seed: np.random.SeedSequence, numbers: Sequence[int], executor: Executor | None = None,
-) -> list[Run]:  # fmt: skip
+) -> list[SmootherRun]:  # fmt: skip
     """Independent runs over an executor."""
     _ = scores.program  # generated once, before threads ask for it
     task = partial(one_run, scores, theta, smoothing, second, seed)
     return run_tasks(task, list(numbers), executor=executor)
 
 
-def combine(runs: Sequence[Run]) -> ParticleScore:
+def combine(runs: Sequence[SmootherRun]) -> ParticleScore:
     """Weighted averages of at least two runs, with their errors."""
     with np.errstate(over="ignore", invalid="ignore"):  # the squares of some scores have no number
         return _combined(runs)
 
 
-def _combined(runs: Sequence[Run]) -> ParticleScore:
+def _combined(runs: Sequence[SmootherRun]) -> ParticleScore:
     n = len(runs)
     log_z = np.array([r.log_z for r in runs])
     share = np.exp(log_z - log_z.max())
@@ -307,7 +304,7 @@ def run_weights(log_z: np.ndarray) -> np.ndarray:
     return w if 1.0 / (w @ w) >= least else np.full(len(w), 1.0 / len(w))
 
 
-def _louis(runs: Sequence[Run], w: np.ndarray) -> np.ndarray:
+def _louis(runs: Sequence[SmootherRun], w: np.ndarray) -> np.ndarray:
     """E[-H] - E[SS'] + E[S]E[S]', the last one from pairs of different runs."""
     means = np.stack([r.mean for r in runs])
     total = w @ means

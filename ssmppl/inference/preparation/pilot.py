@@ -265,7 +265,7 @@ def dispersed(
 
 
 @dataclass(frozen=True)
-class Tuning:
+class TunedParticles:
     """The number of particles and the standard deviation of log Z that it gives."""
 
     particles: int
@@ -275,7 +275,7 @@ class Tuning:
 def tune_particles(
     problem: Problem, theta: np.ndarray, proposal: str, target: float,
     seed: np.random.SeedSequence, rescue: int = 0,
-) -> Tuning:  # fmt: skip
+) -> TunedParticles:  # fmt: skip
     """N at which log Z has about the target's standard deviation: var(log Z) falls as 1 / N."""
 
     def spread(particles: int) -> float:
@@ -287,7 +287,7 @@ def tune_particles(
     return particles_for(spread, target)
 
 
-def particles_for(spread: Callable[[int], float], target: float) -> Tuning:
+def particles_for(spread: Callable[[int], float], target: float) -> TunedParticles:
     """N at which `spread`, a standard deviation that falls as its root, is about the target."""
     particles, sd = 50, np.inf
     for _ in range(8):
@@ -298,4 +298,4 @@ def particles_for(spread: Callable[[int], float], target: float) -> Tuning:
         particles = int(np.clip(round(particles * factor), 10, MOST_PARTICLES))
         if particles >= MOST_PARTICLES:
             break
-    return Tuning(particles, sd)
+    return TunedParticles(particles, sd)

@@ -98,7 +98,7 @@ def run_chains(
         Keeps the chains now and then, at Ctrl-C, at an error and at the end. Where it has them
         from an earlier call, they go on from there, and `states` are not used.
     """
-    run = _Run(step_block, list(states), draws, warmup, block, keep_warmup_stats)
+    run = _RunningChains(step_block, list(states), draws, warmup, block, keep_warmup_stats)
     if keep is not None:
         run.go_on(keep.standings())
     total = len(run.chains) * (warmup + draws)
@@ -142,7 +142,7 @@ class _Chain(Generic[State]):
     known: bool = False  # to the worker that had it last
 
 
-class _Run(Generic[State]):
+class _RunningChains(Generic[State]):
     """The loop of `run_chains`: what is running, and what came back."""
 
     def __init__(

@@ -28,6 +28,11 @@ class Block:
     draws: Arrays
     stats: Arrays
 
+    @classmethod
+    def of(cls, draws: Mapping[str, Sequence[Any]], stats: Mapping[str, Sequence[Any]]) -> Block:
+        """From what was drawn one after the other."""
+        return cls(*({name: np.array(v) for name, v in own.items()} for own in (draws, stats)))
+
 
 @dataclass(frozen=True)
 class ChainDraws(Generic[State]):

@@ -15,11 +15,11 @@ from ssmppl.language.model.traced import Trace
 
 def draw_prior(
     trace: Trace, rng: np.random.Generator, draws: int,
-    held: Mapping[str, np.ndarray] | None = None, instead: str = "or its value by parameters=",
+    held: Mapping[str, np.ndarray] | None = None, alternative: str = "or its value by parameters=",
 ) -> np.ndarray:  # fmt: skip
     """(draws, P) independent draws of theta, parents before children; those held keep their value.
 
-    instead : what else the caller's user can give, for the message.
+    alternative : what else the caller's user can give, for the message.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def draw_prior(
             raise ArgumentError(
                 f"the prior of {site.name!r} is {type(d).__name__}, which is improper: nothing "
                 "can be drawn from it",
-                fix=f"give {site.name!r} a proper prior, {instead}",
+                fix=f"give {site.name!r} a proper prior, {alternative}",
             )
         if not d.drawable:
             raise d.undrawable(f"the prior of {site.name!r} has to be drawn from here")

@@ -1,7 +1,5 @@
-"""Which argument of a law left its range, what to write so that it cannot, and which law has no
-density at some parameters.
-
-Sums of log densities.
+"""Which argument of a law left its range and what to write so that it cannot; which law has no
+density at some parameters; and sums of log densities.
 """
 
 from __future__ import annotations

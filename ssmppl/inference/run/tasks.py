@@ -1,6 +1,5 @@
-"""Independent tasks over any `concurrent.futures.Executor`.
-
-Ctrl-C, obeyed where it suits a loop.
+"""Independent tasks over any `concurrent.futures.Executor`, and Ctrl-C obeyed where it suits a
+loop.
 """
 
 from __future__ import annotations
@@ -23,6 +22,10 @@ from ssmppl.inference.run.executors import (
     workers_of,
 )
 from ssmppl.inference.run.progress import Progress
+
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+POLL_SECONDS = 0.1  # between looks at Ctrl-C
 
 
 @contextmanager
@@ -49,12 +52,6 @@ def interrupt_flag() -> Iterator[threading.Event]:
         yield stop
     finally:
         signal.signal(signal.SIGINT, earlier)
-
-
-Argument = TypeVar("Argument")
-Result = TypeVar("Result")
-
-POLL_SECONDS = 0.1  # between looks at Ctrl-C
 
 
 def run_tasks(

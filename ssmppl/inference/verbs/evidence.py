@@ -25,8 +25,9 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains import smc2
 from ssmppl.inference.chains.bridge import Bridge, Student, bridge, importance
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.methods.methods import PMMH, SMC2, MetropolisHastings
+from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.particles.filtering import (
     FilterSettings,
     log_likelihood_estimate,
@@ -36,7 +37,6 @@ from ssmppl.inference.particles.filtering import (
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood, exact_model, filter_of
 from ssmppl.inference.preparation.pilot import find_mode, tune_particles
 from ssmppl.inference.preparation.proposal_choice import choose
-from ssmppl.inference.preparation.settings import check_settings
 from ssmppl.inference.preparation.space import Space, space_of
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import Problem, pose
@@ -143,11 +143,11 @@ def evidence(
     space = space_of(problem, held, near)
     if isinstance(method, SMC2):
         check_count("chains", chains, 2)
-        setup = Setup(problem, space, held, chains, 0, 1, root, False)
+        setup = SamplingSetup(problem, space, held, chains, 0, 1, root, False)
         return _by_smc2(setup, method, executor, progress)
     chosen = _chosen(problem, method)
     if isinstance(chosen, PMMH):
-        chosen = _settled(problem, space, chosen, root)
+        chosen = _with_filter(problem, space, chosen, root)
     d = space.where.size
     if not d:
         return _without_parameters(problem, space, chosen, root)
@@ -194,7 +194,9 @@ def evidence(
     )  # fmt: skip
 
 
-def _by_smc2(setup: Setup, method: SMC2, executor: Executor | None, progress: bool) -> Evidence:
+def _by_smc2(
+    setup: SamplingSetup, method: SMC2, executor: Executor | None, progress: bool
+) -> Evidence:
     """The mean over independent runs, each of which estimates p(y) without bias."""
     wanted = PARAMETERS if method.parameters is None else method.parameters
     found = smc2.run_smc2(setup, replace(method, parameters=wanted), executor, progress)
@@ -247,8 +249,10 @@ def _chosen(
     return method
 
 
-def _settled(problem: Problem, space: Space, method: PMMH, root: np.random.SeedSequence) -> PMMH:
-    """The method with proposal and particles settled, as the sampler and the bridge share them."""
+def _with_filter(
+    problem: Problem, space: Space, method: PMMH, root: np.random.SeedSequence
+) -> PMMH:
+    """The method with its proposal and particles, which the sampler and the bridge share."""
     proposal, particles = method.proposal, method.particles
     if proposal == "auto" or particles is None:
         theta, _ = space.parameters(find_mode(space, root, rescue=method.rescue).z)

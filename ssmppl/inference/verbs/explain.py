@@ -9,7 +9,6 @@ from typing import Any
 
 from ssmppl import markup
 from ssmppl.analysis.conjugacy.conjugacy import Update, derive_updates
-from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
 from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable
@@ -27,7 +26,7 @@ from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.chains.interweaving import applicable, with_states
+from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import exact_model, kind_of
 from ssmppl.inference.preparation.method_choice import (
@@ -37,6 +36,7 @@ from ssmppl.inference.preparation.method_choice import (
     why_stuck,
 )
 from ssmppl.inference.run.problem import missing_of
+from ssmppl.inference.verbs.sample import METHODS
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Site, Trace
 from ssmppl.language.model.transforms import transforms
@@ -106,18 +106,17 @@ class Plan:
         guided = self.proposals.get("guided")
         if isinstance(guided, NotApplicable) and tempered(t, Missing()):
             rows.append(("tempered", TEMPERED))
-        noisy = not isinstance(exact_model(t), Deterministic)
+        noisy, of_methods = not isinstance(exact_model(t), Deterministic), self._of_methods()
         if noisy:
             out.append(("Particle filter", rows))
-            out.append(("Trajectories", [("PGAS", self._trajectories())]))
+            out.append((TRAJECTORIES, of_methods.pop(TRAJECTORIES)))
         out.append(("Chosen, unless a method is named", self._choices()))
         singular = without_density(t)
         if singular is not None:
-            out.append(("Parameters given the states", [("none", _reason(singular))]))
+            out.append(("Parameters given the states", [("none", reason_and_line(singular))]))
         elif self.updates and noisy:
             out.append(("Parameters given the states", [_update(u) for u in self.updates]))
-            out.append(("Interweaved with these, where parameters mix slowly", self._interweaved()))
-            out.append(("Eliminated in PGAS, where asked for", self._eliminated()))
+            out += of_methods.items()
         return [(title, rows) for title, rows in out if rows]
 
     def _structure(self) -> list[tuple[str, str]]:
@@ -129,7 +128,7 @@ class Plan:
             return [("no noise", "given the parameters the states are known: the likelihood is "
                      "exact, by running them once")]  # fmt: skip
         if isinstance(self.structure, NotApplicable):
-            found = [("nonlinear", f"not linear Gaussian: {_reason(self.structure)}")]
+            found = [("nonlinear", f"not linear Gaussian: {reason_and_line(self.structure)}")]
             if isinstance(self.conditional, ConditionallyLinear):
                 found.append(("given the others", _integrated(self.conditional)))
             return found
@@ -138,12 +137,11 @@ class Plan:
 
     def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
         if isinstance(proposal, NotApplicable):
-            return name, f"not derived: {_reason(proposal)}"
+            return name, f"not derived: {reason_and_line(proposal)}"
         return name, proposal.explanation
 
     def _choices(self) -> list[tuple[str, str]]:
-        exact = exact_model(self.trace)
-        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
+        kind = kind_of(exact_model(self.trace))
         choices: dict[str, tuple[Any, str]] = {
             "sample": choose_sampler(
                 kind,
@@ -162,47 +160,13 @@ class Plan:
         """How many numbers the parameters have on the unconstrained scale."""
         return sum(len(p.free) for p in transforms(self.trace))
 
-    def _interweaved(self) -> list[tuple[str, str]]:
-        exact = exact_model(self.trace)
-        found = applicable(self.noises, None if isinstance(exact, NotApplicable) else exact)
-        if isinstance(found, NotApplicable):
-            return [("nothing", _reason(found))]
-        rows = [("PGAS", with_states(found))]
-        if not isinstance(exact, NotApplicable):
-            rows.insert(0, ("Gibbs", f"{', '.join(found.tied)}: moved with the states "
-                            "integrated out, if the warmup finds a parameter slow given the states")
-                        )  # fmt: skip
-        return rows
-
-    def _eliminated(self) -> list[tuple[str, str]]:
-        rows = [
-            (joined(u.components), "integrated out while trajectories are drawn, each particle "
-             f"carrying its statistics: {u.family}")
-            for u in self.eliminable.updates
-        ]  # fmt: skip
-        why = self.eliminable.refused.items()
-        return [*rows, *((repr(c), f"stays: {_reason(reason)}") for c, reason in why)]
-
-    def _trajectories(self) -> str:
-        singular = without_density(self.trace)
-        if singular is not None:
-            return f"does not apply: {_reason(singular)}"
-        flat = [s.name for s in self.trace.initial.values() if not s.distribution.proper]
-        if flat:
-            return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"
-        if self.memory is None:
-            return (
-                "conditional SMC without ancestor sampling: a deterministic component never "
-                "forgets its past, so a path cannot be joined to another ancestor; take more "
-                "particles, or PMMH"
-            )
-        if self.memory == 0:
-            return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
-        return (
-            "conditional SMC with ancestor sampling, over the noisy components: deterministic "
-            f"ones forget their past in {self.memory} step{'s' * (self.memory > 1)}, whose "
-            "densities enter the ancestor weights"
-        )
+    def _of_methods(self) -> dict[str, PlanRows]:
+        """What the methods of sampling say of the model, by title."""
+        out: dict[str, PlanRows] = {}
+        for method in METHODS.values():
+            for title, rows in method.explain(self).items():
+                out.setdefault(title, []).extend(rows)
+        return out
 
     def __str__(self) -> str:
         lines = [f"{self.trace.name}", "=" * len(self.trace.name)]
@@ -223,10 +187,6 @@ class Plan:
             cells = [(markup.code(what), markup.text(how)) for what, how in rows]
             parts.append(f"<b>{markup.text(title)}</b>{markup.table(cells, left=(0, 1))}")
         return "".join(parts)
-
-
-def _reason(found: NotApplicable) -> str:
-    return found.reason + (f"\n{found.where.short}" if found.where else "")
 
 
 def _integrated(split: ConditionallyLinear) -> str:

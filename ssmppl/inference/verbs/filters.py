@@ -1,6 +1,5 @@
-"""The verb `particle_filter`, and the form of what a filter tells.
-
-The verbs `kalman_filter` and `forward_filter`: filters that are exact.
+"""The verbs `particle_filter`, `kalman_filter` and `forward_filter`, and the form of what a filter
+tells.
 """
 
 from __future__ import annotations
@@ -116,12 +115,12 @@ def particle_filter(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, integrate=True
     )
     if settings.proposal in EXACT:
-        instead = {"kalman": "call ssm.kalman_filter", "forward": "call ssm.forward_filter"}
+        exact = {"kalman": "call ssm.kalman_filter", "forward": "call ssm.forward_filter"}
         # every particle has the same states; quantiles of predictions are of draws from each
         otherwise = 'use proposal="bootstrap"'
         raise ArgumentError(
             f'particle_filter with proposal="{settings.proposal}"',
-            fix=f"{instead.get(settings.proposal, otherwise)} instead",
+            fix=f"{exact.get(settings.proposal, otherwise)} instead",
         )
     if history:
         rows, d = problem.rows, len(problem.trace.state_symbols)
@@ -295,7 +294,7 @@ def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> F
     """Exact moments in the form of a particle filter's."""
     variance = np.diagonal(exact.observation_covariance, axis1=1, axis2=2)
     quantiles = [
-        _normal_quantiles(mean, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), levels)
+        normal_quantiles(mean, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), levels)
         for mean, covariance in (
             (exact.mean, exact.covariance),
             (exact.observation_mean, exact.observation_covariance),
@@ -310,7 +309,7 @@ def _as_run(exact: kalman.KalmanMoments, e: Experiment, levels: np.ndarray) -> F
     )  # fmt: skip
 
 
-def _normal_quantiles(mean: np.ndarray, sd: np.ndarray, levels: np.ndarray) -> np.ndarray:
+def normal_quantiles(mean: np.ndarray, sd: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """(T, P, ...) at the levels (P,), by means and standard deviations (T, ...)."""
     with np.errstate(invalid="ignore"):  # nothing is known yet of a flat component
         found: np.ndarray = mean[:, None, :] + ndtri(levels)[None, :, None] * sd[:, None, :]

@@ -22,7 +22,7 @@ from ssmppl.inference.maximum import (
     psaem,
     score_ascent,
 )
-from ssmppl.inference.maximum.ascent import Ascent, Setup
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.edges import Edges, edges
 from ssmppl.inference.methods.methods import (
     EM,
@@ -32,13 +32,13 @@ from ssmppl.inference.methods.methods import (
     ParticleEM,
     ScoreAscent,
 )
+from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, log_of_mean
 from ssmppl.inference.particles.scores import Smoothing, combine, complete_scores, several_runs
 from ssmppl.inference.preparation.exact_models import kind_of
 from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.method_choice import choose_maximiser, start_as_parameter
 from ssmppl.inference.preparation.proposal_choice import choose
-from ssmppl.inference.preparation.settings import check_settings
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.estimate import NO_METHOD, Estimate, free_components, make_estimate
 from ssmppl.inference.run.executors import check_executor
@@ -48,7 +48,7 @@ from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.model import Model
 
 # The methods: what climbs under each class of settings.
-CLIMBS: dict[type, Callable[[Setup, Any], Ascent]] = {
+METHODS: dict[type, Callable[[Maximization, Any], Ascent]] = {
     DirectOptimization: direct_optimization.climb,
     EM: em.climb,
     ParticleEM: particle_em.climb,
@@ -105,11 +105,11 @@ def maximize(
         raise ArgumentError(
             f"objective={objective!r}", fix=f"use one of: {listing(str(objective), OBJECTIVES)}"
         )
-    if method is not None and type(method) not in CLIMBS:
-        names = ", ".join(f"ssm.{c.__name__}(...)" for c in CLIMBS)
+    if method is not None and type(method) not in METHODS:
+        names = ", ".join(f"ssm.{c.__name__}(...)" for c in METHODS)
         raise ArgumentError(
             f"method={method!r} is no method of maximisation",
-            fix=written_as(method, CLIMBS) or f"use {names} or None",
+            fix=written_as(method, METHODS) or f"use {names} or None",
         )
     check_executor(executor)
     check_settings(method)
@@ -123,13 +123,13 @@ def maximize(
         )
     root = seed_sequence(seed)
     space = space_of(problem, held, near)
-    setup = Setup(problem, space, objective, held, near, root, executor, progress)
+    setup = Maximization(problem, space, objective, held, near, root, executor, progress)
     if not len(space.where):
         chosen, reason = None, "every parameter is fixed, or the model has none"
         ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
     else:
         chosen, reason = (method, "by the user") if method is not None else choose_method(setup)
-        ascent = CLIMBS[type(chosen)](setup, chosen)
+        ascent = METHODS[type(chosen)](setup, chosen)
     attrs: dict[str, Any] = {
         "model": problem.trace.name,
         "method": type(chosen).__name__ if chosen is not None else NO_METHOD,
@@ -158,12 +158,10 @@ def maximize(
     )  # fmt: skip
 
 
-def choose_method(setup: Setup) -> tuple[Any, str]:
+def choose_method(setup: Maximization) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
-    exact = setup.exact
-    kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
     trace = setup.problem.trace
-    chosen, reason = choose_maximiser(kind, trace)
+    chosen, reason = choose_maximiser(kind_of(setup.exact), trace)
     if isinstance(chosen, ScoreAscent) and noisy_start(trace):
         warnings.warn(
             f"{type(chosen).__name__} may take minutes for each hundred rows here: "
@@ -173,7 +171,7 @@ def choose_method(setup: Setup) -> tuple[Any, str]:
     return chosen, f"automatically: {reason}"
 
 
-def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> float:
+def _log_likelihood(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> float:
     """log p(y | theta): the method's own, else exact, else estimated, its error into `attrs`."""
     if ascent.log_likelihood is not None:
         return ascent.log_likelihood
@@ -193,7 +191,7 @@ def _log_likelihood(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> floa
     return value
 
 
-def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:
+def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:
     """(P, P) inverse observed information of the free components; `attrs` says how, or why not."""
     p, where = len(ascent.theta), setup.space.where
     nothing = np.full((p, p), np.nan)
@@ -236,7 +234,7 @@ def _covariance(setup: Setup, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarr
     return covariance
 
 
-def _information(setup: Setup, theta: np.ndarray, found: Edges | None) -> np.ndarray | None:
+def _information(setup: Maximization, theta: np.ndarray, found: Edges | None) -> np.ndarray | None:
     if not isinstance(setup.exact, NotApplicable):
         return _score_of(setup, found).information(theta)
     try:
@@ -251,7 +249,7 @@ def _information(setup: Setup, theta: np.ndarray, found: Edges | None) -> np.nda
     return combine(runs).information
 
 
-def _score_of(setup: Setup, found: Edges | None) -> ExactScore:
+def _score_of(setup: Maximization, found: Edges | None) -> ExactScore:
     """Of an exact likelihood, in what is free and not held at an edge that stays where it is."""
     assert not isinstance(setup.exact, NotApplicable), setup.exact
     free = free_components(setup.problem.trace, setup.held)
@@ -260,7 +258,7 @@ def _score_of(setup: Setup, found: Edges | None) -> ExactScore:
 
 
 def natural_covariance(
-    setup: Setup,
+    setup: Maximization,
     theta: np.ndarray,
     information: np.ndarray,
     found: Edges | None = None,
@@ -279,13 +277,13 @@ def natural_covariance(
     except (ValueError, np.linalg.LinAlgError):
         return NotApplicable("the estimate lies on the edge of what the parameters can be")
     kept = np.ones(len(z), dtype=bool) if found is None else found.kept
-    point = setup.chart.at(z)
+    point = setup.transform.at(z)
     jacobian = point.jacobian[:, kept]
     with np.errstate(all="ignore"):
         curvature = jacobian.T @ information @ jacobian
     if setup.with_prior or score is not None:
         slope = point.inverse().T @ point.d_log_prior if score is None else -score
-        second = setup.chart.curvature(z, slope)
+        second = setup.transform.curvature(z, slope)
         curvature = curvature + second.theta[np.ix_(kept, kept)]
     if setup.with_prior:
         curvature = curvature - second.log_prior[np.ix_(kept, kept)]

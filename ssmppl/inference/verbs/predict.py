@@ -1,7 +1,5 @@
-"""The verb `predict`: observations that the model expects, from the prior or from the posterior.
-
-Posterior draws read back: parameters and trajectories of an InferenceData as the kernels take
-them.
+"""The verb `predict`: observations that the model expects, from the prior or from the posterior,
+whose draws, parameters and trajectories, are read back from an InferenceData.
 """
 
 from __future__ import annotations
@@ -33,6 +31,9 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Trace
 from ssmppl.language.trace import trace
 from ssmppl.results import time_axes, to_inference_data
+
+# Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
+Drawn = tuple[np.ndarray, np.ndarray]
 
 
 def group(idata: Any, name: str) -> Any:
@@ -118,10 +119,6 @@ def _drawn(posterior: Any, name: str, shape: tuple[int, ...], over: tuple[str, .
             fix="use the model that was sampled",
         )
     return values
-
-
-# Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
-Drawn = tuple[np.ndarray, np.ndarray]
 
 
 def predict(
@@ -244,7 +241,7 @@ def _from_prior(
     check_drawable(traced)
     check_names(traced, experiments)
     theta = draw_prior(
-        traced, np.random.default_rng(root), draws, instead="or posterior draws by idata="
+        traced, np.random.default_rng(root), draws, alternative="or posterior draws by idata="
     )
     prior = {n: v[None] for n, v in unpack_parameters(traced, theta).items()}
     over_time: list[str] = []

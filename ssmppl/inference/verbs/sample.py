@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import fields
 from typing import Any
@@ -15,56 +15,36 @@ from ssmppl.analysis.structure import without_density
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
-from ssmppl.inference.chains import (
-    coordinates,
-    elimination,
-    gibbs,
-    interweaving,
-    metropolis,
-    mixing,
-    pgas,
-    pmmh,
-    smc2,
-)
+from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.parameter_steps import plan_updates
-from ssmppl.inference.chains.sampling import Sampler, Setup
+from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
 from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
-from ssmppl.inference.preparation import pilot, proposal_choice
+from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_model, kind_of
 from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
-from ssmppl.inference.preparation.settings import check_settings
 from ssmppl.inference.preparation.space import space_of
-from ssmppl.inference.run.chain_runner import run_chains
-from ssmppl.inference.run.draws import Block, ChainDraws, stack
+from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, observes
+from ssmppl.inference.run.mixing import mixing_attributes
 from ssmppl.inference.run.problem import Problem, pose
-from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms
 from ssmppl.results import to_inference_data
 
-PREPARE: dict[type, Callable[[Setup, Any], Sampler]] = {
-    MetropolisHastings: metropolis.prepare,
-    Gibbs: gibbs.prepare,
-    PMMH: pmmh.prepare,
-    PGAS: pgas.prepare,
+# The methods, under the classes of their settings.
+METHODS: dict[type, SamplingMethod] = {
+    MetropolisHastings: metropolis.METHOD,
+    Gibbs: gibbs.METHOD,
+    PMMH: pmmh.METHOD,
+    PGAS: pgas.METHOD,
+    SMC2: smc2.METHOD,
 }
-
-# What the states of chains are made of, and what is found before they begin.
-STATES = Codec(
-    [
-        coordinates.WalkState, coordinates.Point, coordinates.Run, pmmh.Local, pgas.PGASState,
-        gibbs.GibbsState,
-        interweaving.Tuning, elimination.Learned, mixing.Watch, smc2.State, smc2.Particles,
-        pilot.Pilot, pilot.Tuning, proposal_choice.Choice,
-    ]
-)  # fmt: skip
 
 
 def sample(
@@ -155,18 +135,18 @@ def sample(
     held = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     chosen, reason = (method, "") if method is not None else _chosen(problem, held)
-    prepare = PREPARE.get(type(chosen))
-    if prepare is None and not isinstance(chosen, SMC2):
-        names = ", ".join(f"ssm.{m.__name__}(...)" for m in (*PREPARE, SMC2))
+    kind = METHODS.get(type(chosen))
+    if kind is None:
+        names = ", ".join(f"ssm.{m.__name__}(...)" for m in METHODS)
         raise ArgumentError(
             f"method={method!r} is no method of sampling",
-            fix=written_as(method, (*PREPARE, SMC2)) or f"use {names} or None",
+            fix=written_as(method, METHODS) or f"use {names} or None",
         )
-    if isinstance(chosen, SMC2):  # no chains: independent runs, which need no warmup
+    if not kind.markov:
         states, warmup, thin = False, 0, 1
-        chosen = smc2.settled(chosen, draws)
+    chosen = kind.complete(chosen, draws)
     if not states and all(name in held for name in problem.trace.parameters):
-        what = "SMC2 draws parameters only" if isinstance(chosen, SMC2) else "states=False"
+        what = "states=False" if kind.markov else f"{type(chosen).__name__} draws parameters only"
         raise ArgumentError(
             f"there is nothing to draw: no parameter is free, and {what}",
             fix="draw the states, by another method than SMC2 and without states=False, or leave a "
@@ -174,19 +154,14 @@ def sample(
         )
     check_names(problem.trace, problem.experiments, states)
     if checkpoint is None:
-        _check_room(problem, chosen, chains, draws, states)
+        _check_room(problem, kind.by_row(chosen), chains, draws, states)
     root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
-        kept = ChainFile(checkpoint, origin, seed, root, STATES, draws)
+        kept = ChainFile(checkpoint, origin, seed, root, _codec(), draws)
         root = kept.root
-    setup = Setup(problem, space, held, chains, warmup, thin, root, states, kept)
-    report: dict[str, Any]
-    if isinstance(chosen, SMC2):
-        result, report = smc2.drawn(setup, chosen, draws, executor, progress)
-    else:
-        assert prepare is not None
-        result, report = _drawn(setup, prepare, chosen, draws, executor, progress, kept)
+    setup = SamplingSetup(problem, space, held, chains, warmup, thin, root, states, kept)
+    result, report = kind.draw(setup, chosen, draws, executor, progress)
     attrs = {
         "model": problem.trace.name,
         "method": type(chosen).__name__,
@@ -198,22 +173,27 @@ def sample(
         "interrupted": any(c.interrupted for c in result),
         "seconds": time.perf_counter() - began if kept is None else kept.seconds,
     }  # fmt: skip
-    if isinstance(chosen, PGAS):
-        attrs |= mixing.update_rate_attributes(problem, result)
+    attrs |= kind.attributes(problem, result)
     whole = stack(result) if kept is None else kept.stack(result)
-    if not isinstance(chosen, SMC2):
+    if kind.markov:
         free = free_components(problem.trace, held)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
-        theta = whole[0]["theta"][:, :, free]
-        attrs |= mixing.mixing_attributes(labels, theta, bool(attrs["interrupted"]), chosen, warmup)
+        theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])
+        attrs |= mixing_attributes(labels, theta, interrupted, kind.advice(chosen), warmup)
     return _to_arviz(problem, whole, held, states, attrs)
 
 
-def _check_room(problem: Problem, method: Method, chains: int, draws: int, states: bool) -> None:
+def _codec() -> Codec:
+    """Of what checkpoints are made of: the states of chains, and what is found before them."""
+    return Codec([c for method in METHODS.values() for c in method.state_classes])
+
+
+def _check_room(problem: Problem, by_row: bool, chains: int, draws: int, states: bool) -> None:
     """That memory holds what the draws have of each row, twice: of each chain, and put together."""
-    each = {"states": len(problem.trace.state_symbols) if states else 0}
-    by_row = isinstance(method, PMMH) or (isinstance(method, PGAS) and method.log_likelihood)
-    each["log-likelihoods"] = int(by_row)
+    each = {
+        "states": len(problem.trace.state_symbols) if states else 0,
+        "log-likelihoods": int(by_row),
+    }
     fix = "thin= with fewer draws keeps fewer, checkpoint= keeps them on disk"
     check_room(
         f"{chains} chains of {draws} draws of the {' and '.join(n for n, v in each.items() if v)} "
@@ -221,29 +201,6 @@ def _check_room(problem: Problem, method: Method, chains: int, draws: int, state
         2 * chains * draws * problem.rows * sum(each.values()),
         f"states=False leaves them out, {fix}" if states else fix,
     )
-
-
-def _drawn(
-    setup: Setup, prepare: Callable[[Setup, Any], Sampler], method: Method, draws: int,
-    executor: Executor | None, progress: bool, kept: ChainFile | None,
-) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:  # fmt: skip
-    """The chains of a method, and what it has to report."""
-    if kept is None or kept.report is None or not kept.finished(setup.warmup + draws):
-        with announced(type(method).__name__, "preparing", shown=progress):
-            sampler = prepare(setup, method)
-        if kept is not None:
-            kept.report = sampler.report
-    else:  # nothing is left to draw, and nothing needs to be compiled for it
-        sampler = Sampler(_finished, [None] * setup.chains, kept.report)
-    result = run_chains(
-        sampler.step_block, sampler.states, draws, setup.warmup, executor=executor,
-        progress=progress, title=type(method).__name__, keep=kept,
-    )  # fmt: skip
-    return result, sampler.report
-
-
-def _finished(state: Any, n: int) -> tuple[Any, Block]:
-    raise AssertionError("a finished chain draws no more")
 
 
 def _origin(
@@ -262,14 +219,12 @@ def _origin(
 
 
 def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
-    exact = exact_model(problem.trace)
+    exact, singular = exact_model(problem.trace), without_density(problem.trace)
     numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
-    singular = without_density(problem.trace)
-    if isinstance(exact, NotApplicable) or singular is not None:
-        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
-        return choose_sampler(kind, (), numbers, stuck, singular)
-    return choose_sampler(kind_of(exact), plan_updates(problem, held), numbers)
+    drawn = not isinstance(exact, NotApplicable) and singular is None
+    updates = plan_updates(problem, held) if drawn else ()
+    return choose_sampler(kind_of(exact), updates, numbers, stuck, singular)
 
 
 def _to_arviz(

@@ -1,25 +1,26 @@
 """The verb `smooth`: states given all of the data, at known parameters.
 
-What each smoothing method finds: draws from the joint law, or moments of the marginal ones.
+A method finds draws from the joint law of the states, or moments of the marginal ones
+(`SmoothedStates`); `METHODS` has the function of each, under the class of its settings.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, listing, written_as
 from ssmppl.inference.chains import pgas
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
+from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.methods.methods import (
     PGAS,
     FFBSi,
@@ -29,6 +30,7 @@ from ssmppl.inference.methods.methods import (
     SmoothingMethod,
 )
 from ssmppl.inference.methods.requirements import need_density
+from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.particles.fixed_lag import LAG, collapse, distinct, lag_moments
@@ -36,15 +38,15 @@ from ssmppl.inference.particles.marginal import is_marginal, marginal_paths, may
 from ssmppl.inference.preparation.exact_models import exact_model, kind_of
 from ssmppl.inference.preparation.method_choice import choose_smoother
 from ssmppl.inference.preparation.proposal_choice import choose, resolve_settings
-from ssmppl.inference.preparation.settings import check_settings
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.labels import component_dims, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.inference.verbs.filters import LEVELS, quantile_levels
+from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_levels
 from ssmppl.language.model.model import Model
+from ssmppl.language.model.traced import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
@@ -56,8 +58,11 @@ COLLAPSED = 'Use more particles, proposal="twisted", or method=ssm.PGAS().'
 
 
 @dataclass(frozen=True)
-class Call:
-    """A call of `smooth`, checked; None where the caller left a number to the method."""
+class SmoothingSetup:
+    """A call of `smooth`, checked; None where the caller left a number to the method.
+
+    by_user : whether the caller named the method.
+    """
 
     problem: Problem
     theta: np.ndarray
@@ -65,10 +70,11 @@ class Call:
     trajectories: int | None
     levels: np.ndarray
     root: np.random.SeedSequence
+    by_user: bool
 
 
 @dataclass(frozen=True)
-class Found:
+class SmoothedStates:
     """What a method gives for one experiment: draws (M, T, D), or moments; and its report.
 
     moments : mean (T, D), covariance (T, D, D), cross (T, D, D), quantiles (T, P, D).
@@ -81,46 +87,69 @@ class Found:
     over_time: Mapping[str, np.ndarray] | None = None
 
 
-def by_exact_passes(
-    call: Call, chosen: SmoothingMethod, method: SmoothingMethod | str | None
-) -> list[Found]:
-    """Exact moments, or exact draws."""
-    if call.particles is not None and method is not None:
+def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[SmoothedStates]:
+    """Exact moments, or exact draws, of a linear Gaussian model."""
+    _without_particles(setup, method)
+    model = kalman_model(setup.problem.trace)
+    assert not isinstance(model, NotApplicable)
+    experiments, theta = setup.problem.experiments, setup.theta
+    if setup.trajectories is not None:
+        return _exact_draws(setup, model, [model.log_likelihood([e], theta) for e in experiments])
+    moments = [model.smooth(e, theta) for e in experiments]
+    sds = [np.sqrt(np.maximum(np.diagonal(m.covariance, 0, 1, 2), 0.0)) for m in moments]
+    spreads = [
+        normal_quantiles(m.mean, sd, setup.levels) for m, sd in zip(moments, sds, strict=True)
+    ]
+    return _exact_moments(moments, spreads)
+
+
+def by_forward_backward(setup: SmoothingSetup, method: ForwardBackward) -> list[SmoothedStates]:
+    """Exact moments, or exact draws, where states take finitely many values."""
+    _without_particles(setup, method)
+    model = hidden_markov(setup.problem.trace)
+    assert not isinstance(model, NotApplicable)
+    experiments, theta = setup.problem.experiments, setup.theta
+    if setup.trajectories is not None:
+        filtered = model.filter_each(experiments, theta)
+        return _exact_draws(setup, model, [total_of(f.log_increments) for f in filtered])
+    smoothed = model.smooth_each(experiments, theta)
+    spreads = [model.quantiles(law, setup.levels) for _, law in smoothed]
+    return _exact_moments([m for m, _ in smoothed], spreads)
+
+
+def _without_particles(setup: SmoothingSetup, method: SmoothingMethod) -> None:
+    if setup.particles is not None and setup.by_user:
         raise ArgumentError(
-            f"particles={call.particles}: {type(chosen).__name__} is exact and has none",
+            f"particles={setup.particles}: {type(method).__name__} is exact and has none",
             fix="leave particles= out, or use method=ssm.FFBSi()",
         )
-    trace = call.problem.trace
-    model = kalman_model(trace) if isinstance(chosen, KalmanSmoother) else hidden_markov(trace)
-    assert not isinstance(model, NotApplicable)
-    _check_draws(call, call.trajectories or 0)
-    experiments, theta = call.problem.experiments, call.theta
-    if call.trajectories is not None:
-        streams = [random_state(call.root, i) for i in range(len(experiments))]
-        drawn = model.draw_each(experiments, theta, streams, call.trajectories)
-        if isinstance(model, HiddenMarkov):
-            values = [total_of(f.log_increments) for f in model.filter_each(experiments, theta)]
-        else:
-            values = [model.log_likelihood([e], theta) for e in experiments]
-        pairs = zip(drawn, values, strict=True)
-        return [Found({"log_likelihood": v}, paths=paths) for paths, v in pairs]
-    if isinstance(model, HiddenMarkov):
-        smoothed = model.smooth_each(experiments, theta)
-        spreads = [model.quantiles(law, call.levels) for _, law in smoothed]
-        moments = [m for m, _ in smoothed]
-    else:
-        moments = [model.smooth(e, theta) for e in experiments]
-        spreads = []
-        for m in moments:
-            sd = np.sqrt(np.maximum(np.diagonal(m.covariance, axis1=1, axis2=2), 0.0))
-            spreads.append(m.mean[:, None, :] + ndtri(call.levels)[None, :, None] * sd[:, None, :])
+    _check_draws(setup, setup.trajectories or 0)
+
+
+def _exact_draws(
+    setup: SmoothingSetup, model: KalmanModel | HiddenMarkov, log_likelihoods: Sequence[float]
+) -> list[SmoothedStates]:
+    experiments = setup.problem.experiments
+    streams = [random_state(setup.root, i) for i in range(len(experiments))]
+    drawn = model.draw_each(experiments, setup.theta, streams, setup.trajectories or 0)
+    pairs = zip(drawn, log_likelihoods, strict=True)
+    return [SmoothedStates({"log_likelihood": v}, paths=paths) for paths, v in pairs]
+
+
+def _exact_moments(
+    moments: Sequence[SmoothedMoments], spreads: Sequence[np.ndarray]
+) -> list[SmoothedStates]:
     return [
-        Found({"log_likelihood": m.log_likelihood}, moments=(m.mean, m.covariance, m.cross, s))
+        SmoothedStates(
+            {"log_likelihood": m.log_likelihood}, moments=(m.mean, m.covariance, m.cross, s)
+        )
         for m, s in zip(moments, spreads, strict=True)
     ]
 
 
-def _filter(call: Call, method: FFBSi | FixedLag, integrate: bool = False) -> FilterSettings:
+def _filter(
+    setup: SmoothingSetup, method: FFBSi | FixedLag, integrate: bool = False
+) -> FilterSettings:
     """The filter's settings, "auto" resolved among the particle proposals."""
     proposal = method.proposal
     if proposal in EXACT:
@@ -130,43 +159,43 @@ def _filter(call: Call, method: FFBSi | FixedLag, integrate: bool = False) -> Fi
             fix=f"use {exact.get(proposal, '')}another proposal",
         )
     if proposal == "auto":
-        proposal = choose(call.problem, call.theta, exact=False, integrate=integrate).name
-    n = PARTICLES if call.particles is None else call.particles
+        proposal = choose(setup.problem, setup.theta, exact=False, integrate=integrate).name
+    n = PARTICLES if setup.particles is None else setup.particles
     settings = resolve_settings(
-        call.problem, call.theta, n, proposal, method.resampling, method.ess_threshold,
+        setup.problem, setup.theta, n, proposal, method.resampling, method.ess_threshold,
         method.rescue if isinstance(method, FFBSi) else 0, integrate=integrate,
     )  # fmt: skip
-    longest = max(e.steps for e in call.problem.experiments)
-    each = len(call.problem.trace.state_symbols) + 2  # with weight and ancestor
+    longest = max(e.steps for e in setup.problem.experiments)
+    each = len(setup.problem.trace.state_symbols) + 2  # with weight and ancestor
     check_room(
         f"{n} particles of each of {longest} rows", longest * n * each, "give fewer particles"
     )
     return settings
 
 
-def _check_draws(call: Call, draws: int) -> None:
+def _check_draws(setup: SmoothingSetup, draws: int) -> None:
     """That memory holds the trajectories."""
-    rows = call.problem.rows
-    numbers = draws * rows * len(call.problem.trace.state_symbols)
+    rows = setup.problem.rows
+    numbers = draws * rows * len(setup.problem.trace.state_symbols)
     check_room(f"{draws} trajectories of {rows} rows", numbers, "give fewer trajectories")
 
 
-def by_ffbsi(call: Call, method: FFBSi) -> list[Found]:
+def by_ffbsi(setup: SmoothingSetup, method: FFBSi) -> list[SmoothedStates]:
     """Independent draws, given a particle filter's particles."""
     if method.kernel != "genealogy":
-        need_density(call.problem.trace, f'FFBSi(kernel="{method.kernel}")', "smooth")
-    settings = _filter(call, method, integrate=may_integrate(call.problem, method))
-    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
-    _check_draws(call, draws)
+        need_density(setup.problem.trace, f'FFBSi(kernel="{method.kernel}")', "smooth")
+    settings = _filter(setup, method, integrate=may_integrate(setup.problem, method))
+    draws = TRAJECTORIES if setup.trajectories is None else setup.trajectories
+    _check_draws(setup, draws)
     marginal = is_marginal(settings.proposal)
     kernel, why = "exact", "states that are linear given the others are integrated out"
     if not marginal:
-        kernel, why = choose_kernel(call.problem, settings, draws, method.kernel)
+        kernel, why = choose_kernel(setup.problem, settings, draws, method.kernel)
     out = []
-    for i, e in enumerate(call.problem.experiments):
-        stream = random_state(call.root, i)
-        system = particle_system(call.problem, call.theta, settings, e, stream)
-        own = call.problem, call.theta, e, system, draws, stream
+    for i, e in enumerate(setup.problem.experiments):
+        stream = random_state(setup.root, i)
+        system = particle_system(setup.problem, setup.theta, settings, e, stream)
+        own = setup.problem, setup.theta, e, system, draws, stream
         paths = marginal_paths(*own) if marginal else draw_paths(*own, kernel, method.moves)
         report = {
             "particles": settings.particles, "proposal": settings.proposal, "kernel": kernel,
@@ -175,25 +204,25 @@ def by_ffbsi(call: Call, method: FFBSi) -> list[Found]:
         over_time = {"distinct": distinct(paths), "ess": system.ess}
         if not marginal:
             report |= collapse(over_time["distinct"], system, draws, e, COLLAPSED)
-        out.append(Found(report, paths=paths, over_time=over_time))
+        out.append(SmoothedStates(report, paths=paths, over_time=over_time))
     return out
 
 
-def by_fixed_lag(call: Call, method: FixedLag) -> list[Found]:
+def by_fixed_lag(setup: SmoothingSetup, method: FixedLag) -> list[SmoothedStates]:
     """Moments, each row's from the ancestors of particles some rows later."""
-    if call.trajectories is not None:
+    if setup.trajectories is not None:
         raise ArgumentError(
-            f"trajectories={call.trajectories}: FixedLag knows marginals only, no joint law to "
+            f"trajectories={setup.trajectories}: FixedLag knows marginals only, no joint law to "
             "draw trajectories from",
             fix="leave trajectories= out, or use ssm.FFBSi()",
         )
-    settings = _filter(call, method)
+    settings = _filter(setup, method)
     lag = LAG if method.lag is None else method.lag
     out = []
-    for i, e in enumerate(call.problem.experiments):
-        stream = random_state(call.root, i)
-        system = particle_system(call.problem, call.theta, settings, e, stream)
-        m = lag_moments(system, lag, call.levels)
+    for i, e in enumerate(setup.problem.experiments):
+        stream = random_state(setup.root, i)
+        system = particle_system(setup.problem, setup.theta, settings, e, stream)
+        m = lag_moments(system, lag, setup.levels)
         report = {
             "particles": settings.particles, "proposal": settings.proposal, "lag": lag,
             "log_likelihood": system.log_Z,
@@ -202,19 +231,19 @@ def by_fixed_lag(call: Call, method: FixedLag) -> list[Found]:
         over_time = {"distinct": m.distinct, "ess": system.ess}
         n = settings.particles
         report |= collapse(m.distinct, system, n, e, COLLAPSED)
-        out.append(Found(report, moments=moments, over_time=over_time))
+        out.append(SmoothedStates(report, moments=moments, over_time=over_time))
     return out
 
 
-def by_pgas(call: Call, method: PGAS) -> list[Found]:
+def by_pgas(setup: SmoothingSetup, method: PGAS) -> list[SmoothedStates]:
     """Successive trajectories of one chain at fixed parameters."""
-    draws = TRAJECTORIES if call.trajectories is None else call.trajectories
-    if method.particles is None and call.particles is not None:
-        method = PGAS(call.particles, method.proposal)
-    held = unpack_parameters(call.problem.trace, call.theta)
-    space = space_of(call.problem, held, {})
-    setup = Setup(call.problem, space, held, 1, PGAS_WARMUP, 1, call.root)
-    sampler = pgas.prepare(setup, method)
+    draws = TRAJECTORIES if setup.trajectories is None else setup.trajectories
+    if method.particles is None and setup.particles is not None:
+        method = PGAS(setup.particles, method.proposal)
+    held = unpack_parameters(setup.problem.trace, setup.theta)
+    space = space_of(setup.problem, held, {})
+    one_chain = SamplingSetup(setup.problem, space, held, 1, PGAS_WARMUP, 1, setup.root)
+    sampler = pgas.prepare(one_chain, method)
     (chain,) = run_chains(
         sampler.step_block, sampler.states, draws, PGAS_WARMUP, progress=False
     )  # fmt: skip
@@ -222,13 +251,24 @@ def by_pgas(call: Call, method: PGAS) -> list[Found]:
     report |= {"warmup": PGAS_WARMUP, "update_rate": float(chain.stats["update_rate"].mean())}
     report["trajectories_are"] = "successive draws of a Markov chain, correlated"
     out = []
-    for i in range(len(call.problem.experiments)):
+    for i in range(len(setup.problem.experiments)):
         paths = chain.draws[f"path_{i}"]
-        out.append(Found(report, paths=paths, over_time={"distinct": distinct(paths)}))
+        out.append(SmoothedStates(report, paths=paths, over_time={"distinct": distinct(paths)}))
     return out
 
 
-# what a method may be called by
+# The methods, under the classes of their settings, and what they may be called by.
+METHODS: dict[type, Callable[[SmoothingSetup, Any], list[SmoothedStates]]] = {
+    KalmanSmoother: by_kalman,
+    ForwardBackward: by_forward_backward,
+    FFBSi: by_ffbsi,
+    FixedLag: by_fixed_lag,
+    PGAS: by_pgas,
+}
+NEEDED: dict[type, tuple[str, Callable[[Trace], Any]]] = {  # what a method needs, and finds it
+    KalmanSmoother: ("a linear Gaussian model", kalman_model),
+    ForwardBackward: ("states of finitely many values", hidden_markov),
+}
 NAMES: dict[str, SmoothingMethod] = {
     "kalman": KalmanSmoother(),
     "forward_backward": ForwardBackward(),
@@ -290,7 +330,7 @@ def smooth(
 
     Raises
     ------
-    ModelError, DataError, ArgumentError : what is wrong with model, data or call, and the fix.
+    ModelError, DataError, ArgumentError : what is wrong with model, data or setup, and the fix.
     SamplingError : weights vanish or are NaN; names the step, the user's line, the parameters.
     """
     began = time.perf_counter()
@@ -303,62 +343,52 @@ def smooth(
     for name, value, least in (("particles", particles, 1), ("trajectories", trajectories, 1)):
         if value is not None:
             check_count(name, value, least)
-    call = Call(problem, theta, particles, trajectories, levels, root)
-    if isinstance(chosen, KalmanSmoother | ForwardBackward):
-        found = by_exact_passes(call, chosen, method)
-    elif isinstance(chosen, FFBSi):
-        found = by_ffbsi(call, chosen)
-    elif isinstance(chosen, FixedLag):
-        found = by_fixed_lag(call, chosen)
-    else:
-        found = by_pgas(call, chosen)
+    setup = SmoothingSetup(
+        problem, theta, particles, trajectories, levels, root, method is not None
+    )
+    found = METHODS[type(chosen)](setup, chosen)
     attrs = {
         "model": problem.trace.name, "method": type(chosen).__name__, "method_chosen": why,
         "settings": asdict(chosen), "seed": str(root.entropy),
         "seconds": time.perf_counter() - began,
     }  # fmt: skip
     datasets = [
-        _dataset(call, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
+        _dataset(setup, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
     ]
     return datasets if len(datasets) > 1 else datasets[0]
 
 
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
-    exact = exact_model(problem.trace)
     if method is None:
-        kind = exact if isinstance(exact, NotApplicable) else kind_of(exact)
-        chosen, why = choose_smoother(kind, problem.trace)
+        chosen, why = choose_smoother(kind_of(exact_model(problem.trace)), problem.trace)
         return chosen, f"automatically: {why}"
-    kinds = (KalmanSmoother, ForwardBackward, FFBSi, FixedLag, PGAS)
     if isinstance(method, str):
         if method not in NAMES:
             raise ArgumentError(
                 f"method={method!r} is unknown",
-                fix=written_as(method, kinds) or f"use one of: {listing(method, NAMES)}",
+                fix=written_as(method, METHODS) or f"use one of: {listing(method, NAMES)}",
             )
         method = NAMES[method]
-    if not isinstance(method, SmoothingMethod):
-        names = ", ".join(f"ssm.{t.__name__}(...)" for t in kinds)
+    if type(method) not in METHODS:
+        names = ", ".join(f"ssm.{t.__name__}(...)" for t in METHODS)
         raise ArgumentError(
             f"method={method!r} is no method of smoothing",
-            fix=written_as(method, kinds) or f"use {names}, a name, or None",
+            fix=written_as(method, METHODS) or f"use {names}, a name, or None",
         )
-    needed: tuple[str, KalmanModel | HiddenMarkov | NotApplicable] | None = None
-    if isinstance(method, KalmanSmoother):
-        needed = "a linear Gaussian model", kalman_model(problem.trace)
-    elif isinstance(method, ForwardBackward):
-        needed = "states of finitely many values", hidden_markov(problem.trace)
-    if needed is not None and isinstance(needed[1], NotApplicable):
+    what, find = NEEDED.get(type(method), ("", None))
+    if find is not None and isinstance(model := find(problem.trace), NotApplicable):
         raise ArgumentError(
-            f"{type(method).__name__} needs {needed[0]}: {needed[1].reason}",
+            f"{type(method).__name__} needs {what}: {model.reason}",
             fix="use ssm.FFBSi(...) or ssm.PGAS(...), or None, which picks by structure",
-            where=needed[1].where,
+            where=model.where,
         )
     return method, "by the user"
 
 
-def _dataset(call: Call, experiment: Experiment, found: Found, attrs: dict[str, Any]) -> xr.Dataset:
-    trace = call.problem.trace
+def _dataset(
+    setup: SmoothingSetup, experiment: Experiment, found: SmoothedStates, attrs: dict[str, Any]
+) -> xr.Dataset:
+    trace = setup.problem.trace
     dims: dict[str, list[str]] = {}
     coords: dict[str, Any] = {}
     if found.paths is not None:
@@ -377,13 +407,13 @@ def _dataset(call: Call, experiment: Experiment, found: Found, attrs: dict[str, 
         variables |= {"covariance": covariance, "covariance_previous": cross}
         dims |= {n: ["time", "state", "state_"] for n in ("covariance", "covariance_previous")}
         coords["state"] = coords["state_"] = [repr(s) for s in trace.state_symbols]
-        if len(call.levels):
-            by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(call.levels))]
+        if len(setup.levels):
+            by_level = [unpack_states(trace, spread[:, :, p]) for p in range(len(setup.levels))]
             for name in by_level[0]:
                 variables[f"{name}_quantile"] = np.stack([q[name] for q in by_level], axis=-1)
                 own = component_dims(name, by_level[0][name], 2)
                 dims[f"{name}_quantile"] = ["time", *own, "quantile"]
-            coords["quantile"] = call.levels
+            coords["quantile"] = setup.levels
     out = to_dataset(
         variables, sample_dim=sample_dim, time=experiment.time, dims=dims, coords=coords,
         attrs={**attrs, **found.attrs, "observes": observes(trace)},

@@ -9,7 +9,7 @@ from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.diagnosis import models
@@ -36,8 +36,8 @@ def fitter_of(name, *, exact):
 def log_posterior(fitter, fit, z):
     """Exact log p(y) + log prior on the natural scale, which is what the mode is of."""
     fixed = fitter.fixed
-    setup = Setup(fit.problem, fit.space, "posterior", fixed, {}, np.random.SeedSequence(0))
-    point = setup.chart.at(z)
+    setup = Maximization(fit.problem, fit.space, "posterior", fixed, {}, np.random.SeedSequence(0))
+    point = setup.transform.at(z)
     kalman = kalman_model(fit.problem.trace)
     return kalman.log_likelihood(fit.problem.experiments, point.theta) + point.log_prior
 
@@ -122,8 +122,8 @@ def test_a_fit_may_start_with_an_information_matrix():
     _, particles = fitter_of("level", exact=False)
     seed = seed_sequence(seed_of("information"))
     top = exact.fit(problem.experiments, seed, {})
-    setup = Setup(top.problem, top.space, "posterior", {}, {}, np.random.SeedSequence(0))
-    back = np.linalg.inv(setup.chart.at(top.z).jacobian)
+    setup = Maximization(top.problem, top.space, "posterior", {}, {}, np.random.SeedSequence(0))
+    back = np.linalg.inv(setup.transform.at(top.z).jacobian)
     information = back.T @ top.information @ back
     found = particles.fit(
         problem.experiments, seed, top.start, searched=True, information=information
@@ -147,9 +147,9 @@ def test_a_step_over_a_cliff_is_taken_back(monkeypatch, after):
     start = particles.fit(problem.experiments, seed, {}).start
     whole, calls = particles.gradient, []
 
-    def gradient(space, z, stream, chart):
+    def gradient(space, z, stream, transform):
         calls.append(z)
-        value, slope = whole(space, z, stream, chart)
+        value, slope = whole(space, z, stream, transform)
         return (value - 1e5, 1e5 * slope) if len(calls) == after + 1 else (value, slope)
 
     monkeypatch.setattr(particles, "gradient", gradient)

@@ -19,7 +19,12 @@ from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, symbol, symbols_of, topological
-from ssmppl.inference.chains.elimination import Eliminating, Learned, asked, describe
+from ssmppl.inference.chains.elimination import (
+    Eliminating,
+    EliminationState,
+    describe_elimination,
+    requested_elimination,
+)
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
@@ -248,7 +253,7 @@ def changes(name, kind, draws=2000, sweeps=6, names=None):
     rng, stream, rows = np.random.default_rng(5), random_state(np.random.SeedSequence(3)), []
     first, theta, paths = posed(name, 3, kind, names)
     # fixed numbers, of another draw; particles are few and the base is worth much, to show faults
-    learned = Learned(0, first.begin(theta, tuple(paths)).rate)
+    learned = EliminationState(0, first.begin(theta, tuple(paths)).rate)
     first = replace(first, particles=4, worth=4.0)
     made = first.made
     for i in range(draws):
@@ -418,14 +423,18 @@ SHORT = {"chains": 2, "progress": False, "seed": 1}
 Y = np.exp(np.linspace(1, 2, 6))
 
 
+def described(problem, setting, held, proposal):
+    return describe_elimination(requested_elimination(problem, setting, held, proposal))
+
+
 def test_what_is_eliminated():
     problem = pose(models.scale, {"y": Y})
     for setting in (True, "auto", ("tau",), ["tau"]):
-        assert describe(asked(problem, setting, {}, "bootstrap")) == "tau (Gamma)"
-    assert describe(asked(problem, False, {}, "bootstrap")) == "none: eliminate=False"
-    held = describe(asked(problem, "auto", {"tau": np.array(2.0)}, "bootstrap"))
+        assert described(problem, setting, {}, "bootstrap") == "tau (Gamma)"
+    assert described(problem, False, {}, "bootstrap") == "none: eliminate=False"
+    held = described(problem, "auto", {"tau": np.array(2.0)}, "bootstrap")
     assert held.startswith("none: the initial law of x leaves log(1 - phi**2)")
-    better = describe(asked(problem, "auto", {}, "auxiliary"))
+    better = described(problem, "auto", {}, "auxiliary")
     assert better == "none: particles move by the proposal 'auxiliary'"
 
 

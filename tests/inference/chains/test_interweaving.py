@@ -16,7 +16,7 @@ import ssmppl as ssm
 from ssmppl.analysis.proposals.noises import noises
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.interweaving import Interweaving, NoiseMove, Tuning
+from ssmppl.inference.chains.interweaving import Interweaving, InterweavingTuning, NoiseMove
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.language.model.transforms import constant_bounds
@@ -182,7 +182,7 @@ def changes(name, steered, kind, draws=2000, sweeps=5):
             replace(space, problem=problem), (move,), np.arange(d), np.ones(d), 0, 0,
             bounds,
         )  # fmt: skip
-        tuning = Tuning(0, np.arange(d), (0.5 * np.eye(d),), 0, ())
+        tuning = InterweavingTuning(0, np.arange(d), (0.5 * np.eye(d),), 0, ())
         before = functions(kernel, theta, paths, problem.experiments[0].y)
         for _ in range(sweeps):
             tuning, _ = kernel.step(tuning, theta, paths, rng)

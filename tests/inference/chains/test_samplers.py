@@ -13,9 +13,9 @@ import pytest
 import scipy.stats as st
 
 import ssmppl as ssm
-from ssmppl.inference.chains.coordinates import chart, coordinates
-from ssmppl.inference.chains.pmmh import fitted_covariance
+from ssmppl.inference.chains.metropolis_kernel import coordinates, local_derivatives
 from ssmppl.inference.chains.smc2 import _factor
+from ssmppl.inference.optimisation.quadratic import fitted_covariance
 from ssmppl.inference.preparation.pilot import find_mode, scale_of
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
@@ -240,7 +240,7 @@ def test_chart_gives_derivatives_of_the_change_of_scale():
     space = space_of(pose(chosen, {"y": np.array([0.3, 0.1])}), {}, {"a": 0.4, "q": 1.7})
     w = coordinates(space, "unconstrained", {"q": "reciprocal"})
     point = w.at(space.z[space.where])
-    found = chart(w, point, np.array([0.3, 0.2]), second=True)
+    found = local_derivatives(w, point, np.array([0.3, 0.2]), second=True)
     v = 1 / 1.7
     np.testing.assert_allclose(found.jacobian, [[1, 0], [0, -1 / v**2]], atol=1e-6)
     np.testing.assert_allclose(found.second[1], [[0, 0], [0, 2 / v**3]], atol=1e-5)

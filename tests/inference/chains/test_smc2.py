@@ -8,7 +8,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.inference.chains.sampling import Setup
+from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.chains.smc2 import Filters, begin, exchange, one_row
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
@@ -102,7 +102,7 @@ def test_an_exchange_weighs_by_the_ratio_of_the_likelihoods():
     space = space_of(problem, held, {})
     method = ssm.SMC2(parameters=10, particles=5, ess_threshold=0.0)
     setup, filters = (
-        Setup(problem, space, held, 1, 0, 1, np.random.SeedSequence(1), False),
+        SamplingSetup(problem, space, held, 1, 0, 1, np.random.SeedSequence(1), False),
         Filters(space, method, "bootstrap"),
     )
     state, _, _ = one_row(filters, begin(filters, setup, 0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import ssmppl as ssm
 from ssmppl.inference.checkpoints import archive, chains, origin
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.run import chain_runner
-from ssmppl.inference.verbs.sample import PREPARE
+from ssmppl.inference.verbs.sample import METHODS
 from tests.inference.checkpoints import checkpoint_models as models
 from tests.inference.checkpoints.checkpoint_models import CALLS, bits, call
 
@@ -131,7 +132,7 @@ def test_more_draws_are_those_of_one_longer_run(tmp_path):
 def test_a_finished_call_prepares_nothing(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     expected = bits(call("PGAS", path))
-    monkeypatch.setitem(PREPARE, ssm.PGAS, None.__class__)
+    monkeypatch.setitem(METHODS, ssm.PGAS, replace(METHODS[ssm.PGAS], prepare=None.__class__))
     assert bits(call("PGAS", path)) == expected
     monkeypatch.setattr(origin, "sources_digest", lambda *folders: "0" * 20)
     with pytest.raises(ssm.ArgumentError, match=r"ssmppl .*sources.*now .*sources 00000000"):

@@ -7,7 +7,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters, check_values
 from ssmppl.datasets import load
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.em import climb as climb_em
 from ssmppl.inference.maximum.m_step import maximiser
@@ -26,7 +26,7 @@ def setup_of(model, data, fixed=None, start=None, objective="likelihood", seed=1
     problem = pose(model, data)
     held, near = check_values(problem.trace, fixed), check_values(problem.trace, start)
     root = np.random.SeedSequence(seed)
-    return Setup(problem, space_of(problem, held, near), objective, held, near, root)
+    return Maximization(problem, space_of(problem, held, near), objective, held, near, root)
 
 
 def likelihoods(setup, thetas):

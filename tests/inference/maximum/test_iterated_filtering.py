@@ -13,16 +13,16 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.analysis.proposals.perturbed import perturbed
-from ssmppl.inference.maximum.ascent import Setup
+from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.iterated_filtering import (
-    State,
-    Swarms,
+    IF2State,
+    PerturbedFilter,
     climb,
+    if2_block,
     perturbed_model,
     step_scales,
-    swarm_block,
 )
-from ssmppl.inference.maximum.noisy_maximum import Hilltop, hilltop
+from ssmppl.inference.maximum.noisy_maximum import LocalMaximum, local_maximum
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -74,40 +74,44 @@ def setup_of(model, data, fixed=None, start=None, objective="likelihood", seed=1
     problem = pose(model, data)
     held = {k: np.asarray(v, dtype=float) for k, v in (fixed or {}).items()}
     near = {k: np.asarray(v, dtype=float) for k, v in (start or {}).items()}
-    return Setup(problem, space_of(problem, held, near), objective, held, near, seed_sequence(seed))
+    return Maximization(
+        problem, space_of(problem, held, near), objective, held, near, seed_sequence(seed)
+    )
 
 
-def swarms_of(setup, method):
+def filter_of(setup, method):
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
-    return Swarms(setup.space, setup.with_prior, scales, model.moving, method.cooling)
+    return PerturbedFilter(setup.space, setup.with_prior, scales, model.moving, method.cooling)
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
 def test_each_particle_carries_its_own_parameters(with_prior):
-    """A swarm of two atoms that does not step: Z and the final share of an atom are unbiased for
+    """Particles at two atoms that do not step: Z and the final share of an atom are unbiased for
     the mean of the atoms' likelihoods, and for an atom's part of it (times its prior)."""
     data = [simulated(6, "atoms"), simulated(4, "more atoms")]
     data[0]["y"][2] = np.nan
     objective = "posterior" if with_prior else "likelihood"
     setup = setup_of(series, data, {"a": 0.5, "h": 1.0}, VALUES, objective)
-    swarms = swarms_of(setup, ssm.IF2())
-    swarms = Swarms(swarms.space, with_prior, 0.0 * swarms.perturbation, swarms.moving, 0.5)
+    perturbed = filter_of(setup, ssm.IF2())
+    perturbed = PerturbedFilter(
+        perturbed.space, with_prior, 0.0 * perturbed.perturbation, perturbed.moving, 0.5
+    )
     one = setup.space.z[setup.space.where]
     atoms = [one, one + np.array([0.3, 0.4, -0.3, 0.5])]  # m, phi, q, r
     exact = []
     for z in atoms:
         theta, _ = setup.space.parameters(z)
         log_p = setup.exact.log_likelihood(setup.problem.experiments, theta.copy())
-        exact.append(log_p + (setup.chart.at(z).log_prior if with_prior else 0.0))
+        exact.append(log_p + (setup.transform.at(z).log_prior if with_prior else 0.0))
     assert abs(exact[0] - exact[1]) < 3.0  # both count
     stream, n = random_state(setup.seed(1)), 40
     whole, part = [], []
     for _ in range(1500):
-        swarm = np.repeat(np.array(atoms).T, n // 2, axis=1)
-        _, increments = swarms.one_pass(swarm, 1, stream)
+        particles = np.repeat(np.array(atoms).T, n // 2, axis=1)
+        _, increments = perturbed.one_pass(particles, 1, stream)
         log_z = increments.sum() - (np.logaddexp(*exact) - np.log(2.0))  # less that of the mean
-        share = np.mean(swarm[0] == atoms[0][0])
+        share = np.mean(particles[0] == atoms[0][0])
         whole.append(log_z)
         with np.errstate(divide="ignore"):
             part.append(log_z + np.log(share) - exact[0] + np.logaddexp(*exact))
@@ -116,23 +120,23 @@ def test_each_particle_carries_its_own_parameters(with_prior):
 
 
 def test_the_steps_cool_as_they_should():
-    """Without measurements the swarm is a random walk: its variance is the sum of s^2, of all
+    """Without measurements the particles take a random walk: its variance is the sum of s^2, of all
     rows for what acts at them, of the first one for what acts in the initial law alone."""
     rows, passes, n, cooling, scale = 7, 30, 20_000, 0.2, {"m": 0.3, "q": 0.05}
     data = [{"y": np.full(t, np.nan), "u": np.zeros(t)} for t in (rows, 3)]
     setup = setup_of(series, data, {"a": 0.5, "h": 1.0, "phi": 0.5, "r": 1.0})
-    swarms = swarms_of(setup, ssm.IF2(cooling=cooling, perturbation=scale))
-    state = State(np.zeros((2, n)), random_state(setup.seed(2)), 0)
-    state, _ = swarm_block(swarms, state, 10)
-    state, _ = swarm_block(swarms, state, passes - 10)
+    perturbed = filter_of(setup, ssm.IF2(cooling=cooling, perturbation=scale))
+    state = IF2State(np.zeros((2, n)), random_state(setup.seed(2)), 0)
+    state, _ = if2_block(perturbed, state, 10)
+    state, _ = if2_block(perturbed, state, passes - 10)
     m, q = np.arange(passes)[:, None], np.arange(rows + 3)[None]
     factor = cooling ** ((m + q / (rows + 3)) / 50.0)
     first = np.zeros(rows + 3)
     first[[0, rows]] = 1.0
     variance = [np.sum((0.3 * factor * first) ** 2), np.sum((0.05 * factor) ** 2)]
-    assert [s.data[1] for s in setup.chart.z] == ["m", "q"]
+    assert [s.data[1] for s in setup.transform.z] == ["m", "q"]
     low, high = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], n) / n
-    for drawn, expected in zip(state.swarm, variance, strict=True):
+    for drawn, expected in zip(state.particles, variance, strict=True):
         assert low < np.mean(drawn**2) / expected < high
 
 
@@ -167,13 +171,13 @@ def test_names_of_the_model_are_kept_apart():
     model.observation(lambda unconstrained: {"y": ssm.Normal(unconstrained, sd=1)})
     data = {"y": np.array([0.3, -0.2, 0.5]), "perturbation": np.ones(3)}
     setup = setup_of(model, data, objective="posterior")
-    swarms, swarm = swarms_of(setup, ssm.IF2()), np.zeros((1, 50))
-    mean, _ = swarms.one_pass(swarm, 1, random_state(setup.seed(1)))
+    perturbed, particles = filter_of(setup, ssm.IF2()), np.zeros((1, 50))
+    mean, _ = perturbed.one_pass(particles, 1, random_state(setup.seed(1)))
     assert 0.0 < abs(mean[0]) < 0.5
 
 
 def check_ends(found, exact):
-    """The ends of eight swarms lie round the exact top as far as their own spread allows; the bias
+    """The ends of eight runs lie round the exact top as far as their own spread allows; the bias
     of steps that have not vanished is below a fifth of the standard error."""
     for name, sd in exact.standard_errors.items():
         ends = np.array([e[name] for e in found.attrs["start_parameters"]])
@@ -316,13 +320,13 @@ def tops_of_walk(objective, count, particles=300):
         seed = seed_of("walk", k)
         setup = setup_of(OPAQUE, data, start=exact.parameters, objective=objective, seed=seed)
         z = setup.space.z[setup.space.where]
-        inverse = np.linalg.pinv(setup.chart.at(z).jacobian)
+        inverse = np.linalg.pinv(setup.transform.at(z).jacobian)
         inner = inverse @ exact.covariance.to_numpy() @ inverse.T
         rng = np.random.default_rng(seed)
         beside = rng.standard_normal(2)
         beside *= 2.0 / np.linalg.norm(beside)
         begin = z + np.linalg.cholesky(inner) @ beside
-        out.append(hilltop(setup, ssm.IF2(particles=particles), begin, 0.5))
+        out.append(local_maximum(setup, ssm.IF2(particles=particles), begin, 0.5))
     return z, inner, out
 
 
@@ -330,10 +334,10 @@ def tops_of_walk(objective, count, particles=300):
     "objective", ["likelihood", pytest.param("posterior", marks=pytest.mark.slow)]
 )
 def test_the_top_is_found_from_beside_it(objective):
-    """From where all swarms may lag: within its own Monte Carlo error of the exact top, and that
+    """From where all runs may lag: within its own Monte Carlo error of the exact top, and that
     error is small beside the standard error."""
     z, inner, found = tops_of_walk(objective, 6 if objective == "likelihood" else 12)
-    assert all(isinstance(f, Hilltop) for f in found)
+    assert all(isinstance(f, LocalMaximum) for f in found)
     lengths = [(f.z - z) @ np.linalg.solve(f.error, f.z - z) for f in found]
     low, high = stats.chi2.ppf([LEVEL / 2, 1 - LEVEL / 2], 2 * len(found))
     assert low < np.sum(lengths) < 1.2**2 * high  # errors that are 1.2 times too small at most
@@ -401,7 +405,7 @@ def test_filters_run_side_by_side():
 
     data = simulated(30, "workers", parameters=WALK, model=PLAIN)
     setup = replace(setup_of(OPAQUE, data, start=WALK), executor=Counting(1))
-    hilltop(setup, ssm.IF2(particles=50, points=160), setup.space.z[setup.space.where], 0.5)
+    local_maximum(setup, ssm.IF2(particles=50, points=160), setup.space.z[setup.space.where], 0.5)
     assert setup.executor.most > 10
 
 
@@ -438,24 +442,24 @@ def test_a_row_that_no_particle_can_produce_is_counted():
     model.observation(lambda x: {"y": ssm.Uniform(x - 1, x + 1)})
     data = {"y": np.array([0.1, 0.3, 60.0, 0.2])}
     setup = setup_of(model, data)
-    swarms = swarms_of(setup, ssm.IF2())
-    state = State(np.zeros((1, 50)), random_state(setup.seed(1)), 0)
-    _, block = swarm_block(swarms, state, 2)
+    perturbed = filter_of(setup, ssm.IF2())
+    state = IF2State(np.zeros((1, 50)), random_state(setup.seed(1)), 0)
+    _, block = if2_block(perturbed, state, 2)
     assert block.stats["impossible"].tolist() == [1, 1]
     assert np.all(np.isfinite(block.draws["z"]))
     assert np.all(block.stats["perturbed_log_likelihood"] == -np.inf)
 
 
 def test_an_interrupt_keeps_the_passes_made(monkeypatch):
-    plain, seen = Swarms.one_pass, []
+    plain, seen = PerturbedFilter.one_pass, []
 
-    def one_pass(self, swarm, iteration, stream):
+    def one_pass(self, particles, iteration, stream):
         seen.append(iteration)
         if len(seen) > 60:
             raise KeyboardInterrupt
-        return plain(self, swarm, iteration, stream)
+        return plain(self, particles, iteration, stream)
 
-    monkeypatch.setattr(Swarms, "one_pass", one_pass)
+    monkeypatch.setattr(PerturbedFilter, "one_pass", one_pass)
     setup = setup_of(models.lgss, LGSS, {"c": 0.5}, {"theta": 1.0})
     found = climb(setup, ssm.IF2(particles=50, starts=2, iterations=1000))
     assert found.interrupted
@@ -464,12 +468,12 @@ def test_an_interrupt_keeps_the_passes_made(monkeypatch):
     assert np.all(np.isfinite(found.theta))
 
 
-def test_swarms_travel_to_other_processes():
+def test_the_filter_travels_to_other_processes():
     setup = setup_of(models.lgss, LGSS)
-    swarms = swarms_of(setup, ssm.IF2())
-    state = State(np.zeros((2, 50)), random_state(setup.seed(1)), 0)
-    here = swarm_block(swarms, state, 2)[1].draws["z"]
-    there = swarm_block(pickle.loads(pickle.dumps(swarms)), state, 2)[1].draws["z"]
+    perturbed = filter_of(setup, ssm.IF2())
+    state = IF2State(np.zeros((2, 50)), random_state(setup.seed(1)), 0)
+    here = if2_block(perturbed, state, 2)[1].draws["z"]
+    there = if2_block(pickle.loads(pickle.dumps(perturbed)), state, 2)[1].draws["z"]
     np.testing.assert_array_equal(here, there)
 
 

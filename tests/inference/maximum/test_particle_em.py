@@ -10,15 +10,14 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.datasets import ice_varves, load
-from ssmppl.inference.chains.pgas import Sweeper, start_chain
+from ssmppl.inference.chains.pgas import Sweeper, conditional_settings, start_chain
 from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.m_step import fixed_point, maximiser, ratio_weights
 from ssmppl.inference.maximum.particle_em import climb as climb_particle_em
 from ssmppl.inference.maximum.psaem import (
-    State,
+    PSAEMState,
     averaged_sweep,
     climb,
-    conditional_settings,
     saem_block,
     step_size,
 )
@@ -110,10 +109,11 @@ def test_step_sizes():
 def test_blocks_neither_depend_on_their_borders_nor_on_the_process():
     setup = setup_of(models.lgss, {"y": load("lgss_appendix")["y"]}, fixed={"c": 1.0})
     method = ssm.PSAEM(particles=8, burn_in=5)
-    maximum, settings = maximiser(setup, "PSAEM"), conditional_settings(setup, method)
+    maximum = maximiser(setup, "PSAEM")
+    settings = conditional_settings(setup.problem, method.particles, method.proposal)
     theta = np.array([2.0, 1.0])
     paths, stream = started(setup, theta, settings, "blocks")
-    state = State(theta, paths, stream, np.empty(0), 0)
+    state = PSAEMState(theta, paths, stream, np.empty(0), 0)
     whole, block = saem_block(maximum, settings, method, state, 9)
     task = pickle.loads(pickle.dumps(partial(saem_block, maximum, settings, method)))
     half, first = task(state, 4)

@@ -9,8 +9,8 @@ import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum import score_ascent
-from ssmppl.inference.maximum.ascent import Setup
-from ssmppl.inference.particles.scores import Run
+from ssmppl.inference.maximum.ascent import Maximization
+from ssmppl.inference.particles.scores import SmootherRun
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.verbs.maximize import choose_method
@@ -27,7 +27,9 @@ def exact_runs(scores, theta, smoothing, second, seed, numbers, executor=None):
     assert isinstance(kalman, KalmanModel)
     value, gradient = kalman.score(scores.problem.experiments, theta)
     information = kalman.information(scores.problem.experiments, theta)
-    return [Run(value, gradient, np.outer(gradient, gradient), -information) for _ in numbers]
+    return [
+        SmootherRun(value, gradient, np.outer(gradient, gradient), -information) for _ in numbers
+    ]
 
 
 @pytest.mark.parametrize("objective", ["likelihood", "posterior"])
@@ -63,9 +65,9 @@ def test_a_step_of_the_paper_between_bounds_is_one_in_atanh():
     """(logit, log) steps of the metric are those of (atanh phi, log tau)."""
     problem = pose(models.varves, {"y": np.ones(3)})
     space = space_of(problem, {}, {"phi": np.array(0.5), "tau": np.array(2.0)})
-    setup = Setup(problem, space, "likelihood", {}, {}, np.random.SeedSequence(1))
+    setup = Maximization(problem, space, "likelihood", {}, {}, np.random.SeedSequence(1))
     gradient = np.array([0.3, -0.2])  # in (phi, tau)
-    step = score_ascent.paper_metric(setup) * setup.chart.at(space.z).pull(gradient)
+    step = score_ascent.paper_metric(setup) * setup.transform.at(space.z).pull(gradient)
     moved = space.parameters(space.z + step)[0]
     expected = np.tanh(np.arctanh(0.5) + (1 - 0.25) * 0.3), np.exp(np.log(2.0) + 2.0 * -0.2)
     np.testing.assert_allclose(moved, expected)
@@ -115,7 +117,7 @@ def chosen(transition):
     model.transition(transition)
     model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     problem = pose(model, {"y": np.zeros(4)})
-    setup = Setup(problem, space_of(problem, {}, {}), "likelihood", {}, {},
+    setup = Maximization(problem, space_of(problem, {}, {}), "likelihood", {}, {},
                   np.random.SeedSequence(1))  # fmt: skip
     return choose_method(setup)
 

@@ -16,11 +16,10 @@ from ssmppl.codegen.kernels.particle.particle_filter import GUIDED_SHARE
 from ssmppl.codegen.modules import program
 from ssmppl.datasets import ice_varves
 from ssmppl.errors import ArgumentError, SamplingError
-from ssmppl.inference.chains.pmmh import run_filters
+from ssmppl.inference.chains.pmmh import ParticleLikelihood
 from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
 from ssmppl.inference.preparation import proposal_choice
 from ssmppl.inference.preparation.proposal_choice import ENOUGH, choose
-from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 from tests.inference.twisted_models import (
@@ -103,13 +102,14 @@ def test_filter_that_keeps_a_path():
     """What PMMH runs makes the same estimate, and its path follows the model."""
     y = vehicle_rows(25, 0.5, "rows")
     problem, theta = pose(models.vehicle, {"y": y}), np.array([0.5])
-    space, settings = space_of(problem, {}, {}), FilterSettings(20, "twisted")
+    likelihood = ParticleLikelihood(problem, FilterSettings(20, "twisted"))
     stream = random_state(np.random.SeedSequence(seed_of("twisted path")))
     log_z = np.empty(1000)
     for i in range(len(log_z)):
-        log_z[i], (path,), (increments,) = run_filters(space, theta, settings, stream)
-        assert log_z[i] == pytest.approx(increments.sum())
-        v, p = path.T
+        run = likelihood.run(theta, None, stream)
+        log_z[i] = run.log_likelihood
+        assert log_z[i] == pytest.approx(run.increments[0].sum())
+        v, p = run.paths[0].T
         np.testing.assert_allclose(p[1:], p[:-1] + 0.5 * v[:-1], atol=1e-12)
     table = Table(1)
     table.cell("path of the vehicle", log_z, vehicle_exact(y, 0.5), 20, len(y))

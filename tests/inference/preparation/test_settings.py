@@ -9,7 +9,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.methods import methods
-from ssmppl.inference.preparation.settings import RULES
+from ssmppl.inference.methods.settings import rules_of
+from ssmppl.inference.verbs.sample import METHODS
 
 model = ssm.Model("level")
 
@@ -86,7 +87,6 @@ def goes_on(method, name, value):
     return any(value == fine for fine in FINE.get((type(method).__name__, name), []))
 
 
-SAMPLERS = ("MetropolisHastings", "Gibbs", "PMMH", "PGAS", "SMC2")
 CALLS = [
     pytest.param(
         method,
@@ -103,7 +103,7 @@ CALLS = [
 
 def run(method):
     kind = type(method).__name__
-    if kind in SAMPLERS:
+    if type(method) in METHODS:
         few = {"draws": 4, "warmup": 4, "chains": 1}
         return ssm.sample(model, DATA, method, **few, seed=1, progress=False)
     if kind in ("FFBSi", "FixedLag"):
@@ -124,16 +124,18 @@ def test_odd_settings_are_refused_by_their_names(method, name, value):
     assert "Fix: " in str(error.value)
 
 
-def test_every_setting_has_a_rule():
+def test_every_method_is_tried():
     known = {
         kind
-        for module in (methods, methods)
-        for kind in vars(module).values()
+        for kind in vars(methods).values()
         if isinstance(kind, type) and hasattr(kind, "__dataclass_fields__")
     }
-    assert set(RULES) == known == {type(m) for m in SMALL}
-    for kind, rules in RULES.items():
-        assert set(rules) == {f.name for f in fields(kind)}, kind
+    assert known == {type(m) for m in SMALL}
+
+
+@pytest.mark.parametrize("method", SMALL, ids=lambda m: type(m).__name__)
+def test_every_setting_has_a_rule(method):
+    assert set(rules_of(method)) == {f.name for f in fields(method)}
 
 
 @pytest.mark.parametrize(

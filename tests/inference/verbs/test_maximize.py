@@ -11,7 +11,7 @@ from ssmppl import datasets
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.kalman import KalmanModel
-from ssmppl.inference.maximum.ascent import Ascent, Chart
+from ssmppl.inference.maximum.ascent import Ascent, UnconstrainedTransform
 from ssmppl.inference.preparation.exact_score import ExactScore
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
@@ -61,7 +61,7 @@ def shaped():
     problem = pose(shapes, {"y": np.zeros(3)})
     space = space_of(problem, {"free": np.array([0.3, -0.2])}, {})
     z = np.random.default_rng(seed_of("chart")).normal(size=len(space.where))
-    return space, Chart(space), z
+    return space, UnconstrainedTransform(space), z
 
 
 def differences(function, z, h=1e-4):
@@ -75,8 +75,8 @@ def differences(function, z, h=1e-4):
 
 
 def test_first_derivatives_on_the_unconstrained_scale(shaped):
-    space, chart, z = shaped
-    point = chart.at(z)
+    space, transform, z = shaped
+    point = transform.at(z)
     np.testing.assert_allclose(point.theta, space.parameters(z)[0])
     assert point.log_prior + point.log_jacobian == pytest.approx(space.parameters(z)[1], rel=1e-12)
     expected = differences(lambda v: space.parameters(v)[0].copy(), z)
@@ -84,26 +84,26 @@ def test_first_derivatives_on_the_unconstrained_scale(shaped):
     np.testing.assert_array_equal(point.jacobian[:2], 0.0)  # the fixed ones
     total = differences(lambda v: np.float64(space.parameters(v)[1]), z)
     np.testing.assert_allclose(point.d_log_prior + point.d_log_jacobian, total, atol=1e-7)
-    own = differences(lambda v: np.float64(chart.at(v).log_jacobian), z)
+    own = differences(lambda v: np.float64(transform.at(v).log_jacobian), z)
     np.testing.assert_allclose(point.d_log_jacobian, own, atol=1e-7)
 
 
 def test_second_derivatives_on_the_unconstrained_scale(shaped):
-    _, chart, z = shaped
+    _, transform, z = shaped
     rng = np.random.default_rng(seed_of("weights"))
-    weights = rng.normal(size=len(chart.symbols))
-    found = chart.curvature(z, weights)
+    weights = rng.normal(size=len(transform.symbols))
+    found = transform.curvature(z, weights)
     np.testing.assert_allclose(
-        found.theta, differences(lambda v: chart.at(v).pull(weights), z), atol=1e-7
+        found.theta, differences(lambda v: transform.at(v).pull(weights), z), atol=1e-7
     )
     for name in ("log_prior", "log_jacobian"):
-        expected = differences(lambda v, n=name: getattr(chart.at(v), f"d_{n}"), z)
+        expected = differences(lambda v, n=name: getattr(transform.at(v), f"d_{n}"), z)
         np.testing.assert_allclose(getattr(found, name), expected, atol=1e-6)
 
 
 def test_outside_of_floating_point_there_is_no_prior(shaped):
-    _, chart, z = shaped
-    assert chart.at(np.full(len(z), 800.0)).log_prior == -np.inf
+    _, transform, z = shaped
+    assert transform.at(np.full(len(z), 800.0)).log_prior == -np.inf
 
 
 @pytest.fixture(scope="module")
@@ -313,11 +313,11 @@ def test_a_prior_without_derivative_in_closed_form_is_differenced():
     model.transition(lambda x, m: {"x": ssm.Normal(m * x, sd=1)})
     model.observation(lambda x: {"y": ssm.Normal(x, sd=1)})
     space = space_of(pose(model, {"y": np.zeros(3)}), {}, {})
-    chart, z = Chart(space), space.z.copy()
-    point = chart.at(z)
+    transform, z = UnconstrainedTransform(space), space.z.copy()
+    point = transform.at(z)
     expected = differences(lambda v: np.float64(space.parameters(v)[1]), z)
     np.testing.assert_allclose(point.d_log_prior + point.d_log_jacobian, expected, atol=1e-5)
-    assert np.all(np.isfinite(chart.curvature(z, np.ones(2)).log_prior))
+    assert np.all(np.isfinite(transform.curvature(z, np.ones(2)).log_prior))
     assert set(unpack_parameters(space.problem.trace, point.theta)) == {"k", "m"}
 
 
@@ -356,7 +356,7 @@ def test_an_ascent_may_know_its_likelihood_and_its_error(monkeypatch):
         error[0, 0] = 0.25
         return Ascent(theta, -7.0, theta[None], {"converged": True}, np.diag([4.0, 0.0]), error)
 
-    monkeypatch.setitem(verb.CLIMBS, ssm.DirectOptimization, climb)
+    monkeypatch.setitem(verb.METHODS, ssm.DirectOptimization, climb)
     data = {"y": datasets.load("lgss_main_text")["y"]}
     estimate = ssm.maximize(models.lgss, data, fixed={"c": 0.5}, progress=False)
     assert estimate.log_likelihood == -7.0

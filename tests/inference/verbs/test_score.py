@@ -8,7 +8,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.particles.scores import Run, combine, run_weights
+from ssmppl.inference.particles.scores import SmootherRun, combine, run_weights
 from tests.statistics import models
 from tests.statistics.checks import seed_of, some
 from tests.statistics.exact import DenseGaussian
@@ -114,7 +114,7 @@ def runs_of(seed, repeats, bias=0.0):
         log_z = 0.6 * noise[0] - 0.18
         mean = np.array([1.0 - 0.6 + noise[0], 2.0 + noise[1] + bias])
         square = np.array([[4.0, 1.0], [1.0, 6.0]])
-        out.append(Run(log_z, mean, square, -np.diag([9.0, 7.0])))
+        out.append(SmootherRun(log_z, mean, square, -np.diag([9.0, 7.0])))
     return out
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.data import check_parameters
-from ssmppl.inference.maximum.m_step import climbed, maximiser
+from ssmppl.inference.maximum.m_step import maximise_over_paths, maximiser
 from tests.inference import em_models
 from tests.inference.maximum.test_em import setup_of
 from tests.statistics.checks import seed_of
@@ -54,8 +54,8 @@ def test_the_closed_form(objective, start):
     theta = check_parameters(setup.problem.trace, dict(zip("aqr", start, strict=True)))
     paths, w = trajectories(seed_of("closed form"), (20, 35))
     exact = maximum.step.maximise(maximum.statistics(theta, paths, [w, w]), theta)
-    found = climbed(
-        setup.chart, maximum.scores, paths, w, setup.space_at(theta), objective == "posterior"
+    found = maximise_over_paths(
+        setup.transform, maximum.scores, paths, w, setup.space_at(theta), objective == "posterior"
     )
     np.testing.assert_allclose(found, exact, rtol=1e-6)
 
@@ -73,7 +73,7 @@ def test_what_does_not_separate(objective, monkeypatch):
 
     def mean(z):
         theta, _ = setup.space.parameters(z)
-        prior = setup.chart.at(z).log_prior if objective == "posterior" else 0.0
+        prior = setup.transform.at(z).log_prior if objective == "posterior" else 0.0
         return float(maximum.scores.log_density(theta, paths).mean()) + prior
 
     found = maximum.from_paths(start, paths, np.zeros((1, 1)))

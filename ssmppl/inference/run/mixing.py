@@ -1,15 +1,15 @@
-"""Whether the chains of the parameters have mixed, and a warning where they have not.
+"""Whether chains have mixed, parameters and trajectories, and a warning where they have not.
 
-A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner, "Rank-normalization, folding, and
-localization: an improved R-hat for assessing convergence of MCMC", *Bayesian Analysis* 16 (2021):
-R-hat of split chains, equations (1) to (4), of the ranks and of those of distances from the median
-(section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8) to (11)).
+Parameters: A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner, "Rank-normalization,
+folding, and localization: an improved R-hat for assessing convergence of MCMC", *Bayesian Analysis*
+16 (2021): R-hat of split chains, equations (1) to (4), of the ranks and of those of distances from
+the median (section 4.2), and the effective sample size of the ranks (section 4.1 with equations (8)
+to (11)).
 
-How often the states of a chain change, row by row, and a warning where they hardly do.
-
-Particle Gibbs leaves the right law invariant whatever its update rate, but a row that never changes
-has not been sampled: paths of a conditional particle filter meet in the reference, the earlier the
-row the likelier (Lindsten, Jordan and Schön 2014, section 3). The rate by row is their diagnostic.
+Trajectories: particle Gibbs leaves the right law invariant whatever its update rate, but a row that
+never changes has not been sampled: paths of a conditional particle filter meet in the reference,
+the earlier the row the likelier (Lindsten, Jordan and Schön 2014, section 3). How often the states
+change, row by row, is their diagnostic.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from ssmppl.inference.methods.methods import PMMH, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
@@ -31,15 +30,21 @@ from ssmppl.language.model.traced import Site
 APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
 FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
 LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be told
+LOW = 0.02  # share of draws at which a row changes, below which there is a warning
+STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
+Paths = tuple[np.ndarray, ...]
+PIECE = 2**25  # bytes of draws that are looked at together
+FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
 
 
 def mixing_attributes(
-    labels: list[str], draws: np.ndarray, interrupted: bool, method: Method, warmup: int
+    labels: list[str], draws: np.ndarray, interrupted: bool, advice: str, warmup: int
 ) -> dict[str, str]:
     """What goes to the attributes: nothing, or the warning, which is also given.
 
     labels, draws : of the P free components, (chains, draws, P). Trials of fewer than `FEWEST`
-    draws and runs that were interrupted have none: they are known to be short.
+    draws and runs that were interrupted have none: they are known to be short. advice : what to try
+    besides more draws.
     """
     chains, n, _ = draws.shape
     if interrupted or chains < LEAST_CHAINS or n < FEWEST or not labels:
@@ -59,22 +64,10 @@ def mixing_attributes(
         + ("; one other parameter is like it" if others == 1 else "")
         + f". R-hat has to be below {APART:g} and the ESS at least {FEW:g} before means and "
         f"intervals are used. Take more draws (there were {n} of each chain) and warmup ({warmup})"
-        + _instead(method)
+        + advice
     )
     warnings.warn(text, stacklevel=3)
     return {"mixing_warning": text}
-
-
-def _instead(method: Method) -> str:
-    """What else can be done."""
-    name = type(method).__name__
-    if getattr(method, "interweave", "auto") is False:
-        return f', or ssm.{name}(interweave="auto")'
-    if isinstance(method, (Gibbs, MetropolisHastings)):
-        other = "MetropolisHastings" if isinstance(method, Gibbs) else "Gibbs"
-        return f", or another method, such as ssm.{other}()"
-    other = 'PGAS(interweave="auto")' if isinstance(method, PMMH) else "PMMH()"
-    return f", more particles, or another method, such as ssm.{other}"
 
 
 def rank_r_hat(draws: np.ndarray) -> float:
@@ -129,15 +122,8 @@ def _r_hat(z: np.ndarray) -> float:
         return float(np.sqrt((between / within + n - 1.0) / n))
 
 
-LOW = 0.02  # share of draws at which a row changes, below which there is a warning
-STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
-Paths = tuple[np.ndarray, ...]
-PIECE = 2**25  # bytes of draws that are looked at together
-FEWEST_FOR_RATES = 50  # draws of a chain from which rates are worth a warning
-
-
 @dataclass(frozen=True)
-class Watch:
+class PathMovement:
     """How the trajectories of a chain have moved, for one whose draws leave them out.
 
     waiting : draws of the warmup to come. draws : n since then. Of these for each experiment,
@@ -154,21 +140,21 @@ class Watch:
     square: Paths = ()
 
     @np.errstate(invalid="ignore", over="ignore")  # as in `movement`
-    def after(self, paths: Sequence[np.ndarray]) -> Watch:
+    def after(self, paths: Sequence[np.ndarray]) -> PathMovement:
         """With one more draw (Welford 1962)."""
         if self.waiting:
             return replace(self, waiting=self.waiting - 1)
         new, n = tuple(p.copy() for p in paths), self.draws + 1
         if n == 1:
             none = tuple(np.zeros_like(p) for p in new)
-            return Watch(0, 1, new, new, none, new, none)
+            return PathMovement(0, 1, new, new, none, new, none)
         off = [x - m for x, m in zip(new, self.mean, strict=True)]
         mean = tuple(m + o / n for m, o in zip(self.mean, off, strict=True))
         apart = [x - m for x, m in zip(new, mean, strict=True)]
         square = tuple(s + o * a for s, o, a in zip(self.square, off, apart, strict=True))
         pairs = zip(self.changed, new, self.last, strict=True)
         changed = tuple(c + (x != before) for c, x, before in pairs)
-        return Watch(0, n, self.first, new, changed, mean, square)
+        return PathMovement(0, n, self.first, new, changed, mean, square)
 
 
 def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) -> dict[str, Any]:
@@ -258,7 +244,9 @@ def movement(paths: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def watched_movement(watches: Sequence[Watch], i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def watched_movement(
+    watches: Sequence[PathMovement], i: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `movement`, of experiment i of chains that were watched."""
     changed = np.stack([w.changed[i] for w in watches])
     start = watches[0].first[i]

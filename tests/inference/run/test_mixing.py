@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.chains.mixing import bulk_ess, mixing_attributes, rank_r_hat
+from ssmppl.inference.run.mixing import bulk_ess, mixing_attributes, rank_r_hat
+from ssmppl.inference.verbs.sample import METHODS
 
 
 def chains(rho: float, n: int, apart: float = 0.0, seed: int = 1, m: int = 4) -> np.ndarray:
@@ -43,9 +44,10 @@ def test_figures_are_those_of_arviz(case: str):
 def warned(draws: np.ndarray, interrupted: bool = False, method=None) -> str:
     labels = [f"p{i}" for i in range(draws.shape[2])]
     method = ssm.PGAS() if method is None else method
+    advice = METHODS[type(method)].advice(method)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        attrs = mixing_attributes(labels, draws, interrupted, method, 500)
+        attrs = mixing_attributes(labels, draws, interrupted, advice, 500)
     text = str(found[0].message) if found else ""
     assert attrs.get("mixing_warning", "") == text
     return text

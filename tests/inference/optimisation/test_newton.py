@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.inference.maximum.newton import GOOD, LITTLE, climb, information_at, widths
+from ssmppl.inference.optimisation.newton import GOOD, LITTLE, climb, information_at, widths
 from tests.statistics.checks import seed_of
 
 

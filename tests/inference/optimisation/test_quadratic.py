@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.inference.maximum.noisy_maximum import (
-    Fit,
+from ssmppl.inference.optimisation.quadratic import (
+    LocalQuadratic,
     count,
-    fitted,
+    fit_quadratic,
     monomials,
     slopes_of_monomials,
 )
@@ -47,7 +47,7 @@ def test_what_lies_in_the_family_is_found_exactly():
     u = scattered(np.random.default_rng(1), 60)
     b = np.array([0.2, 0.4])
     log_z = -3.0 + u @ b - 0.5 * np.einsum("ni,ij,nj->n", u, H, u) + (u @ C) * np.sum(u**2, axis=1)
-    fit = fitted(u, log_z, True)
+    fit = fit_quadratic(u, log_z, True)
     np.testing.assert_allclose(fit.b, b, atol=1e-8)
     np.testing.assert_allclose(fit.h, H, atol=1e-8)
     np.testing.assert_allclose(fit.c, C, atol=1e-8)
@@ -64,7 +64,7 @@ def test_derivatives_are_those_of_the_polynomial():
     for i, e in enumerate(step * np.eye(2)):
         up, down = monomials((u + e)[None], True), monomials((u - e)[None], True)
         np.testing.assert_allclose(found[i], (up - down)[0] / (2 * step), atol=1e-9)
-    fit = Fit(np.array([0.2, 0.4]), H, C, np.eye(count(2, True)), 0.0)
+    fit = LocalQuadratic(np.array([0.2, 0.4]), H, C, np.eye(count(2, True)), 0.0)
     minus = [(fit.slope(u + e) - fit.slope(u - e)) / (2 * step) for e in step * np.eye(2)]
     np.testing.assert_allclose(fit.information(u), -np.array(minus), atol=1e-9)
     beta = np.concatenate([[0.0], fit.b, [-H[0, 0] / 2, -H[1, 0], -H[1, 1] / 2], C])
@@ -77,7 +77,7 @@ def tops(skew, values, n=120, repeats=400):
     found = []
     for _ in range(repeats):
         u = scattered(rng, n)
-        fit = fitted(u, values(u, rng), skew)
+        fit = fit_quadratic(u, values(u, rng), skew)
         top = newton(fit)
         found.append((top, np.sqrt(np.diagonal(fit.error(top)))))
     return np.array([t for t, _ in found]), np.array([e for _, e in found])
@@ -118,11 +118,11 @@ def test_estimates_of_zero_count_and_too_few_do_not_do():
     u = scattered(rng, 400)
     dead = rng.uniform(size=400) < 0.3  # alive estimates are larger, so that the mean is right
     log_z = np.where(dead, -np.inf, surface(u) - np.log(0.7))
-    fit = fitted(u, log_z, True)
+    fit = fit_quadratic(u, log_z, True)
     off = np.abs(newton(fit) - TOP) / np.sqrt(np.diagonal(fit.error(newton(fit))))
     assert np.all(off < stats.norm.isf(LEVEL / 4))
-    assert fitted(u[:6], log_z[:6], True) is None
-    assert fitted(u, np.full(400, -np.inf), True) is None
+    assert fit_quadratic(u[:6], log_z[:6], True) is None
+    assert fit_quadratic(u, np.full(400, -np.inf), True) is None
 
 
 @pytest.mark.parametrize("skew", [False, True])
@@ -133,7 +133,7 @@ def test_the_errors_of_the_shape(skew):
         u = scattered(rng, 120)
         log_z = -0.5 * np.sum(u**2 * [2.0, 0.5], axis=1)
         log_z = log_z + 0.3 * rng.standard_normal(120) - 0.045
-        found, errors, _ = fitted(u, log_z, skew).shape()
+        found, errors, _ = fit_quadratic(u, log_z, skew).shape()
         values.append(found)
         told.append(errors)
     ratio = np.std(values, axis=0) / np.mean(told, axis=0)

@@ -1,14 +1,13 @@
-"""The coordinates in which a Metropolis chain moves, with their Jacobian.
-
-Each parameter keeps to the unconstrained scale of `language/model/transforms.py`, or is moved
-itself, or its logarithm or reciprocal is. A proposal outside the support has density zero there.
-
-Metropolis-Hastings chains over parameters, whatever the likelihood and the proposal.
+"""Metropolis-Hastings chains over parameters, whatever the likelihood and the proposal.
 
 Metropolis et al. (1953), Hastings (1970); Schön et al. (2015), algorithms 1 and 4. With an unbiased
 estimate in place of the likelihood it is kept with the point it was made for (Andrieu and Roberts
 2009), and so is whatever else of that run the proposal goes by, so that the chain on point and run
 has the posterior for its marginal. The random walk adapts during warmup and is then held fixed.
+
+A chain moves in coordinates: each parameter keeps to the unconstrained scale of
+`language/model/transforms.py`, or is moved itself, or its logarithm or reciprocal is. A proposal
+outside the support has density zero there.
 """
 
 from __future__ import annotations
@@ -32,6 +31,8 @@ from ssmppl.language.model.transforms import transforms
 
 SCALES = ("unconstrained", "natural", "log", "reciprocal")
 STEP = 1e-3  # of finite differences, in standard deviations
+ADAPTATION_POWER = 0.66
+STARTS = 50  # runs of the likelihood at a start until one is positive
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def _check(site: Site, kind: str, reach: Mapping[Expr, Interval]) -> None:
 
 
 @dataclass(frozen=True)
-class Chart:
+class LocalDerivatives:
     """Derivatives of theta and of the log prior at a point, in w (d,).
 
     jacobian (P, d), second (P, d, d) : of theta. slope (d,), curvature (d, d) : of the log prior
@@ -201,7 +202,9 @@ class Chart:
     curvature: np.ndarray
 
 
-def chart(at: Coordinates, w: np.ndarray, sd: np.ndarray, second: bool) -> Chart:
+def local_derivatives(
+    at: Coordinates, w: np.ndarray, sd: np.ndarray, second: bool
+) -> LocalDerivatives:
     """Central differences; sd (d,) gives the scale of each coordinate."""
     d, h = len(w), STEP * sd
     theta, log_p = at.parameters(w)
@@ -229,15 +232,11 @@ def chart(at: Coordinates, w: np.ndarray, sd: np.ndarray, second: bool) -> Chart
                 twice[:, i, j] = twice[:, j, i] = both / area
                 both = up[1] + down[1] + 2.0 * log_p - sum(s[1] for s in singles)
                 curvature[i, j] = curvature[j, i] = both / area
-    return Chart(jacobian, twice, slope, curvature)
-
-
-ADAPTATION_POWER = 0.66
-STARTS = 50  # runs of the likelihood at a start until one is positive
+    return LocalDerivatives(jacobian, twice, slope, curvature)
 
 
 @dataclass(frozen=True)
-class Run:
+class LikelihoodRun:
     """What a likelihood gave at a point.
 
     paths, increments : of each experiment, (T, D) and (T,), where the run makes them.
@@ -254,40 +253,42 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Point:
+class ChainPoint:
     """w (d,), theta (P,), log_density = log prior + log Jacobian, the run, and what the proposal
     knows at this point."""
 
     w: np.ndarray
     theta: np.ndarray
     log_density: float
-    run: Run
+    run: LikelihoodRun
     local: Any = None
 
 
 class Likelihood(Protocol):
     """Where log-likelihoods come from."""
 
-    def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
+    def run(
+        self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
         """A run at theta, from the run of the current point; None where it is zero, or is none:
         infinite."""
 
-    def kept(self, point: Point, stream: np.ndarray) -> dict[str, np.ndarray]:
+    def kept(self, point: ChainPoint, stream: np.ndarray) -> dict[str, np.ndarray]:
         """What a kept draw has besides theta: path_<i>, increment_<i>."""
 
 
 class Proposal(Protocol):
     """How a point moves; `tuning` is what adaptation changes."""
 
-    def local(self, w: np.ndarray, run: Run) -> Any:
+    def local(self, w: np.ndarray, run: LikelihoodRun) -> Any:
         """What the proposal goes by at a point, made once for it."""
 
     def propose(
-        self, point: Point, tuning: Any, generator: np.random.Generator
+        self, point: ChainPoint, tuning: Any, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """A new w, and the standard normals behind it."""
 
-    def log_ratio(self, old: Point, new: Point, tuning: Any) -> float:
+    def log_ratio(self, old: ChainPoint, new: ChainPoint, tuning: Any) -> float:
         """log q(old | new) - log q(new | old)."""
 
     def adapt(self, tuning: Any, normals: np.ndarray, excess: float, iteration: int) -> Any:
@@ -312,7 +313,7 @@ class Metropolis:
 class WalkState:
     """Where a chain stands; everything that its future depends on."""
 
-    point: Point
+    point: ChainPoint
     tuning: Any
     iteration: int
     generator: np.random.Generator
@@ -333,12 +334,12 @@ def start_chain(
     if run is None:
         problem = kernel.coordinates.problem
         d = len(problem.trace.state_symbols)
-        run = Run(
+        run = LikelihoodRun(
             -np.inf,
             tuple(np.zeros((e.steps, d)) for e in problem.experiments),
             tuple(np.full(e.steps, -np.inf) for e in problem.experiments),
         )
-    point = Point(w, theta, log_density, run, kernel.proposal.local(w, run))
+    point = ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run))
     return WalkState(point, tuning, 0, generator, stream)
 
 
@@ -359,9 +360,7 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
         stats["log_likelihood"].append(float(point.run.log_likelihood))
         stats["lp"].append(float(point.run.log_likelihood + point.log_density))
         stats["acceptance_rate"].append(accepted)
-    return state, Block(
-        {k: np.array(v) for k, v in draws.items()}, {k: np.array(v) for k, v in stats.items()}
-    )
+    return state, Block.of(draws, stats)
 
 
 def _iterate(kernel: Metropolis, state: WalkState) -> tuple[WalkState, float]:
@@ -372,7 +371,7 @@ def _iterate(kernel: Metropolis, state: WalkState) -> tuple[WalkState, float]:
     if log_density > -np.inf:
         run = kernel.likelihood.run(theta, old.run, state.stream)
         if run is not None:
-            new = Point(w, theta, log_density, run, kernel.proposal.local(w, run))
+            new = ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run))
             change = run.log_likelihood + log_density - old.run.log_likelihood - old.log_density
             change += kernel.proposal.log_ratio(old, new, state.tuning)
             probability = 1.0 if not change < 0.0 else float(np.exp(change))
@@ -385,20 +384,24 @@ def _iterate(kernel: Metropolis, state: WalkState) -> tuple[WalkState, float]:
     return replace(state, point=point, tuning=tuning, iteration=state.iteration + 1), float(accept)
 
 
+# What checkpoints of Metropolis chains are made of.
+WALK_STATES = (WalkState, ChainPoint, LikelihoodRun)
+
+
 @dataclass(frozen=True)
 class RandomWalk:
     """w' = w + S e. `tuning` is S (d, d), a Cholesky factor."""
 
-    def local(self, w: np.ndarray, run: Run) -> None:
+    def local(self, w: np.ndarray, run: LikelihoodRun) -> None:
         return None
 
     def propose(
-        self, point: Point, tuning: np.ndarray, generator: np.random.Generator
+        self, point: ChainPoint, tuning: np.ndarray, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         normals = generator.standard_normal(len(point.w))
         return point.w + tuning @ normals, normals
 
-    def log_ratio(self, old: Point, new: Point, tuning: np.ndarray) -> float:
+    def log_ratio(self, old: ChainPoint, new: ChainPoint, tuning: np.ndarray) -> float:
         return 0.0
 
     def adapt(

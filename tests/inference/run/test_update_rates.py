@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.chains import mixing
-from ssmppl.inference.chains.mixing import (
-    Watch,
+from ssmppl.inference.chains.pgas import PGASState
+from ssmppl.inference.run import mixing
+from ssmppl.inference.run.draws import ChainDraws
+from ssmppl.inference.run.mixing import (
+    PathMovement,
     movement,
     random_components,
     update_rate_attributes,
     watched_movement,
 )
-from ssmppl.inference.chains.pgas import PGASState
-from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.verbs.sample import _chosen
 
@@ -112,7 +112,7 @@ def watched(paths, waiting=3):
     (chains, draws, T, D)."""
     out = []
     for chain in paths:
-        watch = Watch(waiting)
+        watch = PathMovement(waiting)
         for path in [*np.full_like(chain[:waiting], 9.0), *chain]:
             watch = watch.after([path])
         out.append(watch)

@@ -183,8 +183,14 @@ def _derivatives(
 def _step(slope: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float, float]:
     """(F,) a step that climbs, in widths, what a quadratic expects of it, the least eigenvalue."""
     lowest = float(np.linalg.eigvalsh(curvature)[0])
-    scale = np.sqrt(np.maximum(np.abs(np.diagonal(curvature)), FLAT))
-    values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
-    values = np.maximum(np.abs(values), LEAST)
-    step = (vectors @ ((vectors.T @ (slope / scale)) / values)) / scale
+    step = newton_step(slope, curvature)
     return step, 0.5 * float(slope @ step), lowest
+
+
+def newton_step(slope: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """(F,) information^-1 slope, the eigenvalues of the information, scaled to a diagonal of one,
+    by their size and none next to zero."""
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), FLAT))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    values = np.maximum(np.abs(values), LEAST)
+    return (vectors @ ((vectors.T @ (slope / scale)) / values)) / scale

@@ -1,0 +1,1 @@
+"""Climbing a function: Newton steps by differences, quadratics fitted to noisy values."""
