@@ -27,7 +27,7 @@ from ssmppl.diagnosis.model.changed_laws import (
     shifted,
     substituted,
 )
-from ssmppl.diagnosis.model.equations import Anatomy, Augmented, Part, as_it_was
+from ssmppl.diagnosis.model.equations import Augmented, Equations, Part, as_it_was
 from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
@@ -55,8 +55,8 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     ModelError : an effect's function does not do what its kind says.
     """
     origin = as_it_was(trace)
-    anatomy = Anatomy(origin)
-    _check(candidates, trace, anatomy)
+    equations = Equations(origin)
+    _check(candidates, trace, equations)
     before = trace if isinstance(trace, Augmented) else None
     every = [*(before.added if before else ()), *candidates]
     places = dict(trace.locations)
@@ -65,12 +65,12 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     late = [c for c in every if c.change not in ("input", "parameter")]
     names: dict[str, dict[str, str]] = {}  # strength -> its auxiliary states
     for c in early:
-        names[c.strength] = auxiliary.add(c, anatomy, places)
-    new = _replaced(origin, early, anatomy, names, places)
-    anatomy = Anatomy(new, anatomy)
+        names[c.strength] = auxiliary.add(c, equations, places)
+    new = _replaced(origin, early, equations, names, places)
+    equations = Equations(new, equations)
     for c in late:
-        names[c.strength] = auxiliary.add(c, anatomy, places)
-    new = _moved(new, late, anatomy, names, places)
+        names[c.strength] = auxiliary.add(c, equations, places)
+    new = _moved(new, late, equations, names, places)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:
         if prior:
@@ -98,9 +98,9 @@ def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Sit
     return {n: new[n] for n in [*before, *(n for n in new if n not in before)]}
 
 
-def _check(candidates: Sequence[Candidate], trace: Trace, anatomy: Anatomy) -> None:
-    """That their names are free, and that they fit the model. anatomy : of it as it was."""
-    taken = {p.name: f"the model's {p.role}" for p in Anatomy(trace, anatomy).parts.values()}
+def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) -> None:
+    """That their names are free, and that they fit the model. equations : of it as it was."""
+    taken = {p.name: f"the model's {p.role}" for p in Equations(trace, equations).parts.values()}
     for c in candidates:
         if c.strength in taken:
             raise ArgumentError(
@@ -110,22 +110,22 @@ def _check(candidates: Sequence[Candidate], trace: Trace, anatomy: Anatomy) -> N
         taken[c.strength] = f"the strength of {c}"
         moved = [label for label, _ in (*c.reaction, *c.carried)]
         for label in (c.equation, *dict(c.bound).values(), *moved):
-            if label not in anatomy.parts:
+            if label not in equations.parts:
                 raise ArgumentError(
-                    f"{c}: the model {anatomy.trace.name!r} has no {label!r}",
+                    f"{c}: the model {equations.trace.name!r} has no {label!r}",
                     fix="make the candidates by offers() of the same model",
                 )
-        _check_law(c, anatomy)
+        _check_law(c, equations)
 
 
-def _check_law(c: Candidate, anatomy: Anatomy) -> None:
+def _check_law(c: Candidate, equations: Equations) -> None:
     """That the law can be changed so."""
     found: Any = None
-    part = anatomy.parts[c.equation]
+    part = equations.parts[c.equation]
     if c.change in ("transition", "observation", "initial"):
-        found = scale_of_mean(anatomy.law(part, c.change))
+        found = scale_of_mean(equations.law(part, c.change))
     elif c.change in ("noise", "tail"):
-        found = {"noise": has_scale, "tail": has_tail}[c.change](anatomy.law(part))
+        found = {"noise": has_scale, "tail": has_tail}[c.change](equations.law(part))
     if isinstance(found, NotApplicable):
         raise ArgumentError(f"{c} cannot be added: {found}", fix="leave it out")
 
@@ -155,7 +155,9 @@ class _Auxiliary:
         self.initial: dict[str, Site] = {}
         self.transition: dict[str, Site] = {}
 
-    def add(self, c: Candidate, anatomy: Anatomy, places: dict[Expr, Location]) -> dict[str, str]:
+    def add(
+        self, c: Candidate, equations: Equations, places: dict[Expr, Location]
+    ) -> dict[str, str]:
         """The names of a candidate's states: those of an earlier one where their laws agree."""
         if not c.effect.states or c.held:
             return {}
@@ -168,8 +170,8 @@ class _Auxiliary:
             if (self.taken | kept - set(self.initial)) & set(names.values()):
                 continue
             with attributed(places, c.effect.where):
-                first = bind(c, anatomy, "initial", names).initial
-                step = bind(c, anatomy, "transition", names).transition
+                first = bind(c, equations, "initial", names).initial
+                step = bind(c, equations, "transition", names).transition
             if all(n not in self.initial for n in names.values()):
                 for n in names.values():
                     self.initial[n] = _site(n, first[n], c)
@@ -199,7 +201,7 @@ def _alike(a: Distribution, b: Distribution) -> bool:
 
 # -- inputs and parameters
 def _replaced(
-    trace: Trace, candidates: Sequence[Candidate], anatomy: Anatomy,
+    trace: Trace, candidates: Sequence[Candidate], equations: Equations,
     names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
     """With what acts in place of inputs and parameters."""
@@ -208,8 +210,8 @@ def _replaced(
         values: dict[Expr, list[Expr]] = defaultdict(list)
         for c in candidates:
             with attributed(places, c.effect.where):
-                changes = bind(c, anatomy, role, names[c.strength]).changes
-            values[anatomy.parts[c.equation].seen_from(role)] += changes.values()
+                changes = bind(c, equations, role, names[c.strength]).changes
+            values[equations.parts[c.equation].seen_from(role)] += changes.values()
         replacement = {}
         for s, new in values.items():
             total = new[0]
@@ -231,16 +233,16 @@ def _with_law(site: Site, change: Any, how: Any, places: dict[Expr, Location]) -
 
 # -- means, variances, tails, starts
 def _moved(
-    trace: Trace, candidates: Sequence[Candidate], anatomy: Anatomy,
+    trace: Trace, candidates: Sequence[Candidate], equations: Equations,
     names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
     layers: dict[tuple[str, str], list[Sum]] = defaultdict(list)  # (which laws, change)
     for c in candidates:
-        part = anatomy.parts[c.equation]
+        part = equations.parts[c.equation]
         role = _role(c, part)
         with attributed(places, c.effect.where):
-            for label, by in bind(c, anatomy, role, names[c.strength]).changes.items():
-                target = anatomy.parts[label]
+            for label, by in bind(c, equations, role, names[c.strength]).changes.items():
+                target = equations.parts[label]
                 at = (target.name, target.index)
                 free = [into for into in layers[role, c.change] if at not in into]
                 if not free:

@@ -25,7 +25,7 @@ from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import Auxiliary, Effect, numbers
 from ssmppl.diagnosis.model.candidates import Scales, slug
 from ssmppl.diagnosis.model.changed_laws import has_scale, scale_of_mean
-from ssmppl.diagnosis.model.equations import Anatomy, Part, Reaction, as_it_was, carried
+from ssmppl.diagnosis.model.equations import Equations, Part, Reaction, as_it_was, carried
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol, symbols_of
@@ -134,18 +134,18 @@ class Term:
 
 def basis(trace: Trace, scales: Scales) -> list[Term]:
     """The terms of all equations that have noise."""
-    anatomy = Anatomy(as_it_was(trace))
-    states, inputs = anatomy.of_role("state"), anatomy.of_role("input")
+    equations = Equations(as_it_was(trace))
+    states, inputs = equations.of_role("state"), equations.of_role("input")
     varying = [p for p in [*states, *inputs] if scales.scale[p.label].sd > 0.0]
-    noisy = [p for p in states if not anatomy.deterministic(p)]
+    noisy = [p for p in states if not equations.deterministic(p)]
     out: list[Term] = []
-    for part in [*noisy, *anatomy.of_role("channel")]:
+    for part in [*noisy, *equations.of_role("channel")]:
         state = part.role == "state"
         own = [v for v in varying if state or v.role != "input"]
-        law = anatomy.law(part)
+        law = equations.law(part)
         if not isinstance(scale_of_mean(law), NotApplicable):
             kind = "transition" if state else "observation"
-            read = own if state else _measured(anatomy.law(part), own)
+            read = own if state else _measured(equations.law(part), own)
             out += [_curve(part, "mean", kind, v, k, scales) for v in read for k in range(MEAN)]
             if state:
                 out += _products(part, own, scales)
@@ -156,7 +156,7 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
                         for v in driving for turn in TURNS for k in range(len(RING))]  # fmt: skip
         if not isinstance(has_scale(law), NotApplicable):
             out += [_curve(part, "scale", "noise", v, k, scales) for v in own for k in range(SCALE)]
-    moved = carried(anatomy)
+    moved = carried(equations)
     return [_with_it(t, moved) if t.candidate.change == "transition" else t for t in out]
 
 
@@ -271,24 +271,27 @@ def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Te
     return Term(candidate, part.label, "mean", f"the ringing of {label} at {turn:.0f} rows")
 
 
-def lifted(
-    candidates: list[Candidate],
-) -> tuple[list[Candidate], Mapping[str, float]]:
+def symbolic_shapes(
+    candidates: Sequence[Candidate], *, of_time: bool = False
+) -> tuple[list[Candidate], dict[str, float]]:
     """Candidates whose shapes are symbols, and the values of these: code that fits all data.
 
-    Shapes that tell a number of states, or that stand in a function of time, stay numbers.
+    Shapes that tell a number of states stay numbers, and those of functions of time unless
+    `of_time`, whose symbols come last.
     """
-    out, values = [], {}
+    out: list[Candidate] = []
+    values: dict[str, float] = {}
+    dates: dict[str, float] = {}
     for c in candidates:
         lengths = {n for n in c.effect.states.values() if n is not None}
-        fixed = lengths | (set(dict(c.shape)) if c.effect.profile else set())
         shape: list[tuple[str, Any]] = []
         for name, value in c.shape:
-            if name in fixed:
+            timed = bool(c.effect.profile)
+            if name in lengths or (timed and (c.held or not of_time)):
                 shape.append((name, value))
                 continue
             own = f"{c.shares or c.strength}_{name}"
-            values[own] = value
+            (dates if timed else values)[own] = value
             shape.append((name, symbol("parameter", own, ())))
         out.append(replace(c, shape=tuple(shape)))
-    return out, values
+    return out, values | {n: float(v) for n, v in dates.items()}

@@ -109,14 +109,14 @@ class Checkpoint:
         if self.progress:
             print(text, file=sys.stderr, flush=True)
 
-    def of(self, name: str, make: Callable[[], Mapping[str, Any]]) -> Numbers:
+    def computed(self, name: str, make: Callable[[], Mapping[str, Any]]) -> Numbers:
         """The numbers under this name, made where they are not there yet."""
         if name not in self:
             self.put(name, make())
             self._keep_up()
         return self.get(name)
 
-    def each(
+    def map(
         self, stage: str, count: int, task: Callable[[int], Mapping[str, Any]]
     ) -> list[Numbers]:
         """The numbers of task(0), ..., task(count - 1), those left out that are there.
