@@ -93,7 +93,7 @@ def diagnose(
     executor : any `concurrent.futures.Executor`, over which simulated sets and refits are shared
         out; None: threads.
     checkpoint : a file, or a folder, that keeps what is done: the same call again goes on from
-        there and gives the same report. None: nothing is checkpoint.
+        there and gives the same report. None: nothing is kept.
     progress : whether to show the stages and the time that they will take, on stderr.
     seed : the same seed gives the same report.
     debug : the first fault of this package is raised, where else the part that it ended (a

@@ -28,7 +28,7 @@ WHOLE = (0,)  # one experiment
 # off is still seen, a pulse is not.
 ALL_DATES = {"step": 300, "pulse": 1000}
 DATES = {"step": 60, "pulse": 300}
-EDGE = 0.1  # share of the rows at either end where no break can be told from a shift
+EDGE = 0.1  # share of the rows at either end where a break cannot be separated from a shift
 LEAST_EDGE = 2  # rows at either end without a pulse
 DATED = ("step", "pulse")  # profiles that have a date
 SHORTEST = 4.0  # period in rows
@@ -175,7 +175,7 @@ def is_dated(candidate: Candidate) -> bool:
 
 
 def is_pulse(candidate: Candidate) -> bool:
-    """Whether it happens in one row, so that no later ones can bear it out."""
+    """Whether it happens in one row, so that no later rows can validate it."""
     return candidate.effect.profile == "pulse"
 
 

@@ -47,8 +47,6 @@ a name or label     that one: "v", "x[0]"
 "second order"      what a second-order step would add to an Euler step: F'F / 2, F the increment
 "profile"           the function of time that `profile` names (`PROFILES`)
 ==================  ===========================================================================
-
-The words of a declaration of an effect, and that a declaration fits its function.
 """
 
 from __future__ import annotations
@@ -68,6 +66,23 @@ from ssmppl.language.model.model import location_of
 from ssmppl.language.model.pickling import holder_of
 
 _MISSING: Any = None
+Bounds = tuple[float, float] | None
+
+# The words of a declaration: see the tables above.
+KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "initial", "state")
+GIVEN = ("position", "integral", "moved", "other state", "any input", "second order", "profile")
+ON = ("any", "rate", "state", "channel", "input", "parameter", "positive parameter",
+      "other parameter")  # fmt: skip
+REQUIRES = ("positive", "both signs")
+PROCESSES = ("random walk", "ar1")  # of zero mean: their score in `strength` is zero
+
+# Functions of time by name: of t and of shape parameters.
+PROFILES: dict[str, Callable[..., Any]] = {
+    "drift": lambda t, rows: t / rows - 0.5,
+    "step": lambda t, date: np.where(t >= date, 1.0, 0.0),
+    "pulse": lambda t, date: np.where(t == date, 1.0, 0.0),
+    "wave": lambda t, period, phase: np.cos(2.0 * math.pi / period * t - phase),
+}
 
 
 @dataclass(frozen=True)
@@ -87,9 +102,6 @@ class Grid:
     between: tuple[float, float] | None = None
 
 
-Bounds = tuple[float, float] | None
-
-
 def numbers(*values: float, between: Bounds = None) -> Grid:
     """Values of a shape parameter, as they are.
 
@@ -105,12 +117,18 @@ def numbers(*values: float, between: Bounds = None) -> Grid:
     return Grid("number", values, between=between)
 
 
-def sds(*values: float, of: str = "", between: Bounds = None) -> Grid:
-    """Multiples of the variable's standard deviation.
+def _relative(name: str, unit: str, what: str) -> Callable[..., Grid]:
+    """The public function `name`, which makes a grid in this unit of the variable."""
+
+    def grid(*values: float, of: str = "", between: Bounds = None) -> Grid:
+        return Grid(unit, values, of, between)
+
+    grid.__name__ = grid.__qualname__ = name
+    grid.__doc__ = f"""{what}.
 
     Parameters
     ----------
-    *values : the multiples that are tried.
+    *values : those that are tried.
     of : the argument of the effect whose variable is meant; "" is the first.
     between : bounds in the same unit, between which refits estimate the parameter; None: it stays
         at a value of the grid.
@@ -119,52 +137,13 @@ def sds(*values: float, of: str = "", between: Bounds = None) -> Grid:
     -------
     Grid : of values, for `shapes`.
     """
-    return Grid("sd", values, of, between)
+    return grid
 
 
-def means(*values: float, of: str = "", between: Bounds = None) -> Grid:
-    """Multiples of the variable's mean.
-
-    Parameters
-    ----------
-    *values : the multiples that are tried.
-    of, between : as of `sds`.
-
-    Returns
-    -------
-    Grid : of values, for `shapes`.
-    """
-    return Grid("mean", values, of, between)
-
-
-def quantiles(*levels: float, of: str = "", between: Bounds = None) -> Grid:
-    """Quantiles of the variable.
-
-    Parameters
-    ----------
-    *levels : their levels, from 0 to 1.
-    of, between : as of `sds`.
-
-    Returns
-    -------
-    Grid : of values, for `shapes`.
-    """
-    return Grid("quantile", levels, of, between)
-
-
-def sizes(*levels: float, of: str = "", between: Bounds = None) -> Grid:
-    """Quantiles of the variable's absolute value.
-
-    Parameters
-    ----------
-    *levels : their levels, from 0 to 1.
-    of, between : as of `sds`.
-
-    Returns
-    -------
-    Grid : of values, for `shapes`.
-    """
-    return Grid("size", levels, of, between)
+sds = _relative("sds", "sd", "Multiples of the variable's standard deviation")
+means = _relative("means", "mean", "Multiples of the variable's mean")
+quantiles = _relative("quantiles", "quantile", "Quantiles of the variable, by their levels")
+sizes = _relative("sizes", "size", "Quantiles of the variable's absolute value, by their levels")
 
 
 def rows(*shares: float) -> Grid:
@@ -357,20 +336,9 @@ def effect(
     return declare if function is _MISSING else declare(function)
 
 
-KINDS = ("transition", "observation", "input", "noise", "tail", "parameter", "initial", "state")
-GIVEN = ("position", "integral", "moved", "other state", "any input", "second order", "profile")
-ON = ("any", "rate", "state", "channel", "input", "parameter", "positive parameter",
-      "other parameter")  # fmt: skip
-REQUIRES = ("positive", "both signs")
-PROCESSES = ("random walk", "ar1")  # of zero mean: their score in `strength` is zero
-
-# Functions of time by name: of t and of shape parameters.
-PROFILES: dict[str, Callable[..., Any]] = {
-    "drift": lambda t, rows: t / rows - 0.5,
-    "step": lambda t, date: np.where(t >= date, 1.0, 0.0),
-    "pulse": lambda t, date: np.where(t == date, 1.0, 0.0),
-    "wave": lambda t, period, phase: np.cos(2.0 * math.pi / period * t - phase),
-}
+def declared(module: Mapping[str, Any]) -> tuple[Effect, ...]:
+    """The effects among the global names of a module, in the order in which they stand there."""
+    return tuple(e for e in module.values() if isinstance(e, Effect))
 
 
 def check(e: Effect) -> None:

@@ -179,7 +179,7 @@ class CrossFit:
         self, model: tuple[Fitter, Fit], events: Sequence[Candidate], fold: Fold,
         seed: np.random.SeedSequence,
     ) -> Predictions:  # fmt: skip
-        """One-step predictions of the block, averaged over dates that the other rows cannot tell.
+        """One-step predictions of the block, averaged over dates that other rows cannot separate.
 
         The average is of the densities of the whole block: `log_density` has it as (R, 1).
         """
@@ -205,7 +205,7 @@ class CrossFit:
 
 def indistinguishable_dates(c: Candidate, fold: Fold) -> list[float]:
     """Dates between the rows on either side of the block, if the event's own is among them; they
-    all say the same of the other rows. Of a single experiment: others tell the date."""
+    have the same likelihood of the other rows. Of one experiment: others tell the date."""
     if len(fold.left_out) != 1:
         return []
     rows = np.flatnonzero(fold.left_out[0]) + 1

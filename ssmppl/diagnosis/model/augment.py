@@ -3,7 +3,7 @@
 Inputs and parameters are replaced first, in transitions and observations; means, variances, tails
 and starts are changed after that. Several effects on one equation add up. Auxiliary states join the
 model's own; those with the same laws are shared. Each effect is bound to the model as it was, not
-to what others make of it: one after the other they are the same as all at once (`augmented`).
+to what others make of it: one after the other they are the same as all at once (`equations.py`).
 """
 
 from __future__ import annotations
@@ -59,22 +59,22 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     _check(candidates, trace, equations)
     before = trace if isinstance(trace, Augmented) else None
     every = [*(before.added if before else ()), *candidates]
-    places = dict(trace.locations)
+    locations = dict(trace.locations)
     auxiliary = _Auxiliary(trace, origin, before.names if before else {})
     early = [c for c in every if c.change in ("input", "parameter")]
     late = [c for c in every if c.change not in ("input", "parameter")]
     names: dict[str, dict[str, str]] = {}  # strength -> its auxiliary states
     for c in early:
-        names[c.strength] = auxiliary.add(c, equations, places)
-    new = _replaced(origin, early, equations, names, places)
+        names[c.strength] = auxiliary.add(c, equations, locations)
+    new = _replaced(origin, early, equations, names, locations)
     equations = Equations(new, equations)
     for c in late:
-        names[c.strength] = auxiliary.add(c, equations, places)
-    new = _moved(new, late, equations, names, places)
+        names[c.strength] = auxiliary.add(c, equations, locations)
+    new = _moved(new, late, equations, names, locations)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:
         if prior:
-            with attributed(places, c.effect.where):
+            with attributed(locations, c.effect.where):
                 parameters[c.strength] = _prior_site(c)
     return Augmented(
         name=trace.name,
@@ -84,7 +84,7 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
         observations=new.observations,
         proposal={**new.proposal, **auxiliary.transition} if new.proposal else {},
         inputs=trace.inputs,
-        locations=places,
+        locations=locations,
         functions=trace.functions,
         choices=trace.choices,
         origin=origin,
@@ -156,7 +156,7 @@ class _Auxiliary:
         self.transition: dict[str, Site] = {}
 
     def add(
-        self, c: Candidate, equations: Equations, places: dict[Expr, Location]
+        self, c: Candidate, equations: Equations, locations: dict[Expr, Location]
     ) -> dict[str, str]:
         """The names of a candidate's states: those of an earlier one where their laws agree."""
         if not c.effect.states or c.held:
@@ -169,7 +169,7 @@ class _Auxiliary:
             kept = self.kept if c.strength not in self.earlier else set()
             if (self.taken | kept - set(self.initial)) & set(names.values()):
                 continue
-            with attributed(places, c.effect.where):
+            with attributed(locations, c.effect.where):
                 first = bind(c, equations, "initial", names).initial
                 step = bind(c, equations, "transition", names).transition
             if all(n not in self.initial for n in names.values()):
@@ -202,14 +202,14 @@ def _alike(a: Distribution, b: Distribution) -> bool:
 # -- inputs and parameters
 def _replaced(
     trace: Trace, candidates: Sequence[Candidate], equations: Equations,
-    names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
+    names: Mapping[str, dict[str, str]], locations: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
     """With what acts in place of inputs and parameters."""
     out = {}
     for role in ("transition", "observation"):
         values: dict[Expr, list[Expr]] = defaultdict(list)
         for c in candidates:
-            with attributed(places, c.effect.where):
+            with attributed(locations, c.effect.where):
                 changes = bind(c, equations, role, names[c.strength]).changes
             values[equations.parts[c.equation].seen_from(role)] += changes.values()
         replacement = {}
@@ -219,28 +219,28 @@ def _replaced(
                 total = total + (other - s)
             replacement[s] = total
         sites = trace.transition if role == "transition" else trace.observations
-        out[role] = {n: _with_law(site, substituted, replacement, places)
+        out[role] = {n: _with_law(site, substituted, replacement, locations)
                      for n, site in sites.items()}  # fmt: skip
     return replace(trace, transition=out["transition"], observations=out["observation"])
 
 
-def _with_law(site: Site, change: Any, how: Any, places: dict[Expr, Location]) -> Site:
+def _with_law(site: Site, change: Any, how: Any, locations: dict[Expr, Location]) -> Site:
     if not how:
         return site
-    with attributed(places, site.distribution.location):
+    with attributed(locations, site.distribution.location):
         return replace(site, distribution=change(site.distribution, how))
 
 
 # -- means, variances, tails, starts
 def _moved(
     trace: Trace, candidates: Sequence[Candidate], equations: Equations,
-    names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
+    names: Mapping[str, dict[str, str]], locations: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
     layers: dict[tuple[str, str], list[Sum]] = defaultdict(list)  # (which laws, change)
     for c in candidates:
         part = equations.parts[c.equation]
         role = _role(c, part)
-        with attributed(places, c.effect.where):
+        with attributed(locations, c.effect.where):
             for label, by in bind(c, equations, role, names[c.strength]).changes.items():
                 target = equations.parts[label]
                 at = (target.name, target.index)
@@ -258,7 +258,7 @@ def _moved(
             for layer in layers.get((role, change), []):
                 for name in dict.fromkeys(n for n, _ in layer):
                     how = {i: by for (n, i), by in layer.items() if n == name}
-                    new[name] = _with_law(new[name], _LAWS[change], how, places)
+                    new[name] = _with_law(new[name], _LAWS[change], how, locations)
         groups[role] = new
     return replace(trace, initial=groups["initial"], transition=groups["transition"],
                    observations=groups["observation"])  # fmt: skip

@@ -4,12 +4,10 @@ For every equation with noise: increments of its mean by smooth functions of eac
 by products of two of them, and by the past of what moves the system; and increments of the log of
 its variance by smooth functions. Their scores tell where the gap is, whatever its form.
 
-Smooth bounded functions of states and inputs, in which a missing term is written.
-
-Polynomials in s = tanh(z / `BEND`), z the standardised variable, orthonormal over its values: next
-to polynomials in z where the data are, and level beyond them. (Hermite functions, which vanish
-there, leave a third of a quadratic drag over normal values unexplained.) Written with NumPy's
-functions alone: the same object is called on numbers and on symbols of a model.
+The functions are polynomials in s = tanh(z / `BEND`), z the standardised variable, orthonormal over
+its values: next to polynomials in z where the data are, and level beyond them. (Hermite functions,
+which vanish there, leave a third of a quadratic drag over normal values unexplained.) Written with
+NumPy's functions alone: the same object is called on numbers and on symbols of a model.
 """
 
 from __future__ import annotations
@@ -33,6 +31,14 @@ from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.traced import Trace
 
 BEND = 2.0  # standard deviations at which the functions begin to level off
+MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
+# Degrees of the functions in a product of two variables; with more than `FEW` of these the first.
+DEGREES, FEW, FIRST = ((1, 1), (2, 1), (1, 2), (2, 2), (3, 1), (1, 3)), 4, 3
+PAST = ("past_1", "past_2", "past_3")  # low-passes in a row
+REACH = 6.0  # the time constant of each, in rows
+RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quarter turn behind
+# Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
+TURNS = tuple(6.0 * 1.4**k for k in range(7))
 
 
 @dataclass(frozen=True)
@@ -94,15 +100,7 @@ def bases(x: Any, count: int = 6) -> tuple[Smooth, ...]:
                  for n in range(distinct))  # fmt: skip
 
 
-MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
 CURVES = bases((0.0, 1.0), MEAN + 1)[1:]  # of a standardised variable, without the constant
-# Degrees of the functions in a product of two variables; with more than `FEW` of these the first.
-DEGREES, FEW, FIRST = ((1, 1), (2, 1), (1, 2), (2, 2), (3, 1), (1, 3)), 4, 3
-PAST = ("past_1", "past_2", "past_3")  # low-passes in a row
-REACH = 6.0  # the time constant of each, in rows
-RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quarter turn behind
-# Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
-TURNS = tuple(6.0 * 1.4**k for k in range(7))
 
 
 @dataclass(frozen=True)

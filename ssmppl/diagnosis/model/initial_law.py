@@ -24,7 +24,7 @@ from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Normal
 from ssmppl.language.model.traced import Trace
 
-WIDE = 5.0  # times how far the states go, root mean square, or the starts lie apart in all
+WIDE = 5.0  # times how far the states go, root mean square, or the starts differ in all
 KEPT = 64  # means of x_1 at a time
 DIGITS = 2  # of the spread, which a reader of the model sees
 
@@ -75,8 +75,8 @@ def proper_initial_law(
     mean = np.mean(starts, axis=0)
     away = np.concatenate([np.reshape(x, (-1, x.shape[-1])) for x in states]) - mean
     # each start that is d from the mean costs d^2 / (2 s^2) nats: 1/50 for all of them together
-    apart = np.sum((np.asarray(starts) - mean) ** 2, axis=0)
-    spread = WIDE * np.sqrt(np.fmax(np.mean(away**2, axis=0), apart))
+    between = np.sum((np.asarray(starts) - mean) ** 2, axis=0)
+    spread = WIDE * np.sqrt(np.fmax(np.mean(away**2, axis=0), between))
     spread = np.where(np.isfinite(spread) & (spread > 0.0), spread, 1.0)
     laws = {}
     for site in flat:

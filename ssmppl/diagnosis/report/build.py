@@ -1,4 +1,4 @@
-"""From the results of the stages to the report."""
+"""The results of the stages turned into the report."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from ssmppl.language.model.traced import Trace
 
 CLEARLY = 2.0  # standard errors
 MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
-LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows bear it out
+LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows validate it
 UNLIKE, NOTHING = "none of these", "no measurable gap"
 
 
 @dataclass
 class Results:
-    """What is known so far. attribution, far : None where that stage is not done.
+    """The results of the stages so far. attribution, held_out : None where not done.
 
     blocks : left out in turn, 0 for three parts. separating : by class, the input that would
     separate it.
@@ -86,7 +86,7 @@ class Results:
 
     @property
     def screened(self) -> bool:
-        """Whether the screen was asked at the model's fit as it is known now."""
+        """Whether the screen was run at the model's fit as it is known now."""
         return not (self.attribution and self.attribution.rebased)
 
     @property
@@ -130,7 +130,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
                     verdict, missing = NOTHING, None
                 elif verdict == UNLIKE:
                     verdict, missing = _effect(r, where)
-    if verdict == NOTHING and not r.screened:  # they tell of a fit that was not the best one
+    if verdict == NOTHING and not r.screened:  # they are of a fit that was not the best one
         where["p"], checks["p"] = np.nan, np.nan
     elif verdict == NOTHING and _stands_out(r.alpha, where, checks):
         verdict, missing = UNLIKE, _curve_of(r, where)
@@ -154,11 +154,11 @@ def build_report(r: Results, seconds: float) -> GapReport:
             screen, found, order, r.separating))  # fmt: skip
         if len(causes) and (text or r.unfitted is not None):
             leading = table("leading", lambda: _leading(r, order), leading)
-    started = next(
+    initial_law = next(
         (x.fitter.initial_law for x in [*r.refits, r.chosen] if x and x.fitter.initial_law), None
     )
-    if started:
-        notes.append(f"only linear Gaussian models can start flat: others start with {started}")
+    if initial_law:
+        notes.append(f"only linear Gaussian models can start flat: others start with {initial_law}")
     return GapReport(
         verdict=verdict, where=where, causes=causes, classes=classes, closed=share,
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
@@ -214,16 +214,16 @@ def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
     """The verdict but for whether a gap can be measured at all, and the missing curve."""
     least = float(np.min(r.screen.family.p, initial=1.0))
-    asked = r.attribution is not None and r.mode == "full" and r.unfitted is None
+    refitted = r.attribution is not None and r.mode == "full" and r.unfitted is None
     if r.held_out is not None and _curves_beat(r.held_out, r.chosen is not None):
         best = r.chosen or (r.refits[0] if r.refits else None)
         tried = list(best.candidates) if best else []
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= r.alpha and key is not None:
             return UNLIKE, _curve(r, key, tried)
-    if r.chosen is not None or (least <= r.alpha and not asked):
+    if r.chosen is not None or (least <= r.alpha and not refitted):
         return _effect(r, where)
-    if not asked:  # nothing is held out: what all of the catalogue leaves
+    if not refitted:  # nothing is held out: what all of the catalogue leaves
         tried = tables.testable_candidates(r.screen)
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= LEFT * r.alpha and key is not None:

@@ -146,7 +146,7 @@ def missing_table(
 
 
 def testable_candidates(screen: Screen) -> list[Candidate]:
-    """The candidates that the screen could tell anything about."""
+    """The candidates with a score that the parameters do not absorb."""
     candidates = screen.design.candidates
     return [c for c, s in zip(candidates, screen.efficient.status, strict=True) if not s]
 
@@ -183,15 +183,15 @@ def causes_table(
         sided = screen.design.sided[k]
         strength = float(s.strength[k])
         error = 1.0 / np.sqrt(s.variance[k]) if s.variance[k] > 0.0 else np.nan
-        if screen.design.quadratic[k]:  # told of is the square
+        if screen.design.quadratic[k]:  # the estimate is of its square
             strength = float(np.sqrt(max(strength, 0.0)))
             error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
         if own is not None:
-            told = estimated_strength(screen, own, own.candidates[0], error)
+            estimate = estimated_strength(screen, own, own.candidates[0], error)
         elif sided * strength < 0.0:  # the screen knows no bounds
-            told = _strength_row(screen, c, 0.0, np.nan)
+            estimate = _strength_row(screen, c, 0.0, np.nan)
         else:
-            told = _strength_row(screen, c, strength, error)
+            estimate = _strength_row(screen, c, strength, error)
         p = tested.get(k, np.nan)
         if screened:
             p = min(float(significant[k]), tested.get(k, 1.0))
@@ -199,7 +199,7 @@ def causes_table(
             "effect": c.effect.name, "equation": c.equation, "z": float(s.z[k]),
             "p": float(np.minimum(1.0, tests * p)),
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
-            "class_id": int(found.class_id[i]), **told,
+            "class_id": int(found.class_id[i]), **estimate,
         })  # fmt: skip
     return tabulate("causes", rows)
 

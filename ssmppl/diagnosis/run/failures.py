@@ -22,8 +22,8 @@ def reason_of(error: BaseException) -> str:
     """An error in one line: what was found; of a fault of this package its class, too."""
     if isinstance(error, SSMError):
         return one_line(error.found)
-    told = one_line(str(error))
-    return f"{type(error).__name__}{f': {told}' if told else ''} (a fault of ssmppl)"
+    text = one_line(str(error))
+    return f"{type(error).__name__}{f': {text}' if text else ''} (a fault of ssmppl)"
 
 
 def one_line(text: str) -> str:
@@ -76,7 +76,7 @@ class Failures:
 
 
 class Tolerant:
-    """A task whose faults are its answer: `{"fault": why}`; errors on purpose are raised.
+    """A task whose faults are its result: `{"fault": why}`; errors on purpose are raised.
 
     Of a class, so that it can be sent to another process with its task.
     """

@@ -1,4 +1,4 @@
-"""Is there a gap at all: what one-step predictions miss, and how well several steps are predicted.
+"""Detection of a gap: checks of one-step predictions, and of how well several steps are predicted.
 
 z_t = Phi^-1 of the probability integral transform of the one-step prediction is standard normal
 white noise under the true parameters (M. Rosenblatt 1952; F. Diebold, T. Gunther and A. Tay 1998).

@@ -1,4 +1,4 @@
-"""Efficient scores: what a candidate's score says that the parameters do not already say.
+"""Efficient scores: what is left of a candidate's score once the nuisance scores are projected out.
 
 B data sets simulated at the fitted parameters give the joint law of the candidates' statistics
 S (K,) and of the nuisance scores S_theta (P,). The efficient statistic is the residual of the
@@ -40,7 +40,7 @@ SPARE_SETS = 20  # degrees of freedom without which a residual variance says not
 
 
 @dataclass(frozen=True)
-class Fit:
+class Regression:
     """Least squares of y (B, K) on x (B, P) over sets, rank-revealing.
 
     left_out : (B, K) prediction errors of each set from the others. spread : (K,) residual
@@ -75,7 +75,7 @@ class Fit:
         return np.divide(self.left_out, scale, out=np.zeros_like(scale), where=scale > 0.0)
 
 
-def regress(y: np.ndarray, x: np.ndarray, *, intercept: bool = False) -> Fit:
+def regress(y: np.ndarray, x: np.ndarray, *, intercept: bool = False) -> Regression:
     """Regression of y (B, K) on x (B, P); directions of x that are linear combinations are cut.
 
     Raises
@@ -102,7 +102,7 @@ def regress(y: np.ndarray, x: np.ndarray, *, intercept: bool = False) -> Fit:
     residuals = y - mean - u @ (u.T @ (y - mean))
     base = 1.0 / sets if intercept else 0.0
     leverage = np.minimum(base + np.sum(u**2, axis=1), 1.0 - 1e-9)
-    return Fit(
+    return Regression(
         coefficients, mean, shift, residuals / (1.0 - leverage)[:, None], residuals,
         np.sum(residuals**2, axis=0) / dof, leverage, dof, whiten, base,
     )  # fmt: skip

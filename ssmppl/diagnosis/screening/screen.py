@@ -41,7 +41,7 @@ from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Distribution, Flat
 from ssmppl.language.model.traced import Site, Trace, symbols
 
-OWN_RUNS = 6  # passes over the data themselves, which tell the smoother's own noise
+OWN_RUNS = 6  # passes over the data themselves, which show the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through
 
 
@@ -269,7 +269,7 @@ def _compilable(
     trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing,
     failures: Failures,
 ) -> list[Candidate]:  # fmt: skip
-    """The candidates that have columns by themselves; the others are said to have failed."""
+    """The candidates that have columns by themselves; the others are recorded as failures."""
     out = []
     for c in candidates:
         with failures.part(f"the candidate {c}"):

@@ -30,7 +30,7 @@ from ssmppl.diagnosis.selection.refit import (
     pairs,
     refit_all,
 )
-from ssmppl.diagnosis.selection.refit_test import LAX, gain_p, quick_enough, refit_p
+from ssmppl.diagnosis.selection.refit_test import LAX, affordable, gain_p, refit_p
 from ssmppl.diagnosis.selection.shapes import shaped_all
 from ssmppl.errors import SSMError
 
@@ -198,12 +198,12 @@ class Selection:
             out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
 
     def _by_refit(self, out: Attribution, alpha: float) -> bool:
-        """Whether a refit gains more than chance: by its own law where fits are quick, else by that
-        of the scores, which is the same to first order (likelihood ratio and score tests)."""
+        """Whether a refit gains more than chance: by bootstrap where that is affordable, else by the
+        law of the scores, the same to first order (likelihood ratio and score tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
         if not found or min(found.values()) > LAX * alpha:
             return False
-        if quick_enough(self.augmented, self.train):
+        if affordable(self.augmented, self.train):
             anew = one_signed_candidates(self.screen)  # fits to simulated data would take too long
             rest = {k: p for k, p in found.items() if k not in anew}
             found = {k: p for k, p in found.items() if k in anew}
@@ -295,8 +295,8 @@ def _unfitted(screen: Screen, refits: Sequence[Refit], alpha: float) -> int | No
 
 
 def _others(screen: Screen, chosen: Refit) -> list[Candidate]:
-    """The candidates of all other groups of which the screen can tell anything. What it said of
-    them is no guide: with an effect added noise shrinks, and others come to light."""
+    """The candidates of all other groups that the parameters do not absorb. Their scores so far are
+    no guide: with an effect added noise shrinks, and others come to light."""
     groups = {c.group for c in chosen.candidates}
     return [
         c for c, status in zip(screen.design.candidates, screen.efficient.status, strict=True)

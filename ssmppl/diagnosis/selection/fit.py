@@ -154,7 +154,7 @@ class Fitter:
         self, problem: Problem, fixed: Mapping[str, np.ndarray], settings: Settings,
         initial_law: ProperInitialLaw | None = None,
     ):  # fmt: skip
-        """start : the law of x_1 is that one, in place of a flat one."""
+        """initial_law : of x_1, in place of a flat one."""
         self.problem, self.fixed, self.settings = problem, dict(fixed), settings
         self.initial_law = initial_law
         self.kalman = kalman_model(problem.trace)
@@ -599,7 +599,7 @@ def hold_at_bounds(
                 continue
             top = max(here, *out)
             inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
-            if inside is None:  # flat either way: nothing tells of this number
+            if inside is None:  # flat either way: this number is not identified
                 continue
             good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
             for _ in range(STEPS):
@@ -622,7 +622,7 @@ def component_names(space: Space, mask: np.ndarray) -> list[str]:
 
 
 def bounds_note(names: Sequence[str], values: dict[str, float], what: str) -> str:
-    """What a report says of parameters at a bound."""
+    """A note on parameters at a bound."""
     if not names:
         return ""
     values_at = ", ".join(f"{n} at {values[n]:.3g}" if n in values else n for n in names)

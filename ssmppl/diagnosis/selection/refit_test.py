@@ -1,12 +1,12 @@
-"""Whether the best refit gains more than chance would.
+"""Tests of the gain of the best refit, by the law of the scores or by parametric bootstrap.
 
 Where noise has grown to swallow what is missing, the score at the fit is far smaller than what a
 refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). So
 the gain itself is tested: by the law of the scores, which is the same to first order (likelihood
-ratio and score tests); in short records, where a fit is quick and first order a poor guide, by its
-own: data sets simulated at theta-hat are fitted, screened and refitted as the data were. That test
-stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991), and as
-soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
+ratio and score tests); in short records, where a fit takes little time and first order is a poor
+guide, by its own: data sets simulated at theta-hat are fitted, screened and refitted as the data
+were. That test stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika*
+78, 1991), and as soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
     return out
 
 
-def quick_enough(augmented: AugmentedModels, experiments: Sequence[Experiment]) -> bool:
+def affordable(augmented: AugmentedModels, experiments: Sequence[Experiment]) -> bool:
     """Whether the fits of the test can be afforded."""
     rows = sum(e.steps for e in experiments)
-    quick = augmented.fitter(()).exact or rows * augmented.settings.particles <= MOST_WORK
-    return quick and rows < MOST_ROWS
+    cheap = augmented.fitter(()).exact or rows * augmented.settings.particles <= MOST_WORK
+    return cheap and rows < MOST_ROWS

@@ -1,4 +1,4 @@
-"""Shapes estimated: the threshold of a stop, the period of a forcing, the memory of a disturbance.
+"""Estimates of shapes: the threshold of a stop, the period of a forcing, a disturbance's memory.
 
 The screen tries a few values of each shape, which is enough to see an effect, and too few to
 predict with it: a period that is off by a quarter of a turn over the record is out of step
