@@ -54,7 +54,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -348,29 +348,31 @@ def check(e: Effect) -> None:
     ------
     ModelError : naming the function's line.
     """
+    for found, fix in _faults(e):
+        raise ModelError(f"the effect {e.name!r}: {found}", fix=fix, where=e.where)
 
-    def refuse(found: str, fix: str) -> ModelError:
-        return ModelError(f"the effect {e.name!r}: {found}", fix=fix, where=e.where)
 
+def _faults(e: Effect) -> Iterator[tuple[str, str]]:
+    """What of a declaration does not fit, and the fix; each assumes that none came before."""
     parameters = inspect.signature(e.function).parameters
     if e.afresh is not None and not (e.lower < e.afresh < e.upper and e.afresh != 0.0):
-        raise refuse(
+        yield (
             f"afresh={e.afresh!r} is no strength between {e.lower:g} and {e.upper:g} other than 0",
             "give the strength at which the model shall be fitted anew, or leave it out",
         )
     if e.kind not in KINDS:
-        raise refuse(f"its kind is {e.kind!r}", f"use one of: {listing(str(e.kind), KINDS)}")
+        yield (f"its kind is {e.kind!r}", f"use one of: {listing(str(e.kind), KINDS)}")
     if any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters.values()):
-        raise refuse("it takes *arguments", "name each argument: they are bound by name")
+        yield ("it takes *arguments", "name each argument: they are bound by name")
     if not isinstance(e.on, str) or not e.on:
-        raise refuse(f"on is {e.on!r}", f"use one of {', '.join(ON)}, or the name of a quantity")
+        yield (f"on is {e.on!r}", f"use one of {', '.join(ON)}, or the name of a quantity")
     if "strength" not in parameters:
-        raise refuse(
+        yield (
             f"{e.function.__name__}({', '.join(parameters)}) has no argument `strength`",
             "add it: the number that is estimated, 0 where there is no such effect",
         )
     if next(iter(parameters)) == "strength":
-        raise refuse(
+        yield (
             "its first argument is `strength`",
             "let the first be the value of what it is bound to, for example the state v",
         )
@@ -378,86 +380,82 @@ def check(e: Effect) -> None:
         for name in names:
             needed_by_profile = what == "shapes" and e.profile
             if name not in list(parameters)[1:] and not needed_by_profile:
-                raise refuse(
+                yield (
                     f"{what} names {name!r}, which is no further argument of the function",
                     f"its arguments are: {listing(name, parameters)}",
                 )
     for argument, role in e.given.items():
         if role not in GIVEN:
-            raise refuse(
-                f"given says that {argument!r} is {role!r}", f"use one of: {listing(role, GIVEN)}"
+            yield (
+                f"given says that {argument!r} is {role!r}",
+                f"use one of: {listing(role, GIVEN)}",
             )
     for name, grid in e.shapes.items():
         if not grid.values or not all(map(math.isfinite, grid.values)):
-            raise refuse(f"the shape {name!r} has the values {grid.values}", "give finite numbers")
+            yield (f"the shape {name!r} has the values {grid.values}", "give finite numbers")
         if grid.between is not None:
             low, high = grid.between
             if not low <= min(grid.values) <= max(grid.values) <= high or low == high:
-                raise refuse(
+                yield (
                     f"the shape {name!r} is estimated between {low} and {high}, and its values are "
                     f"{grid.values}",
                     "give bounds that hold them",
                 )
             if name in e.states.values():
-                raise refuse(
+                yield (
                     f"the shape {name!r} is a number of states, which cannot be estimated",
                     "leave out between=",
                 )
         if grid.of and grid.of not in parameters:
-            raise refuse(
+            yield (
                 f"the shape {name!r} is relative to {grid.of!r}, which is no argument",
                 f"its arguments are: {listing(grid.of, parameters)}",
             )
-    _check_parts(e, refuse)
-
-
-def _check_parts(e: Effect, refuse: Callable[[str, str], ModelError]) -> None:
     if not e.lower < e.upper or e.lower > 0 or e.upper < 0:
-        raise refuse(
+        yield (
             f"the strength lies between {e.lower:g} and {e.upper:g}, which must hold 0",
             "give lower=0 for an effect that has one direction only",
         )
     half = [b for b in (e.lower, e.upper) if math.isfinite(b)]
     if len(half) == 1 and e.lower != 0:
-        raise refuse(
-            f"the strength has the one bound {half[0]:g}", "give lower=0, or both lower and upper"
+        yield (
+            f"the strength has the one bound {half[0]:g}",
+            "give lower=0, or both lower and upper",
         )
     if (e.kind == "state") != bool(e.states):
-        raise refuse(
+        yield (
             f"its kind is {e.kind!r} and its auxiliary states are {list(e.states)}",
             'give kind="state" and states=("name",) together',
         )
     if e.kind == "state" and e.on == "any":
-        raise refuse('it is on "any"', f"say what it is bound to: {', '.join(ON[1:])}, or a name")
+        yield ('it is on "any"', f"say what it is bound to: {', '.join(ON[1:])}, or a name")
     for name, length in e.states.items():
         if length is not None and length not in e.shapes:
-            raise refuse(
+            yield (
                 f"the length of {name!r} is {length!r}, which is none of its shapes",
                 f"its shapes are: {listing(length, e.shapes)}",
             )
     if e.process and (e.process not in PROCESSES or not e.states):
-        raise refuse(
+        yield (
             f"its process is {e.process!r}",
             f'use one of {", ".join(PROCESSES)}, with kind="state" and its auxiliary state',
         )
     if e.requires not in ("", *REQUIRES):
-        raise refuse(
-            f"it requires {e.requires!r}", f"use one of: {listing(e.requires, REQUIRES)}, or none"
+        yield (
+            f"it requires {e.requires!r}",
+            f"use one of: {listing(e.requires, REQUIRES)}, or none",
         )
     if bool(e.profile) != ("profile" in e.given.values()):
-        raise refuse(
+        yield (
             f"its profile is {e.profile!r} and given is {dict(e.given)}",
             'name both: profile="step", given={"w": "profile"}',
         )
     if e.profile:
         known = PROFILES.get(e.profile)
         if known is None:
-            raise refuse(
-                f"its profile is {e.profile!r}", f"use one of: {listing(e.profile, PROFILES)}"
-            )
-        missing = set(inspect.signature(known).parameters) - {"t", *e.shapes}
-        if missing:
-            raise refuse(
+            yield (f"its profile is {e.profile!r}", f"use one of: {listing(e.profile, PROFILES)}")
+        elif missing := set(inspect.signature(known).parameters) - {"t", *e.shapes}:
+            yield (
                 f"the profile {e.profile!r} needs the shapes {', '.join(sorted(missing))}",
                 "give their values in shapes",
             )

@@ -21,7 +21,6 @@ from ssmppl.diagnosis.model.basis import Term, symbolic_shapes
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
 from ssmppl.diagnosis.screening.familywise import familywise
-from ssmppl.diagnosis.screening.location import group_score
 from ssmppl.diagnosis.screening.screen import Screen, with_parameters
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.fit import APPROXIMATELY, WITHOUT_ERRORS, Fit, Fitter
@@ -159,18 +158,14 @@ def residual_groups(
 ) -> dict[tuple[str, str, str], Residual]:
     """Each group of the basis with `others` projected out, by equation, moment and variable: the
     functions of one variable, or of one pair, are a group."""
-    terms, nuisance = screen.design.terms, screen.simulated.nuisance
-    columns, seen = screen.simulated.basis, screen.observed.basis
-    rest = screen.columns_of(others)
+    terms = screen.design.terms
     keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
     if not keys:
         return {}
     groups = []
     for key in keys:
         own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
-        groups.append(
-            group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
-        )
+        groups.append(screen.basis_group(own, others))
     z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
     p = familywise(z, null, sided=1).p
     return {k: Residual(float(z[i]), float(p[i])) for i, k in enumerate(keys)}

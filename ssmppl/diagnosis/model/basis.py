@@ -170,25 +170,37 @@ def _measured(law: Distribution, states: Sequence[Part]) -> list[Part]:
     return [s for s in states if s.seen_from("observation") in inside] or list(states)
 
 
-def _curve(
-    part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales
+def _term(
+    part: Part, moment: str, variable: str, name: str, kind: str, function: Callable[..., Any],
+    shape: Mapping[str, float], bound: Mapping[str, Part], strength: str, *,
+    states: Sequence[str] = (), shares: str = "",
 ) -> Term:  # fmt: skip
+    """A basis function as an effect that is bound: argument -> the state or input it stands for."""
+    effect = Effect(
+        name=name, kind=kind, function=function, on=part.label,
+        shapes={n: numbers(v) for n, v in shape.items()},
+        given=dict.fromkeys(bound, "other state"), states=dict.fromkeys(states),
+    )  # fmt: skip
+    candidate = Candidate(
+        effect, part.label, tuple(shape.items()), tuple((a, v.label) for a, v in bound.items()),
+        part.role, slug(strength), shares=slug(shares) if shares else "",
+    )  # fmt: skip
+    return Term(candidate, part.label, moment, variable)
+
+
+def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales) -> Term:
     curve = CURVES[k]
 
     def term(own, z, strength, centre, width):
         return strength * curve((z - centre) / width)
 
     label, scale = variable.label, scales.scale[variable.label]
-    effect = Effect(
-        name=f"curve {k + 1} of {label}", kind=kind, function=term, on=part.label,
-        shapes={"centre": numbers(scale.mean), "width": numbers(scale.sd)},
-        given={"z": "other state"},
+    found = _term(
+        part, moment, label, f"curve {k + 1} of {label}", kind, term,
+        {"centre": scale.mean, "width": scale.sd}, {"z": variable},
+        f"curve {k + 1} {moment} {part.label} {label}",
     )  # fmt: skip
-    candidate = Candidate(
-        effect, part.label, (("centre", scale.mean), ("width", scale.sd)), (("z", label),),
-        part.role, slug(f"curve {k + 1} {moment} {part.label} {label}"),
-    )  # fmt: skip
-    return Term(candidate, part.label, moment, label, curve, scale.mean, scale.sd)
+    return replace(found, function=curve, centre=scale.mean, width=scale.sd)
 
 
 def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Term]:
@@ -196,20 +208,17 @@ def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Ter
     degrees = DEGREES if len(variables) <= FEW else DEGREES[:FIRST]
     out = []
     for a, b in combinations(variables, 2):
-        for i, j in degrees:
-            x, y = scales.scale[a.label], scales.scale[b.label]
-            shape = {"centre": x.mean, "width": x.sd, "centre_w": y.mean, "width_w": y.sd}
-            effect = Effect(
-                name=f"product {i} {j} of {a.label} and {b.label}", kind="transition",
-                function=_product(CURVES[i - 1], CURVES[j - 1]), on=part.label,
-                shapes={n: numbers(v) for n, v in shape.items()},
-                given={"z": "other state", "w": "other state"},
-            )  # fmt: skip
-            candidate = Candidate(
-                effect, part.label, tuple(shape.items()), (("z", a.label), ("w", b.label)),
-                part.role, slug(f"product {i} {j} {part.label} {a.label} {b.label}"),
-            )  # fmt: skip
-            out.append(Term(candidate, part.label, "mean", f"{a.label} and {b.label}"))
+        x, y = scales.scale[a.label], scales.scale[b.label]
+        shape = {"centre": x.mean, "width": x.sd, "centre_w": y.mean, "width_w": y.sd}
+        out += [
+            _term(
+                part, "mean", f"{a.label} and {b.label}",
+                f"product {i} {j} of {a.label} and {b.label}", "transition",
+                _product(CURVES[i - 1], CURVES[j - 1]), shape, {"z": a, "w": b},
+                f"product {i} {j} {part.label} {a.label} {b.label}",
+            )
+            for i, j in degrees
+        ]  # fmt: skip
     return out
 
 
@@ -231,16 +240,11 @@ def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
         return Auxiliary(strength * past[k], laws, {n: Dirac(0.0) for n in PAST})
 
     label, scale = variable.label, scales.scale[variable.label]
-    effect = Effect(
-        name=f"past {k + 1} of {label}", kind="state", function=term, on=part.label,
-        shapes={"centre": numbers(scale.mean), "width": numbers(scale.sd)},
-        given={"z": "other state"}, states=dict.fromkeys(PAST),
+    return _term(
+        part, "mean", f"the past of {label}", f"past {k + 1} of {label}", "state", term,
+        {"centre": scale.mean, "width": scale.sd}, {"z": variable},
+        f"past {k + 1} {part.label} {label}", states=PAST, shares=f"past {label}",
     )  # fmt: skip
-    candidate = Candidate(
-        effect, part.label, (("centre", scale.mean), ("width", scale.sd)), (("z", label),),
-        part.role, slug(f"past {k + 1} {part.label} {label}"), shares=slug(f"past {label}"),
-    )  # fmt: skip
-    return Term(candidate, part.label, "mean", f"the past of {label}")
 
 
 def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Term:
@@ -257,16 +261,11 @@ def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Te
     label, scale = variable.label, scales.scale[variable.label]
     shape = {"centre": scale.mean, "width": scale.sd, **{n: float(v) for n, v in ring.items()}}
     name = f"ring {turn:.0f} of {label}"
-    effect = Effect(
-        name=f"{name}, phase {k + 1}", kind="state", function=term, on=part.label,
-        shapes={n: numbers(v) for n, v in shape.items()}, given={"z": "other state"},
-        states=dict.fromkeys(RING),
+    return _term(
+        part, "mean", f"the ringing of {label} at {turn:.0f} rows", f"{name}, phase {k + 1}",
+        "state", term, shape, {"z": variable}, f"ring {k + 1} {turn:.0f} {part.label} {label}",
+        states=RING, shares=name,
     )  # fmt: skip
-    candidate = Candidate(
-        effect, part.label, tuple(shape.items()), (("z", label),), part.role,
-        slug(f"ring {k + 1} {turn:.0f} {part.label} {label}"), shares=slug(name),
-    )  # fmt: skip
-    return Term(candidate, part.label, "mean", f"the ringing of {label} at {turn:.0f} rows")
 
 
 def symbolic_shapes(

@@ -14,9 +14,7 @@ from ssmppl.diagnosis.heldout.reference import residual_groups
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.screening.location import (
     Group,
-    bin_edges,
     curve,
-    group_score,
     localise,
     regions,
     when,
@@ -52,23 +50,18 @@ def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, G
     places = {k: [i for i, t in enumerate(terms) if (t.equation, t.moment) == k] for k in keys}
     groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
     table, found = localise(groups, nuisance, observed.nuisance)
-    alone = {
-        k: group_score(columns[:, p], observed.basis[p], nuisance, observed.nuisance)
-        for k, p in places.items()
-    }
-    sizes = [e.steps for e in screen.experiments]
-    starts = starts_of(screen.experiments)
-    edges = bin_edges(sum(sizes), starts)
+    starts, edges = starts_of(screen.experiments), screen.edges
     labels = _labels(screen.experiments)
     bins, own = screen.simulated.basis_bins, screen.simulated.nuisance_bins
     rows = []
     for row in table.itertuples():
         key, p = row.key, float(bonferroni(row.p_either))
-        stretch = (0, sum(sizes))
+        stretch = (0, len(labels))
         if p <= alpha and len(edges) > 3:
             at = when(
-                alone[key], bins[:, :, places[key]], observed.basis_bins[:, places[key]],
-                own, observed.nuisance_bins, edges, alpha=alpha,
+                screen.basis_group(places[key]), bins[:, :, places[key]],
+                observed.basis_bins[:, places[key]], own, observed.nuisance_bins, edges,
+                alpha=alpha,
             )  # fmt: skip
             stretch = (at.first, at.last)
         rows.append({
@@ -99,13 +92,10 @@ def _experiments(starts: Sequence[int], first: int, last: int) -> str:
 
 def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
     """Where the strongest of the variables shows the gap most, in words."""
-    terms, nuisance = screen.design.terms, screen.simulated.nuisance
-    columns, best = screen.simulated.basis, None
+    terms, best = screen.design.terms, None
     for variable in dict.fromkeys(terms[i].variable for i in places):
         own = [i for i in places if terms[i].variable == variable]
-        group = group_score(
-            columns[:, own], screen.observed.basis[own], nuisance, screen.observed.nuisance
-        )
+        group = screen.basis_group(own)
         if best is None or group.z > best[0].z:
             best = group, variable, own
     if best is None:
@@ -126,14 +116,11 @@ def missing_table(
 
     others : candidates that are projected out.
     """
-    terms, nuisance = screen.design.terms, screen.simulated.nuisance
-    columns, seen = screen.simulated.basis, screen.observed.basis
-    rest = screen.columns_of(others)
-    rows = []
+    terms, rows = screen.design.terms, []
     places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key and t.is_curve]
     for variable in dict.fromkeys(terms[i].variable for i in places):
         own = [i for i in places if terms[i].variable == variable]
-        group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
+        group = screen.basis_group(own, others)
         values = screen.design.grid(variable)
         low_end, high_end = np.quantile(values, (0.02, 0.98))
         grid = np.linspace(float(low_end), float(high_end), CURVE_POINTS)
@@ -255,9 +242,7 @@ def classes_table(
 def map_table(screen: Screen) -> pd.DataFrame:
     """Standardised smoothed scores of each equation's linear term by window of time."""
     terms = screen.design.terms
-    sizes = [e.steps for e in screen.experiments]
-    starts = starts_of(screen.experiments)
-    edges = bin_edges(sum(sizes), starts)
+    starts, edges = starts_of(screen.experiments), screen.edges
     labels, rows = _labels(screen.experiments), []
     null, seen = screen.simulated.basis_bins, screen.observed.basis_bins
     for equation in dict.fromkeys(t.equation for t in terms if t.moment == "mean"):

@@ -34,7 +34,7 @@ from ssmppl.diagnosis.run.failures import FAULT, Failures
 from ssmppl.diagnosis.screening import detection, statistics
 from ssmppl.diagnosis.screening.efficient_score import Efficient, Null, efficient
 from ssmppl.diagnosis.screening.familywise import FamilyWise, familywise
-from ssmppl.diagnosis.screening.location import bin_edges, binned
+from ssmppl.diagnosis.screening.location import Group, bin_edges, binned, group_score
 from ssmppl.diagnosis.screening.statistics import information_scale, typical_squares
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.run.seeds import random_state
@@ -238,6 +238,20 @@ class Screen:
         found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)
         own = sorted({k for k in found if k is not None})
         return self.simulated.columns[:, own], self.observed.columns[own]
+
+    def basis_group(self, columns: Sequence[int], others: Sequence[Candidate] = ()) -> Group:
+        """The statistic of these columns of the basis with the scores of others projected out."""
+        own = list(columns)
+        return group_score(
+            self.simulated.basis[:, own], self.observed.basis[own], self.simulated.nuisance,
+            self.observed.nuisance, *self.columns_of(others),
+        )  # fmt: skip
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """(J + 1,) first rows of the bins of time."""
+        rows = sum(e.steps for e in self.experiments)
+        return bin_edges(rows, starts_of(self.experiments))
 
     @property
     def sets(self) -> int:

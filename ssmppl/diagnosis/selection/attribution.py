@@ -198,8 +198,8 @@ class Selection:
             out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
 
     def _by_refit(self, out: Attribution, alpha: float) -> bool:
-        """Whether a refit gains more than chance: by bootstrap where that is affordable, else by the
-        law of the scores, the same to first order (likelihood ratio and score tests)."""
+        """Whether a refit gains more than chance: by bootstrap where that is affordable, else by
+        the law of the scores, the same to first order (likelihood ratio and score tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
         if not found or min(found.values()) > LAX * alpha:
             return False

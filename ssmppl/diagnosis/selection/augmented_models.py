@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,14 +46,11 @@ class AugmentedModels:
         generated code is the same for all data."""
         made, shapes = symbolic_shapes(candidates, of_time=True)
         key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
-        if key not in self._made:
-            with LOCK:  # refits in threads ask for the same models
-                if key not in self._made:
-                    trace = self.trace
-                    if made:
-                        trace = with_parameters(augment(trace, made), shapes)
-                    self._made[key] = self.fitter_of(trace, shapes)
-        return self._made[key].with_fixed(shapes)
+
+        def trace() -> Trace:
+            return with_parameters(augment(self.trace, made), shapes) if made else self.trace
+
+        return self._cached(key, trace, shapes)
 
     def with_free_shapes(
         self, candidates: Sequence[Candidate], free: Mapping[str, tuple[float, float]]
@@ -72,16 +69,23 @@ class AugmentedModels:
             a, b, u = (symbol("parameter", n, ()) for n in (*ends, range_fraction(name)))
             inside[symbol("parameter", name, ())] = a + b * u
         key = (*((c.key, c.strength) for c in made), *((n, "free") for n in free))
+
+        def trace() -> Trace:
+            own = [replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape)) for c in made]
+            whole = with_parameters(augment(self.trace, own), given)
+            return with_parameters(whole, map(range_fraction, free), lambda: Uniform(0, 1))
+
+        return self._cached(key, trace, given)
+
+    def _cached(
+        self, key: tuple[tuple[str, str], ...], trace: Callable[[], Trace],
+        given: Mapping[str, float],
+    ) -> Fitter:  # fmt: skip
+        """The fitter of a trace that is made once for each key, with these parameters given."""
         if key not in self._made:
-            with LOCK:
+            with LOCK:  # refits in threads ask for the same models
                 if key not in self._made:
-                    made = [
-                        replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape))
-                        for c in made
-                    ]
-                    trace = with_parameters(augment(self.trace, made), given)
-                    trace = with_parameters(trace, map(range_fraction, free), lambda: Uniform(0, 1))
-                    self._made[key] = self.fitter_of(trace, given)
+                    self._made[key] = self.fitter_of(trace(), given)
         return self._made[key].with_fixed(given)
 
     def fitter_of(self, trace: Trace, given: Mapping[str, float]) -> Fitter:

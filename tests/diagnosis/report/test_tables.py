@@ -110,6 +110,7 @@ def test_the_p_of_where_counts_both_looks():
         observed=SimpleNamespace(basis=basis[-1], nuisance=nuisance[-1]),
         simulated=SimpleNamespace(**null),
         design=SimpleNamespace(terms=terms), experiments=[SimpleNamespace(steps=1, time=None)],
+        edges=np.array([0, 1]),
     )  # fmt: skip
     table, _ = where_table(screen, alpha=0.0)
     groups = {k: (basis[:-1, 2 * i : 2 * i + 2], basis[-1, 2 * i : 2 * i + 2])
