@@ -116,19 +116,9 @@ def diagnose(
         check_count("particles", particles, 10)
     check_executor(executor)
     return _Diagnosis(
-        model,
-        data,
-        effects,
-        mode,
-        alpha,
-        fixed,
-        particles,
-        executor,
-        checkpoint,
-        progress,
-        seed,
+        model, data, effects, mode, alpha, fixed, particles, executor, checkpoint, progress, seed,
         Failures(debug),
-    ).run()
+    ).run()  # fmt: skip
 
 
 class _Diagnosis:

@@ -21,9 +21,10 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import Auxiliary, Effect, numbers
-from ssmppl.diagnosis.model.candidates import Scales, slug
+from ssmppl.diagnosis.model.candidates import slug
 from ssmppl.diagnosis.model.changed_laws import has_scale, scale_of_mean
 from ssmppl.diagnosis.model.equations import Equations, Part, Reaction, as_it_was, carried
+from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol, symbols_of

@@ -14,15 +14,13 @@ from ssmppl.diagnosis.effects.effect import ON, Effect
 from ssmppl.diagnosis.model.binding import bind, check_base, quantity, unknown
 from ssmppl.diagnosis.model.changed_laws import has_scale, has_tail, scale_of_mean
 from ssmppl.diagnosis.model.equations import Equations, Part, SharedTerms, as_it_was
-from ssmppl.diagnosis.model.scales import Scale, Scales, value_of
+from ssmppl.diagnosis.model.scales import Scales, value_of
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.language.checks.rules import RESERVED
 from ssmppl.language.model.traced import Trace
-
-__all__ = ["Candidate", "Refused", "Scale", "Scales", "offers"]
 
 # What an effect of each kind can be bound to.
 BOUND_TO = {

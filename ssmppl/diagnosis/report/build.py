@@ -112,7 +112,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
     where = table("where", lambda: tables.where_table(screen, r.alpha)[0])
     checks = table("detection", lambda: _detection(screen))
     order, found = table("classes", r.classes, ([], None))
-    verdict, missing = _verdict(r, where)
+    verdict, missing = _revised(r, *_verdict(r, where), where, checks)
     share, runs = tabulate("closed"), None
     if r.attribution:
         notes += r.attribution.notes
@@ -120,20 +120,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
     if r.held_out is not None:
         notes += r.held_out.notes
         runs = (r.held_out.before, r.held_out.after)
-        if r.held_out.rows:
-            share = tabulate("closed", r.held_out.rows)
-            # Few held-out rows leave the share open where the test of the effect does not; what
-            # gains nothing on them was chance, and what curves gain beyond it is as open.
-            open_, gained = not np.isfinite(share["F"].iloc[0]), share["nats_per_sample"].iloc[0]
-            if not r.blocks and open_:
-                if gained <= 0.0 or (verdict == UNLIKE and r.chosen is None):
-                    verdict, missing = NOTHING, None
-                elif verdict == UNLIKE:
-                    verdict, missing = _effect(r, where)
-    if verdict == NOTHING and not r.screened:  # they are of a fit that was not the best one
-        where["p"], checks["p"] = np.nan, np.nan
-    elif verdict == NOTHING and _stands_out(r.alpha, where, checks):
-        verdict, missing = UNLIKE, _curve_of(r, where)
+        share = tabulate("closed", r.held_out.rows)
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}
     if r.chosen is not None and verdict == "effect":
@@ -229,6 +216,23 @@ def _verdict(r: Results, where: Any) -> tuple[str, Any]:
         if residual <= LEFT * r.alpha and key is not None:
             return UNLIKE, _curve(r, key, tried)
     return NOTHING, None
+
+
+def _revised(r: Results, verdict: str, missing: Any, where: Any, checks: Any) -> tuple[str, Any]:
+    """The verdict in the light of the gain on held-out rows and of what else stands out."""
+    rows = r.held_out.rows if r.held_out else []
+    # Few held-out rows leave the share open where the test of the effect does not; what gains
+    # nothing on them was chance, and what curves gain beyond it is as open.
+    if rows and not r.blocks and not np.isfinite(rows[0]["F"]):
+        if rows[0]["nats_per_sample"] <= 0.0 or (verdict == UNLIKE and r.chosen is None):
+            verdict, missing = NOTHING, None
+        elif verdict == UNLIKE:
+            verdict, missing = _effect(r, where)
+    if verdict == NOTHING and not r.screened:  # they are of a fit that was not the best one
+        where["p"], checks["p"] = np.nan, np.nan
+    elif verdict == NOTHING and _stands_out(r.alpha, where, checks):
+        verdict, missing = UNLIKE, _curve_of(r, where)
+    return verdict, missing
 
 
 def _effect(r: Results, where: Any) -> tuple[str, Any]:

@@ -25,8 +25,6 @@ from ssmppl.drawing.numerals import DASH, is_number, number, p_text, with_error
 if TYPE_CHECKING:
     from ssmppl.diagnosis.report.findings import Findings
 
-__all__ = ["cause_rows", "report_html", "report_text"]
-
 PAGE = 100  # columns
 SHOWN_CAUSES = 8
 PREDICTED = "* predicted by the screen, not refitted"
