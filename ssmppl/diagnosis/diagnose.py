@@ -239,7 +239,7 @@ class _Diagnosis:
             r.held_out = self._held_out_gain(r)
 
     def _validate_on_held_out_rows(self, r: Results) -> None:
-        """Of several effects chosen together, fewer again while all of them predict the held-out
+        """Drop effects of several chosen together while all of them predict the held-out
         rows no better than the model itself: what they fitted was chance. It is a choice made on
         these rows, and the report says so."""
         found = r.attribution
@@ -336,7 +336,7 @@ class _Diagnosis:
     def _tell_time(
         self, base: Fitter, fit: Fit, design: ScreenDesign, experiments: Sequence[Experiment]
     ) -> None:
-        """What the mode will take, from passes over the data."""
+        """Show how long the mode will take, from passes over the data."""
         done = sum(f"screening/{k}" in self.checkpoint for k in range(SETS[self.mode]))
         if not self.checkpoint.progress or done > SETS[self.mode] // 2:
             return

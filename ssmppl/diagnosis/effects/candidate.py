@@ -127,8 +127,11 @@ class Candidate:
 
     @property
     def increment(self) -> Candidate:
-        """With its process (or function of time) held at 1: the column that a quadratic form in
-        the process's covariance, or the weights of `weights`, turn into its statistic."""
+        """The candidate with its process (or function of time) held at 1.
+
+        Its column is what a quadratic form in the process's covariance, or `weights`, turn into
+        the statistic.
+        """
         return replace(self, held=True) if self.effect.process or self.effect.profile else self
 
     def weights(self, n: int) -> np.ndarray:
@@ -180,8 +183,7 @@ def is_pulse(candidate: Candidate) -> bool:
 
 
 def with_all_dates(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
-    """With a candidate for every date (`DATES` of them in long records) and for every period
-    and phase where there is one.
+    """The candidates, with one for every date (`DATES` of them in long records), period and phase.
 
     rows : of the longest experiment.
     """

@@ -162,7 +162,7 @@ def rows(*shares: float) -> Grid:
 
 @dataclass(frozen=True)
 class Auxiliary:
-    """What an effect of kind "state" returns.
+    """Returned by an effect of kind "state".
 
     change : what the effect does to its equation, from the auxiliary states among the arguments.
     transition, initial : by auxiliary state, its law given the step before, and of x_1; the latter
@@ -342,7 +342,7 @@ def declared(module: Mapping[str, Any]) -> tuple[Effect, ...]:
 
 
 def check(e: Effect) -> None:
-    """That the declaration fits the function.
+    """Check that the declaration fits the function.
 
     Raises
     ------
@@ -353,7 +353,7 @@ def check(e: Effect) -> None:
 
 
 def _faults(e: Effect) -> Iterator[tuple[str, str]]:
-    """What of a declaration does not fit, and the fix; each assumes that none came before."""
+    """Faults of a declaration, and their fixes; each assumes that none came before."""
     parameters = inspect.signature(e.function).parameters
     if e.afresh is not None and not (e.lower < e.afresh < e.upper and e.afresh != 0.0):
         yield (

@@ -56,7 +56,7 @@ class _FoldModels:
 
 @dataclass(frozen=True)
 class CrossFit:
-    """What every fold works with.
+    """The gain on blocks left out: what every fold works with.
 
     design : of the screen. base : the model's fitter and its fit to all rows. alpha : family-wise
     error rate of the selection. chosen : on all rows; None: the reference stands for it. whole :
@@ -87,7 +87,7 @@ class CrossFit:
             except SSMError:  # a block that a model cannot predict is no block to leave out
                 raise
             except Exception as error:
-                checkpoint.failures.met(name, error)
+                checkpoint.failures.record(name, error)
                 return {}
 
         try:  # in threads of this process: their tasks go over the executor

@@ -342,7 +342,7 @@ class HeldOutGain:
 
 @dataclass(frozen=True)
 class HeldOutRows:
-    """What the gain on the held-out rows is measured with.
+    """The gain on held-out rows: what it is measured with.
 
     base : the model's fitter and fit. chosen : None where no effect was, and the reference stands
     for it. best_refit : chosen or not.

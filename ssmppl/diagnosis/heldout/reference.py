@@ -147,7 +147,7 @@ def superset(
 
 @dataclass(frozen=True)
 class Residual:
-    """How much a group of the basis stands out: z, and its family-wise p."""
+    """The statistic of a group of the basis: z, and its family-wise p."""
 
     z: float
     p: float

@@ -99,7 +99,7 @@ def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Sit
 
 
 def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) -> None:
-    """That their names are free, and that they fit the model. equations : of it as it was."""
+    """Check that names are free, and candidates fit the model. equations : of it as it was."""
     taken = {p.name: f"the model's {p.role}" for p in Equations(trace, equations).parts.values()}
     for c in candidates:
         if c.strength in taken:
@@ -119,7 +119,7 @@ def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) 
 
 
 def _check_law(c: Candidate, equations: Equations) -> None:
-    """That the law can be changed so."""
+    """Check that the law can be changed so."""
     found: Any = None
     part = equations.parts[c.equation]
     if c.change in ("transition", "observation", "initial"):
@@ -204,7 +204,7 @@ def _replaced(
     trace: Trace, candidates: Sequence[Candidate], equations: Equations,
     names: Mapping[str, dict[str, str]], locations: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
-    """With what acts in place of inputs and parameters."""
+    """The trace with what acts in place of inputs and parameters."""
     out = {}
     for role in ("transition", "observation"):
         values: dict[Expr, list[Expr]] = defaultdict(list)

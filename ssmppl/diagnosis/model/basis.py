@@ -160,7 +160,7 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
 
 
 def _with_it(term: Term, moved: Mapping[str, Reaction]) -> Term:
-    """With what moves within the step."""
+    """The term with what moves within the step."""
     along = moved.get(term.equation, ())
     return replace(term, candidate=replace(term.candidate, carried=along)) if along else term
 
@@ -205,7 +205,7 @@ def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: S
 
 
 def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Term]:
-    """Of functions of two variables each."""
+    """Terms that are products of functions of two variables."""
     degrees = DEGREES if len(variables) <= FEW else DEGREES[:FIRST]
     out = []
     for a, b in combinations(variables, 2):
@@ -231,7 +231,7 @@ def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
 
 
 def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
-    """By the variable through k + 1 low-passes in a row: B. de Vries and J. Principe, *Neural
+    """The variable through k + 1 low-passes in a row: B. de Vries and J. Principe, *Neural
     Networks* 5, 1992. All k of a variable share these states."""
 
     def term(own, z, past_1, past_2, past_3, strength, centre, width):

@@ -27,7 +27,7 @@ _WITHOUT_STATES = ("parameter", "input", "time")  # what an initial law may depe
 
 @dataclass
 class Bound:
-    """What a candidate does to one law of the model.
+    """The changes that a candidate makes to one law of the model.
 
     changes : label of the part -> increment, or value in its place.
     transition, initial : laws of its auxiliary states, by name in the model.
@@ -250,7 +250,7 @@ def _given(
 
 
 def check_base(candidate: Candidate, equations: Equations, bound: Bound, role: str) -> None:
-    """That strength 0 gives the model back.
+    """Check that strength 0 gives the model back.
 
     Raises
     ------

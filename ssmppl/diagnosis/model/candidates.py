@@ -1,4 +1,4 @@
-"""Which effects apply to a model, read off its equations, with their shapes in numbers."""
+"""The candidates of a model: which effects apply to its equations, with their shapes in numbers."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def offers(
         except SSMError:  # of the user's own effect, or of their model
             raise
         except Exception as error:
-            failures.met(f"the effect {effect.name!r}", error)
+            failures.record(f"the effect {effect.name!r}", error)
             continue
         out += found
         refused += not_for
@@ -169,7 +169,7 @@ def _wanted(effect: Effect) -> str:
 
 
 def _parts(effect: Effect, equations: Equations) -> list[Part]:
-    """What an effect is bound to by its kind and `on`."""
+    """The parts that an effect is bound to, by its kind and `on`."""
     parts = [p for p in equations.parts.values() if p.role in BOUND_TO[effect.kind]]
     on = effect.on
     if on not in ON:
@@ -319,7 +319,7 @@ def _check(candidate: Candidate, equations: Equations) -> str:
 
 # -- names
 def _named(candidates: Sequence[Candidate], equations: Equations) -> list[Candidate]:
-    """With a strength each that is a readable name, and none that the model has."""
+    """The candidates with a readable name for each strength, none of which the model has."""
     taken = {p.name for p in equations.parts.values()} | set(RESERVED) | {"np", "ssm", "model"}
     out = []
     for c in candidates:

@@ -70,7 +70,7 @@ def _inner(d: Distribution) -> Distribution:
 
 
 def truncated(base: Distribution, bounds: Mapping[str, ExprArray]) -> Truncated:
-    """With the bounds of `bounds_of`; infinite ones are left out."""
+    """A law truncated at the bounds of `bounds_of`; infinite ones are left out."""
     kept = {k: v for k, v in bounds.items() if not infinite(v)}
     return Truncated(base, **kept)
 
@@ -131,7 +131,7 @@ def _entry(values: Any, index: Index) -> Expr:
 
 
 def shifted(d: Distribution, changes: Changes) -> Distribution:
-    """With the mean of the components at these indices moved, on the scale of `scale_of_mean`."""
+    """The law with means at these indices moved, on the scale of `scale_of_mean`."""
     inner = _inner(d)
     name, scale = _MEAN[type(inner)]
     sign = 1.0
@@ -177,7 +177,7 @@ def has_scale(d: Distribution) -> NotApplicable | None:
 
 
 def scaled(d: Distribution, changes: Changes) -> Distribution:
-    """With increments of the log variance of the components at these indices."""
+    """The law with increments of the log variance of the components at these indices."""
     inner = _inner(d)
     if isinstance(inner, MvNormal):
         name = inner.spread

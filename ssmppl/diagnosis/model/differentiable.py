@@ -23,7 +23,7 @@ _LAW_OF = {"initial": "the initial law of", "transition": "the transition of",
 
 
 def check_differentiable(trace: Trace, fixed: Collection[str] = ()) -> None:
-    """That the model has a derivative in each of its free parameters.
+    """Check that the model has a derivative in each of its free parameters.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ _TERM = symbol("flow", "F")  # stands for a shared term
 
 @dataclass(frozen=True)
 class Augmented(Trace):
-    """What `augment` makes.
+    """A traced model with effects added, as of `augment`.
 
     origin : the model as it was. added : the effects, in the order in which they were added.
     names : strength -> the names of its auxiliary states in the model.
@@ -249,19 +249,19 @@ def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> An
 
 @dataclass(frozen=True)
 class SharedTerms:
-    """What moves with the state of a label: by `shared_terms`, and what is `carried`."""
+    """What moves with each state: by terms that are shared, and what is `carried`."""
 
     reactions: Mapping[str, list[Reaction]]
     carried: Mapping[str, Reaction]
 
     @classmethod
     def of(cls, equations: Equations) -> SharedTerms:
-        """Of a model."""
+        """The shared terms of a model."""
         return cls(shared_terms(equations), carried(equations))
 
 
 def shared_terms(equations: Equations) -> dict[str, list[Reaction]]:
-    """By the label of a state: how the others move with it, once for each set of others.
+    """Label of a state -> how the others move with it, once for each set of others.
 
     A shared term is an expression of states or inputs, the largest of its kind, that enters the
     state's own equation with a constant factor, and the others' linearly. What integrates the state
@@ -287,7 +287,7 @@ def shared_terms(equations: Equations) -> dict[str, list[Reaction]]:
 
 
 def carried(equations: Equations) -> dict[str, Reaction]:
-    """By the label of a state: what integrates its new value, and so moves within the same step, as
+    """Label of a state -> what integrates its new value, and so moves within the same step, as
     in semi-implicit steps, x + h v_new."""
     out: dict[str, Reaction] = {}
     for x, v in equations.integral_of.items():

@@ -58,7 +58,7 @@ FEWEST = 8  # of these rows, without which a horizon is left out (0 in every dat
 
 @dataclass(frozen=True)
 class Settings:
-    """Of a pass: the filter's particles and proposal, and the smoother's lag in rows."""
+    """Settings of a pass: the filter's particles and proposal, the smoother's lag in rows."""
 
     particles: int = 1000
     proposal: str = "bootstrap"

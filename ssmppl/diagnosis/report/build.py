@@ -76,7 +76,7 @@ class Results:
 
     @property
     def label(self) -> str:
-        """Of what the share that is closed is about."""
+        """What the share that is closed is about."""
         return " + ".join(self.names) if self.chosen else CURVES
 
     @property
@@ -166,7 +166,7 @@ def _stands_out(alpha: float, *found: Any) -> bool:
 
 
 def _bound(r: Results) -> str:
-    """Of the parameters of the chosen model that ran to a bound of their support."""
+    """A note on parameters of the chosen model that ran to a bound of their support."""
     if r.chosen is None:
         return ""
     names = " and ".join(r.names)
@@ -236,7 +236,7 @@ def _revised(r: Results, verdict: str, missing: Any, where: Any, checks: Any) ->
 
 
 def _effect(r: Results, where: Any) -> tuple[str, Any]:
-    """That verdict, with the curve of the equation where most is missing."""
+    """The verdict "effect", with the curve of the equation where most is missing."""
     return "effect", _curve_of(r, where)
 
 
@@ -293,7 +293,7 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
     except SSMError as error:
         notes.append(f"the augmented model is not written: {error.found}")
     except Exception as error:
-        r.failures.met("the augmented model", error)
+        r.failures.record("the augmented model", error)
     return None, ""
 
 

@@ -242,7 +242,7 @@ class _Writer:
 
 # -- layout
 def _wishes(role: str, sites: list[Site]) -> dict[Expr, str]:
-    """What means would be called if they needed a name: `x_next`, `y_mean`."""
+    """Names of means, if they should need one: `x_next`, `y_mean`."""
     out = {}
     for site in sites:
         mean = next(iter(site.distribution.parameters.values()), None)
@@ -272,7 +272,7 @@ def _signature(role: str, arguments: Sequence[str]) -> str:
 
 
 def _numbered(laws: list[str]) -> list[str]:
-    """With distinct names of the functions: prior, prior_2, ..."""
+    """The laws with distinct names of their functions: prior, prior_2, ..."""
     out: list[str] = []
     count: dict[str, int] = {}
     for law in laws:
@@ -324,18 +324,18 @@ class Import:
 
     @classmethod
     def of_primitive(cls, p: Primitive) -> Import:
-        """What a call of it needs."""
+        """The import that a call of it needs."""
         f = p.function
         return cls("primitive", p.__name__, p.name, p.location, f.__module__, f.__qualname__)
 
     @classmethod
     def of_law(cls, o: Origin) -> Import:
-        """What naming it needs."""
+        """The import that naming it needs."""
         return cls("distribution", o.name, o, o.location, o.module, o.qualname)
 
 
 def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> dict[str, Import]:
-    """By name, in the order in which they occur.
+    """The imports by name, in the order in which they occur.
 
     Raises
     ------

@@ -45,7 +45,7 @@ Numbers = dict[str, np.ndarray]
 
 
 class Checkpoint:
-    """What is done, by name; in memory alone where there is no path.
+    """Results of the parts that are done, by name; in memory alone where there is no path.
 
     path : a file, or a folder that has one file for each mode; neither needs to exist.
     made_from : digests by what they are of: "model", "data", ...
@@ -213,7 +213,7 @@ def digests(
     trace: Trace, experiments: Sequence[Experiment], effects: Sequence[Effect], mode: str,
     settings: Mapping[str, Any],
 ) -> dict[str, str]:  # fmt: skip
-    """By what they are of: the mode itself, digests of the others."""
+    """Digests by what they are of; the mode as it is."""
     return {
         "mode": mode,
         "model": model_digest(trace),

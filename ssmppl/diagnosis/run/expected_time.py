@@ -1,4 +1,4 @@
-"""How long a diagnosis will take, from passes over the data that were timed."""
+"""The expected time of a diagnosis, from passes over the data that were timed."""
 
 from __future__ import annotations
 
@@ -70,6 +70,6 @@ def in_words(value: float) -> str:
 
 
 def _cores() -> int:
-    """That this process may use."""
+    """Number of cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -59,7 +59,7 @@ class Regression:
     base: float  # leverage of the intercept
 
     def predict_error(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """What the regression leaves of new statistics y (..., K) at x (..., P)."""
+        """Residuals of new statistics y (..., K) at x (..., P)."""
         return y - self.mean - (x - self.shift) @ self.coefficients
 
     def leverage_of(self, x: np.ndarray) -> float:
@@ -128,7 +128,7 @@ class Null:
         cls, columns: Any, nuisance: Any, *, quadratic: Any = False, sided: Any = 0,
         noise: Any = 0.0,
     ) -> Null:  # fmt: skip
-        """With the shapes checked and scalars spread over the columns.
+        """The null law, its shapes checked and scalars spread over the columns.
 
         Raises
         ------
@@ -271,7 +271,7 @@ def normal_score(t: np.ndarray | float, skewness: np.ndarray | float) -> np.ndar
 
 
 def _skewness(values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Of values (B,), and (B,) of all but each one: its own extreme must not excuse it."""
+    """Skewness of values (B,), and (B,) of all but each one: its own extreme must not excuse it."""
     x = (values - values.mean()) / (values.std() or 1.0)
     sums = np.array([np.sum(x**k) for k in (1, 2, 3)])
     powers, count = np.stack([x, x**2, x**3]), len(x)

@@ -1,4 +1,4 @@
-"""Where the gap is: which equation and moment, when, and in which region of states and inputs.
+"""Location of the gap: equation and moment, stretch of time, region of states and inputs.
 
 A group is the scores of one equation and moment in the strengths of D basis functions. With the
 nuisance scores (and the other groups, or the catalogue) regressed out, its statistic is
@@ -67,7 +67,7 @@ class Group:
 
     @property
     def p(self) -> float:
-        """Of this group alone."""
+        """p of this group alone."""
         return tail_p(self.z, self.null)
 
     @property

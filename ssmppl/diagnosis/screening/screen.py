@@ -47,7 +47,7 @@ FEWEST = 60  # simulated sets that must have gone through
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
+    """Statistics of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
 
     squares (K,) : of the columns' rows, summed; NaN where a column is no sum of scores.
     nuisance_bins (J, P), basis_bins (J, D) : sums over J bins of time.
@@ -316,7 +316,7 @@ def run_screen(
     _ = smoother.program, smoother.module, design.simulator  # before threads ask for them
     one = partial(_one_set, design, tuple(experiments), whole, seed, checks)
     results = checkpoint.map(stage, OWN_RUNS + sets, one)
-    faults = [r for r in results if checkpoint.failures.of_task(f"a data set of {stage}", r)]
+    faults = [r for r in results if checkpoint.failures.record_task(f"a data set of {stage}", r)]
     own = [r for r in results[:OWN_RUNS] if r and FAULT not in r]
     drawn = [r for r in results[OWN_RUNS:] if r and FAULT not in r]
     if not own or len(drawn) < min(FEWEST, sets):

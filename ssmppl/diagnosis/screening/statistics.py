@@ -68,5 +68,5 @@ def typical_squares(squares: np.ndarray) -> np.ndarray:
 
 
 def information_scale(squares: np.ndarray, typical: np.ndarray) -> np.ndarray:
-    """By what scores with these sums of squares (..., K) are to be divided, typical ones (K,)."""
+    """What scores with sums of squares (..., K) are divided by, where (K,) are typical."""
     return np.sqrt(np.fmax(squares / (FREE * typical), 1.0))

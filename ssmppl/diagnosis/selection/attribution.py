@@ -42,7 +42,7 @@ FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated set
 
 @dataclass
 class Attribution:
-    """What refits say, filled in as they come to an end.
+    """The results of the refits, filled in as they come to an end.
 
     base : the model's own fit. refits, doubles : with one effect, with two; best first.
     chosen : what is kept, None for the model as it is. fewer : what it grew from, the fewest

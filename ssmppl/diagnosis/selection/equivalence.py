@@ -272,7 +272,9 @@ def best_separating_input(
     covariances = {}
     for which, name in enumerate(names):
         own = results[which :: len(names)]
-        done = [r for r in own if not checkpoint.failures.of_task(f"a set under {name}", r) and r]
+        done = [
+            r for r in own if not checkpoint.failures.record_task(f"a set under {name}", r) and r
+        ]
         if not done:
             continue
         law = Null.of(

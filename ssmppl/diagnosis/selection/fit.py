@@ -84,7 +84,7 @@ NUMBERS = (  # of a fit, in a checkpoint
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done for a fit.
+    """Settings of a fit: how much is done for it.
 
     pilot : look for a better start around the one that is given. standard_errors : the information
     at the end is needed. approximate : the top of the extended Kalman filter's likelihood will do,

@@ -69,7 +69,7 @@ class Refit:
 
     @property
     def penalised_gain(self) -> float:
-        """By which refits are ranked: a date chosen among hundreds gains nats by that alone."""
+        """The gain that ranks refits: a date chosen among hundreds gains nats by that alone."""
         return self.gain - self.cost
 
     @property
@@ -90,9 +90,11 @@ class Refit:
 
 
 def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """By the text of each component; 0 for what is fixed, NaN where there is no information: for
-    what ran to a bound of its support, and for all where the information about the others is not
-    positive definite."""
+    """Standard errors by the text of each component; 0 for what is fixed.
+
+    NaN where there is no information: for what ran to a bound of its support, and for all where the
+    information about the others is not positive definite.
+    """
     symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
     nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
     information = fit.information[np.ix_(free, free)]
@@ -157,8 +159,8 @@ def refit(
 
 
 def effort_for(candidates: Sequence[Candidate], approximate: bool = False) -> Effort:
-    """Of a fit from near its top; several effects have standard errors only once they are chosen
-    (`Fitter.with_information`)."""
+    """The effort of a fit from near its top; several effects have standard errors only once they
+    are chosen (`Fitter.with_information`)."""
     if approximate:
         return APPROXIMATELY
     return FROM_START if len(candidates) < 2 else WITHOUT_ERRORS
@@ -212,7 +214,8 @@ def _information(
 def start_at(
     base: Fit, design: ScreenDesign, found: Efficient, index: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Where the quadratic expects the top: the strengths jointly, the parameters as they are."""
+    """The start of a refit, where the quadratic expects the top: of the strengths jointly, with the
+    parameters as they are."""
     at = list(index)
     v = found.covariance[np.ix_(at, at)]
     strengths = np.linalg.lstsq(v, found.score[at], rcond=1e-6)[0]
@@ -283,7 +286,7 @@ def one_signed_candidates(screen: Screen) -> list[int]:
 
 
 def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
-    """Of refits that differ in their shapes only, the best; best first."""
+    """The best of refits that differ in their shapes only; best first."""
     out: dict[int, Refit] = {}
     for r in sorted(refits, key=lambda r: -r.penalised_gain):
         out.setdefault(int(screen.groups[r.index[0]]), r)
@@ -335,7 +338,7 @@ def refit_all(
     results = checkpoint.map(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
         name = " and ".join(map(str, candidates))
-        if checkpoint.failures.of_task(f"the refit with {name}", numbers):
+        if checkpoint.failures.record_task(f"the refit with {name}", numbers):
             continue
         if "reason" in numbers:
             reasons.append(str(numbers["reason"]))

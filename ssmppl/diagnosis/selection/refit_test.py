@@ -67,7 +67,7 @@ def refit_p(
     for last in range(CHUNK, SETS + CHUNK, CHUNK):
         found = checkpoint.map("refitting simulated data", min(last, SETS), one)
         for f in found:
-            checkpoint.failures.of_task("a refit of simulated data", f)
+            checkpoint.failures.record_task("a refit of simulated data", f)
         gains = np.array([float(f.get("gain", np.nan)) for f in found])
         done = int(np.sum(np.isfinite(gains)))
         beyond = int(np.sum(gains >= gain))
@@ -84,7 +84,7 @@ def refit_p(
 def _one(
     augmented: AugmentedModels, base: Fit, screen: Screen, seed: np.random.SeedSequence, k: int
 ) -> Numbers:
-    """Of one simulated data set."""
+    """The gain in one simulated data set."""
     design, stream = screen.design, random_state(seed, k)
     given = design.theta(screen.theta)[: len(design.columns.base.parameter_symbols)]
     try:
@@ -98,7 +98,7 @@ def _gain(
     augmented: AugmentedModels, base: Fit, screen: Screen, data: Sequence[Experiment],
     seed: np.random.SeedSequence, k: int,
 ) -> float:  # fmt: skip
-    """Of one data set; NaN where a fit failed."""
+    """The largest gain in one data set; NaN where a fit failed."""
     design, plain = screen.design, augmented.fitter(())
     stream = random_state(seed, 200, k)
     own = child_seed(seed, 100, k)

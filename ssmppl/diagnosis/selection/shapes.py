@@ -66,7 +66,7 @@ def shaped_all(
     one = partial(_one, augmented, scales, [out[i] for i in tried], tuple(train), seed)
     for i, numbers in zip(tried, checkpoint.map(stage, len(tried), one), strict=True):
         name = " and ".join(map(str, out[i].candidates))
-        checkpoint.failures.of_task(f"the shapes of {name}", numbers)
+        checkpoint.failures.record_task(f"the shapes of {name}", numbers)
         if "shapes" in numbers:
             old, shapes = out[i], numbers["shapes"]
             made = _reshaped(old.candidates, scales, shapes)
@@ -134,7 +134,7 @@ def _bounded(r: Refit, scales: Scales) -> dict[str, tuple[float, float, float]]:
 def _reshaped(
     candidates: Sequence[Candidate], scales: Scales, shapes: np.ndarray
 ) -> tuple[Candidate, ...]:
-    """With these values of all shapes that can be estimated."""
+    """The candidates with these values of all shapes that can be estimated."""
     rest = list(map(float, shapes))
     out = []
     for c in candidates:

@@ -85,7 +85,7 @@ def test_a_task_that_fails_is_not_kept(tmp_path):
     kept = Checkpoint(tmp_path / "stages.npz", {"mode": "full"})
     found = kept.map("halves", 3, _halved)
     assert [float(found[k]["half"]) for k in (0, 2)] == [0.0, 1.0]
-    assert kept.failures.of_task("the half of 1", found[1])
+    assert kept.failures.record_task("the half of 1", found[1])
     assert list(kept.failures) == [
         ("the half of 1", "ZeroDivisionError: by nothing (a fault of ssmppl)")
     ]
