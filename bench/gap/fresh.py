@@ -31,7 +31,7 @@ from bench.gap.records import CACHE, Record
 from bench.gap.run import SETS
 from bench.gap.score import opened, records
 from bench.gap.truth import SYSTEMS, System
-from ssmppl.diagnosis.heldout.gain_ratio import closed
+from ssmppl.diagnosis.heldout.gain_ratio import gain_ratio
 from ssmppl.language.model.model import Model
 from ssmppl.modelfile import load_model
 
@@ -87,7 +87,7 @@ def share(
     """F, its interval and F* of one model (NaN where no gap is measurable)."""
     cut = int(CONFIRM * len(data))
     parts = [rows(data, REPEATS)[:, cut:] for rows in (base, effect, true)]
-    found = closed(*parts)
+    found = gain_ratio(*parts)
     p = parameters(system, answer)
     e = system.strengths({x["key"]: x["strength"] for x in answer["effects"]})
     U, _ = arrays(system, data)

@@ -1,7 +1,8 @@
 """The command line: one command for each verb of the package, and what helps to begin.
 
-`group` has the group and the errors, `options` what commands share, `reading` and `targets` the
-files, `rendering` words and JSON; the commands stand in one module for each family.
+`group` has the group and the errors, `options` what commands share, `reading` the files that are
+read, `rendering` words, JSON and the files that are written; the commands stand in one module for
+each family.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ code  when
 130   interrupted by Ctrl-C; what was kept is said on standard error
 ====  ==============================================================================
 
-The fix of an error in words of the command line: `steps=100` is `--steps 100` there.
+The fix of an error is in words of the command line: `steps=100` is `--steps 100` there.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Arguments and options that several commands share, under the names that the verbs have.
+"""Arguments and options that several commands share, and methods by their short names.
 
-Methods by the names that the command line has for them, with their settings.
+Options have the names that the arguments of the verbs have, with dashes.
 """
 
 from __future__ import annotations

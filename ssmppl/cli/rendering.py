@@ -1,9 +1,8 @@
 """What a command says: words for a reader, or one line of JSON; and the files that it writes.
 
 Words go to standard output, unless JSON is asked for; then nothing else goes there. What is said
-of the run itself (interrupted, warnings, progress) goes to standard error.
-
-Where results are written: names by default, and files that are not written over.
+of the run itself (interrupted, warnings, progress) goes to standard error. Files that a command
+reads are never written over.
 """
 
 from __future__ import annotations

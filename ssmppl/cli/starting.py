@@ -1,6 +1,5 @@
-"""Commands to begin with: the demonstration, and a model file of one's own with data beside it.
-
-The command `completion`: what a shell needs to complete commands, options and files.
+"""Commands to begin with: the demonstration, a model file of one's own with data beside it, and
+what a shell needs to complete commands, options and files.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The verb `diagnose`: where a model differs from data, which effect causes it, how far it closes.
 
-The stages are fit, screen, refit and confirm; each has a module of its own.
+The stages are the fit, the screen, the refits and the gain on held-out rows; each has a module.
 """
 
 from __future__ import annotations
@@ -16,29 +16,35 @@ import numpy as np
 
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
-from ssmppl.diagnosis.effects.candidate import passing
+from ssmppl.diagnosis.effects.candidate import is_pulse
 from ssmppl.diagnosis.heldout.crossfit import CrossFit
-from ssmppl.diagnosis.heldout.gain_ratio import HowFar, how_far
+from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
 from ssmppl.diagnosis.heldout.parts import FOLDS, Parts, long_enough, three_parts
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
 from ssmppl.diagnosis.model.candidates import Chosen
 from ssmppl.diagnosis.model.candidates import chosen as chosen_effects
 from ssmppl.diagnosis.model.differentiable import check_differentiable
-from ssmppl.diagnosis.model.initial_law import start_of
+from ssmppl.diagnosis.model.initial_law import proper_initial_law
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.report.answer import Results, answer
+from ssmppl.diagnosis.report.build import Results, build_report
 from ssmppl.diagnosis.report.findings import MODES
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers, digests
 from ssmppl.diagnosis.run.expected_time import Timed, in_words, timed
 from ssmppl.diagnosis.run.expected_time import seconds as expected
 from ssmppl.diagnosis.run.failures import Failures, reason_of
-from ssmppl.diagnosis.screening.screen import Question, ask
-from ssmppl.diagnosis.selection.attribution import MOST_WORK, Attribution, attribute, measure
-from ssmppl.diagnosis.selection.augmented_models import Workshop, proposal_of
-from ssmppl.diagnosis.selection.equivalence import separating
-from ssmppl.diagnosis.selection.fit import Fit, Fitter, note
+from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
+from ssmppl.diagnosis.selection.attribution import (
+    MOST_WORK,
+    Attribution,
+    Selection,
+    add_standard_errors,
+)
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
+from ssmppl.diagnosis.selection.equivalence import best_separating_input
+from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
 from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import pose
@@ -110,19 +116,9 @@ def diagnose(
         check_count("particles", particles, 10)
     check_executor(executor)
     return _Diagnosis(
-        model,
-        data,
-        effects,
-        mode,
-        alpha,
-        fixed,
-        particles,
-        executor,
-        checkpoint,
-        progress,
-        seed,
+        model, data, effects, mode, alpha, fixed, particles, executor, checkpoint, progress, seed,
         Failures(debug),
-    ).run()
+    ).run()  # fmt: skip
 
 
 class _Diagnosis:
@@ -153,7 +149,7 @@ class _Diagnosis:
         proposal = proposal_of(self.problem.program)
         number = particles or (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)[mode]
         self.settings = Settings(number, proposal)
-        self.workshop = Workshop(self.trace, missing, self.fixed, self.settings)
+        self.augmented = AugmentedModels(self.trace, missing, self.fixed, self.settings)
         self.notes = [
             f"The law of {n}, {type(s.distribution).__name__}, has no distribution function "
             "(.cdf): its one-step predictions are not checked."
@@ -165,19 +161,19 @@ class _Diagnosis:
             "sets": SETS[mode],
         }  # fmt: skip
         made_from = digests(self.trace, self.experiments, chosen_effects(effects), mode, described)
-        self.kept = Checkpoint(checkpoint, made_from, executor, progress, failures)
+        self.checkpoint = Checkpoint(checkpoint, made_from, executor, progress, failures)
 
     def run(self) -> GapReport:
         """All stages, and the report; after an interrupt, of those that are done."""
         try:
-            results = self._screened()
+            results = self._screen()
             if self.mode == "full":
                 try:
-                    self._explained(results)
+                    self._attribute(results)
                 except KeyboardInterrupt:
                     results.interrupted = True
-                    self.kept.say("interrupted: the report is of the stages that are done")
-            return answer(results, time.perf_counter() - self.began)
+                    self.checkpoint.say("interrupted: the report is of the stages that are done")
+            return build_report(results, time.perf_counter() - self.began)
         except SSMError:
             raise
         except Exception as error:
@@ -188,29 +184,33 @@ class _Diagnosis:
                 fix="please report it with the model and the data; debug=True shows where it is",
             ) from error
         finally:
-            self.kept.flush()
+            self.checkpoint.flush()
 
     # -- stages
-    def _screened(self) -> Results:
+    def _screen(self) -> Results:
         """Fit, and screen."""
-        base = self.workshop.fitter(())
+        base = self.augmented.fitter(())
         training = self.parts.train if self.parts else self.experiments
-        fit = self._fit("fitting", base, training, 1, {}, searched=False)
+        fit = self._fit(base, training)
         states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
-        self.workshop.start = start_of(self.trace, [x[0].mean(axis=0) for x in states], states)
-        question = Question(
-            self.trace, self._scales(states, training), self.workshop.missing,
+        self.augmented.initial_law = proper_initial_law(
+            self.trace, [x[0].mean(axis=0) for x in states], states
+        )
+        design = ScreenDesign(
+            self.trace, self._scales(states, training), self.augmented.missing,
             (*self.fixed, *fit.bounds), self.settings, self.effects, failures=self.failures,
         )  # fmt: skip
-        if not question.candidates:
+        if not design.candidates:
             raise ArgumentError(
                 "none of the effects applies to this model: "
-                + "; ".join(map(str, question.refused[:3])),
+                + "; ".join(map(str, design.refused[:3])),
                 fix="name others in effects=; ssm.effects.names() lists them",
             )
         with self.failures.part("the time that is expected"):
-            self._tell_time(base, fit, question, training)
-        screen = ask(question, training, fit.theta, SETS[self.mode], self._seed(2), self.kept)
+            self._tell_time(base, fit, design, training)
+        screen = run_screen(
+            design, training, fit.theta, SETS[self.mode], self._seed(2), self.checkpoint
+        )
         settings = {
             "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
             "particles": 0 if base.exact else self.settings.particles,
@@ -220,39 +220,39 @@ class _Diagnosis:
             settings, self.notes, failures=self.failures,
         )  # fmt: skip
 
-    def _explained(self, r: Results) -> None:
-        """Refit and choose, tell apart, and measure how far the gap closes; into `r`."""
+    def _attribute(self, r: Results) -> None:
+        """Refit and choose, find the equivalence class, measure the held-out gain; into `r`."""
         found = Attribution(r.fit)
         with self.failures.part("the choice of an effect"):
-            attribute(
-                found, self.workshop, r.screen, r.screen.experiments, self._seed(4), self.alpha,
-                self.kept,
-            )  # fmt: skip
+            Selection(
+                self.augmented, r.screen, r.screen.experiments, self._seed(4), self.alpha,
+                self.checkpoint,
+            ).run(found)  # fmt: skip
         r.attribution, r.fit = found, found.base
         if found.unfitted is not None:  # nothing to measure, then
             return
         with self.failures.part("whether several effects predict better than fewer"):
-            self._borne_out(r)
+            self._validate_on_held_out_rows(r)
         with self.failures.part("the input that would separate the class best"):
-            self._separated(r)
+            self._separating_input(r)
         with self.failures.part("how far the gap closes"):
-            r.far = self._how_far(r)
+            r.held_out = self._held_out_gain(r)
 
-    def _borne_out(self, r: Results) -> None:
-        """Of several effects chosen together, fewer again while all of them predict the held-out
+    def _validate_on_held_out_rows(self, r: Results) -> None:
+        """Drop effects of several chosen together while all of them predict the held-out
         rows no better than the model itself: what they fitted was chance. It is a choice made on
         these rows, and the report says so."""
         found = r.attribution
         if not self.parts or found is None or found.chosen is None or not found.fewer:
             return
         try:
-            plain = self._confirmed(r.base, r.fit)
-        except SSMError:  # as will be said where the share is measured
+            plain = self._held_out_predictions(r.base, r.fit)
+        except SSMError:  # as will be said where the gain is measured
             return
         while found.fewer:
             last = found.chosen
             try:
-                seen = self._confirmed(last.fitter, last.fit)
+                seen = self._held_out_predictions(last.fitter, last.fit)
             except SSMError as error:
                 found.notes.append(
                     f"{' and '.join(map(str, last.candidates))} fit better together, and whether "
@@ -263,42 +263,44 @@ class _Diagnosis:
             if gain > 0.0:
                 return
             found.chosen, found.left_out = found.fewer.pop(), True
-            measure(found, self._seed(4), self.kept)
+            add_standard_errors(found, self._seed(4), self.checkpoint)
             found.notes.append(
                 f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
                 f"held-out rows worse than the model itself ({gain:.1f} nats); kept instead: "
                 + " and ".join(map(str, found.chosen.candidates))
             )
 
-    def _confirmed(self, fitter: Fitter, fit: Fit) -> Predictions:
+    def _held_out_predictions(self, fitter: Fitter, fit: Fit) -> Predictions:
         """One-step predictions of the held-out rows."""
         assert self.parts is not None
-        return predict(fitter, fit, self.experiments, self.parts.confirm, self._seed(8))
+        return predict(fitter, fit, self.experiments, self.parts.held_out, self._seed(8))
 
-    def _how_far(self, r: Results) -> HowFar:
-        once = r.chosen is not None and any(passing(c) for c in r.chosen.candidates)
+    def _held_out_gain(self, r: Results) -> HeldOutGain:
+        once = r.chosen is not None and any(is_pulse(c) for c in r.chosen.candidates)
         if self.parts and not once:
-            return how_far(
-                self.workshop, self.parts, self.experiments, (r.base, r.fit), r.screen, r.chosen,
-                r.refits[0] if r.refits else None, r.label, self._seed(8), self.kept,
-            )  # fmt: skip
+            best = r.refits[0] if r.refits else None
+            return HeldOutRows(
+                self.augmented, self.parts, (r.base, r.fit), r.screen, r.chosen, best
+            ).gain(r.label, self._seed(8), self.checkpoint)
         r.blocks = FOLDS
-        workshop, question, base = self.workshop, r.screen.question, (r.base, r.fit)
+        augmented, design, base = self.augmented, r.screen.design, (r.base, r.fit)
         if self.parts:  # the code so far knows no missing rows
-            missing = replace(self.workshop.missing, none=False)
-            workshop = Workshop(self.trace, missing, self.fixed, self.settings, self.workshop.start)
-            question = Question(
-                self.trace, question.scales, missing, (*self.fixed, *r.fit.bounds),
+            missing = replace(self.augmented.missing, none=False)
+            augmented = AugmentedModels(
+                self.trace, missing, self.fixed, self.settings, self.augmented.initial_law
+            )
+            design = ScreenDesign(
+                self.trace, design.scales, missing, (*self.fixed, *r.fit.bounds),
                 self.settings, self.effects, failures=self.failures,
             )  # fmt: skip
-            fitter = workshop.fitter(())
+            fitter = augmented.fitter(())
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
         whole = None if self.parts or (r.attribution and r.attribution.rebased) else r.screen
         return CrossFit(
-            workshop, question, base, self.experiments, self.alpha, r.chosen, whole
-        ).how_far(r.label, self._seed(8), self.kept)
+            augmented, design, base, self.experiments, self.alpha, r.chosen, whole
+        ).gain(r.label, self._seed(8), self.checkpoint)
 
-    def _separated(self, r: Results) -> None:
+    def _separating_input(self, r: Results) -> None:
         """The input that would separate the class of the best, where there is a class."""
         order, found = r.classes()
         members = [order[i] for i in found.members(1)] if len(order) else []
@@ -306,39 +308,42 @@ class _Diagnosis:
         if r.chosen is None or len(members) < 2 or not self.trace.inputs:
             return
         if r.base.exact or work <= MOST_WORK:
-            r.separating[1] = separating(r.screen, members, self._seed(7), self.kept)
+            r.separating[1] = best_separating_input(
+                r.screen, members, self._seed(7), self.checkpoint
+            )
 
     # -- small parts
-    def _fit(
-        self, stage: str, base: Fitter, experiments: Sequence[Experiment], seed: int,
-        start: Mapping[str, np.ndarray], *, searched: bool,
-    ) -> Fit:  # fmt: skip
-        if stage not in self.kept:
-            self.kept.say(f"{stage} {self.trace.name!r}")
+    def _fit(self, base: Fitter, experiments: Sequence[Experiment]) -> Fit:
+        """The model's own fit."""
+        stage = "fitting"
+        if stage not in self.checkpoint:
+            self.checkpoint.say(f"{stage} {self.trace.name!r}")
 
         def numbers() -> Numbers:
-            return base.fit(experiments, self._seed(seed), start, searched=searched).numbers
+            return base.fit(experiments, self._seed(1), {}).numbers
 
-        with announced("diagnose", stage, shown=self.kept.progress):
-            fit = base.restored(experiments, self.kept.of(stage, numbers))
+        with announced("diagnose", stage, shown=self.checkpoint.progress):
+            fit = base.restored(experiments, self.checkpoint.computed(stage, numbers))
         if not fit.converged:
             left = f": about {fit.distance:.1f} nats may be left" if fit.distance > 0.0 else ""
             self.notes.append(f"the fit of the model did not settle ({stage}){left}")
         if fit.bounds:
-            self.notes.append(note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}"))
+            self.notes.append(
+                bounds_note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}")
+            )
         return fit
 
     def _tell_time(
-        self, base: Fitter, fit: Fit, question: Question, experiments: Sequence[Experiment]
+        self, base: Fitter, fit: Fit, design: ScreenDesign, experiments: Sequence[Experiment]
     ) -> None:
-        """What the mode will take, from passes over the data."""
-        done = sum(f"screening/{k}" in self.kept for k in range(SETS[self.mode]))
-        if not self.kept.progress or done > SETS[self.mode] // 2:
+        """Show how long the mode will take, from passes over the data."""
+        done = sum(f"screening/{k}" in self.checkpoint for k in range(SETS[self.mode]))
+        if not self.checkpoint.progress or done > SETS[self.mode] // 2:
             return
-        whole = question.theta(fit.theta)
+        whole = design.theta(fit.theta)
         # A refit's code is about as much to compile as the screen's.
         for_screen, generating = timed(
-            lambda: question.smoother.run(experiments, whole, random_state(self._seed(12)))
+            lambda: design.smoother.run(experiments, whole, random_state(self._seed(12)))
         )
         for_fit, _ = timed(
             lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
@@ -347,9 +352,9 @@ class _Diagnosis:
         blocks = 0 if self.parts else FOLDS
         rest = expected(
             Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
-            self.kept.executor,
+            self.checkpoint.executor,
         )  # fmt: skip
-        self.kept.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
+        self.checkpoint.say(f"{self.mode} mode: {in_words(rest)} expected from here on")
 
     def _scales(self, states: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> Scales:
         """From filtered states, observations and inputs."""
@@ -359,4 +364,4 @@ class _Diagnosis:
         return Scales.of(self.trace, np.concatenate(states), y, u, longest)
 
     def _seed(self, stage: int) -> np.random.SeedSequence:
-        return np.random.SeedSequence(self.root.entropy, spawn_key=(*self.root.spawn_key, stage))
+        return child_seed(self.root, stage)

@@ -1,13 +1,13 @@
 """What results look like: plots of what the verbs return.
 
-    language/model/closure_digest.py      results read for drawing: bands over time, data, names
+    reading.py      results read for drawing: bands over time, data, names
     drawing.py      what the plots of results share: axes, fans, dots, legends
     density.py      densities of draws and of priors
     states.py       plot_states, plot_forecast
     filters.py      plot_filter, plot_ancestry
     predictions.py  plot_predictions
     parameters.py   plot_prior_posterior, plot_maximization
-    inference/verbs/log_likelihood.py   plot_likelihood
+    likelihood.py   plot_likelihood
 
 The panels of a report of `diagnose` are under these names too; they stand in
 `ssmppl.diagnosis.report`.

@@ -11,12 +11,8 @@ from ssmppl.cli.options import CLIMBERS, SAMPLERS, method_of
 from ssmppl.errors import ArgumentError
 from tests.cli.shared import fails, run
 
-VERBS = (
-    "explain", "compile", "simulate", "log_likelihood", "particle_filter", "kalman_filter",
-    "forward_filter", "smooth", "sample", "maximize", "score", "predict", "forecast",
-    "leave_future_out", "evidence", "diagnose", "summary",
-)  # fmt: skip
 COMMANDS = sorted(main.commands)
+VERBS = [n.replace("-", "_") for n in COMMANDS if n.replace("-", "_") in ssm.__all__]
 OTHER_NAMES = {"idata": "posterior"}
 
 

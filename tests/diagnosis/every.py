@@ -16,9 +16,9 @@ import numpy as np
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import linear_gaussian
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import lifted
+from ssmppl.diagnosis.model.basis import symbolic_shapes
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.initial_law import needs_start
+from ssmppl.diagnosis.model.initial_law import needs_proper_initial_law
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.diagnosis.screening.screen import with_parameters
 from ssmppl.errors import NotApplicable
@@ -122,7 +122,7 @@ def different(one, other):
 # -- what is asked of a model before anything is compiled or fitted
 def analysed(t):
     """What fits ask of an augmented model: what structure it has, and whether it can start."""
-    needs_start(t)
+    needs_proper_initial_law(t)
     found = linear_gaussian(t)
     assert found is not None
     return found
@@ -131,7 +131,7 @@ def analysed(t):
 def scored(t, added):
     """The columns that a screen asks of a model, for these effects; why some have none."""
     unique = {c.increment.key: c.increment for c in added}
-    made, shapes = lifted(list(unique.values()))
+    made, shapes = symbolic_shapes(list(unique.values()))
     superset = with_parameters(augment(t, made), shapes)
     names = [c.strength for c in made]
     found = score_columns(t, superset, names, (), Missing())

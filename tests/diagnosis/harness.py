@@ -4,7 +4,8 @@ import functools
 
 import numpy as np
 
-from ssmppl.diagnosis.model.candidates import Scales, offers
+from ssmppl.diagnosis.model.candidates import offers
+from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.expressions.arrays import array
 from ssmppl.language.distributions import Truncated
 from ssmppl.language.trace import trace

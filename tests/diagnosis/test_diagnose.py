@@ -114,15 +114,15 @@ def test_an_interrupt_keeps_the_stages_that_are_done(jump, tmp_path, monkeypatch
     assert first.closed.empty
     assert first.causes["gain_refit"].notna().any() == (stage == "share")
     with monkeypatch.context() as patch:  # the screen is not asked again
-        patch.setattr(screen.Question, "statistics", _only_later(patch))
+        patch.setattr(screen.ScreenDesign, "statistics", _only_later(patch))
         second = run(level(), levels(80, BREAK), checkpoint=kept)
     assert not second.interrupted
     same(second, jump)
 
 
 def _only_later(patch):
-    """`Question.statistics`, forbidden until the refits have begun."""
-    begun, original, attributed = [], screen.Question.statistics, attribution.attribute
+    """`ScreenDesign.statistics`, forbidden until the refits have begun."""
+    begun, original, selected = [], screen.ScreenDesign.statistics, attribution.Selection.run
 
     def statistics(self, *args, **kwargs):
         assert begun, "a simulated set of the first screen was drawn again"
@@ -130,9 +130,9 @@ def _only_later(patch):
 
     def later(*args, **kwargs):
         begun.append(True)
-        return attributed(*args, **kwargs)
+        return selected(*args, **kwargs)
 
-    patch.setattr(diagnose, "attribute", later)
+    patch.setattr(attribution.Selection, "run", later)
     return statistics
 
 
@@ -140,7 +140,7 @@ def _only_later(patch):
 
 
 def test_the_screen_resumes_where_it_was_interrupted(tmp_path, monkeypatch):
-    count, original = [], screen.Question.statistics
+    count, original = [], screen.ScreenDesign.statistics
 
     def statistics(self, *args, **kwargs):
         count.append(1)
@@ -150,7 +150,7 @@ def test_the_screen_resumes_where_it_was_interrupted(tmp_path, monkeypatch):
 
     kept = tmp_path / "kept.npz"
     with monkeypatch.context() as patch:
-        patch.setattr(screen.Question, "statistics", statistics)
+        patch.setattr(screen.ScreenDesign, "statistics", statistics)
         with pytest.raises(KeyboardInterrupt):
             run(mode="fast", checkpoint=kept)
         before = len(count)

@@ -1,10 +1,9 @@
-"""A candidate: an effect bound to one equation of one model.
+"""Candidates: effects bound to one equation of one model, with their shapes in numbers.
 
-Effects that are functions of time: their dates and periods, their statistics from one column.
-
-The column of an increment held at 1 gives the statistic of any function of time as a weighted sum
-over its rows, so that every date of a break or of a pulse can be tried, and every period of a wave:
-it costs a sum.
+Of effects that are functions of time, every date and period is a candidate, and one column serves
+them all: the column of an increment held at 1 gives the statistic of any function of time as a
+weighted sum over its rows, so that every date of a break or of a pulse can be tried, and every
+period of a wave: it costs a sum.
 """
 
 from __future__ import annotations
@@ -18,9 +17,23 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.effect import PROFILES, Effect
 from ssmppl.errors import ArgumentError, ModelError, listing
 from ssmppl.expressions.expr import Expr
+
+WHOLE = (0,)  # one experiment
+
+# Rows up to which every date is tried, and how many dates beyond: a break that is dated some rows
+# off is still seen, a pulse is not.
+ALL_DATES = {"step": 300, "pulse": 1000}
+DATES = {"step": 60, "pulse": 300}
+EDGE = 0.1  # share of the rows at either end where a break cannot be separated from a shift
+LEAST_EDGE = 2  # rows at either end without a pulse
+DATED = ("step", "pulse")  # profiles that have a date
+SHORTEST = 4.0  # period in rows
+WAVES = 100  # periods at most, the longest first
+PHASES = 3  # that are tried: a wave between two of them keeps three quarters of its nats
 
 # What a state, a channel, ... has changed by an effect of kind "state".
 OF_ROLE = {"state": "transition", "channel": "observation", "input": "input",
@@ -39,7 +52,7 @@ class Candidate:
     role : what the equation is: "state", "channel", "input" or "parameter".
     held : its process is held at 1: see `increment`.
     reaction : (label, factor) of each equation that moves with its own, by so many times as much
-        (`flows`). carried : likewise of what integrates its new value.
+        (`shared_terms`). carried : likewise of what integrates its new value.
     shares : candidates of the same text here have the same shapes, which then are one parameter.
     """
 
@@ -114,8 +127,11 @@ class Candidate:
 
     @property
     def increment(self) -> Candidate:
-        """With its process (or function of time) held at 1: the column that a quadratic form in
-        the process's covariance, or the weights of `weights`, turn into its statistic."""
+        """The candidate with its process (or function of time) held at 1.
+
+        Its column is what a quadratic form in the process's covariance, or `weights`, turn into
+        the statistic.
+        """
         return replace(self, held=True) if self.effect.process or self.effect.profile else self
 
     def weights(self, n: int) -> np.ndarray:
@@ -156,33 +172,18 @@ def shape_text(value: float | Expr) -> str:
     return whole if float(whole) == value else f"{value:g}"
 
 
-WHOLE = (0,)  # one experiment
-
-# Rows up to which every date is tried, and how many dates beyond: a break that is dated some rows
-# off is still seen, a pulse is not.
-ALL_DATES = {"step": 300, "pulse": 1000}
-DATES = {"step": 60, "pulse": 300}
-EDGE = 0.1  # share of the rows at either end where no break can be told from a shift
-LEAST_EDGE = 2  # rows at either end without a pulse
-ONE_OFF = ("step", "pulse")  # profiles that have a date
-SHORTEST = 4.0  # period in rows
-WAVES = 100  # periods at most, the longest first
-PHASES = 3  # that are tried: a wave between two of them keeps three quarters of its nats
-
-
-def one_off(candidate: Candidate) -> bool:
+def is_dated(candidate: Candidate) -> bool:
     """Whether it happens once: a break or a pulse."""
-    return candidate.effect.profile in ONE_OFF
+    return candidate.effect.profile in DATED
 
 
-def passing(candidate: Candidate) -> bool:
-    """Whether it happens in one row, so that no later ones can bear it out."""
+def is_pulse(candidate: Candidate) -> bool:
+    """Whether it happens in one row, so that no later rows can validate it."""
     return candidate.effect.profile == "pulse"
 
 
-def dated(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
-    """With a candidate for every date (`DATES` of them in long records) and for every period
-    and phase where there is one.
+def with_all_dates(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
+    """The candidates, with one for every date (`DATES` of them in long records), period and phase.
 
     rows : of the longest experiment.
     """
@@ -195,7 +196,7 @@ def dated(candidates: Sequence[Candidate], rows: int) -> list[Candidate]:
                 out += [c.with_shape(period=float(p), phase=k * np.pi / PHASES)
                         for p in periods(rows) for k in range(PHASES)]  # fmt: skip
             continue
-        if not one_off(c) or "date" not in dict(c.shape):
+        if not is_dated(c) or "date" not in dict(c.shape):
             out.append(c)
             continue
         rest = [f"{n}={v}" for n, v in c.shape if n != "date"]
@@ -223,7 +224,7 @@ def periods(rows: int) -> np.ndarray:
     return rows / turns if len(turns) else np.array([float(rows)])
 
 
-def sharpened(c: Candidate, column: np.ndarray, starts: Sequence[int], rows: int) -> Candidate:
+def refine_wave(c: Candidate, column: np.ndarray, starts: Sequence[int], rows: int) -> Candidate:
     """A wave with period and phase by the column (T,) of more rows than those it was found on.
 
     rows : of the longest experiment it was found on, whose resolution is how far the frequency can
@@ -254,7 +255,7 @@ class Profiles:
     def statistics(self, rows: np.ndarray, starts: Sequence[int]) -> np.ndarray:
         """(K,) sums of the columns of rows (T, F), weighted by the functions of time."""
         out = np.zeros(len(self.candidates))
-        places = np.array(self.columns, dtype=int)
+        columns = np.array(self.columns, dtype=int)
         index, kind = self._begins
         for s in segments(len(rows), starts):
             part, n = rows[s], s.stop - s.start
@@ -263,31 +264,31 @@ class Profiles:
             )
             step, pulse = kind == "step", kind == "pulse"
             at = np.clip(index, 0, n)
-            out[step] += onwards[at[step], places[step]]
+            out[step] += onwards[at[step], columns[step]]
             inside = pulse & (index < n)
-            out[inside] += part[at[inside], places[inside]]
+            out[inside] += part[at[inside], columns[inside]]
             other = np.flatnonzero(kind == "")
             if len(other):
-                out[other] += np.sum(self._weights(n) * part[:, places[other]], axis=0)
+                out[other] += np.sum(self._weights(n) * part[:, columns[other]], axis=0)
         return out
 
     @cached_property
     def _begins(self) -> tuple[np.ndarray, np.ndarray]:
         """(K,) rows, from 0, in which dated ones begin, and (K,) their kind, "" for others."""
         index = np.array([_index(c) for c in self.candidates], dtype=int)
-        return index, np.array([c.effect.profile if one_off(c) else "" for c in self.candidates])
+        return index, np.array([c.effect.profile if is_dated(c) else "" for c in self.candidates])
 
     def _weights(self, n: int) -> np.ndarray:
         """(n, K) of those that are no one-off event."""
         if n not in self.known:
-            plain = [c for c in self.candidates if not one_off(c)]
+            plain = [c for c in self.candidates if not is_dated(c)]
             self.known[n] = np.stack([c.weights(n) for c in plain], axis=1)
         return self.known[n]
 
 
 def _index(c: Candidate) -> int:
     """The row, from 0, in which a dated candidate begins: see `Candidate.weights`."""
-    if not one_off(c):
+    if not is_dated(c):
         return 0
     return int(dict(c.shape)["date"]) - 1 + (c.change == "transition")
 
@@ -306,3 +307,8 @@ def segments(rows: int, starts: Sequence[int] = WHOLE) -> Iterator[slice]:
             fix="give the first row of each experiment, increasing, the first one 0",
         )
     return (slice(a, b) for a, b in pairwise(edges))
+
+
+def starts_of(experiments: Sequence[Experiment]) -> list[int]:
+    """The first row of each experiment in arrays that have them one below the other."""
+    return np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.diagnosis.effects.effect import Auxiliary, effect, numbers, rows, sds, sizes
+from ssmppl.diagnosis.effects.effect import Auxiliary, declared, effect, numbers, rows, sds, sizes
 from ssmppl.language.distributions import Dirac, Normal
 
 
@@ -126,8 +126,4 @@ def parameter_walk(p, wander, strength):
                      {"wander": Normal(0, sd=1.0)})  # fmt: skip
 
 
-EFFECTS = (
-    input_saturation, dead_zone, quadratic_input, absolute_input, input_offset, backlash,
-    input_delay, actuator_lag, relative_drift, parameter_drift, relative_break, parameter_break,
-    relative_walk, parameter_walk,
-)  # fmt: skip
+EFFECTS = declared(globals())

@@ -10,7 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.diagnosis.effects.effect import Auxiliary, effect, means, numbers, quantiles, rows, sds
+from ssmppl.diagnosis.effects.effect import (
+    Auxiliary,
+    declared,
+    effect,
+    means,
+    numbers,
+    quantiles,
+    rows,
+    sds,
+)
 from ssmppl.language.distributions import Dirac, Normal
 
 POSITION, OTHER, LOAD = {"x": "position"}, {"other": "other state"}, {"u": "any input"}
@@ -111,24 +120,6 @@ def overflow(x, other, strength, h):
     return {"x": -over, "other": over}
 
 
-@effect(on="rate", name="gravity", given={"x": "integral"})
-def gravity(v, x, strength):
-    """-l sin x, x an angle"""
-    return -strength * np.sin(x)
-
-
-@effect(on="rate", name="bouc-wen hysteresis", kind="state", lower=0,
-        given={"x": "integral", "moved": "moved"},
-        shapes={"d": sds(0.2, 1.0, of="x", between=(0.2, 4.0))},
-        states=("hysteresis",))  # fmt: skip
-def bouc_wen_hysteresis(v, x, moved, hysteresis, strength, d):
-    """-l z, z following x over the distance d: dz = (dx - |dx| z / 2 - dx |z| / 2) / d"""
-    slip = 0.5 * (np.abs(moved) * hysteresis + moved * np.abs(hysteresis))
-    follows = np.clip(hysteresis + (moved - slip) / d, -1.0, 1.0)
-    return Auxiliary(-strength * hysteresis, {"hysteresis": Dirac(follows)},
-                     {"hysteresis": Dirac(0.0)})  # fmt: skip
-
-
 # -- couplings, losses
 @effect(on="rate", name="cross-coupling", form="linear", given=OTHER)
 def linear_coupling(x, other, strength):
@@ -150,11 +141,29 @@ def extra_loss(x, strength, p, ambient):
     return -strength * (np.maximum(x, 0.0) ** p - ambient**p)
 
 
-# -- loads and disturbances
+# -- loads, gravity, hysteresis, disturbances
 @effect(on="state", name="constant load")
 def constant_load(v, strength):
     """l"""
     return strength
+
+
+@effect(on="rate", name="gravity", given={"x": "integral"})
+def gravity(v, x, strength):
+    """-l sin x, x an angle"""
+    return -strength * np.sin(x)
+
+
+@effect(on="rate", name="bouc-wen hysteresis", kind="state", lower=0,
+        given={"x": "integral", "moved": "moved"},
+        shapes={"d": sds(0.2, 1.0, of="x", between=(0.2, 4.0))},
+        states=("hysteresis",))  # fmt: skip
+def bouc_wen_hysteresis(v, x, moved, hysteresis, strength, d):
+    """-l z, z following x over the distance d: dz = (dx - |dx| z / 2 - dx |z| / 2) / d"""
+    slip = 0.5 * (np.abs(moved) * hysteresis + moved * np.abs(hysteresis))
+    follows = np.clip(hysteresis + (moved - slip) / d, -1.0, 1.0)
+    return Auxiliary(-strength * hysteresis, {"hysteresis": Dirac(follows)},
+                     {"hysteresis": Dirac(0.0)})  # fmt: skip
 
 
 @effect(on="state", name="missing input", form="random walk", kind="state", lower=0,
@@ -202,10 +211,4 @@ def coarse_discretisation(x, second_order, strength):
     return strength * second_order
 
 
-EFFECTS = (
-    coulomb_friction, stribeck, asymmetric_viscous_friction, asymmetric_dry_friction,
-    load_dependent_friction, quadratic_drag, cubic_stiffness, quadratic_stiffness,
-    state_dependent_damping, upper_stop, lower_stop, both_stops, overflow, linear_coupling,
-    product_coupling, extra_loss, constant_load, gravity, bouc_wen_hysteresis, random_walk_load,
-    ar1_load, periodic_forcing, level_break, coarse_discretisation,
-)  # fmt: skip
+EFFECTS = declared(globals())

@@ -10,7 +10,16 @@ import math
 
 import numpy as np
 
-from ssmppl.diagnosis.effects.effect import Auxiliary, effect, means, numbers, quantiles, rows, sds
+from ssmppl.diagnosis.effects.effect import (
+    Auxiliary,
+    declared,
+    effect,
+    means,
+    numbers,
+    quantiles,
+    rows,
+    sds,
+)
 from ssmppl.language.distributions import Dirac, Normal
 
 
@@ -70,14 +79,6 @@ def sensor_rectification(h, strength):
     return strength * (np.abs(h) - h)
 
 
-@effect(on="channel", kind="observation", name="quantisation", lower=0,
-        shapes={"d": sds(0.25, 0.5, 1.0)})  # fmt: skip
-def quantisation(h, strength, d):
-    """l (round(h / d) d - h)"""
-    turn = 2.0 * math.pi / d  # without floor(), which would have no derivative in what moves h
-    return -strength / turn * np.arctan2(np.sin(turn * h), np.cos(turn * h))
-
-
 @effect(on="channel", kind="state", name="sensor lag", lower=0, upper=2, states=("sensed",),
         shapes={"k": numbers(2, 5, between=(1.0, 30.0)), "start": means(1.0)})  # fmt: skip
 def sensor_lag(h, sensed, strength, k, start):
@@ -96,14 +97,12 @@ def sensor_delay(h, earlier, strength, delay, start):
                      {"earlier": Dirac(np.full(int(delay), start))})  # fmt: skip
 
 
-@effect(on="channel", kind="state", name="coloured noise", lower=0, states=("colour",),
-        constant="sensor bias", process="ar1",
-        shapes={"memory": numbers(0.5, 0.9, between=(0.05, 0.99))})  # fmt: skip
-def coloured_noise(h, colour, strength, memory):
-    """l w, w an autoregression of standard deviation 1"""
-    noise = np.sqrt(1.0 - memory**2)
-    return Auxiliary(strength * colour, {"colour": Normal(memory * colour, sd=noise)},
-                     {"colour": Normal(0, sd=1.0)})  # fmt: skip
+@effect(on="channel", kind="observation", name="quantisation", lower=0,
+        shapes={"d": sds(0.25, 0.5, 1.0)})  # fmt: skip
+def quantisation(h, strength, d):
+    """l (round(h / d) d - h)"""
+    turn = 2.0 * math.pi / d  # without floor(), which would have no derivative in what moves h
+    return -strength / turn * np.arctan2(np.sin(turn * h), np.cos(turn * h))
 
 
 # -- noise laws, of states and channels
@@ -134,6 +133,16 @@ def noise_by_input(x, u, strength, s):
     return strength * np.abs(u) / s
 
 
+@effect(on="channel", kind="state", name="coloured noise", lower=0, states=("colour",),
+        constant="sensor bias", process="ar1",
+        shapes={"memory": numbers(0.5, 0.9, between=(0.05, 0.99))})  # fmt: skip
+def coloured_noise(h, colour, strength, memory):
+    """l w, w an autoregression of standard deviation 1"""
+    noise = np.sqrt(1.0 - memory**2)
+    return Auxiliary(strength * colour, {"colour": Normal(memory * colour, sd=noise)},
+                     {"colour": Normal(0, sd=1.0)})  # fmt: skip
+
+
 # -- the start
 @effect(on="any", kind="initial", name="wrong initial state")
 def wrong_initial_state(x, strength):
@@ -141,8 +150,4 @@ def wrong_initial_state(x, strength):
     return strength
 
 
-EFFECTS = (
-    sensor_bias, sensor_drift, quadratic_gain, cubic_gain, upper_clipping, lower_clipping,
-    both_clippings, sensor_rectification, sensor_lag, sensor_delay, quantisation, outliers,
-    noise_by_size, noise_by_state, noise_by_input, coloured_noise, wrong_initial_state,
-)  # fmt: skip
+EFFECTS = declared(globals())

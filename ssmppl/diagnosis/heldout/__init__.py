@@ -1,1 +1,1 @@
-"""How far the gap closes on rows that took no part in fitting or choosing."""
+"""The gain on held-out rows, which took no part in fitting or choosing."""

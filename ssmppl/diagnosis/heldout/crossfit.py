@@ -1,13 +1,13 @@
-"""How far the gap closes where rows are too few, or the effect happens once: by leaving blocks out.
+"""Cross-validation by blocks: the held-out gain where rows are few, or the effect happens once.
 
 Contiguous blocks of rows are set missing in turn; fit and selection are repeated on the rest, the
 latter among the `SINGLES` leading effects, pairs of them and steps from the best, with the shapes
-that the screen has, up to as many effects as were chosen on all rows (M.
-Stone, *JRSS B* 36, 1974; blocks for dependent rows: P. Burman, E. Chow and D. Nolan, *Biometrika*
-81, 1994). l_b is the sum of the one-step log predictive densities of the block's rows, the filter
-run over all rows with what the other blocks gave: the quantity that is measured on the confirm part
-of longer records. (log p(y_b | y_-b) would look ahead: there a noisy level bridges the break that
-it does not know from both sides, and hardly a gap is left.)
+that the screen has, up to as many effects as were chosen on all rows (M. Stone, *JRSS B* 36, 1974;
+blocks for dependent rows: P. Burman, E. Chow and D. Nolan, *Biometrika* 81, 1994). l_b is the sum
+of the one-step log predictive densities of the block's rows, the filter run over all rows with what
+the other blocks gave: the quantity that is measured on the held-out rows of longer records. (log
+p(y_b | y_-b) would look ahead: there a noisy level bridges the break that it does not know from
+both sides, and hardly a gap is left.)
 """
 
 from __future__ import annotations
@@ -19,23 +19,22 @@ from functools import partial
 import numpy as np
 
 from ssmppl.data import Experiment, unpack_parameters
-from ssmppl.diagnosis.effects.candidate import Candidate, one_off
+from ssmppl.diagnosis.effects.candidate import Candidate, is_dated
 from ssmppl.diagnosis.heldout.gain_ratio import (
     FEWEST_BLOCKS,
     NOT_GIVEN,
-    HowFar,
-    closed,
-    interval_of,
-    notes_of,
+    HeldOutGain,
+    gain_ratio,
 )
 from ssmppl.diagnosis.heldout.parts import FOLDS, Fold, folds
 from ssmppl.diagnosis.heldout.predictions import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.screening.screen import Question, Screen, ask, held_against
-from ssmppl.diagnosis.selection.attribution import Attribution, attribute
-from ssmppl.diagnosis.selection.augmented_models import Workshop
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen, screen_part
+from ssmppl.diagnosis.selection.attribution import Attribution, Selection
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.fit import APPROXIMATELY, Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.errors import ArgumentError, SSMError
 from ssmppl.inference.run.tasks import run_tasks
@@ -46,40 +45,49 @@ SINGLES = 4  # refits in each fold
 
 
 @dataclass(frozen=True)
-class CrossFit:
-    """What every fold works with.
+class _FoldModels:
+    """Fitter and fit of each model without a block. chosen : the effects, None without any."""
 
-    question : the screen's. base : the model's fitter and its fit to all rows. alpha : family-wise
+    base: tuple[Fitter, Fit]
+    effect: tuple[Fitter, Fit]
+    reference: tuple[Fitter, Fit]
+    chosen: Refit | None
+
+
+@dataclass(frozen=True)
+class CrossFit:
+    """The gain on blocks left out: what every fold works with.
+
+    design : of the screen. base : the model's fitter and its fit to all rows. alpha : family-wise
     error rate of the selection. chosen : on all rows; None: the reference stands for it. whole :
-    the screen of all rows by that question, whose simulated sets serve all blocks; None: each
-    block has its own.
+    the screen of all rows by that design, whose simulated sets serve all blocks; None: each block
+    has its own.
     """
 
-    workshop: Workshop
-    question: Question
+    augmented: AugmentedModels
+    design: ScreenDesign
     base: tuple[Fitter, Fit]
     experiments: tuple[Experiment, ...]
     alpha: float
     chosen: Refit | None
     whole: Screen | None = None
 
-    def how_far(self, label: str, seed: np.random.SeedSequence, kept: Checkpoint) -> HowFar:
+    def gain(self, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> HeldOutGain:
         """Share of the gap that is closed on the blocks left out."""
-        out = HowFar()
-        out.runs(self.base, self.experiments, self.chosen, seed)
-        fed_back = feeds_back(self.workshop.trace)
+        out = HeldOutGain()
+        out.simulate(self.base, self.experiments, self.chosen, seed)
+        fed_back = feeds_back(self.augmented.trace)
         parts = folds(self.experiments, FOLDS, fed_back=fed_back)
 
         def one(k: int) -> Numbers:
-            own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 20, k))
             name = f"block {k + 1} of {len(parts)}"
-            where = kept.within(name)
+            own, kept = child_seed(seed, 20, k), checkpoint.within(name)
             try:
-                return where.of("held out", partial(self._one, parts[k], own, where))
+                return kept.computed("held out", partial(self._one, parts[k], own, kept))
             except SSMError:  # a block that a model cannot predict is no block to leave out
                 raise
             except Exception as error:
-                kept.failures.met(name, error)
+                checkpoint.failures.record(name, error)
                 return {}
 
         try:  # in threads of this process: their tasks go over the executor
@@ -91,20 +99,18 @@ class CrossFit:
             out.notes.append(NOT_GIVEN.format(f"{len(each)} of {len(parts)} blocks are done"))
             return out
         table = {n: np.stack([v[n] for v in each], axis=-1) for n in each[0]}
-        share = closed(table["base"], table["effect"], table["reference"], block=1)
+        ratio = gain_ratio(table["base"], table["effect"], table["reference"], block=1)
         best, rival = table["reference"], table["effect" if self.chosen else "base"]
-        out.beyond = closed(rival, best, best, block=1).gain
-        size = table["rows"] / table["rows"].sum()
-        mean = float(table["gain_mean"].sum())
-        low, high = interval_of(share)
-        out.rows.append({
-            "effect": label, "F": share.F, "F_low": low, "F_high": high,
-            "nats_per_sample": share.gain.nats / float(table["rows"].sum()), "gain_mean": mean,
-            "gain_noise": share.gain.nats - mean,
-            "rmse_before": float(np.sqrt(np.sum(size * table["before"] ** 2))),
-            "rmse_after": float(np.sqrt(np.sum(size * table["after"] ** 2))),
-        })  # fmt: skip
-        out.notes += notes_of(share, self.chosen is not None)
+        out.beyond_catalogue = gain_ratio(rival, best, best, block=1).gain
+        rows = table["rows"].sum()
+        before, after = (
+            float(np.sqrt(np.sum(table["rows"] / rows * table[n] ** 2)))
+            for n in ("before", "after")
+        )
+        out.add(
+            label, ratio, ratio.gain.nats / float(rows), float(table["gain_mean"].sum()),
+            (before, after), self.chosen is not None,
+        )  # fmt: skip
         same = int(table["same"].sum()) if "same" in table else len(each)  # resumed from before
         if self.chosen is not None and same < len(each):
             out.notes.append(
@@ -113,62 +119,67 @@ class CrossFit:
             )
         return out
 
-    def _one(self, fold: Fold, seed: np.random.SeedSequence, kept: Checkpoint) -> Numbers:
+    def _one(self, fold: Fold, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> Numbers:
         """Fit, select and predict: log densities of the block, and free-run errors."""
-        fitter, whole = self.base
-        start = unpack_parameters(whole.problem.trace, whole.theta)
-        numbers = kept.of(
-            "fitting",
-            lambda: fitter.fit(fold.train, seed, start, searched=True, rough=True).numbers,
-        )
-        fit = fitter.restored(fold.train, numbers)
-        if self.whole is None:
-            screen = ask(self.question, fold.train, fit.theta, SETS, seed, kept, checks=False)
-        else:
-            screen = held_against(self.whole, fold.train, fit.theta, seed)
-        found = Attribution(fit)
-        if self.chosen is not None:
-            attribute(
-                found, self.workshop, screen, fold.train, seed, self.alpha, kept, always=True,
-                singles=SINGLES, steps=len(self.chosen.candidates), quick=True,
-            )  # fmt: skip
-        pick = found.chosen
-        reference = fit_reference(
-            self.workshop, pick.candidates if pick else (), pick.fit if pick else fit, screen,
-            fold.train, seed, kept,
-        )  # fmt: skip
-        effect = (fitter, fit)
-        if pick is not None:
-            effect = (pick.fitter, pick.fit)
-        elif self.chosen is None:
-            effect = reference
-        counts, models = list(fold.left_out), {"base": (fitter, fit), "effect": effect}
-        events = [c for c in (pick.candidates if pick else ()) if one_off(c)]
-        found_by = {"base": predict(fitter, fit, self.experiments, counts, seed)}
-        for name, model in (("effect", effect), ("reference", reference)):
-            found_by[name] = self._predict(model, events, fold, seed)
-        out = {n: p.log_density.sum(axis=1) for n, p in found_by.items()}
+        models = self._models(fold, seed, checkpoint)
+        counts, chosen = list(fold.left_out), models.chosen
+        events = [c for c in (chosen.candidates if chosen else ()) if is_dated(c)]
+        found = {"base": predict(*models.base, self.experiments, counts, seed)}
+        for name, model in (("effect", models.effect), ("reference", models.reference)):
+            found[name] = self._predict(model, events, fold, seed)
+        out = {n: p.log_density.sum(axis=1) for n, p in found.items()}
         if not all(np.all(np.isfinite(v)) for v in out.values()):
             raise ArgumentError("a model fitted without a block gives the block no probability")
-        out["gain_mean"] = np.asarray(gain_of_mean(found_by["base"], found_by["effect"]))
+        out["gain_mean"] = np.asarray(gain_of_mean(found["base"], found["effect"]))
         measured = [(e.seen.any(axis=1) & c).sum()
                     for e, c in zip(self.experiments, counts, strict=True)]  # fmt: skip
-        groups = [{c.group for c in r.candidates} for r in (pick, self.chosen) if r]
+        groups = [{c.group for c in r.candidates} for r in (chosen, self.chosen) if r]
         out["same"] = np.asarray(float(len(groups) == 2 and groups[0] == groups[1]))
         out["rows"] = np.asarray(float(sum(measured)))
         inside = [i for i, m in enumerate(measured) if m]
-        for name, model in (("before", models["base"]), ("after", effect)):
-            at = [self.experiments[i] for i in inside]
+        at = [self.experiments[i] for i in inside]
+        for name, model in (("before", models.base), ("after", models.effect)):
             runs = [free_run(*model, e, seed) for e in at]
-            value = rmse(runs, at, [counts[i] for i in inside]) if at else 0.0
-            out[name] = np.asarray(value)
+            out[name] = np.asarray(rmse(runs, at, [counts[i] for i in inside]) if at else 0.0)
         return out
+
+    def _models(
+        self, fold: Fold, seed: np.random.SeedSequence, checkpoint: Checkpoint
+    ) -> _FoldModels:
+        """Base model, model with effects and reference, fitted and chosen without the block."""
+        fitter, whole = self.base
+        start = unpack_parameters(whole.problem.trace, whole.theta)
+        numbers = checkpoint.computed(
+            "fitting", lambda: fitter.fit(fold.train, seed, start, APPROXIMATELY).numbers
+        )
+        fit = fitter.restored(fold.train, numbers)
+        if self.whole is None:
+            screen = run_screen(
+                self.design, fold.train, fit.theta, SETS, seed, checkpoint, checks=False
+            )
+        else:
+            screen = screen_part(self.whole, fold.train, fit.theta, seed)
+        found = Attribution(fit)
+        if self.chosen is not None:
+            Selection(
+                self.augmented, screen, fold.train, seed, self.alpha, checkpoint, always=True,
+                singles=SINGLES, most=len(self.chosen.candidates), approximate=True,
+            ).run(found)  # fmt: skip
+        chosen = found.chosen
+        reference = fit_reference(
+            self.augmented, chosen.candidates if chosen else (), chosen.fit if chosen else fit,
+            screen, fold.train, seed, checkpoint,
+        )  # fmt: skip
+        effect = (fitter, fit) if self.chosen else reference
+        if chosen is not None:
+            effect = (chosen.fitter, chosen.fit)
+        return _FoldModels((fitter, fit), effect, reference, chosen)
 
     def _predict(
         self, model: tuple[Fitter, Fit], events: Sequence[Candidate], fold: Fold,
         seed: np.random.SeedSequence,
     ) -> Predictions:  # fmt: skip
-        """One-step predictions of the block, averaged over dates that the other rows cannot tell.
+        """One-step predictions of the block, averaged over dates that other rows cannot separate.
 
         The average is of the densities of the whole block: `log_density` has it as (R, 1).
         """
@@ -176,7 +187,7 @@ class CrossFit:
         counts = list(fold.left_out)
         names = [s.data[1] for s in fitter.problem.trace.parameter_symbols]
         for c in events:
-            own, dates = f"{c.strength}_date", untold_dates(c, fold)
+            own, dates = f"{c.strength}_date", indistinguishable_dates(c, fold)
             if own in names and dates:
                 each = []
                 for date in dates:
@@ -192,9 +203,9 @@ class CrossFit:
         return predict(fitter, fit, self.experiments, counts, seed)
 
 
-def untold_dates(c: Candidate, fold: Fold) -> list[float]:
+def indistinguishable_dates(c: Candidate, fold: Fold) -> list[float]:
     """Dates between the rows on either side of the block, if the event's own is among them; they
-    all say the same of the other rows. Of a single experiment: others tell the date."""
+    have the same likelihood of the other rows. Of one experiment: others tell the date."""
     if len(fold.left_out) != 1:
         return []
     rows = np.flatnonzero(fold.left_out[0]) + 1

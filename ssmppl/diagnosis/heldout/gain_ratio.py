@@ -1,12 +1,10 @@
-"""How far the gap closes on rows that took no part in fitting or choosing.
+"""How much of the gap an effect closes on rows that took no part in fitting or choosing it.
 
-How much of the gap an effect closes on data that did not choose it.
-
-F = sum_t (l_kt - l_0t) / sum_t (l_Ct - l_0t), l the one-step log predictive densities of the base
-model (0), the model with the effect (k) and the reference (C). Numerator and denominator are sums
-over the same dependent rows: their 2 x 2 covariance comes from a paired circular block bootstrap
-(Politis and Romano 1992), and the interval of the ratio from Fieller's theorem (E. Fieller 1954),
-which says so where the denominator could be zero.
+The gain ratio is F = sum_t (l_kt - l_0t) / sum_t (l_Ct - l_0t), l the one-step log predictive
+densities of the base model (0), the model with the effect (k) and the reference (C). Numerator and
+denominator are sums over the same dependent rows: their 2 x 2 covariance comes from a paired
+circular block bootstrap (Politis and Romano 1992), and the confidence set of the ratio from
+Fieller's theorem (E. Fieller 1954), which says so where the denominator could be zero.
 """
 
 from __future__ import annotations
@@ -25,20 +23,22 @@ from ssmppl.diagnosis.heldout.predictions import FreeRun, free_run, gain_of_mean
 from ssmppl.diagnosis.heldout.reference import fit_reference
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.errors import ArgumentError, SSMError
 
-REPLICATES = 2000
+REPLICATES = 2000  # of the bootstrap
 LEAST_CHOSEN = 10  # blocks that the choice of their length leaves
 FEWEST_BLOCKS = 5  # below which the bootstrap does not know a variance
+SAME = 1e-3  # relative difference of two gains up to which they are the same model's
+NOT_GIVEN = "the share of the gap that is closed is not given: {}"
 
 Kind = Literal["bounded", "complement", "unbounded"]
 
 
 @dataclass(frozen=True)
-class Fieller:
+class ConfidenceSet:
     """Confidence set of a ratio: [low, high], all but (low, high), or every number."""
 
     kind: Kind
@@ -65,8 +65,8 @@ class Gain:
 
 
 @dataclass(frozen=True)
-class Closed:
-    """Share of the gap that is closed.
+class GainRatio:
+    """Share of the gap that is closed, with its confidence set.
 
     F, low, high : NaN where the gap is not measurable; `reason` then says why, else it is "".
     gain, reference : numerator and denominator. covariance : (2, 2) of their two sums.
@@ -89,8 +89,31 @@ class Closed:
         """Whether the reference gains more than nothing, as far as these rows tell."""
         return not self.reason
 
+    @property
+    def own_reference(self) -> bool:
+        """Whether the reference is the chosen model itself, so that the ratio compares nothing."""
+        return abs(self.gain.nats - self.reference.nats) <= SAME * abs(self.reference.nats)
 
-def closed(
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The interval of the ratio; NaN where it compares a model with itself."""
+        return (np.nan, np.nan) if self.own_reference else (self.low, self.high)
+
+    def notes(self, chosen: bool) -> list[str]:
+        """What has to be known beside the ratio. chosen : whether an effect was."""
+        if self.reason:
+            return [self.reason]
+        if not self.own_reference:
+            return []
+        low, high = (self.gain.nats + s * 1.96 * self.gain.error for s in (-1.0, 1.0))
+        what = "nothing beyond the chosen effect was found" if chosen else "no effect was chosen"
+        return [
+            f"{what}, so that the share is of its own gain: {self.gain.nats:.1f} nats on held-out "
+            f"rows (95% interval {low:.1f} to {high:.1f})"
+        ]
+
+
+def gain_ratio(
     base: np.ndarray,
     effect: np.ndarray,
     reference: np.ndarray,
@@ -101,7 +124,7 @@ def closed(
     level: float = 0.95,
     replicates: int = REPLICATES,
     seed: int = 1,
-) -> Closed:
+) -> GainRatio:
     """F with its interval from one-step log predictive densities.
 
     Parameters
@@ -153,14 +176,16 @@ def closed(
             f"no measurable gap: the reference gains {total[1]:.1f} nats, {level:.0%} interval "
             f"from {low:.1f}"
         )
-        return Closed(nan, nan, nan, gain[0], gain[1], covariance, length, blocks, level,
+        return GainRatio(nan, nan, nan, gain[0], gain[1], covariance, length, blocks, level,
                       reason)  # fmt: skip
     interval = fieller(float(total[0]), float(total[1]), covariance, q)
-    return Closed(float(total[0] / total[1]), interval.low, interval.high, gain[0], gain[1],
+    return GainRatio(float(total[0] / total[1]), interval.low, interval.high, gain[0], gain[1],
                   covariance, length, blocks, level)  # fmt: skip
 
 
-def fieller(numerator: float, denominator: float, covariance: np.ndarray, q: float) -> Fieller:
+def fieller(
+    numerator: float, denominator: float, covariance: np.ndarray, q: float
+) -> ConfidenceSet:
     """The ratios F with |N - F D| <= q sd(N - F D), q a two-sided critical value.
 
     A quadratic inequality in F: its solutions are an interval where D differs from zero at this
@@ -173,12 +198,14 @@ def fieller(numerator: float, denominator: float, covariance: np.ndarray, q: flo
     if a == 0.0 or inside < 0.0:
         # a > 0 always has the solution N / D: only rounding can say otherwise.
         return (
-            Fieller("bounded", n / d, n / d) if a > 0.0 else Fieller("unbounded", -np.inf, np.inf)
+            ConfidenceSet("bounded", n / d, n / d)
+            if a > 0.0
+            else ConfidenceSet("unbounded", -np.inf, np.inf)
         )
     # The root without cancellation, and the other by the product of the two.
     far = half_b + np.copysign(np.sqrt(inside), half_b)
     roots = sorted((far / a, constant / far) if far != 0.0 else (0.0, 0.0))
-    return Fieller("bounded" if a > 0.0 else "complement", roots[0], roots[1])
+    return ConfidenceSet("bounded" if a > 0.0 else "complement", roots[0], roots[1])
 
 
 def block_length(gains: np.ndarray, starts: Sequence[int] = WHOLE) -> int:
@@ -276,115 +303,104 @@ def _runs(values: np.ndarray, name: str) -> np.ndarray:
     return found
 
 
-NOT_GIVEN = "the share of the gap that is closed is not given: {}"
-SAME = 1e-3  # relative difference of two gains up to which they are the same model's
-
-
 @dataclass
-class HowFar:
+class HeldOutGain:
     """Rows of the report's table, free runs of each experiment before and after, and notes.
 
-    beyond : what the reference gains over the best of the catalogue, chosen or not.
+    beyond_catalogue : what the reference gains over the best of the catalogue, chosen or not.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    beyond: Gain | None = None
+    beyond_catalogue: Gain | None = None
     before: list[FreeRun] = field(default_factory=list)
     after: list[FreeRun] | None = None
     notes: list[str] = field(default_factory=list)
 
-    def runs(
+    def simulate(
         self, base: tuple[Fitter, Fit], experiments: Sequence[Experiment], chosen: Refit | None,
         seed: np.random.SeedSequence,
     ) -> None:  # fmt: skip
-        """Simulate freely before and after."""
+        """Free runs of the model as it was and, where an effect was chosen, with it."""
         self.before = [free_run(*base, e, seed) for e in experiments]
         if chosen is not None:
             self.after = [free_run(chosen.fitter, chosen.fit, e, seed) for e in experiments]
 
+    def add(
+        self, label: str, ratio: GainRatio, nats_per_sample: float, gain_mean: float,
+        errors: tuple[float, float], chosen: bool,
+    ) -> None:  # fmt: skip
+        """A row of the table and its notes. errors : of the free runs before and after."""
+        low, high = ratio.interval
+        self.rows.append({
+            "effect": label, "F": ratio.F, "F_low": low, "F_high": high,
+            "nats_per_sample": nats_per_sample, "gain_mean": gain_mean,
+            "gain_noise": ratio.gain.nats - gain_mean,
+            "rmse_before": errors[0], "rmse_after": errors[1],
+        })  # fmt: skip
+        self.notes += ratio.notes(chosen)
 
-def how_far(
-    workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
-    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, leader: Refit | None,
-    label: str, seed: np.random.SeedSequence, kept: Checkpoint,
-) -> HowFar:  # fmt: skip
-    """The chosen model, or, where none was chosen, the reference itself, against the base model.
 
-    leader : the best refit, chosen or not.
+@dataclass(frozen=True)
+class HeldOutRows:
+    """The gain on held-out rows: what it is measured with.
+
+    base : the model's fitter and fit. chosen : None where no effect was, and the reference stands
+    for it. best_refit : chosen or not.
     """
-    out = HowFar()
-    out.runs(base, experiments, chosen, seed)
-    try:
-        _measure(out, workshop, parts, experiments, base, screen, chosen, leader, label, seed, kept)
-    except SSMError as error:  # a held-out row may be impossible under what was fitted to others
-        out.notes.append(NOT_GIVEN.format(error.found))
-    return out
 
+    augmented: AugmentedModels
+    parts: Parts
+    base: tuple[Fitter, Fit]
+    screen: Screen
+    chosen: Refit | None
+    best_refit: Refit | None
 
-def _measure(
-    out: HowFar, workshop: Workshop, parts: Parts, experiments: Sequence[Experiment],
-    base: tuple[Fitter, Fit], screen: Screen, chosen: Refit | None, leader: Refit | None,
-    label: str, seed: np.random.SeedSequence, kept: Checkpoint,
-) -> None:  # fmt: skip
-    """The share, and what the reference gains beyond, into `out`.
+    def gain(self, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> HeldOutGain:
+        """The chosen model, or else the reference itself, against the base model."""
+        out = HeldOutGain()
+        out.simulate(self.base, self.parts.experiments, self.chosen, seed)
+        try:
+            self._measure(out, label, seed, checkpoint)
+        except SSMError as error:  # a held-out row may be impossible under what others were fit to
+            out.notes.append(NOT_GIVEN.format(error.found))
+        return out
 
-    Raises
-    ------
-    SSMError : a model cannot predict the held-out rows, or there are too few.
-    """
-    counts = parts.confirm
-    plain = predict(*base, experiments, counts, seed)
-    try:
-        reference = fit_reference(
-            workshop, chosen.candidates if chosen else (), chosen.fit if chosen else base[1],
-            screen, parts.train, seed, kept, parts,
+    def _measure(
+        self, out: HeldOutGain, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint
+    ) -> None:
+        """The gain ratio, and what the reference gains beyond the catalogue, into `out`.
+
+        Raises
+        ------
+        SSMError : a model cannot predict the held-out rows, or there are too few.
+        """
+        chosen, experiments, counts = self.chosen, self.parts.experiments, self.parts.held_out
+        plain = predict(*self.base, experiments, counts, seed)
+        try:
+            reference = fit_reference(
+                self.augmented, chosen.candidates if chosen else (),
+                chosen.fit if chosen else self.base[1], self.screen, self.parts.train, seed,
+                checkpoint, self.parts,
+            )  # fmt: skip
+            best = predict(*reference, experiments, counts, seed)
+        except SSMError as error:
+            out.notes.append(f"no reference to measure the gap against: {error.found}")
+            return
+        model = (chosen.fitter, chosen.fit) if chosen else reference
+        same = reference[1] is model[1]  # nothing was found beyond the chosen effects
+        found = best if same else predict(*model, experiments, counts, seed)
+        ratio = gain_ratio(
+            plain.log_density, found.log_density, best.log_density, starts=plain.starts
+        )
+        rival, other = found, self.best_refit
+        if chosen is None:
+            rival = predict(other.fitter, other.fit, experiments, counts, seed) if other else plain
+        out.beyond_catalogue = gain_ratio(
+            rival.log_density, best.log_density, best.log_density, starts=plain.starts
+        ).gain
+        after = out.after or [free_run(*model, e, seed) for e in experiments]
+        before_error, after_error = (rmse(r, experiments, counts) for r in (out.before, after))
+        out.add(
+            label, ratio, ratio.gain.nats_per_sample, gain_of_mean(plain, found),
+            (before_error, after_error), chosen is not None,
         )  # fmt: skip
-        best = predict(*reference, experiments, counts, seed)
-    except SSMError as error:
-        out.notes.append(f"no reference to measure the gap against: {error.found}")
-        return
-    model = (chosen.fitter, chosen.fit) if chosen else reference
-    same = reference[1] is model[1]  # nothing was found beyond the chosen effects
-    found = best if same else predict(*model, experiments, counts, seed)
-    share = closed(plain.log_density, found.log_density, best.log_density, starts=plain.starts)
-    rival = found
-    if chosen is None:
-        rival = predict(leader.fitter, leader.fit, experiments, counts, seed) if leader else plain
-    out.beyond = closed(
-        rival.log_density, best.log_density, best.log_density, starts=plain.starts
-    ).gain
-    runs = out.after or [free_run(*model, e, seed) for e in experiments]
-    mean = gain_of_mean(plain, found)
-    low, high = interval_of(share)
-    out.rows.append({
-        "effect": label, "F": share.F, "F_low": low, "F_high": high,
-        "nats_per_sample": share.gain.nats_per_sample, "gain_mean": mean,
-        "gain_noise": share.gain.nats - mean,
-        "rmse_before": rmse(out.before, experiments, counts),
-        "rmse_after": rmse(runs, experiments, counts),
-    })  # fmt: skip
-    out.notes += notes_of(share, chosen is not None)
-
-
-def own_reference(share: Closed) -> bool:
-    """Whether the reference is the chosen model itself, so that the share is no comparison."""
-    return abs(share.gain.nats - share.reference.nats) <= SAME * abs(share.reference.nats)
-
-
-def interval_of(share: Closed) -> tuple[float, float]:
-    """The interval of the share; NaN where it compares a model with itself."""
-    return (np.nan, np.nan) if own_reference(share) else (share.low, share.high)
-
-
-def notes_of(share: Closed, chosen: bool) -> list[str]:
-    """What has to be known beside the share."""
-    if share.reason:
-        return [share.reason]
-    if not own_reference(share):
-        return []
-    low, high = (share.gain.nats + s * 1.96 * share.gain.error for s in (-1.0, 1.0))
-    what = "nothing beyond the chosen effect was found" if chosen else "no effect was chosen"
-    return [
-        f"{what}, so that the share is of its own gain: {share.gain.nats:.1f} nats on held-out "
-        f"rows (95% interval {low:.1f} to {high:.1f})"
-    ]

@@ -1,5 +1,4 @@
-"""What each part of the data is used for: to find and choose an effect, to confirm it; or blocks
-left out in turn.
+"""Training and held-out rows: each experiment cut in two, or cross-validation blocks.
 
 A filter runs over all rows before the one that it predicts, so that a part needs no rows to settle
 in: with parameters fitted to earlier rows only, one-step predictions of later ones are honest
@@ -17,41 +16,43 @@ import numpy as np
 
 from ssmppl.data import Experiment
 
-SHARES = (0.4, 0.7)  # of the rows, where screen and choose end
+SHARES = (0.4, 0.7)  # of the rows, where the first and the second part end
 SHORTEST = 300  # rows in all, below which blocks are left out in turn instead
-LEAST_CONFIRMED = 10  # held-out rows, below which they are, too
+LEAST_HELD_OUT = 10  # held-out rows, below which they are, too
 GAP = 5  # rows between the parts
 FOLDS = 10
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Rows of each experiment: train = [0, second), on which effects are looked for and chosen;
-    confirm = [second, T). The reference of the share is fitted to [0, first) and chosen by the rest
-    of `train`, before it is fitted to all of that."""
+    """The rows of each experiment by their use: train = [0, second), held_out = [second, T).
+
+    Effects are looked for and chosen on `train`. The reference of the gain ratio is fitted to
+    [0, first) and chosen by the rest of `train`, before it is fitted to all of that.
+    """
 
     experiments: tuple[Experiment, ...]
     first: tuple[int, ...]
     second: tuple[int, ...]
 
     @property
-    def screen(self) -> tuple[Experiment, ...]:
+    def reference_train(self) -> tuple[Experiment, ...]:
         """The first rows of each experiment."""
         return tuple(head(e, n) for e, n in zip(self.experiments, self.first, strict=True))
 
     @property
     def train(self) -> tuple[Experiment, ...]:
-        """Screen and choose."""
+        """The rows before the held-out ones."""
         return tuple(head(e, n) for e, n in zip(self.experiments, self.second, strict=True))
 
     @property
-    def confirm(self) -> list[np.ndarray]:
-        """For each experiment (T,), whether a row counts in the end."""
+    def held_out(self) -> list[np.ndarray]:
+        """For each experiment (T,), whether a row is held out."""
         return [_behind(n, e.steps) for e, n in zip(self.experiments, self.second, strict=True)]
 
     @property
-    def chosen(self) -> list[np.ndarray]:
-        """For each experiment (T2,), whether a row of `train` belongs to the choose part."""
+    def reference_validation(self) -> list[np.ndarray]:
+        """For each experiment (T2,), whether a row of `train` chooses the reference."""
         return [_behind(a, b) for a, b in zip(self.first, self.second, strict=True)]
 
 
@@ -82,8 +83,8 @@ def three_parts(experiments: Sequence[Experiment]) -> Parts:
 
 def long_enough(experiments: Sequence[Experiment]) -> bool:
     """Whether there are rows for three parts: of many short experiments few are behind the cuts."""
-    held_out = sum(int(c.sum()) for c in three_parts(experiments).confirm)
-    return sum(e.steps for e in experiments) >= SHORTEST and held_out >= LEAST_CONFIRMED
+    held_out = sum(int(c.sum()) for c in three_parts(experiments).held_out)
+    return sum(e.steps for e in experiments) >= SHORTEST and held_out >= LEAST_HELD_OUT
 
 
 @dataclass(frozen=True)

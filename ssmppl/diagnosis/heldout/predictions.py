@@ -16,7 +16,7 @@ from ssmppl.inference.run.tasks import run_tasks
 
 RUNS = 8  # of the particle filter
 FREE_RUNS = 100  # simulations behind a free run
-STRETCH, MOST_STRETCHES = 5, 40  # rows, number: what is told apart of the held-out rows
+STRETCH, MOST_STRETCHES = 5, 40  # rows, number: as finely as held-out rows are resolved
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def predict(
         stream = random_state(seed, 6, r)
         passes = fitter.smoother.run(experiments, fit.theta, stream)
         for p in passes:
-            p.log_increments[:1] += fitter.height
+            p.log_increments[:1] += fitter.log_correction
         if fitter.exact or fitter.settings.proposal != "twisted":
             return passes
         return [
@@ -113,15 +113,15 @@ def gain_of_mean(base: Predictions, other: Predictions) -> float:
     errors = np.stack([base.observed - base.mean, other.observed - other.mean])
     with np.errstate(all="ignore"):  # NaN where missing, or before a flat start is known
         scaled = errors / np.sqrt(base.variance)
-    told = np.isfinite(scaled).all(axis=0)
-    scaled = np.where(told, scaled, 0.0)
+    known = np.isfinite(scaled).all(axis=0)
+    scaled = np.where(known, scaled, 0.0)
     if base.covariance is None:
-        if np.any(told.sum(axis=1) > 1):
+        if np.any(known.sum(axis=1) > 1):
             return float("nan")
         squares = np.sum(scaled**2, axis=(1, 2))
     else:
-        sd = np.sqrt(np.where(told, base.variance, 1.0))
-        both = told[:, :, None] & told[:, None, :]
+        sd = np.sqrt(np.where(known, base.variance, 1.0))
+        both = known[:, :, None] & known[:, None, :]
         alike = np.where(
             both, base.covariance / (sd[:, :, None] * sd[:, None, :]), np.eye(sd.shape[1])
         )

@@ -1,4 +1,4 @@
-"""The reference that "how far" is measured against: a regularised superset of the model.
+"""The reference that the gain ratio is measured against: a regularised superset of the model.
 
 The base model with the chosen effects and with smooth functions of the states and inputs wherever
 the screen says that there is something, shrunk by normal priors whose width is an empirical Bayes
@@ -17,14 +17,13 @@ from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.heldout.parts import Parts
 from ssmppl.diagnosis.heldout.predictions import predict
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import Term
+from ssmppl.diagnosis.model.basis import Term, symbolic_shapes
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
 from ssmppl.diagnosis.screening.familywise import familywise
-from ssmppl.diagnosis.screening.location import group_score
 from ssmppl.diagnosis.screening.screen import Screen, with_parameters
-from ssmppl.diagnosis.selection.augmented_models import Workshop, lift
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.fit import APPROXIMATELY, WITHOUT_ERRORS, Fit, Fitter
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol
@@ -37,18 +36,20 @@ ASTRAY = 1.0  # nats below the model without the groups, beyond Monte Carlo nois
 Values = dict[str, np.ndarray]
 
 
-def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term], float]]:
+def significant_groups(
+    screen: Screen, chosen: Sequence[Candidate]
+) -> list[tuple[list[Term], float]]:
     """(terms of one equation, moment and variable, tau) where the basis has signal beyond what was
     chosen, best first; none where chance explains it."""
-    question = screen.question
-    if not question.terms:
+    design = screen.design
+    if not design.terms:
         return []
     own, own_seen = screen.columns_of(chosen)
-    taken = np.concatenate([screen.stacked("nuisance"), own], axis=1)
+    taken = np.concatenate([screen.simulated.nuisance, own], axis=1)
     seen = np.concatenate([screen.observed.nuisance, own_seen])
-    found = efficient(Null.of(screen.stacked("basis"), taken), screen.observed.basis, seen)
+    found = efficient(Null.of(screen.simulated.basis, taken), screen.observed.basis, seen)
     groups: dict[tuple[str, str, str], list[int]] = {}
-    for i, t in enumerate(question.terms):
+    for i, t in enumerate(design.terms):
         if not found.status[i]:
             groups.setdefault((t.equation, t.moment, t.variable), []).append(i)
     out, residual = [], residual_groups(screen, chosen)
@@ -57,76 +58,75 @@ def signal(screen: Screen, chosen: Sequence[Candidate]) -> list[tuple[list[Term]
         if residual[key].p <= CHANCE and size > 1.0:
             variance = float(np.mean(found.variance[places]))
             tau = float(np.sqrt((size - 1.0) / variance))
-            out.append((size, [question.terms[i] for i in places], tau))
+            out.append((size, [design.terms[i] for i in places], tau))
     out.sort(key=lambda g: -g[0])
     return [(terms, tau) for _, terms, tau in out[:GROUPS]]
 
 
 def fit_reference(
-    workshop: Workshop, chosen: Sequence[Candidate], start: Fit, screen: Screen,
-    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint,
+    augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit, screen: Screen,
+    train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint,
     parts: Parts | None = None,
 ) -> tuple[Fitter, Fit]:  # fmt: skip
     """The superset, fitted from the fit of the model with the chosen effects.
 
     A fit that comes out below where it started has gone astray (a feedback of what is past that
     makes the model unstable): then with the best group alone, and at last with none. Where there
-    are `parts`, the curves have to predict the rows of the choose part, fitted to the screen part,
+    are `parts`, the curves, fitted to the first rows, have to predict the rows of the second part
     better than the model without them does: what only bends through the noise is left out.
 
     Raises
     ------
     SSMError : it cannot be fitted.
     """
-    groups = signal(screen, chosen)
+    groups = significant_groups(screen, chosen)
     if groups and parts is not None:
-        gained = kept.of(
+        gained = checkpoint.computed(
             "reference on other rows",
-            lambda: {"nats": _gained(workshop, chosen, start, groups, parts, seed)},
+            lambda: {"nats": _gained(augmented, chosen, start, groups, parts, seed)},
         )
         groups = groups if float(gained["nats"]) > 0.0 else []
     for count in dict.fromkeys((len(groups), min(1, len(groups)))):
-        fitter, begin = superset(workshop, chosen, start, groups[:count])
+        fitter, begin = superset(augmented, chosen, start, groups[:count])
 
         def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:
-            return fitter.fit(
-                train, seed, begin, searched=True, quick=True, rough=parts is None
-            ).numbers
+            effort = APPROXIMATELY if parts is None else WITHOUT_ERRORS
+            return fitter.fit(train, seed, begin, effort).numbers
 
         stage = "reference" if count == len(groups) else "reference with one group"
-        fit = fitter.restored(train, kept.of(stage, numbers))
+        fit = fitter.restored(train, checkpoint.computed(stage, numbers))
         noise = 3.0 * np.hypot(fit.error, start.error)
         if fit.log_likelihood >= start.log_likelihood - ASTRAY - noise:
             return fitter, fit
-    return workshop.fitter(chosen), start
+    return augmented.fitter(chosen), start
 
 
 def _gained(
-    workshop: Workshop, chosen: Sequence[Candidate], start: Fit,
+    augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
     groups: Sequence[tuple[list[Term], float]], parts: Parts, seed: np.random.SeedSequence,
 ) -> np.ndarray:  # fmt: skip
-    """() nats by which the superset predicts the choose part better; -inf where it has no fit."""
-    told = []
+    """() nats by which the superset predicts the second part better; -inf where it has no fit."""
+    gains = []
     for wanted in ([], groups):
-        fitter, begin = superset(workshop, chosen, start, wanted)
+        fitter, begin = superset(augmented, chosen, start, wanted)
         try:
-            fit = fitter.fit(parts.screen, seed, begin, searched=True, quick=True)
-            found = predict(fitter, fit, parts.train, parts.chosen, seed)
+            fit = fitter.fit(parts.reference_train, seed, begin, WITHOUT_ERRORS)
+            found = predict(fitter, fit, parts.train, parts.reference_validation, seed)
         except SSMError:
             return np.asarray(-np.inf)
-        told.append(found.log_density.sum(axis=1).mean())
-    return np.asarray(told[1] - told[0])
+        gains.append(found.log_density.sum(axis=1).mean())
+    return np.asarray(gains[1] - gains[0])
 
 
 def superset(
-    workshop: Workshop, chosen: Sequence[Candidate], start: Fit,
+    augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
     groups: Sequence[tuple[list[Term], float]],
 ) -> tuple[Fitter, Values]:  # fmt: skip
     """The fitter of the superset, and where it starts."""
     candidates = [t.candidate for terms, _ in groups for t in terms]
-    made, shapes = lift([*chosen, *candidates])
+    made, shapes = symbolic_shapes([*chosen, *candidates], of_time=True)
     widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}
-    trace = with_parameters(augment(workshop.trace, made), {**shapes, **widths})
+    trace = with_parameters(augment(augmented.trace, made), {**shapes, **widths})
     parameters = dict(trace.parameters)
     # A prior may depend on parameters declared before: the widths come first.
     ordered = {n: parameters.pop(n) for n in widths}
@@ -138,7 +138,7 @@ def superset(
             parameters[t.candidate.strength] = replace(site, distribution=law)
     trace = replace(trace, parameters={**ordered, **parameters})
     given = {**shapes, **widths}
-    fitter = workshop.made(trace, given)
+    fitter = augmented.fitter_of(trace, given)
     values = unpack_parameters(start.problem.trace, start.theta)
     begin = {n: v for n, v in values.items() if n in trace.parameters and n not in given}
     begin |= {t.candidate.strength: np.asarray(0.0) for terms, _ in groups for t in terms}
@@ -147,7 +147,7 @@ def superset(
 
 @dataclass(frozen=True)
 class Residual:
-    """How much a group of the basis stands out: z, and its family-wise p."""
+    """The statistic of a group of the basis: z, and its family-wise p."""
 
     z: float
     p: float
@@ -158,18 +158,14 @@ def residual_groups(
 ) -> dict[tuple[str, str, str], Residual]:
     """Each group of the basis with `others` projected out, by equation, moment and variable: the
     functions of one variable, or of one pair, are a group."""
-    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
-    columns, seen = screen.stacked("basis"), screen.observed.basis
-    rest = screen.columns_of(others)
+    terms = screen.design.terms
     keys = list(dict.fromkeys((t.equation, t.moment, t.variable) for t in terms))
     if not keys:
         return {}
     groups = []
     for key in keys:
         own = [i for i, t in enumerate(terms) if (t.equation, t.moment, t.variable) == key]
-        groups.append(
-            group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
-        )
+        groups.append(screen.basis_group(own, others))
     z, null = np.array([g.z for g in groups]), np.stack([g.null for g in groups], axis=1)
     p = familywise(z, null, sided=1).p
     return {k: Residual(float(z[i]), float(p[i])) for i, k in enumerate(keys)}

@@ -3,7 +3,7 @@
 Inputs and parameters are replaced first, in transitions and observations; means, variances, tails
 and starts are changed after that. Several effects on one equation add up. Auxiliary states join the
 model's own; those with the same laws are shared. Each effect is bound to the model as it was, not
-to what others make of it: one after the other they are the same as all at once (`augmented`).
+to what others make of it: one after the other they are the same as all at once (`equations.py`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ssmppl.diagnosis.model.changed_laws import (
     shifted,
     substituted,
 )
-from ssmppl.diagnosis.model.equations import Anatomy, Augmented, Part, as_it_was
+from ssmppl.diagnosis.model.equations import Augmented, Equations, Part, as_it_was
 from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
@@ -55,26 +55,26 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
     ModelError : an effect's function does not do what its kind says.
     """
     origin = as_it_was(trace)
-    anatomy = Anatomy(origin)
-    _check(candidates, trace, anatomy)
+    equations = Equations(origin)
+    _check(candidates, trace, equations)
     before = trace if isinstance(trace, Augmented) else None
     every = [*(before.added if before else ()), *candidates]
-    places = dict(trace.locations)
+    locations = dict(trace.locations)
     auxiliary = _Auxiliary(trace, origin, before.names if before else {})
     early = [c for c in every if c.change in ("input", "parameter")]
     late = [c for c in every if c.change not in ("input", "parameter")]
     names: dict[str, dict[str, str]] = {}  # strength -> its auxiliary states
     for c in early:
-        names[c.strength] = auxiliary.add(c, anatomy, places)
-    new = _replaced(origin, early, anatomy, names, places)
-    anatomy = Anatomy(new, anatomy)
+        names[c.strength] = auxiliary.add(c, equations, locations)
+    new = _replaced(origin, early, equations, names, locations)
+    equations = Equations(new, equations)
     for c in late:
-        names[c.strength] = auxiliary.add(c, anatomy, places)
-    new = _moved(new, late, anatomy, names, places)
+        names[c.strength] = auxiliary.add(c, equations, locations)
+    new = _moved(new, late, equations, names, locations)
     parameters = dict(trace.parameters)  # those of the shapes of earlier effects among them
     for c in candidates:
         if prior:
-            with attributed(places, c.effect.where):
+            with attributed(locations, c.effect.where):
                 parameters[c.strength] = _prior_site(c)
     return Augmented(
         name=trace.name,
@@ -84,7 +84,7 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
         observations=new.observations,
         proposal={**new.proposal, **auxiliary.transition} if new.proposal else {},
         inputs=trace.inputs,
-        locations=places,
+        locations=locations,
         functions=trace.functions,
         choices=trace.choices,
         origin=origin,
@@ -98,9 +98,9 @@ def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Sit
     return {n: new[n] for n in [*before, *(n for n in new if n not in before)]}
 
 
-def _check(candidates: Sequence[Candidate], trace: Trace, anatomy: Anatomy) -> None:
-    """That their names are free, and that they fit the model. anatomy : of it as it was."""
-    taken = {p.name: f"the model's {p.role}" for p in Anatomy(trace, anatomy).parts.values()}
+def _check(candidates: Sequence[Candidate], trace: Trace, equations: Equations) -> None:
+    """Check that names are free, and candidates fit the model. equations : of it as it was."""
+    taken = {p.name: f"the model's {p.role}" for p in Equations(trace, equations).parts.values()}
     for c in candidates:
         if c.strength in taken:
             raise ArgumentError(
@@ -110,22 +110,22 @@ def _check(candidates: Sequence[Candidate], trace: Trace, anatomy: Anatomy) -> N
         taken[c.strength] = f"the strength of {c}"
         moved = [label for label, _ in (*c.reaction, *c.carried)]
         for label in (c.equation, *dict(c.bound).values(), *moved):
-            if label not in anatomy.parts:
+            if label not in equations.parts:
                 raise ArgumentError(
-                    f"{c}: the model {anatomy.trace.name!r} has no {label!r}",
+                    f"{c}: the model {equations.trace.name!r} has no {label!r}",
                     fix="make the candidates by offers() of the same model",
                 )
-        _check_law(c, anatomy)
+        _check_law(c, equations)
 
 
-def _check_law(c: Candidate, anatomy: Anatomy) -> None:
-    """That the law can be changed so."""
+def _check_law(c: Candidate, equations: Equations) -> None:
+    """Check that the law can be changed so."""
     found: Any = None
-    part = anatomy.parts[c.equation]
+    part = equations.parts[c.equation]
     if c.change in ("transition", "observation", "initial"):
-        found = scale_of_mean(anatomy.law(part, c.change))
+        found = scale_of_mean(equations.law(part, c.change))
     elif c.change in ("noise", "tail"):
-        found = {"noise": has_scale, "tail": has_tail}[c.change](anatomy.law(part))
+        found = {"noise": has_scale, "tail": has_tail}[c.change](equations.law(part))
     if isinstance(found, NotApplicable):
         raise ArgumentError(f"{c} cannot be added: {found}", fix="leave it out")
 
@@ -155,7 +155,9 @@ class _Auxiliary:
         self.initial: dict[str, Site] = {}
         self.transition: dict[str, Site] = {}
 
-    def add(self, c: Candidate, anatomy: Anatomy, places: dict[Expr, Location]) -> dict[str, str]:
+    def add(
+        self, c: Candidate, equations: Equations, locations: dict[Expr, Location]
+    ) -> dict[str, str]:
         """The names of a candidate's states: those of an earlier one where their laws agree."""
         if not c.effect.states or c.held:
             return {}
@@ -167,9 +169,9 @@ class _Auxiliary:
             kept = self.kept if c.strength not in self.earlier else set()
             if (self.taken | kept - set(self.initial)) & set(names.values()):
                 continue
-            with attributed(places, c.effect.where):
-                first = bind(c, anatomy, "initial", names).initial
-                step = bind(c, anatomy, "transition", names).transition
+            with attributed(locations, c.effect.where):
+                first = bind(c, equations, "initial", names).initial
+                step = bind(c, equations, "transition", names).transition
             if all(n not in self.initial for n in names.values()):
                 for n in names.values():
                     self.initial[n] = _site(n, first[n], c)
@@ -199,17 +201,17 @@ def _alike(a: Distribution, b: Distribution) -> bool:
 
 # -- inputs and parameters
 def _replaced(
-    trace: Trace, candidates: Sequence[Candidate], anatomy: Anatomy,
-    names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
+    trace: Trace, candidates: Sequence[Candidate], equations: Equations,
+    names: Mapping[str, dict[str, str]], locations: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
-    """With what acts in place of inputs and parameters."""
+    """The trace with what acts in place of inputs and parameters."""
     out = {}
     for role in ("transition", "observation"):
         values: dict[Expr, list[Expr]] = defaultdict(list)
         for c in candidates:
-            with attributed(places, c.effect.where):
-                changes = bind(c, anatomy, role, names[c.strength]).changes
-            values[anatomy.parts[c.equation].seen_from(role)] += changes.values()
+            with attributed(locations, c.effect.where):
+                changes = bind(c, equations, role, names[c.strength]).changes
+            values[equations.parts[c.equation].seen_from(role)] += changes.values()
         replacement = {}
         for s, new in values.items():
             total = new[0]
@@ -217,30 +219,30 @@ def _replaced(
                 total = total + (other - s)
             replacement[s] = total
         sites = trace.transition if role == "transition" else trace.observations
-        out[role] = {n: _with_law(site, substituted, replacement, places)
+        out[role] = {n: _with_law(site, substituted, replacement, locations)
                      for n, site in sites.items()}  # fmt: skip
     return replace(trace, transition=out["transition"], observations=out["observation"])
 
 
-def _with_law(site: Site, change: Any, how: Any, places: dict[Expr, Location]) -> Site:
+def _with_law(site: Site, change: Any, how: Any, locations: dict[Expr, Location]) -> Site:
     if not how:
         return site
-    with attributed(places, site.distribution.location):
+    with attributed(locations, site.distribution.location):
         return replace(site, distribution=change(site.distribution, how))
 
 
 # -- means, variances, tails, starts
 def _moved(
-    trace: Trace, candidates: Sequence[Candidate], anatomy: Anatomy,
-    names: Mapping[str, dict[str, str]], places: dict[Expr, Location],
+    trace: Trace, candidates: Sequence[Candidate], equations: Equations,
+    names: Mapping[str, dict[str, str]], locations: dict[Expr, Location],
 ) -> Trace:  # fmt: skip
     layers: dict[tuple[str, str], list[Sum]] = defaultdict(list)  # (which laws, change)
     for c in candidates:
-        part = anatomy.parts[c.equation]
+        part = equations.parts[c.equation]
         role = _role(c, part)
-        with attributed(places, c.effect.where):
-            for label, by in bind(c, anatomy, role, names[c.strength]).changes.items():
-                target = anatomy.parts[label]
+        with attributed(locations, c.effect.where):
+            for label, by in bind(c, equations, role, names[c.strength]).changes.items():
+                target = equations.parts[label]
                 at = (target.name, target.index)
                 free = [into for into in layers[role, c.change] if at not in into]
                 if not free:
@@ -256,7 +258,7 @@ def _moved(
             for layer in layers.get((role, change), []):
                 for name in dict.fromkeys(n for n, _ in layer):
                     how = {i: by for (n, i), by in layer.items() if n == name}
-                    new[name] = _with_law(new[name], _LAWS[change], how, places)
+                    new[name] = _with_law(new[name], _LAWS[change], how, locations)
         groups[role] = new
     return replace(trace, initial=groups["initial"], transition=groups["transition"],
                    observations=groups["observation"])  # fmt: skip

@@ -4,12 +4,10 @@ For every equation with noise: increments of its mean by smooth functions of eac
 by products of two of them, and by the past of what moves the system; and increments of the log of
 its variance by smooth functions. Their scores tell where the gap is, whatever its form.
 
-Smooth bounded functions of states and inputs, in which a missing term is written.
-
-Polynomials in s = tanh(z / `BEND`), z the standardised variable, orthonormal over its values: next
-to polynomials in z where the data are, and level beyond them. (Hermite functions, which vanish
-there, leave a third of a quadratic drag over normal values unexplained.) Written with NumPy's
-functions alone: the same object is called on numbers and on symbols of a model.
+The functions are polynomials in s = tanh(z / `BEND`), z the standardised variable, orthonormal over
+its values: next to polynomials in z where the data are, and level beyond them. (Hermite functions,
+which vanish there, leave a third of a quadratic drag over normal values unexplained.) Written with
+NumPy's functions alone: the same object is called on numbers and on symbols of a model.
 """
 
 from __future__ import annotations
@@ -23,9 +21,10 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import Auxiliary, Effect, numbers
-from ssmppl.diagnosis.model.candidates import Scales, slug
+from ssmppl.diagnosis.model.candidates import slug
 from ssmppl.diagnosis.model.changed_laws import has_scale, scale_of_mean
-from ssmppl.diagnosis.model.equations import Anatomy, Part, Reaction, as_it_was, carried
+from ssmppl.diagnosis.model.equations import Equations, Part, Reaction, as_it_was, carried
+from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol, symbols_of
@@ -33,6 +32,14 @@ from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.traced import Trace
 
 BEND = 2.0  # standard deviations at which the functions begin to level off
+MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
+# Degrees of the functions in a product of two variables; with more than `FEW` of these the first.
+DEGREES, FEW, FIRST = ((1, 1), (2, 1), (1, 2), (2, 2), (3, 1), (1, 3)), 4, 3
+PAST = ("past_1", "past_2", "past_3")  # low-passes in a row
+REACH = 6.0  # the time constant of each, in rows
+RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quarter turn behind
+# Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
+TURNS = tuple(6.0 * 1.4**k for k in range(7))
 
 
 @dataclass(frozen=True)
@@ -94,15 +101,7 @@ def bases(x: Any, count: int = 6) -> tuple[Smooth, ...]:
                  for n in range(distinct))  # fmt: skip
 
 
-MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale
 CURVES = bases((0.0, 1.0), MEAN + 1)[1:]  # of a standardised variable, without the constant
-# Degrees of the functions in a product of two variables; with more than `FEW` of these the first.
-DEGREES, FEW, FIRST = ((1, 1), (2, 1), (1, 2), (2, 2), (3, 1), (1, 3)), 4, 3
-PAST = ("past_1", "past_2", "past_3")  # low-passes in a row
-REACH = 6.0  # the time constant of each, in rows
-RING = ("ring_1", "ring_2")  # a resonance: what is in step with it, and a quarter turn behind
-# Rows to a turn: so close that with a ring that dies away within a turn none between two is missed.
-TURNS = tuple(6.0 * 1.4**k for k in range(7))
 
 
 @dataclass(frozen=True)
@@ -134,18 +133,18 @@ class Term:
 
 def basis(trace: Trace, scales: Scales) -> list[Term]:
     """The terms of all equations that have noise."""
-    anatomy = Anatomy(as_it_was(trace))
-    states, inputs = anatomy.of_role("state"), anatomy.of_role("input")
+    equations = Equations(as_it_was(trace))
+    states, inputs = equations.of_role("state"), equations.of_role("input")
     varying = [p for p in [*states, *inputs] if scales.scale[p.label].sd > 0.0]
-    noisy = [p for p in states if not anatomy.deterministic(p)]
+    noisy = [p for p in states if not equations.deterministic(p)]
     out: list[Term] = []
-    for part in [*noisy, *anatomy.of_role("channel")]:
+    for part in [*noisy, *equations.of_role("channel")]:
         state = part.role == "state"
         own = [v for v in varying if state or v.role != "input"]
-        law = anatomy.law(part)
+        law = equations.law(part)
         if not isinstance(scale_of_mean(law), NotApplicable):
             kind = "transition" if state else "observation"
-            read = own if state else _measured(anatomy.law(part), own)
+            read = own if state else _measured(equations.law(part), own)
             out += [_curve(part, "mean", kind, v, k, scales) for v in read for k in range(MEAN)]
             if state:
                 out += _products(part, own, scales)
@@ -156,12 +155,12 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
                         for v in driving for turn in TURNS for k in range(len(RING))]  # fmt: skip
         if not isinstance(has_scale(law), NotApplicable):
             out += [_curve(part, "scale", "noise", v, k, scales) for v in own for k in range(SCALE)]
-    moved = carried(anatomy)
+    moved = carried(equations)
     return [_with_it(t, moved) if t.candidate.change == "transition" else t for t in out]
 
 
 def _with_it(term: Term, moved: Mapping[str, Reaction]) -> Term:
-    """With what moves within the step."""
+    """The term with what moves within the step."""
     along = moved.get(term.equation, ())
     return replace(term, candidate=replace(term.candidate, carried=along)) if along else term
 
@@ -172,46 +171,55 @@ def _measured(law: Distribution, states: Sequence[Part]) -> list[Part]:
     return [s for s in states if s.seen_from("observation") in inside] or list(states)
 
 
-def _curve(
-    part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales
+def _term(
+    part: Part, moment: str, variable: str, name: str, kind: str, function: Callable[..., Any],
+    shape: Mapping[str, float], bound: Mapping[str, Part], strength: str, *,
+    states: Sequence[str] = (), shares: str = "",
 ) -> Term:  # fmt: skip
+    """A basis function as an effect that is bound: argument -> the state or input it stands for."""
+    effect = Effect(
+        name=name, kind=kind, function=function, on=part.label,
+        shapes={n: numbers(v) for n, v in shape.items()},
+        given=dict.fromkeys(bound, "other state"), states=dict.fromkeys(states),
+    )  # fmt: skip
+    candidate = Candidate(
+        effect, part.label, tuple(shape.items()), tuple((a, v.label) for a, v in bound.items()),
+        part.role, slug(strength), shares=slug(shares) if shares else "",
+    )  # fmt: skip
+    return Term(candidate, part.label, moment, variable)
+
+
+def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales) -> Term:
     curve = CURVES[k]
 
     def term(own, z, strength, centre, width):
         return strength * curve((z - centre) / width)
 
     label, scale = variable.label, scales.scale[variable.label]
-    effect = Effect(
-        name=f"curve {k + 1} of {label}", kind=kind, function=term, on=part.label,
-        shapes={"centre": numbers(scale.mean), "width": numbers(scale.sd)},
-        given={"z": "other state"},
+    found = _term(
+        part, moment, label, f"curve {k + 1} of {label}", kind, term,
+        {"centre": scale.mean, "width": scale.sd}, {"z": variable},
+        f"curve {k + 1} {moment} {part.label} {label}",
     )  # fmt: skip
-    candidate = Candidate(
-        effect, part.label, (("centre", scale.mean), ("width", scale.sd)), (("z", label),),
-        part.role, slug(f"curve {k + 1} {moment} {part.label} {label}"),
-    )  # fmt: skip
-    return Term(candidate, part.label, moment, label, curve, scale.mean, scale.sd)
+    return replace(found, function=curve, centre=scale.mean, width=scale.sd)
 
 
 def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Term]:
-    """Of functions of two variables each."""
+    """Terms that are products of functions of two variables."""
     degrees = DEGREES if len(variables) <= FEW else DEGREES[:FIRST]
     out = []
     for a, b in combinations(variables, 2):
-        for i, j in degrees:
-            x, y = scales.scale[a.label], scales.scale[b.label]
-            shape = {"centre": x.mean, "width": x.sd, "centre_w": y.mean, "width_w": y.sd}
-            effect = Effect(
-                name=f"product {i} {j} of {a.label} and {b.label}", kind="transition",
-                function=_product(CURVES[i - 1], CURVES[j - 1]), on=part.label,
-                shapes={n: numbers(v) for n, v in shape.items()},
-                given={"z": "other state", "w": "other state"},
-            )  # fmt: skip
-            candidate = Candidate(
-                effect, part.label, tuple(shape.items()), (("z", a.label), ("w", b.label)),
-                part.role, slug(f"product {i} {j} {part.label} {a.label} {b.label}"),
-            )  # fmt: skip
-            out.append(Term(candidate, part.label, "mean", f"{a.label} and {b.label}"))
+        x, y = scales.scale[a.label], scales.scale[b.label]
+        shape = {"centre": x.mean, "width": x.sd, "centre_w": y.mean, "width_w": y.sd}
+        out += [
+            _term(
+                part, "mean", f"{a.label} and {b.label}",
+                f"product {i} {j} of {a.label} and {b.label}", "transition",
+                _product(CURVES[i - 1], CURVES[j - 1]), shape, {"z": a, "w": b},
+                f"product {i} {j} {part.label} {a.label} {b.label}",
+            )
+            for i, j in degrees
+        ]  # fmt: skip
     return out
 
 
@@ -223,7 +231,7 @@ def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
 
 
 def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
-    """By the variable through k + 1 low-passes in a row: B. de Vries and J. Principe, *Neural
+    """The variable through k + 1 low-passes in a row: B. de Vries and J. Principe, *Neural
     Networks* 5, 1992. All k of a variable share these states."""
 
     def term(own, z, past_1, past_2, past_3, strength, centre, width):
@@ -233,16 +241,11 @@ def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
         return Auxiliary(strength * past[k], laws, {n: Dirac(0.0) for n in PAST})
 
     label, scale = variable.label, scales.scale[variable.label]
-    effect = Effect(
-        name=f"past {k + 1} of {label}", kind="state", function=term, on=part.label,
-        shapes={"centre": numbers(scale.mean), "width": numbers(scale.sd)},
-        given={"z": "other state"}, states=dict.fromkeys(PAST),
+    return _term(
+        part, "mean", f"the past of {label}", f"past {k + 1} of {label}", "state", term,
+        {"centre": scale.mean, "width": scale.sd}, {"z": variable},
+        f"past {k + 1} {part.label} {label}", states=PAST, shares=f"past {label}",
     )  # fmt: skip
-    candidate = Candidate(
-        effect, part.label, (("centre", scale.mean), ("width", scale.sd)), (("z", label),),
-        part.role, slug(f"past {k + 1} {part.label} {label}"), shares=slug(f"past {label}"),
-    )  # fmt: skip
-    return Term(candidate, part.label, "mean", f"the past of {label}")
 
 
 def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Term:
@@ -259,36 +262,34 @@ def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Te
     label, scale = variable.label, scales.scale[variable.label]
     shape = {"centre": scale.mean, "width": scale.sd, **{n: float(v) for n, v in ring.items()}}
     name = f"ring {turn:.0f} of {label}"
-    effect = Effect(
-        name=f"{name}, phase {k + 1}", kind="state", function=term, on=part.label,
-        shapes={n: numbers(v) for n, v in shape.items()}, given={"z": "other state"},
-        states=dict.fromkeys(RING),
+    return _term(
+        part, "mean", f"the ringing of {label} at {turn:.0f} rows", f"{name}, phase {k + 1}",
+        "state", term, shape, {"z": variable}, f"ring {k + 1} {turn:.0f} {part.label} {label}",
+        states=RING, shares=name,
     )  # fmt: skip
-    candidate = Candidate(
-        effect, part.label, tuple(shape.items()), (("z", label),), part.role,
-        slug(f"ring {k + 1} {turn:.0f} {part.label} {label}"), shares=slug(name),
-    )  # fmt: skip
-    return Term(candidate, part.label, "mean", f"the ringing of {label} at {turn:.0f} rows")
 
 
-def lifted(
-    candidates: list[Candidate],
-) -> tuple[list[Candidate], Mapping[str, float]]:
+def symbolic_shapes(
+    candidates: Sequence[Candidate], *, of_time: bool = False
+) -> tuple[list[Candidate], dict[str, float]]:
     """Candidates whose shapes are symbols, and the values of these: code that fits all data.
 
-    Shapes that tell a number of states, or that stand in a function of time, stay numbers.
+    Shapes that tell a number of states stay numbers, and those of functions of time unless
+    `of_time`, whose symbols come last.
     """
-    out, values = [], {}
+    out: list[Candidate] = []
+    values: dict[str, float] = {}
+    dates: dict[str, float] = {}
     for c in candidates:
         lengths = {n for n in c.effect.states.values() if n is not None}
-        fixed = lengths | (set(dict(c.shape)) if c.effect.profile else set())
         shape: list[tuple[str, Any]] = []
         for name, value in c.shape:
-            if name in fixed:
+            timed = bool(c.effect.profile)
+            if name in lengths or (timed and (c.held or not of_time)):
                 shape.append((name, value))
                 continue
             own = f"{c.shares or c.strength}_{name}"
-            values[own] = value
+            (dates if timed else values)[own] = value
             shape.append((name, symbol("parameter", own, ())))
         out.append(replace(c, shape=tuple(shape)))
-    return out, values
+    return out, values | {n: float(v) for n, v in dates.items()}

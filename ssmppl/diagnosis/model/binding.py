@@ -11,7 +11,7 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.effects.effect import PROFILES, Auxiliary, Effect
-from ssmppl.diagnosis.model.equations import Anatomy, Part, components, time_symbol
+from ssmppl.diagnosis.model.equations import Equations, Part, components, time_symbol
 from ssmppl.errors import ModelError, NotApplicable, listing
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
@@ -27,7 +27,7 @@ _WITHOUT_STATES = ("parameter", "input", "time")  # what an initial law may depe
 
 @dataclass
 class Bound:
-    """What a candidate does to one law of the model.
+    """The changes that a candidate makes to one law of the model.
 
     changes : label of the part -> increment, or value in its place.
     transition, initial : laws of its auxiliary states, by name in the model.
@@ -39,7 +39,7 @@ class Bound:
 
 
 def bind(
-    candidate: Candidate, anatomy: Anatomy, role: str, names: Mapping[str, str] | None = None,
+    candidate: Candidate, equations: Equations, role: str, names: Mapping[str, str] | None = None,
     *, own: bool = False,
 ) -> Bound:  # fmt: skip
     """Call the effect's function as part of a law.
@@ -55,10 +55,10 @@ def bind(
     ModelError : the function raises, asks for what the model does not have, or returns something
         else than its kind says; names its line.
     """
-    effect, part = candidate.effect, anatomy.parts[candidate.equation]
+    effect, part = candidate.effect, equations.parts[candidate.equation]
     names = dict(names or {})
-    arguments = _arguments(candidate, anatomy, part, role, names)
-    known = {p.name: p.role for p in anatomy.parts.values()}
+    arguments = _arguments(candidate, equations, part, role, names)
+    known = {p.name: p.role for p in equations.parts.values()}
     returned = call(effect.function, "effect", arguments, known)
     out = Bound()
     if effect.kind == "state":
@@ -135,14 +135,14 @@ def _changes(candidate: Candidate, returned: Any, part: Part) -> dict[str, Expr]
 
 # -- arguments
 def _arguments(
-    candidate: Candidate, anatomy: Anatomy, part: Part, role: str, names: dict[str, str]
+    candidate: Candidate, equations: Equations, part: Part, role: str, names: dict[str, str]
 ) -> dict[str, Any]:
     effect, shape, bound = candidate.effect, dict(candidate.shape), dict(candidate.bound)
     parameters = inspect.signature(effect.function).parameters
     out: dict[str, Any] = {}
     for i, (name, parameter) in enumerate(parameters.items()):
         if i == 0:
-            out[name] = _first(effect, anatomy, part, role)
+            out[name] = _first(effect, equations, part, role)
         elif name == "strength":
             out[name] = symbol("parameter", candidate.strength)
         elif name in shape:
@@ -157,21 +157,21 @@ def _arguments(
                 form = () if length is None else (int(shape[length]),)
                 out[name] = _auxiliary(names.get(name, name), form, role)
         elif name in effect.given:
-            out[name] = _given(candidate, anatomy, part, role, name, bound)
+            out[name] = _given(candidate, equations, part, role, name, bound)
         elif name == "t":
             out[name] = time_symbol(role)
-        elif (value := quantity(anatomy, name, role)) is not None:
+        elif (value := quantity(equations, name, role)) is not None:
             out[name] = value
         elif parameter.default is not parameter.empty:
             continue
         else:
-            raise unknown(effect, name, anatomy)
+            raise unknown(effect, name, equations)
     return out
 
 
-def unknown(effect: Effect, name: str, anatomy: Anatomy) -> ModelError:
+def unknown(effect: Effect, name: str, equations: Equations) -> ModelError:
     """The error on an argument that is nothing the effect or the model knows."""
-    known = [*dict.fromkeys(p.name for p in anatomy.parts.values()), *effect.shapes,
+    known = [*dict.fromkeys(p.name for p in equations.parts.values()), *effect.shapes,
              *effect.states, *effect.given, "strength", "t"]  # fmt: skip
     return _refuse(
         effect,
@@ -180,13 +180,13 @@ def unknown(effect: Effect, name: str, anatomy: Anatomy) -> ModelError:
     )
 
 
-def quantity(anatomy: Anatomy, name: str, role: str) -> Any:
+def quantity(equations: Equations, name: str, role: str) -> Any:
     """A quantity of the model seen from a law; None where it has none of that name there."""
-    parts = [p for p in anatomy.parts.values() if p.name == name]
+    parts = [p for p in equations.parts.values() if p.name == name]
     if not parts or (parts[0].role == "channel" and role != "transition"):
         return None
-    shape = anatomy.trace.inputs.get(name, ())
-    value = components(anatomy.trace, parts[0].role, name, shape)
+    shape = equations.trace.inputs.get(name, ())
+    value = components(equations.trace, parts[0].role, name, shape)
     return _lagged(value) if role == "transition" and parts[0].role != "parameter" else value
 
 
@@ -201,12 +201,12 @@ def _auxiliary(name: str, shape: tuple[int, ...], role: str) -> Any:
     return value[()] if shape == () else value
 
 
-def _first(effect: Effect, anatomy: Anatomy, part: Part, role: str) -> Expr:
+def _first(effect: Effect, equations: Equations, part: Part, role: str) -> Expr:
     if effect.kind == "initial":
-        return _value(anatomy.mean(part, "initial"), effect)
+        return _value(equations.mean(part, "initial"), effect)
     if part.role != "channel":
         return part.seen_from(role)
-    mean = _value(anatomy.mean(part), effect)
+    mean = _value(equations.mean(part), effect)
     if role != "transition":
         return mean
     moved = ("state", "input", "time")
@@ -220,7 +220,12 @@ def _value(found: Expr | NotApplicable, effect: Effect) -> Expr:
 
 
 def _given(
-    candidate: Candidate, anatomy: Anatomy, part: Part, role: str, name: str, bound: dict[str, str]
+    candidate: Candidate,
+    equations: Equations,
+    part: Part,
+    role: str,
+    name: str,
+    bound: dict[str, str],
 ) -> Any:
     effect = candidate.effect
     what = effect.given[name]
@@ -231,27 +236,27 @@ def _given(
         wanted = inspect.signature(function).parameters
         return function(time_symbol(role), **{k: v for k, v in candidate.shape if k in wanted})
     if what == "second order":
-        return _value(anatomy.second_order(part), effect)
+        return _value(equations.second_order(part), effect)
     if what == "moved":
-        position = anatomy.position(part)
+        position = equations.position(part)
         if position is None:
             raise _refuse(effect, f"no state is the integral of {part.label}, whose move it asks "
                           "for", "bind it to the rate of a position")  # fmt: skip
-        return _value(anatomy.step(position), effect)
+        return _value(equations.step(position), effect)
     if name not in bound:
         raise _refuse(effect, f"nothing is bound to {name!r}, which is to be {what!r}",
                       "make its candidates by offers()")  # fmt: skip
-    return anatomy.parts[bound[name]].seen_from(role)
+    return equations.parts[bound[name]].seen_from(role)
 
 
-def check_base(candidate: Candidate, anatomy: Anatomy, bound: Bound, role: str) -> None:
-    """That strength 0 gives the model back.
+def check_base(candidate: Candidate, equations: Equations, bound: Bound, role: str) -> None:
+    """Check that strength 0 gives the model back.
 
     Raises
     ------
     ModelError : it does not; names the effect's line.
     """
-    part = anatomy.parts[candidate.equation]
+    part = equations.parts[candidate.equation]
     zero = {symbol("parameter", candidate.strength): constant(0.0)}
     kept = candidate.change in ("input", "parameter")
     base = part.seen_from(role) if kept else constant(0.0)

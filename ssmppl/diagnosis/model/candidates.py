@@ -1,4 +1,4 @@
-"""Which effects apply to a model, read off its equations, with their shapes in numbers."""
+"""The candidates of a model: which effects apply to its equations, with their shapes in numbers."""
 
 from __future__ import annotations
 
@@ -8,21 +8,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ssmppl.diagnosis.effects.candidate import OF_ROLE, ONE_OFF, Candidate
+from ssmppl.diagnosis.effects.candidate import DATED, OF_ROLE, Candidate
 from ssmppl.diagnosis.effects.catalogue import effects as catalogue
 from ssmppl.diagnosis.effects.effect import ON, Effect
 from ssmppl.diagnosis.model.binding import bind, check_base, quantity, unknown
 from ssmppl.diagnosis.model.changed_laws import has_scale, has_tail, scale_of_mean
-from ssmppl.diagnosis.model.equations import Anatomy, Flows, Part, as_it_was
-from ssmppl.diagnosis.model.scales import Scale, Scales, value_of
+from ssmppl.diagnosis.model.equations import Equations, Part, SharedTerms, as_it_was
+from ssmppl.diagnosis.model.scales import Scales, value_of
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.language.checks.rules import RESERVED
 from ssmppl.language.model.traced import Trace
-
-__all__ = ["Candidate", "Refused", "Scale", "Scales", "offers"]
 
 # What an effect of each kind can be bound to.
 BOUND_TO = {
@@ -66,22 +64,22 @@ def offers(
     ArgumentError : a name is not in the catalogue.
     ModelError : an effect's function does not fit its kind or the model; names its line.
     """
-    anatomy = Anatomy(as_it_was(trace))  # what was added is no part of the model
-    shared = Flows.of(anatomy)
+    equations = Equations(as_it_was(trace))  # what was added is no part of the model
+    shared = SharedTerms.of(equations)
     out: list[Candidate] = []
     refused: list[Refused] = []
     failures = Failures(raised=True) if failures is None else failures
     for effect in chosen(effects):
         try:
-            found, not_for = _of_effect(effect, anatomy, scales, shared)
+            found, not_for = _of_effect(effect, equations, scales, shared)
         except SSMError:  # of the user's own effect, or of their model
             raise
         except Exception as error:
-            failures.met(f"the effect {effect.name!r}", error)
+            failures.record(f"the effect {effect.name!r}", error)
             continue
         out += found
         refused += not_for
-    return _named(out, Anatomy(trace)), refused
+    return _named(out, Equations(trace)), refused
 
 
 def chosen(effects: Chosen = None) -> list[Effect]:
@@ -117,7 +115,7 @@ def chosen(effects: Chosen = None) -> list[Effect]:
 
 # -- one effect
 def _of_effect(
-    effect: Effect, anatomy: Anatomy, scales: Scales, shared: Flows
+    effect: Effect, equations: Equations, scales: Scales, shared: SharedTerms
 ) -> tuple[list[Candidate], list[Refused]]:
     out: list[Candidate] = []
     refused: list[Refused] = []
@@ -127,17 +125,17 @@ def _of_effect(
 
     own = {*effect.shapes, *effect.states, *effect.given, "strength", "t"}
     for name in effect.arguments[1:]:
-        if name not in own and quantity(anatomy, name, "transition") is None:
-            raise unknown(effect, name, anatomy)
-    parts = _parts(effect, anatomy)
+        if name not in own and quantity(equations, name, "transition") is None:
+            raise unknown(effect, name, equations)
+    parts = _parts(effect, equations)
     if not parts:
         refuse("", f"the model has no {_wanted(effect)}")
     for part in parts:
-        reason = _reason(effect, part, anatomy, scales)
+        reason = _reason(effect, part, equations, scales)
         if reason:
             refuse(part.label, reason)
             continue
-        for bound in _bindings(effect, part, anatomy):
+        for bound in _bindings(effect, part, equations):
             if isinstance(bound, str):
                 refuse(part.label, bound)
                 continue
@@ -146,19 +144,19 @@ def _of_effect(
                 refuse(part.label, shapes)
                 continue
             made = [Candidate(effect, part.label, shape, bound, part.role) for shape in shapes]
-            moves = made[0].change == "transition" and effect.profile not in ONE_OFF
+            moves = made[0].change == "transition" and effect.profile not in DATED
             if moves and part.label in shared.carried:
                 made = [replace(c, carried=shared.carried[part.label]) for c in made]
-            reason = _check(made[0], anatomy)
+            reason = _check(made[0], equations)
             if reason:
                 refuse(part.label, reason)
                 continue
             out += made
-            alone = moves and len(bind(made[0], anatomy, "transition", own=True).changes) == 1
+            alone = moves and len(bind(made[0], equations, "transition", own=True).changes) == 1
             if effect.on in ("rate", "state") and alone:
                 for reaction in shared.reactions.get(part.label, []):
                     acting = [replace(c, reaction=reaction) for c in made]
-                    if not _check(acting[0], anatomy):
+                    if not _check(acting[0], equations):
                         out += acting
     return out, refused
 
@@ -170,9 +168,9 @@ def _wanted(effect: Effect) -> str:
     return role if role != "any" else " or ".join(BOUND_TO[effect.kind])
 
 
-def _parts(effect: Effect, anatomy: Anatomy) -> list[Part]:
-    """What an effect is bound to by its kind and `on`."""
-    parts = [p for p in anatomy.parts.values() if p.role in BOUND_TO[effect.kind]]
+def _parts(effect: Effect, equations: Equations) -> list[Part]:
+    """The parts that an effect is bound to, by its kind and `on`."""
+    parts = [p for p in equations.parts.values() if p.role in BOUND_TO[effect.kind]]
     on = effect.on
     if on not in ON:
         return [p for p in parts if on in (p.label, p.name)]
@@ -183,36 +181,36 @@ def _parts(effect: Effect, anatomy: Anatomy) -> list[Part]:
     if on in ("channel", "input", "parameter"):
         return [p for p in parts if p.role == on]
     positive = on == "positive parameter"
-    return [p for p in parts if p.role == "parameter" and _positive(p, anatomy) == positive]
+    return [p for p in parts if p.role == "parameter" and _positive(p, equations) == positive]
 
 
-def _positive(part: Part, anatomy: Anatomy) -> bool:
-    support = anatomy.trace.parameters[part.name].distribution.support()
+def _positive(part: Part, equations: Equations) -> bool:
+    support = equations.trace.parameters[part.name].distribution.support()
     lower = array(support.lower)
     bound = lower[part.index] if lower.ndim == len(part.index) else lower.ravel()[0]
     return support.kind == "interval" and bound.op == "const" and bound.data >= 0.0
 
 
-def _reason(effect: Effect, part: Part, anatomy: Anatomy, scales: Scales) -> str:
+def _reason(effect: Effect, part: Part, equations: Equations, scales: Scales) -> str:
     """Why an effect is not offered for a part; "" where it is."""
     change = OF_ROLE[part.role] if effect.kind == "state" else effect.kind
     found: NotApplicable | str | None = None
     if effect.on == "rate":
-        found = anatomy.fixed_by_others(part)
-    elif effect.on == "state" and part.role == "state" and anatomy.deterministic(part):
-        found = anatomy.fixed_by_others(part)
+        found = equations.fixed_by_others(part)
+    elif effect.on == "state" and part.role == "state" and equations.deterministic(part):
+        found = equations.fixed_by_others(part)
         found = f"{found}, without noise" if found else ""
     if found:
         return str(found)
     if change in ("transition", "observation", "initial"):
-        found = scale_of_mean(anatomy.law(part, change))
+        found = scale_of_mean(equations.law(part, change))
         found = found if isinstance(found, NotApplicable) else None
     elif change == "noise":
-        found = has_scale(anatomy.law(part))
+        found = has_scale(equations.law(part))
     elif change == "tail":
-        found = has_tail(anatomy.law(part))
+        found = has_tail(equations.law(part))
     else:
-        found = _unused(part, anatomy)
+        found = _unused(part, equations)
     if isinstance(found, NotApplicable):
         return found.reason
     if found:
@@ -224,14 +222,14 @@ def _reason(effect: Effect, part: Part, anatomy: Anatomy, scales: Scales) -> str
         if effect.requires == "both signs" and (low > 0.0 or high < 0.0):
             return "it never changes its sign"
     if "second order" in effect.given.values():
-        term = anatomy.second_order(part)
+        term = equations.second_order(part)
         return term.reason if isinstance(term, NotApplicable) else ""
     return ""
 
 
-def _unused(part: Part, anatomy: Anatomy) -> str:
+def _unused(part: Part, equations: Equations) -> str:
     """Why an input or a parameter cannot be changed over time."""
-    trace = anatomy.trace
+    trace = equations.trace
     if part.role == "parameter":
         kind = trace.parameters[part.name].distribution.support().kind
         if kind in ("simplex", "positive definite"):
@@ -247,14 +245,14 @@ def _unused(part: Part, anatomy: Anatomy) -> str:
 
 # -- what its arguments are
 def _bindings(
-    effect: Effect, part: Part, anatomy: Anatomy
+    effect: Effect, part: Part, equations: Equations
 ) -> list[tuple[tuple[str, str], ...] | str]:
     """(argument, label) for each argument that is given; a text where there is nothing to bind."""
     options: list[list[tuple[str, str]]] = []
     for argument, what in effect.given.items():
         if what in ("profile", "second order"):
             continue
-        labels = _options(what, part, anatomy)
+        labels = _options(what, part, equations)
         if isinstance(labels, str):
             return [labels]
         if what != "moved":
@@ -262,14 +260,14 @@ def _bindings(
     return list(itertools.product(*options))
 
 
-def _options(what: str, part: Part, anatomy: Anatomy) -> list[str] | str:
+def _options(what: str, part: Part, equations: Equations) -> list[str] | str:
     if what == "other state":
-        labels = [p.label for p in anatomy.of_role("state") if p.label != part.label]
+        labels = [p.label for p in equations.of_role("state") if p.label != part.label]
         return labels or "the model has no other state"
     if what == "any input":
-        labels = [p.label for p in anatomy.of_role("input")]
+        labels = [p.label for p in equations.of_role("input")]
         return labels or "the model has no input"
-    position = anatomy.position(part)
+    position = equations.position(part)
     if position is None:
         return [part.label] if what == "position" else f"no state is the integral of {part.label}"
     return [position.label]
@@ -297,7 +295,7 @@ def _shapes(
     return list(itertools.product(*axes))
 
 
-def _check(candidate: Candidate, anatomy: Anatomy) -> str:
+def _check(candidate: Candidate, equations: Equations) -> str:
     """Call the function once: it has to give the model back at strength 0.
 
     Returns why an equation that it changes besides its own cannot be changed; "" where all can.
@@ -306,13 +304,13 @@ def _check(candidate: Candidate, anatomy: Anatomy) -> str:
     role = change if change in ("initial", "observation") else "transition"
     if candidate.effect.kind in ("noise", "tail"):
         role = OF_ROLE[candidate.role]
-    bound = bind(candidate, anatomy, role)
-    check_base(candidate, anatomy, bound, role)
+    bound = bind(candidate, equations, role)
+    check_base(candidate, equations, bound, role)
     for label in bound.changes:
-        part = anatomy.parts[label]
-        reason = anatomy.fixed_by_others(part) if label != candidate.equation else ""
+        part = equations.parts[label]
+        reason = equations.fixed_by_others(part) if label != candidate.equation else ""
         if not reason and part.role == "state" and change == "transition":
-            scale = scale_of_mean(anatomy.law(part))
+            scale = scale_of_mean(equations.law(part))
             reason = scale.reason if isinstance(scale, NotApplicable) else ""
         if reason and label not in dict(candidate.carried):
             return f"it changes {label} too: {reason}"
@@ -320,9 +318,9 @@ def _check(candidate: Candidate, anatomy: Anatomy) -> str:
 
 
 # -- names
-def _named(candidates: Sequence[Candidate], anatomy: Anatomy) -> list[Candidate]:
-    """With a strength each that is a readable name, and none that the model has."""
-    taken = {p.name for p in anatomy.parts.values()} | set(RESERVED) | {"np", "ssm", "model"}
+def _named(candidates: Sequence[Candidate], equations: Equations) -> list[Candidate]:
+    """The candidates with a readable name for each strength, none of which the model has."""
+    taken = {p.name for p in equations.parts.values()} | set(RESERVED) | {"np", "ssm", "model"}
     out = []
     for c in candidates:
         plain = slug(f"{c.effect.name} {c.equation}")

@@ -82,7 +82,7 @@ def noise_free(d: Distribution, index: Index) -> Expr:
 
 
 def shifted(d: Distribution, changes: Changes) -> Distribution:
-    """With the mean of the components at these indices moved, on the scale of `scale_of_mean`."""
+    """The law with means at these indices moved, on the scale of `scale_of_mean`."""
     inner = _inner(d)
     link = inner.mean_link
     assert link is not None
@@ -123,7 +123,7 @@ def has_scale(d: Distribution) -> NotApplicable | None:
 
 
 def scaled(d: Distribution, changes: Changes) -> Distribution:
-    """With increments of the log variance of the components at these indices."""
+    """The law with increments of the log variance of the components at these indices."""
     inner = _inner(d)
     assert inner.variance_link is not None
     name, power = inner.variance_link.parameter, inner.variance_link.power

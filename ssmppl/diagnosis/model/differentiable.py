@@ -1,4 +1,4 @@
-"""Whether a model has the derivatives that a diagnosis is made of, told before anything is fitted.
+"""Whether a model has the derivatives that a diagnosis needs, checked before anything is fitted.
 
 What an effect would do is held against what other values of the parameters would do: for that the
 log density needs a derivative in every parameter that is free. An `@ssm.primitive` of a state or an
@@ -23,7 +23,7 @@ _LAW_OF = {"initial": "the initial law of", "transition": "the transition of",
 
 
 def check_differentiable(trace: Trace, fixed: Collection[str] = ()) -> None:
-    """That the model has a derivative in each of its free parameters.
+    """Check that the model has a derivative in each of its free parameters.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def _error(
     inside = [(r, s) for r, s, roots in calling if node in set(topological(roots))]
     role, site = inside[0]
     names = list(dict.fromkeys(p.data[1] for ps in found.values() for p in ps))
-    told = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    named = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
     function = node.data.__name__
     return ModelError(
-        f"diagnose needs the derivatives of {_LAW_OF[role]} {site.name} in {told}, and "
+        f"diagnose needs the derivatives of {_LAW_OF[role]} {site.name} in {named}, and "
         f"{function}() is an @ssm.primitive, which has none",
         fix=f"write the formula of {function} in the model, with NumPy functions, or give the "
-        f"values of {told} in fixed=",
+        f"values of {named} in fixed=",
         where=site.distribution.location,
     )

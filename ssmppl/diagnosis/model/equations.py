@@ -1,18 +1,15 @@
-"""What of a traced model effects can be bound to, and what its equations say of each other.
-
-A traced model with effects added, which remembers the model as it was.
+"""The equations of a traced model: what effects can be bound to, and what they say of each other.
 
 What an effect is bound to (the state that integrates a rate, how far that moves in a step, what
 moves along) is read off the model as it was: with the terms of another effect in its equations a
 position is no plain integral any more, and means, steps and inputs are others. So a further effect
-is added to the model as it was, beside those that are in already, and means the same as if all had
-been added at once.
+is added to the model as it was (`Augmented.origin`), beside those that are in already, and means
+the same as if all had been added at once.
 
-Flows: expressions that several equations share, so that what one lacks the others lack with it.
-
-The acceleration of a cart turns the pole on it; who is infected leaves the susceptible. A force or
-a loss that is missing there is missing in every equation that holds the flow: an increment g of x_i
-is then one of g (d f_j / d F) / (d f_i / d F) of x_j, f the transitions' means and F the flow.
+What one equation lacks others lack with it where they share a term. The acceleration of a cart
+turns the pole on it; who is infected leaves the susceptible. A force or a loss that is missing
+there is missing in every equation that holds the term: an increment g of x_i is then one of g (d
+f_j / d F) / (d f_i / d F) of x_j, f the transitions' means and F the term.
 """
 
 from __future__ import annotations
@@ -33,10 +30,15 @@ from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.traced import Trace, previous, symbols
 
+Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
+
+_POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
+_TERM = symbol("flow", "F")  # stands for a shared term
+
 
 @dataclass(frozen=True)
 class Augmented(Trace):
-    """What `augment` makes.
+    """A traced model with effects added, as of `augment`.
 
     origin : the model as it was. added : the effects, in the order in which they were added.
     names : strength -> the names of its auxiliary states in the model.
@@ -52,9 +54,6 @@ def as_it_was(trace: Trace) -> Trace:
     if isinstance(trace, Augmented) and trace.origin is not None:
         return trace.origin
     return trace
-
-
-_POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
 
 
 def label_of(name: str, index: Index) -> str:
@@ -81,17 +80,17 @@ class Part:
         return previous(self.symbol) if lagging else self.symbol
 
 
-class Anatomy:
+class Equations:
     """The parts of a traced model by label, and which state is the integral of which.
 
     integral_of : state -> the state that it integrates (a position's velocity).
     copies : state -> the quantity that its transition only hands on.
     """
 
-    def __init__(self, trace: Trace, base: Anatomy | None = None):
+    def __init__(self, trace: Trace, base: Equations | None = None):
         """base : of the same model before effects were added; of itself where it has none."""
         if base is None and as_it_was(trace) is not trace:
-            base = Anatomy(as_it_was(trace))
+            base = Equations(as_it_was(trace))
         self.trace = trace
         self.parts: dict[str, Part] = {}
         for role, sites in (("state", trace.initial), ("channel", trace.observations),
@@ -248,64 +247,59 @@ def components(trace: Trace, role: str, name: str, shape: tuple[int, ...]) -> An
     return value[()] if array(value).shape == () else value
 
 
-Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
-
-FLOW = symbol("flow", "F")
-
-
 @dataclass(frozen=True)
-class Flows:
-    """What moves with the state of a label: `flows`, and what is `carried`."""
+class SharedTerms:
+    """What moves with each state: by terms that are shared, and what is `carried`."""
 
     reactions: Mapping[str, list[Reaction]]
     carried: Mapping[str, Reaction]
 
     @classmethod
-    def of(cls, anatomy: Anatomy) -> Flows:
-        """Of a model."""
-        return cls(flows(anatomy), carried(anatomy))
+    def of(cls, equations: Equations) -> SharedTerms:
+        """The shared terms of a model."""
+        return cls(shared_terms(equations), carried(equations))
 
 
-def flows(anatomy: Anatomy) -> dict[str, list[Reaction]]:
-    """By the label of a state: how the others move with it, once for each set of others.
+def shared_terms(equations: Equations) -> dict[str, list[Reaction]]:
+    """Label of a state -> how the others move with it, once for each set of others.
 
-    A flow is a shared expression of states or inputs, the largest of its kind, that enters the
+    A shared term is an expression of states or inputs, the largest of its kind, that enters the
     state's own equation with a constant factor, and the others' linearly. What integrates the state
     is not moved: see `carried`.
     """
     means = {}
-    for part in anatomy.of_role("state"):
-        mean = anatomy.mean(part)
-        if isinstance(mean, Expr) and scale_of_mean(anatomy.law(part)) == "identity":
+    for part in equations.of_role("state"):
+        mean = equations.mean(part)
+        if isinstance(mean, Expr) and scale_of_mean(equations.law(part)) == "identity":
             means[part.label] = mean
     out: dict[str, list[Reaction]] = {}
     for label in means:
-        part = anatomy.parts[label]
-        if not anatomy.fixed_by_others(part):
+        part = equations.parts[label]
+        if not equations.fixed_by_others(part):
             found: dict[tuple[str, ...], Reaction] = {}
             others = {k: m for k, m in means.items()
-                      if k != label and anatomy.integral_of.get(k) != label}  # fmt: skip
-            for flow in _shared(means[label], others):
-                reaction = _reaction(flow, means[label], others)
+                      if k != label and equations.integral_of.get(k) != label}  # fmt: skip
+            for term in _shared(means[label], others):
+                reaction = _reaction(term, means[label], others)
                 found.setdefault(tuple(other for other, _ in reaction), reaction)
             out[label] = [r for r in found.values() if r]
     return out
 
 
-def carried(anatomy: Anatomy) -> dict[str, Reaction]:
-    """By the label of a state: what integrates its new value, and so moves within the same step, as
+def carried(equations: Equations) -> dict[str, Reaction]:
+    """Label of a state -> what integrates its new value, and so moves within the same step, as
     in semi-implicit steps, x + h v_new."""
     out: dict[str, Reaction] = {}
-    for x, v in anatomy.integral_of.items():
-        mean, whole = (anatomy.mean(anatomy.parts[label]) for label in (v, x))
+    for x, v in equations.integral_of.items():
+        mean, whole = (equations.mean(equations.parts[label]) for label in (v, x))
         if not (isinstance(mean, Expr) and isinstance(whole, Expr)):
             continue
         if mean in set(topological([whole])):
             try:
-                (slope,) = gradient(substitute([whole], {mean: FLOW})[0], [FLOW])
+                (slope,) = gradient(substitute([whole], {mean: _TERM})[0], [_TERM])
             except NotDifferentiable:
                 continue
-            if not _moving(slope) and FLOW not in symbols_of(slope):
+            if not _moving(slope) and _TERM not in symbols_of(slope):
                 out[v] = ((x, slope),)
     return out
 
@@ -317,7 +311,7 @@ def _moving(e: Expr) -> bool:
 
 def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
     """What a state's equation and some other one hold, the larger first. Without a parameter,
-    as h v, cos x or x_1 - x_2, it is geometry and no flow."""
+    as h v, cos x or x_1 - x_2, it is geometry and no force or loss."""
     elsewhere = set(topological(others.values()))
     out: list[Expr] = []
     seen: set[Expr] = set()
@@ -334,18 +328,18 @@ def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
     return out
 
 
-def _reaction(flow: Expr, mean: Expr, others: Mapping[str, Expr]) -> Reaction:
-    """How the other equations move with one; () where the flow does not enter as it has to."""
+def _reaction(term: Expr, mean: Expr, others: Mapping[str, Expr]) -> Reaction:
+    """How the other equations move with one; () where the term does not enter as it has to."""
     out = []
     try:
-        (own,) = gradient(substitute([mean], {flow: FLOW})[0], [FLOW])
-        if _moving(own) or FLOW in symbols_of(own):
+        (own,) = gradient(substitute([mean], {term: _TERM})[0], [_TERM])
+        if _moving(own) or _TERM in symbols_of(own):
             return ()
         for label, other in others.items():
-            (slope,) = gradient(substitute([other], {flow: FLOW})[0], [FLOW])
+            (slope,) = gradient(substitute([other], {term: _TERM})[0], [_TERM])
             if slope.op == "const" and slope.data == 0.0:
                 continue
-            if FLOW in symbols_of(slope):
+            if _TERM in symbols_of(slope):
                 return ()
             out.append((label, slope / own))
     except NotDifferentiable:

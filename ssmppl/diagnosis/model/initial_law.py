@@ -1,10 +1,10 @@
-"""A proper start for augmented models that cannot have a flat one.
+"""A proper initial law for augmented models that cannot have a flat one.
 
 A model whose x_1 is Flat has a likelihood while it is linear and Gaussian, and an effect may end
 that. Such a model gets x_1 ~ N(m, s^2) in each flat component, so wide that the data alone tell
-where it starts. As p(y) under it is then p(y) under the flat law (of density 1) times the height of
-the normal law, the log of that height is added back: gains over the model as it was compare like
-with like.
+where it starts. As p(y) under it is then p(y) under the flat law (of density 1) times the largest
+density of the normal law, the log of that is taken off again (`log_correction`): gains over the
+model as it was compare like with like.
 """
 
 from __future__ import annotations
@@ -24,44 +24,47 @@ from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Normal
 from ssmppl.language.model.traced import Trace
 
-WIDE = 5.0  # times how far the states go, root mean square, or the starts lie apart in all
+WIDE = 5.0  # times how far the states go, root mean square, or the starts differ in all
 KEPT = 64  # means of x_1 at a time
 DIGITS = 2  # of the spread, which a reader of the model sees
 
 
 @dataclass(frozen=True)
-class Start:
-    """laws : by flat state, the mean and the spread of its proper law, of the state's shape."""
+class ProperInitialLaw:
+    """The law of x_1 in place of a flat one.
+
+    laws : by flat state, the mean and the spread of its proper law, of the state's shape.
+    """
 
     laws: Mapping[str, tuple[np.ndarray, np.ndarray]]
 
     @property
-    def height(self) -> float:
+    def log_correction(self) -> float:
         """Minus the log density of the laws at their means."""
         spread = np.concatenate([np.ravel(s) for _, s in self.laws.values()])
         return float(np.sum(np.log(spread)) + 0.5 * len(spread) * math.log(2.0 * math.pi))
 
-    def given(self, trace: Trace) -> Trace:
-        """The trace with these laws at its start."""
+    def applied_to(self, trace: Trace) -> Trace:
+        """The trace with these initial laws."""
         initial = dict(trace.initial)
         for name, (mean, spread) in self.laws.items():
             site = initial[name]
             law = Normal(mean, sd=spread)
             law.location = site.distribution.location
             initial[name] = replace(site, distribution=law)
-        if isinstance(trace, Augmented):  # what is added later is added to a model with this start
-            return replace(trace, initial=initial, origin=self.given(as_it_was(trace)))
+        if isinstance(trace, Augmented):  # what is added later is added to a model with it
+            return replace(trace, initial=initial, origin=self.applied_to(as_it_was(trace)))
         return replace(trace, initial=initial)
 
     def __str__(self) -> str:
-        told = (f"{n} ~ Normal({_text(m)}, sd={_text(s)})" for n, (m, s) in self.laws.items())
-        return ", ".join(told)
+        laws = (f"{n} ~ Normal({_text(m)}, sd={_text(s)})" for n, (m, s) in self.laws.items())
+        return ", ".join(laws)
 
 
-def start_of(
+def proper_initial_law(
     trace: Trace, starts: Sequence[np.ndarray], states: Sequence[np.ndarray]
-) -> Start | None:
-    """The start of the flat states; None where there is none.
+) -> ProperInitialLaw | None:
+    """Proper laws of the flat states; None where there is none.
 
     starts : (D,) of each experiment, where its x_1 is about. states : (..., D) of each experiment,
     draws from where its states are.
@@ -72,8 +75,8 @@ def start_of(
     mean = np.mean(starts, axis=0)
     away = np.concatenate([np.reshape(x, (-1, x.shape[-1])) for x in states]) - mean
     # each start that is d from the mean costs d^2 / (2 s^2) nats: 1/50 for all of them together
-    apart = np.sum((np.asarray(starts) - mean) ** 2, axis=0)
-    spread = WIDE * np.sqrt(np.fmax(np.mean(away**2, axis=0), apart))
+    between = np.sum((np.asarray(starts) - mean) ** 2, axis=0)
+    spread = WIDE * np.sqrt(np.fmax(np.mean(away**2, axis=0), between))
     spread = np.where(np.isfinite(spread) & (spread > 0.0), spread, 1.0)
     laws = {}
     for site in flat:
@@ -81,15 +84,15 @@ def start_of(
         rounded = [_rounded(m, s) for m, s in zip(mean[own], spread[own], strict=True)]
         m, s = (np.reshape(v, site.shape) for v in zip(*rounded, strict=True))
         laws[site.name] = m, s
-    return Start(laws)
+    return ProperInitialLaw(laws)
 
 
-def needs_start(trace: Trace) -> bool:
-    """Whether a start is flat that cannot be."""
+def needs_proper_initial_law(trace: Trace) -> bool:
+    """Whether an initial law is flat that cannot be."""
     return bool(flat_start(trace)) and isinstance(linear_gaussian(trace), NotApplicable)
 
 
-class FirstStates:
+class InitialStateMeans:
     """(D,) mean of x_1 given the rows up to `LAG`, by the ancestors of the particles there.
 
     What was found for an experiment and theta (P,) is kept: many sets are drawn from the same.

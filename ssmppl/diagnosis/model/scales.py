@@ -1,4 +1,4 @@
-"""Where the variables of a model lie, which shapes of effects are given relative to."""
+"""Scales of the variables of a model, which shapes of effects are given relative to."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DIGITS = 4  # of the numbers that shapes are given in, at least, and of the spre
 
 @dataclass(frozen=True)
 class Scale:
-    """Where the values of one variable lie: quantiles and quantiles of |values| at `LEVELS`."""
+    """The scale of one variable: quantiles of its values and of their sizes at `LEVELS`."""
 
     mean: float
     sd: float
@@ -30,7 +30,7 @@ class Scale:
 
     @classmethod
     def of(cls, values: Any) -> Scale:
-        """Of an array of any shape; NaN is missing."""
+        """The scale of an array of any shape; NaN is missing."""
         v = np.asarray(values, dtype=float).ravel()
         v = v[np.isfinite(v)]
         v = v if v.size else np.zeros(1)
@@ -39,7 +39,7 @@ class Scale:
         return cls(size * float((v / size).mean()), size * float((v / size).std()), *at)
 
     def quantile(self, level: float) -> float:
-        """By linear interpolation between `LEVELS`."""
+        """Quantile of the value, by linear interpolation between `LEVELS`."""
         return float(np.interp(level, LEVELS, self.quantiles))
 
     def size(self, level: float) -> float:

@@ -118,7 +118,7 @@ def opaque_in(derived: CompleteScore, s: Expr) -> NotApplicable | None:
 
 
 def _derived_from(derived: CompleteScore) -> list[Expr]:
-    """What the score is derived of."""
+    """The expressions that the score is derived of."""
     known = [e for values in derived.value.values() for s, e in values.items()
              if s not in derived.inert]  # fmt: skip
     return [*derived.density.values(), *known]
@@ -140,7 +140,7 @@ def _linear_in(
     superset: Trace, strengths: Collection[str], inert: Collection[Expr],
     refused: dict[str, NotApplicable],
 ) -> Trace:  # fmt: skip
-    """With the deterministic laws linear in the strengths, which is all that first derivatives at
+    """The trace with deterministic laws linear in strengths, which is all that first derivatives at
     zero see: products of two of them would have to be carried for nothing. In the laws of what is
     inert the strengths are zero, as are those without a derivative, which are `refused`."""
     own = [s for s in superset.parameter_symbols if s.data[1] in strengths]

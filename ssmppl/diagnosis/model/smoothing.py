@@ -1,23 +1,19 @@
-"""One pass over the data: log-likelihood, smoothed scores row by row, one-step predictions.
+"""One pass over the data: log-likelihood, smoothed scores row by row, predictions; and simulation.
 
-Exact draws of the trajectories where the model is linear and Gaussian, else a particle filter,
-twisted where the model allows it, with fixed-lag smoothing over its genealogy; see
-`codegen/kernels/particle/scored_filters.py`.
-
-Data sets drawn from a fitted model, with the lengths, inputs and gaps of the data.
-
-A component of x_1 whose law is Flat cannot be drawn: it starts at its smoothed mean given the data,
-as does one whose law stands for a flat one (`initial_law.py`).
-What a linear Gaussian model with a flat start says of its disturbances does not depend on where it
-starts (P. de Jong, *Annals of Statistics* 19, 1991).
-
-How well observations are predicted several rows ahead: the CRPS of simulations from what the
-filter knows.
+A pass (`Smoother`) has exact draws of the trajectories where the model is linear and Gaussian, else
+a particle filter, twisted where the model allows it, with fixed-lag smoothing over its genealogy;
+see `codegen/kernels/particle/scored_filters.py`.
 
 A model can predict one row well and drift away from reality in ten, as one-step predictions are
 corrected by every observation. So the filtered states of some rows are simulated on, and the
-continuous ranked probability score of what they give at each horizon is a statistic like the
-others, whose law comes from simulated data sets (`detect`).
+continuous ranked probability score (CRPS) of what they give at each horizon is a statistic like the
+others, whose law comes from simulated data sets.
+
+Data sets are drawn from a fitted model (`Simulator`) with the lengths, inputs and gaps of the data.
+A component of x_1 whose law is Flat cannot be drawn: it starts at its smoothed mean given the data,
+as does one whose law stands for a flat one (`initial_law.py`). What a linear Gaussian model with a
+flat start says of its disturbances does not depend on where it starts (P. de Jong, *Annals of
+Statistics* 19, 1991).
 """
 
 from __future__ import annotations
@@ -48,180 +44,21 @@ from ssmppl.inference.verbs.simulate import feeds_back
 from ssmppl.language.distributions import Dirac, Flat
 from ssmppl.language.model.traced import Site, Trace, symbols
 
+# Of a pass.
+LAG = 40  # rows of the fixed-lag smoother
+DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
+PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
 
-class Simulator:
-    """Draws from a model at given parameters.
-
-    program : of the model, which is used as it is where x_1 has a law. kalman : of the model where
-    it is linear and Gaussian. held : further states that start at a mean; found : of an experiment
-    and theta (P,), the means (D,) of x_1 that these take.
-    """
-
-    def __init__(
-        self, program: Program, missing: Missing, kalman: object, held: Sequence[str] = (),
-        found: Callable[[Experiment, np.ndarray], np.ndarray] | None = None,
-    ):  # fmt: skip
-        self.trace, self.feedback = program.trace, feeds_back(program.trace)
-        self.found = found
-        flat = [*flat_start(self.trace), *(self.trace.initial[n] for n in held)]
-        self.starts: list[Expr] = [s for site in flat for s in site.components]
-        self.kalman = kalman if isinstance(kalman, KalmanModel) else None
-        self.program = compile_trace(_started(self.trace, flat), missing) if flat else program
-
-    def sets(
-        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
-    ) -> list[Experiment]:
-        """The experiments with observations drawn at theta (P,), missing where theirs are.
-
-        Where a transition reads observations, `y` has those that it read, seen or not.
-        """
-        out = []
-        for e in experiments:
-            drawn = self.observations(e, theta, stream, 1)[:, :, 0]
-            y = drawn if self.feedback else np.where(e.seen == 1.0, drawn, 0.0)
-            out.append(replace(e, y=y))
-        return out
-
-    def observations(
-        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, n: int
-    ) -> np.ndarray:
-        """(T, K, n) drawn with the experiment's inputs, all rows measured."""
-        d, k = len(self.trace.state_symbols), len(self.trace.observation_symbols)
-        at = np.append(theta, self._start(e, theta))
-        run, width = self.program.entry("simulate"), 1 if self.feedback else n
-        drawn = []
-        for _ in range(n // width):
-            x, out = np.empty((e.steps, d, width)), np.empty((e.steps, k, width))
-            run(at, np.zeros_like(e.y), np.ones_like(e.seen), e.u, stream, x, out, self.feedback)
-            drawn.append(out)
-        return np.concatenate(drawn, axis=2)
-
-    def _start(self, e: Experiment, theta: np.ndarray) -> list[float]:
-        if not self.starts:
-            return []
-        place = {s: i for i, s in enumerate(self.trace.state_symbols)}
-        own = theta[: len(self.trace.parameter_symbols)]
-        if self.found is not None:
-            mean = self.found(e, own)
-        elif self.kalman is not None:
-            mean = self.kalman.smooth(e, own).mean[0]
-        else:
-            return []
-        return [float(mean[place[s]]) for s in self.starts]
-
-
-def _started(trace: Trace, flat: Sequence[Site]) -> Trace:
-    """The trace with flat starts replaced by further parameters."""
-    initial, parameters = dict(trace.initial), dict(trace.parameters)
-    for site in flat:
-        name = f"{site.name}_start"
-        while name in parameters or name in trace.transition:
-            name += "_"
-        at = symbols("parameter", name, site.shape)
-        law, start = Flat(shape=site.shape), Dirac(at)
-        law.location = start.location = site.distribution.location
-        parameters[name] = Site(name, "parameter", law, at, site.distribution.location)
-        initial[site.name] = replace(site, distribution=start)
-    return replace(trace, initial=initial, parameters=parameters)
-
-
+# Of predictions further ahead.
 HORIZONS = (1, 10, 100)  # rows
 ORIGINS = 40  # rows that are simulated on from, spread evenly
 CRPS_DRAWS = 24  # from each
 FEWEST = 8  # of these rows, without which a horizon is left out (0 in every data set)
 
 
-def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """(T,) continuous ranked probability score of predictive samples (T, M), smaller is better.
-
-    mean |x_i - y| - sum_{i<j} |x_i - x_j| / (M (M - 1)): fair, i.e. unbiased for the score of the
-    law that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018, equation 6).
-    NaN where nothing was observed, or a sample is infinite.
-    """
-    x, y = np.sort(np.asarray(samples, float), axis=-1), np.asarray(observed, float)
-    m = x.shape[-1]
-    if m < 2 or x.shape[:-1] != y.shape:
-        raise ArgumentError(
-            f"predictive samples of shape {x.shape} for observations of shape {y.shape}",
-            fix="give (T, M) samples, M at least 2, and (T,) observations",
-        )
-    with np.errstate(invalid="ignore", over="ignore"):
-        apart = x @ (2.0 * np.arange(1, m + 1) - m - 1.0)  # sum over pairs, by the order statistics
-        score = np.mean(np.abs(x - y[..., None]), axis=-1) - apart / (m * (m - 1.0))
-    return np.where(np.isfinite(x).all(axis=-1), score, np.nan)
-
-
-def crps_ahead(
-    program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
-    stream: np.ndarray, feedback: bool, horizons: Sequence[int] = HORIZONS,
-) -> np.ndarray:  # fmt: skip
-    """(O, H, K) CRPS of each channel at each horizon, from O rows on; NaN where nothing was
-    observed, or the record ends before.
-
-    particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
-    observations; rows that lack one are then not simulated on from.
-    """
-    simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
-    origins = np.unique(np.linspace(0, max(steps - 2, 0), ORIGINS).astype(int))
-    if steps < 2:
-        return np.full((len(origins), len(horizons), channels), np.nan)
-    levels = np.empty(1)
-    samples = np.full((len(origins), len(horizons), channels, CRPS_DRAWS), np.nan)
-    known = np.isfinite(particles[origins]).all(axis=(1, 2))  # not a flat start before it is
-    for o, t in enumerate(origins.tolist()):
-        if not known[o] or (feedback and not np.all(e.seen[t] == 1.0)):
-            continue
-        fill_uniform(stream, levels)
-        chosen = _systematic(weights[t], float(levels[0]))
-        reach = min(max(horizons), steps - 1 - t)
-        states = np.empty((reach, particles.shape[1], CRPS_DRAWS))
-        drawn = np.empty((reach, channels, CRPS_DRAWS))
-        start = np.ascontiguousarray(particles[t][:, chosen])
-        y = e.y.copy() if feedback else e.y
-        simulate(theta, y, e.seen, e.u, t + 1, start, stream, states, drawn, feedback)
-        for h, horizon in enumerate(horizons):
-            if horizon <= reach:
-                samples[o, h] = drawn[horizon - 1]
-    rows = origins[:, None] + np.array(horizons)
-    inside = np.minimum(rows, steps - 1)
-    measured = (rows < steps)[..., None] & (e.seen[inside] == 1.0)
-    return crps(samples, np.where(measured, e.y[inside], np.nan))
-
-
-def _systematic(weights: np.ndarray, level: float) -> np.ndarray:
-    """Indices of `DRAWS` particles, drawn by their weights with one uniform."""
-    cumulative = np.cumsum(weights)
-    points = (np.arange(CRPS_DRAWS) + level) / CRPS_DRAWS * cumulative[-1]
-    return np.minimum(np.searchsorted(cumulative, points), len(weights) - 1)
-
-
-def mean_scores(
-    scores: Sequence[np.ndarray], channels: Sequence[str]
-) -> dict[str, dict[str, float]]:
-    """Statistics by channel: the mean CRPS at each horizon over all rows and experiments; 0 where
-    there are too few."""
-    together = np.concatenate([np.empty((0, len(HORIZONS), len(channels))), *scores])
-    out: dict[str, dict[str, float]] = {}
-    for k, channel in enumerate(channels):
-        own = out[channel] = {}
-        for h, horizon in enumerate(HORIZONS):
-            known = together[:, h, k]
-            known = known[np.isfinite(known)]
-            rows = "row" if horizon == 1 else "rows"
-            own[f"CRPS {horizon} {rows} ahead"] = (
-                float(known.mean()) if len(known) >= FEWEST else 0.0
-            )
-    return out
-
-
-LAG = 40
-DRAWS = 64  # exact trajectories of a linear Gaussian model, half of them mirrored at their mean
-PREDICTIVE = 128  # draws behind a prediction under the twisted proposal
-
-
 @dataclass(frozen=True)
 class Settings:
-    """particles : N of the filter. proposal : of the filter. lag : of the smoother, in rows."""
+    """Settings of a pass: the filter's particles and proposal, the smoother's lag in rows."""
 
     particles: int = 1000
     proposal: str = "bootstrap"
@@ -230,7 +67,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Pass:
-    """What one pass tells of one experiment (T rows, F columns, K channels).
+    """Results of one pass over one experiment (T rows, F columns, K channels).
 
     log_increments : (T,) log p(y_t | y_{1:t-1}). rows : (T, F) smoothed scores, row by row.
     prediction : (T, 4, K) mean, variance, P(Y <= y), P(Y < y) given y_{1:t-1}.
@@ -344,7 +181,7 @@ class Smoother:
         self, system: ParticleSystem, weights: np.ndarray, e: Experiment, theta: np.ndarray,
         stream: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Particles (T, D, N) and weights (T, N) that tell what was known at each row.
+        """Particles (T, D, N) and weights (T, N) of the filtering law at each row.
 
         Of the filter itself; under the twisted proposal, whose particles know what comes later,
         draws from the extended Kalman filter, in pairs mirrored at its mean.
@@ -403,3 +240,164 @@ def probability_transforms(
         value = lower + uniforms.reshape(upper.shape) * (upper - lower)
         out.append(np.where(e.seen == 1.0, value, np.nan))
     return out
+
+
+def crps(samples: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """(T,) continuous ranked probability score of predictive samples (T, M), smaller is better.
+
+    mean |x_i - y| - sum_{i<j} |x_i - x_j| / (M (M - 1)): fair, i.e. unbiased for the score of the
+    law that the M samples come from (Gneiting and Raftery 2007; Zamo and Naveau 2018, equation 6).
+    NaN where nothing was observed, or a sample is infinite.
+    """
+    x, y = np.sort(np.asarray(samples, float), axis=-1), np.asarray(observed, float)
+    m = x.shape[-1]
+    if m < 2 or x.shape[:-1] != y.shape:
+        raise ArgumentError(
+            f"predictive samples of shape {x.shape} for observations of shape {y.shape}",
+            fix="give (T, M) samples, M at least 2, and (T,) observations",
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        pairs = x @ (2.0 * np.arange(1, m + 1) - m - 1.0)  # sum over pairs, by the order statistics
+        score = np.mean(np.abs(x - y[..., None]), axis=-1) - pairs / (m * (m - 1.0))
+    return np.where(np.isfinite(x).all(axis=-1), score, np.nan)
+
+
+def crps_ahead(
+    program: Program, e: Experiment, theta: np.ndarray, particles: np.ndarray, weights: np.ndarray,
+    stream: np.ndarray, feedback: bool, horizons: Sequence[int] = HORIZONS,
+) -> np.ndarray:  # fmt: skip
+    """(O, H, K) CRPS of each channel at each horizon, from O rows on; NaN where nothing was
+    observed, or the record ends before.
+
+    particles (T, D, N), weights (T, N) : of x_t given y_{1:t}. feedback : a transition names
+    observations; rows that lack one are then not simulated on from.
+    """
+    simulate, (steps, channels) = program.entry("simulate_on"), e.y.shape
+    origins = np.unique(np.linspace(0, max(steps - 2, 0), ORIGINS).astype(int))
+    if steps < 2:
+        return np.full((len(origins), len(horizons), channels), np.nan)
+    levels = np.empty(1)
+    samples = np.full((len(origins), len(horizons), channels, CRPS_DRAWS), np.nan)
+    known = np.isfinite(particles[origins]).all(axis=(1, 2))  # not a flat start before it is
+    for o, t in enumerate(origins.tolist()):
+        if not known[o] or (feedback and not np.all(e.seen[t] == 1.0)):
+            continue
+        fill_uniform(stream, levels)
+        chosen = _systematic(weights[t], float(levels[0]))
+        reach = min(max(horizons), steps - 1 - t)
+        states = np.empty((reach, particles.shape[1], CRPS_DRAWS))
+        drawn = np.empty((reach, channels, CRPS_DRAWS))
+        start = np.ascontiguousarray(particles[t][:, chosen])
+        y = e.y.copy() if feedback else e.y
+        simulate(theta, y, e.seen, e.u, t + 1, start, stream, states, drawn, feedback)
+        for h, horizon in enumerate(horizons):
+            if horizon <= reach:
+                samples[o, h] = drawn[horizon - 1]
+    rows = origins[:, None] + np.array(horizons)
+    inside = np.minimum(rows, steps - 1)
+    measured = (rows < steps)[..., None] & (e.seen[inside] == 1.0)
+    return crps(samples, np.where(measured, e.y[inside], np.nan))
+
+
+def _systematic(weights: np.ndarray, level: float) -> np.ndarray:
+    """Indices of `CRPS_DRAWS` particles, drawn by their weights with one uniform."""
+    cumulative = np.cumsum(weights)
+    points = (np.arange(CRPS_DRAWS) + level) / CRPS_DRAWS * cumulative[-1]
+    return np.minimum(np.searchsorted(cumulative, points), len(weights) - 1)
+
+
+def mean_scores(
+    scores: Sequence[np.ndarray], channels: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Statistics by channel: the mean CRPS at each horizon over all rows and experiments; 0 where
+    there are too few."""
+    together = np.concatenate([np.empty((0, len(HORIZONS), len(channels))), *scores])
+    out: dict[str, dict[str, float]] = {}
+    for k, channel in enumerate(channels):
+        own = out[channel] = {}
+        for h, horizon in enumerate(HORIZONS):
+            known = together[:, h, k]
+            known = known[np.isfinite(known)]
+            rows = "row" if horizon == 1 else "rows"
+            own[f"CRPS {horizon} {rows} ahead"] = (
+                float(known.mean()) if len(known) >= FEWEST else 0.0
+            )
+    return out
+
+
+class Simulator:
+    """Draws from a model at given parameters.
+
+    program : of the model, which is used as it is where x_1 has a law. kalman : of the model where
+    it is linear and Gaussian. held : further states that start at a mean; initial_means : of an
+    experiment and theta (P,), the means (D,) of x_1 that these take.
+    """
+
+    def __init__(
+        self, program: Program, missing: Missing, kalman: object, held: Sequence[str] = (),
+        initial_means: Callable[[Experiment, np.ndarray], np.ndarray] | None = None,
+    ):  # fmt: skip
+        self.trace, self.feedback = program.trace, feeds_back(program.trace)
+        self.initial_means = initial_means
+        flat = [*flat_start(self.trace), *(self.trace.initial[n] for n in held)]
+        self.starts: list[Expr] = [s for site in flat for s in site.components]
+        self.kalman = kalman if isinstance(kalman, KalmanModel) else None
+        self.program = (
+            compile_trace(_with_initial_parameters(self.trace, flat), missing) if flat else program
+        )
+
+    def sets(
+        self, experiments: Sequence[Experiment], theta: np.ndarray, stream: np.ndarray
+    ) -> list[Experiment]:
+        """The experiments with observations drawn at theta (P,), missing where theirs are.
+
+        Where a transition reads observations, `y` has those that it read, seen or not.
+        """
+        out = []
+        for e in experiments:
+            drawn = self.observations(e, theta, stream, 1)[:, :, 0]
+            y = drawn if self.feedback else np.where(e.seen == 1.0, drawn, 0.0)
+            out.append(replace(e, y=y))
+        return out
+
+    def observations(
+        self, e: Experiment, theta: np.ndarray, stream: np.ndarray, n: int
+    ) -> np.ndarray:
+        """(T, K, n) drawn with the experiment's inputs, all rows measured."""
+        d, k = len(self.trace.state_symbols), len(self.trace.observation_symbols)
+        at = np.append(theta, self._start(e, theta))
+        run, width = self.program.entry("simulate"), 1 if self.feedback else n
+        drawn = []
+        for _ in range(n // width):
+            x, out = np.empty((e.steps, d, width)), np.empty((e.steps, k, width))
+            run(at, np.zeros_like(e.y), np.ones_like(e.seen), e.u, stream, x, out, self.feedback)
+            drawn.append(out)
+        return np.concatenate(drawn, axis=2)
+
+    def _start(self, e: Experiment, theta: np.ndarray) -> list[float]:
+        if not self.starts:
+            return []
+        place = {s: i for i, s in enumerate(self.trace.state_symbols)}
+        own = theta[: len(self.trace.parameter_symbols)]
+        if self.initial_means is not None:
+            mean = self.initial_means(e, own)
+        elif self.kalman is not None:
+            mean = self.kalman.smooth(e, own).mean[0]
+        else:
+            return []
+        return [float(mean[place[s]]) for s in self.starts]
+
+
+def _with_initial_parameters(trace: Trace, flat: Sequence[Site]) -> Trace:
+    """The trace with flat initial laws replaced by further parameters."""
+    initial, parameters = dict(trace.initial), dict(trace.parameters)
+    for site in flat:
+        name = f"{site.name}_start"
+        while name in parameters or name in trace.transition:
+            name += "_"
+        at = symbols("parameter", name, site.shape)
+        law, start = Flat(shape=site.shape), Dirac(at)
+        law.location = start.location = site.distribution.location
+        parameters[name] = Site(name, "parameter", law, at, site.distribution.location)
+        initial[site.name] = replace(site, distribution=start)
+    return replace(trace, initial=initial, parameters=parameters)

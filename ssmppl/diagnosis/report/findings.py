@@ -16,8 +16,6 @@ from ssmppl.language.model.model import Model
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["COLUMNS", "MODES", "VERDICTS", "Findings", "tabulate"]
-
 VERDICTS = ("effect", "none of these", "no measurable gap")
 MODES = ("full", "fast")
 

@@ -10,8 +10,6 @@ from ssmppl.diagnosis.report.page import GENERATOR, page
 from ssmppl.diagnosis.report.panels import TITLES, pictures
 from ssmppl.errors import ArgumentError
 
-__all__ = ["MODEL_FILE", "PAGE_FILE", "save"]
-
 PAGE_FILE = "index.html"
 MODEL_FILE = "augmented_model.py"
 TEXT_FILE = "report.txt"

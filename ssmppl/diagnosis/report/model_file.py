@@ -1,11 +1,8 @@
 """A traced model as a model file that a person reads, and as a `Model` again.
 
-The file stands by itself: it imports numpy and ssmppl, keeps the user's names, and gives, when it
-is traced, the laws it was written from, expression by expression.
-
-What a model file imports of the user's own: primitives and laws, under their names.
-
-Which parts of expressions belong to a parameter: the terms that an effect has added.
+The file stands by itself: it imports numpy, ssmppl and the user's own primitives and laws, keeps
+the user's names, and gives, when it is traced, the laws it was written from, expression by
+expression.
 """
 
 from __future__ import annotations
@@ -36,179 +33,12 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive
 
-_INSTALLED = [sysconfig.get_path(k) for k in ("stdlib", "purelib", "platlib")]
-
-
-@dataclass(frozen=True)
-class Import:
-    """One primitive or distribution. same : equal for what is the same thing. path : its qualified
-    name in its module."""
-
-    kind: str
-    name: str
-    same: object
-    location: Location
-    module: str
-    path: str
-
-    @classmethod
-    def of_primitive(cls, p: Primitive) -> Import:
-        """What a call of it needs."""
-        f = p.function
-        return cls("primitive", p.__name__, p.name, p.location, f.__module__, f.__qualname__)
-
-    @classmethod
-    def of_law(cls, o: Origin) -> Import:
-        """What naming it needs."""
-        return cls("distribution", o.name, o, o.location, o.module, o.qualname)
-
-
-def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> dict[str, Import]:
-    """By name, in the order in which they occur.
-
-    Raises
-    ------
-    ArgumentError : two of one name, or one with a name that is taken in the file.
-    """
-    out: dict[str, Import] = {}
-    for wanted in (w for d in distributions for w in _wanted(d)):
-        if wanted.name in taken or out.setdefault(wanted.name, wanted).same != wanted.same:
-            kind = "law" if wanted.kind == "distribution" else wanted.kind
-            raise ArgumentError(
-                f"the model's file would have two things named {wanted.name!r}, one of them a "
-                f"{kind}",
-                fix=f"rename the {kind}",
-                where=wanted.location,
-            )
-    return out
-
-
-def _wanted(d: Distribution) -> Iterable[Import]:
-    for node in topological(nodes_of(d)):
-        if node.op == "call":
-            yield Import.of_primitive(node.data)
-    for part in _laws(d):
-        if isinstance(part, UserDefined):
-            yield Import.of_law(part.origin)
-
-
-def _laws(d: Distribution) -> Iterable[Distribution]:
-    """A law and those that it is made of."""
-    yield d
-    for part in d.inside():
-        yield from _laws(part)
-
-
-def nodes_of(d: Distribution) -> list[Expr]:
-    """All expressions of a law, those of what it is made of among them."""
-    if isinstance(d, Flat):
-        return []
-    if isinstance(d, Mixture):
-        own = [e for w in d.weights for e in w.ravel()]
-        return [*own, *(e for law in d.components for e in nodes_of(law))]
-    if isinstance(d, ZeroInflated):
-        return [*nodes_of(d.base), *d.p.ravel()]
-    if isinstance(d, Truncated):
-        return [*nodes_of(d.base), *(e for a in d.given_bounds().values() for e in a.ravel())]
-    return [e for a in d.parameters.values() for e in array(a).ravel()]
-
-
-def import_lines(found: Iterable[Import], before: list[str]) -> list[str]:
-    """The imports of a file, those that it has anyway `before`.
-
-    Raises
-    ------
-    ArgumentError : something cannot be imported.
-    """
-    lines, own, folders = before, [], []
-    for wanted in found:
-        module, folder = _home(wanted)
-        if all(part.isidentifier() and not iskeyword(part) for part in module.split(".")):
-            own.append(f"from {module} import {wanted.name}")
-        else:  # dc-motor.py
-            own.append(f'{wanted.name} = importlib.import_module("{module}").{wanted.name}')
-            lines = lines if "import importlib" in lines else ["import importlib", "", *lines]
-        folders += [folder] if folder else []
-    if folders:
-        lines = ["import sys", *([] if "import importlib" in lines else [""]), *lines]
-        own = [*(f"sys.path.append({f!r})" for f in dict.fromkeys(folders)),
-               *(f"{line}  # noqa: E402" for line in own)]  # fmt: skip
-    return [*lines, *([""] if own else []), *own]
-
-
-def in_memory(i: Import) -> object | None:
-    """The thing itself, where its module is there and has it under its name."""
-    held = getattr(sys.modules.get(i.module), i.name, None) if i.path == i.name else None
-    return held if getattr(held, "location", None) == i.location else None
-
-
-def _home(i: Import) -> tuple[str, str]:
-    """(module, folder) to import from; the folder is empty where it is not needed.
-
-    Raises
-    ------
-    ArgumentError : it stands in no file, or inside of a function.
-    """
-    file = Path(i.location.file)
-    held = getattr(sys.modules.get(i.module), i.name, None)
-    if i.path == i.name and file.exists() and inspect.isfunction(held):
-        raise ArgumentError(
-            f"the {i.kind} {i.name!r} does not stand under that name in its file",
-            fix="decorate its def, which gives it its name",
-            where=i.location,
-        )
-    if i.path != i.name or not file.exists():
-        place = "inside of a function" if file.exists() else f"in {file}, which is no file"
-        raise ArgumentError(
-            f"the {i.kind} {i.name!r} is defined {place}: a model file cannot import it",
-            fix="define it at the top level of a Python file",
-            where=i.location,
-        )
-    file = file.resolve()
-    if any(file.is_relative_to(p) for p in _INSTALLED):
-        return i.module, ""
-    if "." not in i.module or i.module == "__main__":  # a file by itself, whatever it was run as
-        if "." in file.stem:
-            raise ArgumentError(
-                f"the {i.kind} {i.name!r} is defined in {file.name}, which cannot be imported",
-                fix="take the dots out of the file's name",
-                where=i.location,
-            )
-        return file.stem, str(file.parent)
-    return i.module, str(file.parents[i.module.count(".")])
-
-
-_ADDITIVE = ("add", "sub", "neg")
-
-
-def terms_with(roots: Iterable[Expr], parameter: Expr) -> list[Expr]:
-    """The largest parts of sums that hold the parameter."""
-    out: list[Expr] = []
-    stack = [r for r in roots if depends_on(r, [parameter])]
-    while stack:
-        node = stack.pop(0)
-        if node.op in _ADDITIVE:
-            stack += [a for a in node.args if depends_on(a, [parameter])]
-        elif node.args and node not in out:
-            out.append(node)
-    return out
-
-
-def parts_of(roots: Iterable[Expr], parameter: Expr, own: Callable[[str], bool]) -> list[Expr]:
-    """The largest expressions that hold the parameter and else only quantities that are `own`."""
-    order = topological(roots)
-    inside = {n: n.op != "symbol" or n is parameter or own(n.data[1]) for n in order}
-    for n in order:
-        inside[n] &= all(inside[a] for a in n.args)
-    holds = dependent(order, [parameter])
-    used = {a for n in order if not inside[n] for a in n.args} | set(roots)
-    return [n for n in order if n.args and n in holds and inside[n] and n in used]
-
-
 LINE = 96
 INDENT = "    "
 _TAKEN = ("t", "np", "ssm", "special", "sys", "model", "prior", "initial", "transition",
           "observation", "proposal")  # fmt: skip
+_ADDITIVE = ("add", "sub", "neg")
+_INSTALLED = [sysconfig.get_path(k) for k in ("stdlib", "purelib", "platlib")]
 
 
 def model_text(
@@ -412,7 +242,7 @@ class _Writer:
 
 # -- layout
 def _wishes(role: str, sites: list[Site]) -> dict[Expr, str]:
-    """What means would be called if they needed a name: `x_next`, `y_mean`."""
+    """Names of means, if they should need one: `x_next`, `y_mean`."""
     out = {}
     for site in sites:
         mean = next(iter(site.distribution.parameters.values()), None)
@@ -442,7 +272,7 @@ def _signature(role: str, arguments: Sequence[str]) -> str:
 
 
 def _numbered(laws: list[str]) -> list[str]:
-    """With distinct names of the functions: prior, prior_2, ..."""
+    """The laws with distinct names of their functions: prior, prior_2, ..."""
     out: list[str] = []
     count: dict[str, int] = {}
     for law in laws:
@@ -452,3 +282,168 @@ def _numbered(laws: list[str]) -> list[str]:
             law = law.replace(f"def {role}(", f"def {role}_{count[role]}(", 1)
         out.append(law)
     return out
+
+
+# -- the terms of an effect
+def terms_with(roots: Iterable[Expr], parameter: Expr) -> list[Expr]:
+    """The largest parts of sums that hold the parameter."""
+    out: list[Expr] = []
+    stack = [r for r in roots if depends_on(r, [parameter])]
+    while stack:
+        node = stack.pop(0)
+        if node.op in _ADDITIVE:
+            stack += [a for a in node.args if depends_on(a, [parameter])]
+        elif node.args and node not in out:
+            out.append(node)
+    return out
+
+
+def parts_of(roots: Iterable[Expr], parameter: Expr, own: Callable[[str], bool]) -> list[Expr]:
+    """The largest expressions that hold the parameter and else only quantities that are `own`."""
+    order = topological(roots)
+    inside = {n: n.op != "symbol" or n is parameter or own(n.data[1]) for n in order}
+    for n in order:
+        inside[n] &= all(inside[a] for a in n.args)
+    holds = dependent(order, [parameter])
+    used = {a for n in order if not inside[n] for a in n.args} | set(roots)
+    return [n for n in order if n.args and n in holds and inside[n] and n in used]
+
+
+# -- imports
+@dataclass(frozen=True)
+class Import:
+    """One primitive or distribution. same : equal for what is the same thing. path : its qualified
+    name in its module."""
+
+    kind: str
+    name: str
+    same: object
+    location: Location
+    module: str
+    path: str
+
+    @classmethod
+    def of_primitive(cls, p: Primitive) -> Import:
+        """The import that a call of it needs."""
+        f = p.function
+        return cls("primitive", p.__name__, p.name, p.location, f.__module__, f.__qualname__)
+
+    @classmethod
+    def of_law(cls, o: Origin) -> Import:
+        """The import that naming it needs."""
+        return cls("distribution", o.name, o, o.location, o.module, o.qualname)
+
+
+def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> dict[str, Import]:
+    """The imports by name, in the order in which they occur.
+
+    Raises
+    ------
+    ArgumentError : two of one name, or one with a name that is taken in the file.
+    """
+    out: dict[str, Import] = {}
+    for wanted in (w for d in distributions for w in _wanted(d)):
+        if wanted.name in taken or out.setdefault(wanted.name, wanted).same != wanted.same:
+            kind = "law" if wanted.kind == "distribution" else wanted.kind
+            raise ArgumentError(
+                f"the model's file would have two things named {wanted.name!r}, one of them a "
+                f"{kind}",
+                fix=f"rename the {kind}",
+                where=wanted.location,
+            )
+    return out
+
+
+def _wanted(d: Distribution) -> Iterable[Import]:
+    for node in topological(nodes_of(d)):
+        if node.op == "call":
+            yield Import.of_primitive(node.data)
+    for part in _laws(d):
+        if isinstance(part, UserDefined):
+            yield Import.of_law(part.origin)
+
+
+def _laws(d: Distribution) -> Iterable[Distribution]:
+    """A law and those that it is made of."""
+    yield d
+    for part in d.inside():
+        yield from _laws(part)
+
+
+def nodes_of(d: Distribution) -> list[Expr]:
+    """All expressions of a law, those of what it is made of among them."""
+    if isinstance(d, Flat):
+        return []
+    if isinstance(d, Mixture):
+        own = [e for w in d.weights for e in w.ravel()]
+        return [*own, *(e for law in d.components for e in nodes_of(law))]
+    if isinstance(d, ZeroInflated):
+        return [*nodes_of(d.base), *d.p.ravel()]
+    if isinstance(d, Truncated):
+        return [*nodes_of(d.base), *(e for a in d.given_bounds().values() for e in a.ravel())]
+    return [e for a in d.parameters.values() for e in array(a).ravel()]
+
+
+def import_lines(found: Iterable[Import], before: list[str]) -> list[str]:
+    """The imports of a file, those that it has anyway `before`.
+
+    Raises
+    ------
+    ArgumentError : something cannot be imported.
+    """
+    lines, own, folders = before, [], []
+    for wanted in found:
+        module, folder = _home(wanted)
+        if all(part.isidentifier() and not iskeyword(part) for part in module.split(".")):
+            own.append(f"from {module} import {wanted.name}")
+        else:  # dc-motor.py
+            own.append(f'{wanted.name} = importlib.import_module("{module}").{wanted.name}')
+            lines = lines if "import importlib" in lines else ["import importlib", "", *lines]
+        folders += [folder] if folder else []
+    if folders:
+        lines = ["import sys", *([] if "import importlib" in lines else [""]), *lines]
+        own = [*(f"sys.path.append({f!r})" for f in dict.fromkeys(folders)),
+               *(f"{line}  # noqa: E402" for line in own)]  # fmt: skip
+    return [*lines, *([""] if own else []), *own]
+
+
+def in_memory(i: Import) -> object | None:
+    """The thing itself, where its module is there and has it under its name."""
+    held = getattr(sys.modules.get(i.module), i.name, None) if i.path == i.name else None
+    return held if getattr(held, "location", None) == i.location else None
+
+
+def _home(i: Import) -> tuple[str, str]:
+    """(module, folder) to import from; the folder is empty where it is not needed.
+
+    Raises
+    ------
+    ArgumentError : it stands in no file, or inside of a function.
+    """
+    file = Path(i.location.file)
+    held = getattr(sys.modules.get(i.module), i.name, None)
+    if i.path == i.name and file.exists() and inspect.isfunction(held):
+        raise ArgumentError(
+            f"the {i.kind} {i.name!r} does not stand under that name in its file",
+            fix="decorate its def, which gives it its name",
+            where=i.location,
+        )
+    if i.path != i.name or not file.exists():
+        place = "inside of a function" if file.exists() else f"in {file}, which is no file"
+        raise ArgumentError(
+            f"the {i.kind} {i.name!r} is defined {place}: a model file cannot import it",
+            fix="define it at the top level of a Python file",
+            where=i.location,
+        )
+    file = file.resolve()
+    if any(file.is_relative_to(p) for p in _INSTALLED):
+        return i.module, ""
+    if "." not in i.module or i.module == "__main__":  # a file by itself, whatever it was run as
+        if "." in file.stem:
+            raise ArgumentError(
+                f"the {i.kind} {i.name!r} is defined in {file.name}, which cannot be imported",
+                fix="take the dots out of the file's name",
+                where=i.location,
+            )
+        return file.stem, str(file.parent)
+    return i.module, str(file.parents[i.module.count(".")])

@@ -2,8 +2,6 @@
 
 The answers come first, then how sure they are, then what to do next, then the evidence, and at the
 end the model file. Plots are inside of it, once for narrow and once for wide screens.
-
-The style sheet of the page: one column of text, cards side by side where there is room.
 """
 
 from __future__ import annotations
@@ -41,6 +39,41 @@ from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent
 if TYPE_CHECKING:
     import pandas as pd
 
+GENERATOR = '<meta name="generator" content="ssmppl diagnose">'
+PHONE = 4.1  # inches: what a phone is wide
+LONGEST_TABLE = 60  # rows; the CSV files have all
+
+# What the page calls columns and tables, and says below the panels.
+HEADINGS = {
+    "F": "share closed", "F_low": "from", "F_high": "to", "t_from": "from t", "t_to": "to t",
+    "gain_screen": "gain, predicted", "gain_refit": "gain, refitted", "class_id": "alike",
+    "estimate": "strength", "se": "±", "rho": "correlation", "separating_input": "told apart by",
+    "nats_per_sample": "nats per sample", "gain_mean": "nats from the mean",
+    "gain_noise": "nats from the noise law", "rmse_before": "error before",
+    "rmse_after": "error after", "p": "p",
+}  # fmt: skip
+TABLES = {
+    "causes": "All effects tried, best first",
+    "classes": "Effects that cannot be told apart",
+    "where": "Where the gap is",
+    "closed": "How far the gap closes",
+    "detection": "Checks of the one-step predictions",
+}
+CAPTIONS = {
+    "residual_map": "Each cell is what the data say against one equation in one stretch of time, "
+    "in standard deviations (z). + and − mark cells beyond 3; a few cells beyond 2 are chance.",
+    "ranked_effects": "Gain in nats once the effect is added. Filled: the model was fitted again "
+    "with it; hatched: predicted by the screen. Effects with the same letter cannot be told apart "
+    "by these data.",
+    "gap_closed": "0% is the model as it was, 100% the best reference at hand. Lines are 95% "
+    "intervals; an arrow where the data do not bound them.",
+    "missing_term": "What would have to be added to the equation in each step, estimated without "
+    "a formula, with its 95% band. Where the band holds zero, nothing may be missing.",
+    "free_run": "A model is started once and never shown the data again. Shaded: where it expects "
+    "95% of them.",
+}
+
+# One column of text, cards side by side where there is room.
 CSS = """
 :root {
   color-scheme: light dark;
@@ -117,11 +150,6 @@ footer { margin-top: 2.5rem; border-top: 1px solid var(--line); padding-top: 0.6
 """
 
 
-GENERATOR = '<meta name="generator" content="ssmppl diagnose">'
-PHONE = 4.1  # inches: what a phone is wide
-LONGEST_TABLE = 60  # rows; the CSV files have all
-
-
 def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
     """The text of the page; nothing in it refers to another file or host.
 
@@ -129,7 +157,7 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
     """
     title = f"Diagnosis of {report.title}" if report.title else "Diagnosis of a model"
     kind = report.verdict.replace(" ", "-")
-    # These first: what fails in them is told among what is left out.
+    # These first: what fails in them is among the parts left out.
     evidence = _part(
         report,
         "the page's pictures",
@@ -240,21 +268,6 @@ def _evidence(report: Findings, wide: dict[str, bytes]) -> str:
     return _section("The evidence", body)
 
 
-CAPTIONS = {
-    "residual_map": "Each cell is what the data say against one equation in one stretch of time, "
-    "in standard deviations (z). + and − mark cells beyond 3; a few cells beyond 2 are chance.",
-    "ranked_effects": "Gain in nats once the effect is added. Filled: the model was fitted again "
-    "with it; hatched: predicted by the screen. Effects with the same letter cannot be told apart "
-    "by these data.",
-    "gap_closed": "0% is the model as it was, 100% the best reference at hand. Lines are 95% "
-    "intervals; an arrow where the data do not bound them.",
-    "missing_term": "What would have to be added to the equation in each step, estimated without "
-    "a formula, with its 95% band. Where the band holds zero, nothing may be missing.",
-    "free_run": "A model is started once and never shown the data again. Shaded: where it expects "
-    "95% of them.",
-}
-
-
 def _alt(report: Findings, name: str) -> str:
     """What the picture shows, for those who cannot see it."""
     if name == "residual_map":
@@ -294,23 +307,6 @@ def _png(picture: bytes) -> str:
 
 
 # -- the tables
-HEADINGS = {
-    "F": "share closed", "F_low": "from", "F_high": "to", "t_from": "from t", "t_to": "to t",
-    "gain_screen": "gain, predicted", "gain_refit": "gain, refitted", "class_id": "alike",
-    "estimate": "strength", "se": "±", "rho": "correlation", "separating_input": "told apart by",
-    "nats_per_sample": "nats per sample", "gain_mean": "nats from the mean",
-    "gain_noise": "nats from the noise law", "rmse_before": "error before",
-    "rmse_after": "error after", "p": "p",
-}  # fmt: skip
-TABLES = {
-    "causes": "All effects tried, best first",
-    "classes": "Effects that cannot be told apart",
-    "where": "Where the gap is",
-    "closed": "How far the gap closes",
-    "detection": "Checks of the one-step predictions",
-}
-
-
 def _tables(report: Findings) -> str:
     out = []
     letters = class_letters(report)

@@ -1,9 +1,8 @@
-"""The panels of a report, each on axes that are given: the gap, its causes, how far it closes.
+"""The panels of a report: where the gap is, its causes, how far it closes; alone and put together.
 
-Every function takes the report and Matplotlib axes, draws, and gives the axes back. Labels of bars
-stand above them, so that a panel is readable at the width of a phone.
-
-The panels of a report put together: one figure of all, or one figure for each.
+Every panel takes the report and Matplotlib axes, draws, and gives the axes back. Labels of bars
+stand above them, so that a panel is readable at the width of a phone. `plot` has all of them in one
+figure, `pictures` one for each.
 """
 
 from __future__ import annotations
@@ -22,10 +21,20 @@ from ssmppl.errors import ArgumentError
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_EQUATIONS = 12
-MOST_EFFECTS = 8
+TITLES = {
+    "residual_map": "Where the model and the data disagree",
+    "ranked_effects": "Effects that were tried, best first",
+    "gap_closed": "How much of the gap each closes",
+    "missing_term": "What is missing, as estimated",
+    "free_run": "Simulated without seeing the data",
+}
+
+MOST_EQUATIONS, MOST_EFFECTS, MOST_CURVES, MOST_RUNS = 12, 8, 4, 6  # that are drawn
 STANDS_OUT = 3.0  # |z| of a cell that gets a sign
 LONGEST_NAME = 52  # characters above a bar
+WIDE = 6.0  # inches, from which curves stand side by side
+DESK = 7.4  # inches: what a column of text is wide
+DPI = 170
 OPAQUE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 SHARES = (-1.0, 2.0)  # what is shown of F at most
 
@@ -282,21 +291,6 @@ def free_run(
     return ax
 
 
-TITLES = {
-    "residual_map": "Where the model and the data disagree",
-    "ranked_effects": "Effects that were tried, best first",
-    "gap_closed": "How much of the gap each closes",
-    "missing_term": "What is missing, as estimated",
-    "free_run": "Simulated without seeing the data",
-}
-
-WIDE = 6.0  # inches, from which curves stand side by side
-DESK = 7.4  # inches: what a column of text is wide
-DPI = 170
-MOST_CURVES = 4
-MOST_RUNS = 6
-
-
 def plot(report: Findings) -> Any:
     """All panels that the report has something for, below each other, as a pyplot figure."""
     from matplotlib import pyplot
@@ -353,7 +347,7 @@ def _height(report: Findings, name: str, width: float) -> float:
         return 0.75 + 0.42 * len(bars(report)) if len(report.causes) else 0.0
     if name == "gap_closed":
         shown = sum(is_number(f) for f in report.closed["F"])
-        return 0.75 + 0.42 * min(shown, 8) if shown else 0.0
+        return 0.75 + 0.42 * min(shown, MOST_EFFECTS) if shown else 0.0
     if name == "missing_term":
         lines, _ = _grid(len(curves(report)[:MOST_CURVES]), width)
         return 2.4 * lines

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.effects.candidate import Candidate, one_off, shape_text
+from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, starts_of
 from ssmppl.diagnosis.heldout.predictions import FreeRun
 from ssmppl.diagnosis.heldout.reference import residual_groups
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.screening.location import (
     Group,
-    bin_edges,
     curve,
-    group_score,
     localise,
     regions,
     when,
@@ -37,38 +35,33 @@ STANDS_OUT = 3.0  # |z| of a region that is named
 SHARED = 0.2
 
 
-def shared(p: Any) -> Any:
+def bonferroni(p: Any) -> Any:
     """p of the places, or of the checks, with what else is looked at counted (Bonferroni)."""
     return np.minimum(1.0, np.asarray(p, dtype=float) / SHARED)
 
 
 def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, Group]]:
     """Equation, moment, stretch of time and region of each group of the basis; by p (`shared`)."""
-    observed, nuisance = screen.observed, screen.stacked("nuisance")
-    columns, terms = screen.stacked("basis"), screen.question.terms
+    observed, nuisance = screen.observed, screen.simulated.nuisance
+    columns, terms = screen.simulated.basis, screen.design.terms
     keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
     if not keys:
         return tabulate("where"), {}
     places = {k: [i for i, t in enumerate(terms) if (t.equation, t.moment) == k] for k in keys}
     groups: dict[Hashable, Any] = {k: (columns[:, p], observed.basis[p]) for k, p in places.items()}
     table, found = localise(groups, nuisance, observed.nuisance)
-    alone = {
-        k: group_score(columns[:, p], observed.basis[p], nuisance, observed.nuisance)
-        for k, p in places.items()
-    }
-    sizes = [e.steps for e in screen.experiments]
-    starts = np.cumsum([0, *sizes[:-1]]).tolist()
-    edges = bin_edges(sum(sizes), starts)
+    starts, edges = starts_of(screen.experiments), screen.edges
     labels = _labels(screen.experiments)
-    bins, own = screen.stacked("basis_bins"), screen.stacked("nuisance_bins")
+    bins, own = screen.simulated.basis_bins, screen.simulated.nuisance_bins
     rows = []
     for row in table.itertuples():
-        key, p = row.key, float(shared(row.p_either))
-        stretch = (0, sum(sizes))
+        key, p = row.key, float(bonferroni(row.p_either))
+        stretch = (0, len(labels))
         if p <= alpha and len(edges) > 3:
             at = when(
-                alone[key], bins[:, :, places[key]], observed.basis_bins[:, places[key]],
-                own, observed.nuisance_bins, edges, alpha=alpha,
+                screen.basis_group(places[key]), bins[:, :, places[key]],
+                observed.basis_bins[:, places[key]], own, observed.nuisance_bins, edges,
+                alpha=alpha,
             )  # fmt: skip
             stretch = (at.first, at.last)
         rows.append({
@@ -99,13 +92,10 @@ def _experiments(starts: Sequence[int], first: int, last: int) -> str:
 
 def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
     """Where the strongest of the variables shows the gap most, in words."""
-    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
-    columns, best = screen.stacked("basis"), None
+    terms, best = screen.design.terms, None
     for variable in dict.fromkeys(terms[i].variable for i in places):
         own = [i for i in places if terms[i].variable == variable]
-        group = group_score(
-            columns[:, own], screen.observed.basis[own], nuisance, screen.observed.nuisance
-        )
+        group = screen.basis_group(own)
         if best is None or group.z > best[0].z:
             best = group, variable, own
     if best is None:
@@ -113,7 +103,7 @@ def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
     group, variable, own = best
     if not terms[own[0]].is_curve:
         return f"with {variable}"
-    values = screen.question.grid(variable)
+    values = screen.design.grid(variable)
     table = regions(group, [terms[i].at for i in own], values, variable)
     row = table.iloc[int(np.argmax(np.abs(table["z"].to_numpy())))]
     return f"where {row['region']}" if abs(row["z"]) >= STANDS_OUT else f"over {variable}"
@@ -122,19 +112,16 @@ def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
 def missing_table(
     screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
 ) -> pd.DataFrame:
-    """The estimated missing curve of the mean over each variable of an equation.
+    """The estimated_strength missing curve of the mean over each variable of an equation.
 
     others : candidates that are projected out.
     """
-    terms, nuisance = screen.question.terms, screen.stacked("nuisance")
-    columns, seen = screen.stacked("basis"), screen.observed.basis
-    rest = screen.columns_of(others)
-    rows = []
+    terms, rows = screen.design.terms, []
     places = [i for i, t in enumerate(terms) if (t.equation, t.moment) == key and t.is_curve]
     for variable in dict.fromkeys(terms[i].variable for i in places):
         own = [i for i in places if terms[i].variable == variable]
-        group = group_score(columns[:, own], seen[own], nuisance, screen.observed.nuisance, *rest)
-        values = screen.question.grid(variable)
+        group = screen.basis_group(own, others)
+        values = screen.design.grid(variable)
         low_end, high_end = np.quantile(values, (0.02, 0.98))
         grid = np.linspace(float(low_end), float(high_end), CURVE_POINTS)
         design = np.stack([np.asarray(terms[i].at(grid)) for i in own], axis=1)
@@ -145,10 +132,10 @@ def missing_table(
     return tabulate("missing", rows)
 
 
-def catalogue(screen: Screen) -> list[Candidate]:
-    """The candidates that the screen could tell anything about."""
-    candidates = screen.question.candidates
-    return [c for c, s in zip(candidates, screen.found.status, strict=True) if not s]
+def testable_candidates(screen: Screen) -> list[Candidate]:
+    """The candidates with a score that the parameters do not absorb."""
+    candidates = screen.design.candidates
+    return [c for c, s in zip(candidates, screen.efficient.status, strict=True) if not s]
 
 
 def residual_group(
@@ -178,20 +165,20 @@ def causes_table(
     significant = screen.significant
     rows = []
     for i, k in enumerate(order):
-        c, s = screen.question.candidates[k], screen.found
+        c, s = screen.design.candidates[k], screen.efficient
         own = by_head.get(k)
-        sided = screen.question.sided[k]
+        sided = screen.design.sided[k]
         strength = float(s.strength[k])
         error = 1.0 / np.sqrt(s.variance[k]) if s.variance[k] > 0.0 else np.nan
-        if screen.question.quadratic[k]:  # told of is the square
+        if screen.design.quadratic[k]:  # the estimate is of its square
             strength = float(np.sqrt(max(strength, 0.0)))
             error = error / (2.0 * strength) if strength > 0.0 else np.sqrt(error)
         if own is not None:
-            told = estimated(screen, own, own.candidates[0], error)
+            estimate = estimated_strength(screen, own, own.candidates[0], error)
         elif sided * strength < 0.0:  # the screen knows no bounds
-            told = _told(screen, c, 0.0, np.nan)
+            estimate = _strength_row(screen, c, 0.0, np.nan)
         else:
-            told = _told(screen, c, strength, error)
+            estimate = _strength_row(screen, c, strength, error)
         p = tested.get(k, np.nan)
         if screened:
             p = min(float(significant[k]), tested.get(k, 1.0))
@@ -199,22 +186,24 @@ def causes_table(
             "effect": c.effect.name, "equation": c.equation, "z": float(s.z[k]),
             "p": float(np.minimum(1.0, tests * p)),
             "gain_screen": float(s.gain[k]), "gain_refit": own.gain if own else np.nan,
-            "class_id": int(found.class_id[i]), **told,
+            "class_id": int(found.class_id[i]), **estimate,
         })  # fmt: skip
     return tabulate("causes", rows)
 
 
-def estimated(screen: Screen, refit: Refit, c: Candidate, error: float = np.nan) -> dict[str, Any]:
+def estimated_strength(
+    screen: Screen, refit: Refit, c: Candidate, error: float = np.nan
+) -> dict[str, Any]:
     """Form, sign, estimate and se of one of a refit's effects, whose shape need not be among those
     that the screen tried. error : of the strength by the screen, about, where it is known."""
     strengths = {own.strength: v for own, v in zip(refit.candidates, refit.strengths, strict=True)}
     strength = strengths[c.strength]
     if c.sided and (abs(strength) < AT_BOUND * error or c.strength in refit.bounds):
-        return _told(screen, c, 0.0, np.nan)  # the search runs towards the bound for ever
-    return _told(screen, c, strength, refit.errors[c.strength])
+        return _strength_row(screen, c, 0.0, np.nan)  # the search runs towards the bound for ever
+    return _strength_row(screen, c, strength, refit.errors[c.strength])
 
 
-def _told(screen: Screen, c: Candidate, strength: float, error: float) -> dict[str, Any]:
+def _strength_row(screen: Screen, c: Candidate, strength: float, error: float) -> dict[str, Any]:
     times = [e.time for e in screen.experiments]
     shape = ", ".join(f"{n} = {shape_text(v)}{_when(c, n, v, times)}" for n, v in c.shape)
     return {
@@ -227,7 +216,7 @@ def _told(screen: Screen, c: Candidate, strength: float, error: float) -> dict[s
 def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:
     """The label of the row that a date is, if it is the same in all experiments that reach there;
     times : of each, None where its rows have none."""
-    if shape != "date" or not one_off(c) or any(t is None for t in times):
+    if shape != "date" or not is_dated(c) or any(t is None for t in times):
         return ""
     found = {label(t[int(value) - 1]) for t in times if 1 <= value <= len(t)}
     return f" ({found.pop()})" if len(found) == 1 else ""
@@ -241,7 +230,7 @@ def classes_table(
     for number in dict.fromkeys(found.class_id.tolist()):
         members = found.members(number)
         for m in members:
-            c = screen.question.candidates[order[m]]
+            c = screen.design.candidates[order[m]]
             rows.append({
                 "class_id": int(number), "effect": c.effect.name, "equation": c.equation,
                 "rho": float(found.rho[m]),
@@ -252,12 +241,10 @@ def classes_table(
 
 def map_table(screen: Screen) -> pd.DataFrame:
     """Standardised smoothed scores of each equation's linear term by window of time."""
-    terms = screen.question.terms
-    sizes = [e.steps for e in screen.experiments]
-    starts = np.cumsum([0, *sizes[:-1]]).tolist()
-    edges = bin_edges(sum(sizes), starts)
+    terms = screen.design.terms
+    starts, edges = starts_of(screen.experiments), screen.edges
     labels, rows = _labels(screen.experiments), []
-    null, seen = screen.stacked("basis_bins"), screen.observed.basis_bins
+    null, seen = screen.simulated.basis_bins, screen.observed.basis_bins
     for equation in dict.fromkeys(t.equation for t in terms if t.moment == "mean"):
         own = [i for i, t in enumerate(terms) if t.equation == equation and t.moment == "mean"]
         spread = null[:, :, own].std(axis=0)

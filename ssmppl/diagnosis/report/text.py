@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 from ssmppl import markup
 from ssmppl.diagnosis.report.words import (
     GLOSSARY,
+    answers,
     class_letters,
     headline,
-    how_far,
-    how_sure,
     left_out,
     marked,
     next_steps,
@@ -20,18 +19,16 @@ from ssmppl.diagnosis.report.words import (
     rows,
     sentence,
     untold,
-    where,
-    which,
 )
 from ssmppl.drawing.numerals import DASH, is_number, number, p_text, with_error
 
 if TYPE_CHECKING:
     from ssmppl.diagnosis.report.findings import Findings
 
-__all__ = ["cause_rows", "report_html", "report_text"]
-
 PAGE = 100  # columns
 SHOWN_CAUSES = 8
+PREDICTED = "* predicted by the screen, not refitted"
+ALIKE = "Effects with the same letter cannot be told apart by these data."
 
 
 def cause_rows(report: Findings, shown: int = SHOWN_CAUSES) -> list[tuple[str, ...]]:
@@ -70,18 +67,15 @@ def _table(cells: list[tuple[str, ...]]) -> list[str]:
 def report_text(report: Findings) -> str:
     """The verdict, the three answers, one table, what could not be told and what would tell."""
     lines = [*wrapped(headline(report)), ""]
-    for name, sentences in (
-        ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
-        ("How sure", how_sure(report)),
-    ):  # fmt: skip
+    for name, sentences in answers(report):
         lines += wrapped(" ".join(sentences), f"{name:<10}", " " * 10)
     cells = cause_rows(report)
     if len(cells) > 1:
         lines += ["", *_table(cells)]
         if any("*" in row[3] for row in cells[1:]):
-            lines.append("* predicted by the screen, not refitted")
+            lines.append(PREDICTED)
         if class_letters(report):
-            lines.append("Effects with the same letter cannot be told apart by these data.")
+            lines.append(ALIKE)
         for term in ("gain", "closable gap", "p")[:: 1 if len(report.closed) else 2]:
             lines += wrapped(f"{term}: {GLOSSARY[term]}.")
     for name, found in _rest(report):
@@ -94,15 +88,12 @@ def report_text(report: Findings) -> str:
 def report_html(report: Findings) -> str:
     """What `report_text` says, for a notebook."""
     parts = [markup.heading(report.title or "Diagnosis"), markup.paragraph(headline(report))]
-    answers = [
+    rows_of_answers = [
         (markup.text(name), markup.text(" ".join(sentences)))
-        for name, sentences in (
-            ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
-            ("How sure", how_sure(report)),
-        )
+        for name, sentences in answers(report)
         if sentences
-    ]  # fmt: skip
-    parts.append(markup.table(answers, left=(0, 1)))
+    ]
+    parts.append(markup.table(rows_of_answers, left=(0, 1)))
     head, *causes = cause_rows(report)
     if causes:
         keep = [i for i in range(len(head)) if any(row[i] for row in causes)]
@@ -110,10 +101,9 @@ def report_html(report: Findings) -> str:
         left = [k for k, i in enumerate(keep) if i < 2]
         parts.append(markup.table(cells, [head[i] for i in keep], left))
         if any("*" in row[3] for row in causes):
-            parts.append(markup.paragraph("* predicted by the screen, not refitted"))
+            parts.append(markup.paragraph(PREDICTED))
         if class_letters(report):
-            told = "Effects with the same letter cannot be told apart by these data."
-            parts.append(markup.paragraph(told))
+            parts.append(markup.paragraph(ALIKE))
     for name, found in _rest(report):
         items = "".join(f"<li>{markup.text(item)}</li>" for item in found)
         parts.append(markup.folded(f"{name} ({len(found)})", f"<ul>{items}</ul>"))

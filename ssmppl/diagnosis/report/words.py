@@ -2,8 +2,6 @@
 
 Every function takes the report and gives plain sentences: what is missing, where, how far adding it
 closes the gap, how sure that is, and what would tell what these data cannot.
-
-What things are called in a report's sentences: effects, their rivals and their classes.
 """
 
 from __future__ import annotations
@@ -18,11 +16,35 @@ if TYPE_CHECKING:
     from ssmppl.diagnosis.report.findings import Findings
 
 NAMED_RIVALS = 3
+CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
+MOMENTS = {
+    "mean": "the mean of",
+    "scale": "the noise level of",
+    "tails": "the tails of the noise of",
+    "time dependence": "how the noise of one step depends on the last, of",
+}
+
+USE = {
+    "screen": "effects were looked for on",
+    "confirm": "the gap was measured on",
+}
+
+GLOSSARY = {
+    "gain": "how much more probable the effect makes the data, on a log scale: 1 nat is 2.7 times "
+    "as probable, 3 nats 20 times, 10 nats 22,000 times",
+    "closable gap": "what the best reference at hand gains over the model as it was, on the same "
+    "data; 100% closed means as good as that reference",
+    "p": "how often the best of everything tried would stand out this much if the model were "
+    "right; everything tried is counted, so one p does not mislead because many were computed",
+    "z": "a distance from what the model expects, in standard deviations",
+    "±": "one standard error; twice that, either way, is about a 95% interval",
+}
 
 # Effects that are something *of* an input, a sensor or a parameter; others act *in* an equation.
 OF = ("input", "sensor", "actuator", "parameter", "wrong initial", "backlash", "dead zone")
 
 
+# -- names
 def rows(table: Any) -> list[dict[str, Any]]:
     """The rows of a table as mappings."""
     return [] if table is None else list(table.to_dict("records"))
@@ -127,31 +149,7 @@ def alternatives(report: Findings, row: dict[str, Any]) -> list[str]:
     return [row_label(row), *others]
 
 
-CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
-MOMENTS = {
-    "mean": "the mean of",
-    "scale": "the noise level of",
-    "tails": "the tails of the noise of",
-    "time dependence": "how the noise of one step depends on the last, of",
-}
-
-USE = {
-    "screen": "effects were looked for on",
-    "confirm": "the gap was measured on",
-}
-
-GLOSSARY = {
-    "gain": "how much more probable the effect makes the data, on a log scale: 1 nat is 2.7 times "
-    "as probable, 3 nats 20 times, 10 nats 22,000 times",
-    "closable gap": "what the best reference at hand gains over the model as it was, on the same "
-    "data; 100% closed means as good as that reference",
-    "p": "how often the best of everything tried would stand out this much if the model were "
-    "right; everything tried is counted, so one p does not mislead because many were computed",
-    "z": "a distance from what the model expects, in standard deviations",
-    "±": "one standard error; twice that, either way, is about a 95% interval",
-}
-
-
+# -- parts of sentences
 def share(report: Findings) -> str:
     """How much of the gap the chosen model closes, with its interval; "" if not measured."""
     closed = rows(report.closed)
@@ -193,7 +191,15 @@ def outstanding(report: Findings, table: Any) -> list[dict[str, Any]]:
     return [r for r in rows(table) if is_number(r["p"]) and r["p"] <= alpha]
 
 
-# -- the three answers
+# -- the answers
+def answers(report: Findings) -> list[tuple[str, list[str]]]:
+    """The title and the sentences of each answer."""
+    return [
+        ("Where", where(report)), ("Which", which(report)), ("How far", how_far(report)),
+        ("How sure", how_sure(report)),
+    ]  # fmt: skip
+
+
 def headline(report: Findings) -> str:
     """The verdict in a sentence or two, with its number and its uncertainty."""
     if report.verdict == "no measurable gap":

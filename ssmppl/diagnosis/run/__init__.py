@@ -1,1 +1,1 @@
-"""What a diagnosis runs on: its checkpoint, the parts that failed, the time it will take."""
+"""What a diagnosis runs on: its checkpoint, the parts that failed, seeds, the expected time."""

@@ -45,7 +45,7 @@ Numbers = dict[str, np.ndarray]
 
 
 class Checkpoint:
-    """What is done, by name; in memory alone where there is no path.
+    """Results of the parts that are done, by name; in memory alone where there is no path.
 
     path : a file, or a folder that has one file for each mode; neither needs to exist.
     made_from : digests by what they are of: "model", "data", ...
@@ -109,14 +109,14 @@ class Checkpoint:
         if self.progress:
             print(text, file=sys.stderr, flush=True)
 
-    def of(self, name: str, make: Callable[[], Mapping[str, Any]]) -> Numbers:
+    def computed(self, name: str, make: Callable[[], Mapping[str, Any]]) -> Numbers:
         """The numbers under this name, made where they are not there yet."""
         if name not in self:
             self.put(name, make())
             self._keep_up()
         return self.get(name)
 
-    def each(
+    def map(
         self, stage: str, count: int, task: Callable[[int], Mapping[str, Any]]
     ) -> list[Numbers]:
         """The numbers of task(0), ..., task(count - 1), those left out that are there.
@@ -213,7 +213,7 @@ def digests(
     trace: Trace, experiments: Sequence[Experiment], effects: Sequence[Effect], mode: str,
     settings: Mapping[str, Any],
 ) -> dict[str, str]:  # fmt: skip
-    """By what they are of: the mode itself, digests of the others."""
+    """Digests by what they are of; the mode as it is."""
     return {
         "mode": mode,
         "model": model_digest(trace),

@@ -1,4 +1,4 @@
-"""How long a diagnosis will take, from passes over the data that were timed."""
+"""The expected time of a diagnosis, from passes over the data that were timed."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from ssmppl.inference.run.executors import workers_of
 
 REFITS = 18  # of single effects, their shapes, pairs and the reference, about
 EVALUATIONS, FIT_PASSES = 4000, 60  # likelihoods and passes over the data in a fit, about
-ROUGH = 800  # likelihoods in a rough fit
+APPROXIMATE = 800  # likelihoods in an approximate fit
 SCREENS = 1.0  # as long as the first one that follow it: for further effects, under other inputs
 TEXT = 0.5  # of the time that the screen's code took, which a fit's takes, one at a time
 BESIDE = 1.5  # times as long as what is timed here alone: Python between the passes, and waiting
-SIMULATED = 3 * 50  # rough fits of simulated data in short records, about
-FOLD_FITS, FOLD_PASSES = 8, 12  # rough fits, and passes, for a block that is left out
+SIMULATED = 3 * 50  # approximate fits of simulated data in short records, about
+FOLD_FITS, FOLD_PASSES = 8, 12  # approximate fits, and passes, for a block that is left out
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ def seconds(found: Timed, sets: int, mode: str, folds: int, executor: Executor |
     if mode == "fast":
         return screen
     one = EVALUATIONS * found.likelihood + FIT_PASSES * found.fit_pass
-    rough, text = ROUGH * found.likelihood, TEXT * found.generating
+    approximate, text = APPROXIMATE * found.likelihood, TEXT * found.generating
     total = screen * (1.0 + SCREENS) + REFITS * (one / workers + text)
     if folds:
-        total += SIMULATED * (rough + found.screen_pass) / workers
-        block = FOLD_FITS * rough + FOLD_PASSES * found.screen_pass
+        total += SIMULATED * (approximate + found.screen_pass) / workers
+        block = FOLD_FITS * approximate + FOLD_PASSES * found.screen_pass
         total += folds * (block / workers + 2.0 * text)
     return BESIDE * total
 
@@ -70,6 +70,6 @@ def in_words(value: float) -> str:
 
 
 def _cores() -> int:
-    """That this process may use."""
+    """Number of cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1

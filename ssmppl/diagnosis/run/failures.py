@@ -1,4 +1,4 @@
-"""What of a diagnosis failed: each part that an error ended, with the reason in one line.
+"""The parts of a diagnosis that an error ended, each with the reason in one line.
 
 A diagnosis has many parts (candidates, refits, blocks left out, tables, panels), and the rest of
 them are worth having where one fails. So an error ends its part and no other, and is reported.
@@ -22,8 +22,8 @@ def reason_of(error: BaseException) -> str:
     """An error in one line: what was found; of a fault of this package its class, too."""
     if isinstance(error, SSMError):
         return one_line(error.found)
-    told = one_line(str(error))
-    return f"{type(error).__name__}{f': {told}' if told else ''} (a fault of ssmppl)"
+    text = one_line(str(error))
+    return f"{type(error).__name__}{f': {text}' if text else ''} (a fault of ssmppl)"
 
 
 def one_line(text: str) -> str:
@@ -49,11 +49,11 @@ class Failures:
         return len(self._reasons)
 
     def add(self, part: str, reason: str) -> None:
-        """Say that a part failed, and why in one line."""
+        """Record that a part failed, and why in one line."""
         self._reasons.setdefault(part, reason)
 
-    def of_task(self, part: str, numbers: Mapping[str, Any]) -> bool:
-        """Whether a task failed by a fault; then that is said of the part."""
+    def record_task(self, part: str, numbers: Mapping[str, Any]) -> bool:
+        """Whether a task failed by a fault, which is then recorded of the part."""
         if FAULT not in numbers:
             return False
         self.add(part, str(numbers[FAULT]))
@@ -66,17 +66,17 @@ class Failures:
         try:
             yield
         except Exception as error:
-            self.met(name, error)
+            self.record(name, error)
 
-    def met(self, part: str, error: Exception) -> None:
-        """Say of a part which error ended it; in an `except` clause, which may raise it again."""
+    def record(self, part: str, error: Exception) -> None:
+        """Record which error ended a part; in an `except` clause, which may raise it again."""
         if self.raised or isinstance(error, ExecutorError):
             raise error
         self.add(part, reason_of(error))
 
 
 class Tolerant:
-    """A task whose faults are its answer: `{"fault": why}`; errors on purpose are raised.
+    """A task whose faults are its result: `{"fault": why}`; errors on purpose are raised.
 
     Of a class, so that it can be sent to another process with its task.
     """

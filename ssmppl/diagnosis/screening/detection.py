@@ -1,4 +1,4 @@
-"""Is there a gap at all: what one-step predictions miss, and how well several steps are predicted.
+"""Detection of a gap: checks of one-step predictions, and of how well several steps are predicted.
 
 z_t = Phi^-1 of the probability integral transform of the one-step prediction is standard normal
 white noise under the true parameters (M. Rosenblatt 1952; F. Diebold, T. Gunther and A. Tay 1998).
@@ -42,7 +42,7 @@ class Statistics:
     quadratic: np.ndarray
 
     def with_values(self, channel: str, values: Mapping[str, float]) -> Statistics:
-        """With more statistics of a channel, its CRPS at each horizon (`ahead`)."""
+        """These and more statistics of a channel, its CRPS at each horizon."""
         names = tuple((channel, name) for name in values)
         return Statistics(
             self.names + names, np.append(self.values, list(values.values())),
@@ -65,7 +65,7 @@ def statistics(
     lags: int = LAGS,
     delays: int = DELAYS,
 ) -> Statistics:
-    """What is wrong with one-step predictions, channel by channel.
+    """Statistics of the one-step predictions, channel by channel.
 
     mean, variance, tails : sqrt(n) times the mean of the Hermite polynomials of degree 1, 2 and 4
     of z, which are uncorrelated for normal z. autocorrelation at each lag, and of `LONG` lags
@@ -149,7 +149,7 @@ def _sum(values: np.ndarray) -> float:
 
 
 def _standard(u: np.ndarray) -> np.ndarray:
-    """With mean 0 and variance 1; all NaN where it does not vary."""
+    """u with mean 0 and variance 1; all NaN where it does not vary."""
     spread = np.nanstd(u) if np.isfinite(u).any() else 0.0
     if spread <= 1e-12 * np.nanmax(np.abs(u), initial=0.0):
         return np.full(len(u), np.nan)

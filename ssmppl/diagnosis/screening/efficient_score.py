@@ -1,4 +1,4 @@
-"""Efficient scores: what a candidate's score says that the parameters do not already say.
+"""Efficient scores: what is left of a candidate's score once the nuisance scores are projected out.
 
 B data sets simulated at the fitted parameters give the joint law of the candidates' statistics
 S (K,) and of the nuisance scores S_theta (P,). The efficient statistic is the residual of the
@@ -40,7 +40,7 @@ SPARE_SETS = 20  # degrees of freedom without which a residual variance says not
 
 
 @dataclass(frozen=True)
-class Fit:
+class Regression:
     """Least squares of y (B, K) on x (B, P) over sets, rank-revealing.
 
     left_out : (B, K) prediction errors of each set from the others. spread : (K,) residual
@@ -59,7 +59,7 @@ class Fit:
     base: float  # leverage of the intercept
 
     def predict_error(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """What the regression leaves of new statistics y (..., K) at x (..., P)."""
+        """Residuals of new statistics y (..., K) at x (..., P)."""
         return y - self.mean - (x - self.shift) @ self.coefficients
 
     def leverage_of(self, x: np.ndarray) -> float:
@@ -75,7 +75,7 @@ class Fit:
         return np.divide(self.left_out, scale, out=np.zeros_like(scale), where=scale > 0.0)
 
 
-def regress(y: np.ndarray, x: np.ndarray, *, intercept: bool = False) -> Fit:
+def regress(y: np.ndarray, x: np.ndarray, *, intercept: bool = False) -> Regression:
     """Regression of y (B, K) on x (B, P); directions of x that are linear combinations are cut.
 
     Raises
@@ -102,7 +102,7 @@ def regress(y: np.ndarray, x: np.ndarray, *, intercept: bool = False) -> Fit:
     residuals = y - mean - u @ (u.T @ (y - mean))
     base = 1.0 / sets if intercept else 0.0
     leverage = np.minimum(base + np.sum(u**2, axis=1), 1.0 - 1e-9)
-    return Fit(
+    return Regression(
         coefficients, mean, shift, residuals / (1.0 - leverage)[:, None], residuals,
         np.sum(residuals**2, axis=0) / dof, leverage, dof, whiten, base,
     )  # fmt: skip
@@ -128,7 +128,7 @@ class Null:
         cls, columns: Any, nuisance: Any, *, quadratic: Any = False, sided: Any = 0,
         noise: Any = 0.0,
     ) -> Null:  # fmt: skip
-        """With the shapes checked and scalars spread over the columns.
+        """The null law, its shapes checked and scalars spread over the columns.
 
         Raises
         ------
@@ -271,7 +271,7 @@ def normal_score(t: np.ndarray | float, skewness: np.ndarray | float) -> np.ndar
 
 
 def _skewness(values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Of values (B,), and (B,) of all but each one: its own extreme must not excuse it."""
+    """Skewness of values (B,), and (B,) of all but each one: its own extreme must not excuse it."""
     x = (values - values.mean()) / (values.std() or 1.0)
     sums = np.array([np.sum(x**k) for k in (1, 2, 3)])
     powers, count = np.stack([x, x**2, x**3]), len(x)

@@ -30,7 +30,7 @@ BOTH = 2.409420839653209  # normals whose largest has the median of |normal|: lo
 
 @dataclass(frozen=True)
 class Scale:
-    """Of groups of statistics: what is as rare for one |normal| as a height is for the group.
+    """The common scale of groups: what is as rare for one |normal| as a height is for its group.
 
     number : (G,) of independent normals whose largest has the group's median. stretch : (G,) at
     least 1, by which its upper quantile lies further out than theirs.

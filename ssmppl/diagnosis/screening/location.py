@@ -1,4 +1,4 @@
-"""Where the gap is: which equation and moment, when, and in which region of states and inputs.
+"""Location of the gap: equation and moment, stretch of time, region of states and inputs.
 
 A group is the scores of one equation and moment in the strengths of D basis functions. With the
 nuisance scores (and the other groups, or the catalogue) regressed out, its statistic is
@@ -11,11 +11,10 @@ of V come out too small, and their inverses would rule Q. Set b is measured by t
 sets (Sherman and Morrison), as the observed one is; Q in turn is put on the normal scale by its
 simulated law, so that groups of different size compare.
 
-When the gap opens: the stretch of time that carries more of a statistic than its share.
-
-The scores of a group summed over J bins of time, W_1 .. W_J, add up to S~. Projected on the
-estimated strengths c = V^- S~ they are the statistic bin by bin. Under a missing term that acts all
-the time, E W_w = V_w c for every window w: what a window has beyond its share,
+When the gap opens is the stretch of time that carries more of a statistic than its share. The
+scores of a group summed over J bins of time, W_1 .. W_J, add up to S~. Projected on the estimated
+strengths c = V^- S~ they are the statistic bin by bin. Under a missing term that acts all the time,
+E W_w = V_w c for every window w: what a window has beyond its share,
 
     a_w - r_w a,    a_w = c' W_w,    r_w = cov(a_w, a) / var(a),
 
@@ -42,6 +41,8 @@ if TYPE_CHECKING:
 RANK_CUT = 1e-3  # of the largest eigenvalue, in units in which every unprojected score has size 1
 KEPT = 0.999  # share of the variance of what is projected out that its components must hold
 SHARE = 4  # one component of what is projected out takes at least this many sets
+BINS = 24  # of time
+LEAST_VARIANCE = 1e-3  # of a window's contrast, in shares of the whole: less is all of the record
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Group:
 
     @property
     def p(self) -> float:
-        """Of this group alone."""
+        """p of this group alone."""
         return tail_p(self.z, self.null)
 
     @property
@@ -152,26 +153,29 @@ def localise(
     import pandas as pd
 
     keys = list(groups)
-    alone, apart = [], []
+    alone, given_others = [], []
     for key in keys:
         columns, observed = groups[key]
         rest = [groups[k] for k in keys if k != key]
         alone.append(group_score(columns, observed, nuisance, observed_nuisance))
         others = np.hstack([c for c, _ in rest]) if rest else None
         seen = np.hstack([o for _, o in rest]) if rest else None
-        apart.append(group_score(columns, observed, nuisance, observed_nuisance, others, seen))
+        given_others.append(
+            group_score(columns, observed, nuisance, observed_nuisance, others, seen)
+        )
 
     def together(found: list[Group]) -> np.ndarray:
         z, null = np.array([g.z for g in found]), np.stack([g.null for g in found], axis=1)
         return familywise(z, null, sided=1, groups=np.arange(len(found)) % len(keys)).p
 
     table = pd.DataFrame({
-        "key": pd.Series(keys, dtype=object), "statistic": [g.statistic for g in apart],
-        "z": [g.z for g in apart], "p": together(apart), "kappa": [g.kappa for g in apart],
+        "key": pd.Series(keys, dtype=object), "statistic": [g.statistic for g in given_others],
+        "z": [g.z for g in given_others], "p": together(given_others),
+        "kappa": [g.kappa for g in given_others],
         "z_alone": [g.z for g in alone], "p_alone": together(alone),
-        "p_either": together([*apart, *alone]),
+        "p_either": together([*given_others, *alone]),
     })  # fmt: skip
-    return table, dict(zip(keys, apart, strict=True))
+    return table, dict(zip(keys, given_others, strict=True))
 
 
 # --- the curve of what is missing ----------------------------------------------------------------
@@ -273,8 +277,7 @@ def _shrinkage(x: np.ndarray, c: np.ndarray) -> float:
     return float(np.clip(spread / len(x) / distance, 0.0, 1.0))
 
 
-BINS = 24
-LEAST_VARIANCE = 1e-3  # of a window's contrast, in shares of the whole: less is all of the record
+# --- when ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -381,7 +384,7 @@ def _left(
 ) -> np.ndarray:
     """(B + 1, J, D) efficient scores by bin, each set's as the other sets predict them; last: seen.
 
-    Scaled to the variance of a residual, as the totals in `Fit.studentised` are.
+    Scaled to the variance of a residual, as the totals in `Regression.studentised` are.
     """
     totals = nuisance.sum(axis=1)
     fit = regress(columns.sum(axis=1), totals)

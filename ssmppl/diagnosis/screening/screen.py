@@ -15,9 +15,9 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.effects.candidate import Candidate, Profiles, dated
+from ssmppl.diagnosis.effects.candidate import Candidate, Profiles, starts_of, with_all_dates
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import Term, basis, lifted
+from ssmppl.diagnosis.model.basis import Term, basis, symbolic_shapes
 from ssmppl.diagnosis.model.candidates import Chosen, Refused, offers
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.score_columns import Columns, score_columns
@@ -34,20 +34,20 @@ from ssmppl.diagnosis.run.failures import FAULT, Failures
 from ssmppl.diagnosis.screening import detection, statistics
 from ssmppl.diagnosis.screening.efficient_score import Efficient, Null, efficient
 from ssmppl.diagnosis.screening.familywise import FamilyWise, familywise
-from ssmppl.diagnosis.screening.location import bin_edges, binned
-from ssmppl.diagnosis.screening.statistics import excess, typical
+from ssmppl.diagnosis.screening.location import Group, bin_edges, binned, group_score
+from ssmppl.diagnosis.screening.statistics import information_scale, typical_squares
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Distribution, Flat
 from ssmppl.language.model.traced import Site, Trace, symbols
 
-OWN_RUNS = 6  # passes over the data themselves, which tell the smoother's own noise
+OWN_RUNS = 6  # passes over the data themselves, which show the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
+    """Statistics of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
 
     squares (K,) : of the columns' rows, summed; NaN where a column is no sum of scores.
     nuisance_bins (J, P), basis_bins (J, D) : sums over J bins of time.
@@ -62,8 +62,8 @@ class Statistics:
     basis_bins: np.ndarray
 
 
-class Question:
-    """What is asked of a model: candidates, basis, and the code that answers."""
+class ScreenDesign:
+    """The candidate effects of a model, the basis, and their compiled score columns."""
 
     def __init__(
         self, trace: Trace, scales: Scales, missing: Missing, held: Sequence[str],
@@ -80,7 +80,7 @@ class Question:
         self.terms: list[Term] = []
         if candidates is None:
             offered, self.refused = offers(trace, scales, effects, failures)
-            offered = dated(offered, scales.rows)
+            offered = with_all_dates(offered, scales.rows)
             with failures.part("the basis of smooth functions"):
                 self.terms = basis(trace, scales)
         else:
@@ -96,7 +96,7 @@ class Question:
         except Exception:
             if failures.raised:
                 raise
-            plain = _sound(trace, plain, held, missing, failures)
+            plain = _compilable(trace, plain, held, missing, failures)
             self.columns, self.shapes = _columns(trace, plain, held, missing)
         self.smoother = Smoother(self.columns, missing, settings)
         for name, reason in self.columns.refused.items():
@@ -106,19 +106,19 @@ class Question:
         place = {n: len(self.columns.nuisance) + i for i, n in enumerate(self.columns.names)}
         by_key = {key: place.get(c.strength) for key, c in unique.items()}
         self.candidates: list[Candidate] = []
-        self.place: list[int] = []
+        self.column_of: list[int] = []
         for c in offered:
             found = by_key[c.increment.key]
             if found is not None:
                 self.candidates.append(c)
-                self.place.append(found)
+                self.column_of.append(found)
         self.terms = [t for t in self.terms if t.candidate.strength in place]
-        self.basis_place = [place[t.candidate.strength] for t in self.terms]
-        self._timed = [k for k, c in enumerate(self.candidates)
+        self.basis_columns = [place[t.candidate.strength] for t in self.terms]
+        self._profiled = [k for k, c in enumerate(self.candidates)
                        if c.effect.profile and not c.process]  # fmt: skip
         self._profiles = Profiles(
-            tuple(self.candidates[k] for k in self._timed),
-            tuple(self.place[k] for k in self._timed),
+            tuple(self.candidates[k] for k in self._profiled),
+            tuple(self.column_of[k] for k in self._profiled),
         )
 
     @cached_property
@@ -144,7 +144,7 @@ class Question:
         return np.array([c.sided for c in self.candidates], dtype=int)
 
     @cached_property
-    def _sums(self) -> np.ndarray:
+    def _plain_sums(self) -> np.ndarray:
         """(K,) which statistics are sums of one column's rows, all with the same weight."""
         return np.array([not (c.process or c.effect.profile) for c in self.candidates])
 
@@ -157,9 +157,9 @@ class Question:
         self, experiments: Sequence[Experiment], passes: Sequence[Pass], stream: np.ndarray,
         checks: bool = True,
     ) -> Statistics:  # fmt: skip
-        """Everything that is asked of one data set; without `checks` nothing of its predictions."""
+        """The statistics of one data set; without `checks` none of its predictions."""
         rows = np.concatenate([p.rows for p in passes])
-        starts = np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()
+        starts = starts_of(experiments)
         edges = bin_edges(len(rows), starts)
         p = len(self.columns.nuisance)
         bins = binned(rows, edges)
@@ -170,17 +170,17 @@ class Question:
             found = self._detection(pits, experiments, starts, ahead).values
         return Statistics(
             rows[:, :p].sum(axis=0),
-            self._of_candidates(rows, starts),
-            np.where(self._sums, np.sum(rows**2, axis=0)[self.place], np.nan),
-            rows[:, self.basis_place].sum(axis=0),
+            self._candidate_statistics(rows, starts),
+            np.where(self._plain_sums, np.sum(rows**2, axis=0)[self.column_of], np.nan),
+            rows[:, self.basis_columns].sum(axis=0),
             found,
             bins[:, :p],
-            bins[:, self.basis_place],
+            bins[:, self.basis_columns],
         )
 
-    def _of_candidates(self, rows: np.ndarray, starts: list[int]) -> np.ndarray:
+    def _candidate_statistics(self, rows: np.ndarray, starts: list[int]) -> np.ndarray:
         out = np.empty(len(self.candidates))
-        for k, (c, at) in enumerate(zip(self.candidates, self.place, strict=True)):
+        for k, (c, at) in enumerate(zip(self.candidates, self.column_of, strict=True)):
             own = rows[:, at, None]
             if c.process == "random walk":
                 out[k] = statistics.random_walk(own, starts)[0]
@@ -188,7 +188,7 @@ class Question:
                 out[k] = statistics.autoregressive(own, [dict(c.shape)["memory"]], starts)[0, 0]
             elif not c.effect.profile:
                 out[k] = own.sum()
-        out[np.array(self._timed, dtype=int)] = self._profiles.statistics(rows, starts)
+        out[np.array(self._profiled, dtype=int)] = self._profiles.statistics(rows, starts)
         return out
 
     def _detection(
@@ -206,7 +206,7 @@ class Question:
     def detection_names(self, experiments: Sequence[Experiment]) -> detection.Statistics:
         """The detection statistics' names, with values of nothing."""
         rows = sum(e.steps for e in experiments)
-        starts = np.cumsum([0, *(e.steps for e in experiments[:-1])]).tolist()
+        starts = starts_of(experiments)
         nothing = np.full((rows, len(self.trace.observation_symbols)), 0.5)
         return self._detection(nothing, experiments, starts, ())
 
@@ -215,39 +215,48 @@ class Question:
 class Screen:
     """The data's statistics beside those of B simulated sets.
 
-    observed : means over passes. null : (B, ...) of the simulated ones, by name. found, family : of
-    the candidates. law : what they were compared with. usual : (K,) sums of squares.
+    observed : means over passes. simulated : (B, ...) of the simulated sets. efficient, family : of
+    the candidates, as compared with `null`. typical_squares : (K,) of the columns, of one set.
     """
 
-    question: Question
+    design: ScreenDesign
     theta: np.ndarray
     observed: Statistics
-    null: Statistics
-    found: Efficient
+    simulated: Statistics
+    efficient: Efficient
     family: FamilyWise
-    law: Null
-    usual: np.ndarray
+    null: Null
+    typical_squares: np.ndarray
     experiments: tuple[Experiment, ...]
-
-    def stacked(self, name: str) -> np.ndarray:
-        """(B, ...) one statistic of all simulated sets."""
-        values: np.ndarray = getattr(self.null, name)
-        return values
 
     def columns_of(self, chosen: Sequence[Candidate]) -> tuple[np.ndarray, np.ndarray]:
         """(B, K), (K,) scores of these candidates, simulated and observed; of those among them
         whose statistic is a sum of scores. A shape that the screen has not (a period that was
-        sharpened) stands for the best one of its group."""
-        known = {c.key: k for k, c in enumerate(self.question.candidates)}
-        best = {self.question.candidates[k].group: int(k) for k in self.family.best}
+        refine_wave) stands for the best one of its group."""
+        known = {c.key: k for k, c in enumerate(self.design.candidates)}
+        best = {self.design.candidates[k].group: int(k) for k in self.family.best}
         found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)
         own = sorted({k for k in found if k is not None})
-        return self.stacked("columns")[:, own], self.observed.columns[own]
+        return self.simulated.columns[:, own], self.observed.columns[own]
+
+    def basis_group(self, columns: Sequence[int], others: Sequence[Candidate] = ()) -> Group:
+        """The statistic of these columns of the basis with the scores of others projected out."""
+        own = list(columns)
+        return group_score(
+            self.simulated.basis[:, own], self.observed.basis[own], self.simulated.nuisance,
+            self.observed.nuisance, *self.columns_of(others),
+        )  # fmt: skip
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """(J + 1,) first rows of the bins of time."""
+        rows = sum(e.steps for e in self.experiments)
+        return bin_edges(rows, starts_of(self.experiments))
 
     @property
     def sets(self) -> int:
         """B, the simulated sets that went through."""
-        return len(self.null.nuisance)
+        return len(self.simulated.nuisance)
 
     @property
     def significant(self) -> np.ndarray:
@@ -257,24 +266,24 @@ class Screen:
     @cached_property
     def groups(self) -> np.ndarray:
         """(K,) labels of the candidates' groups."""
-        return groups_of(self.question.candidates)
+        return groups_of(self.design.candidates)
 
 
 def _columns(
     trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing
 ) -> tuple[Columns, dict[str, float]]:
     """The score columns of the model with all candidates, and the values of their shapes."""
-    made, shapes = lifted(list(candidates))
+    made, shapes = symbolic_shapes(candidates)
     superset = with_parameters(augment(trace, made), shapes)
     names = [c.strength for c in made]
     return score_columns(trace, superset, names, held, missing), dict(shapes)
 
 
-def _sound(
+def _compilable(
     trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing,
     failures: Failures,
 ) -> list[Candidate]:  # fmt: skip
-    """The candidates that have columns by themselves; the others are said to have failed."""
+    """The candidates that have columns by themselves; the others are recorded as failures."""
     out = []
     for c in candidates:
         with failures.part(f"the candidate {c}"):
@@ -289,65 +298,65 @@ def groups_of(candidates: Sequence[Candidate]) -> np.ndarray:
     return np.array([labels[c.group] for c in candidates], dtype=int)
 
 
-def ask(
-    question: Question, experiments: Sequence[Experiment], theta: np.ndarray, sets: int,
-    seed: np.random.SeedSequence, kept: Checkpoint, stage: str = "screening", *,
+def run_screen(
+    design: ScreenDesign, experiments: Sequence[Experiment], theta: np.ndarray, sets: int,
+    seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str = "screening", *,
     checks: bool = True,
 ) -> Screen:  # fmt: skip
-    """Simulate, smooth, and put the data's statistics beside the simulated ones.
+    """The screen: data sets simulated at the fit, smoothed, and the data compared with them.
 
-    theta : (P,) the fitted parameters. kept : takes every set as soon as it is done, as `stage`.
-    checks : whether those of the predictions are wanted, which cost something.
+    theta : (P,) the fitted parameters. checkpoint : takes every set as soon as it is done, as
+    `stage`. checks : whether those of the predictions are wanted, which cost something.
 
     Raises
     ------
     ArgumentError : too few simulated sets went through the filter.
     """
-    smoother, whole = question.smoother, question.theta(theta)
-    _ = smoother.program, smoother.module, question.simulator  # before threads ask for them
-    one = partial(_one_set, question, tuple(experiments), whole, seed, checks)
-    results = kept.each(stage, OWN_RUNS + sets, one)
-    faults = [r for r in results if kept.failures.of_task(f"a data set of {stage}", r)]
+    smoother, whole = design.smoother, design.theta(theta)
+    _ = smoother.program, smoother.module, design.simulator  # before threads ask for them
+    one = partial(_one_set, design, tuple(experiments), whole, seed, checks)
+    results = checkpoint.map(stage, OWN_RUNS + sets, one)
+    faults = [r for r in results if checkpoint.failures.record_task(f"a data set of {stage}", r)]
     own = [r for r in results[:OWN_RUNS] if r and FAULT not in r]
-    null = [r for r in results[OWN_RUNS:] if r and FAULT not in r]
-    if not own or len(null) < min(FEWEST, sets):
+    drawn = [r for r in results[OWN_RUNS:] if r and FAULT not in r]
+    if not own or len(drawn) < min(FEWEST, sets):
         why = f": {faults[0][FAULT]}" if faults else ""
         raise ArgumentError(
-            f"{len(null)} of {sets} data sets simulated at the fit went through the smoother{why}",
+            f"{len(drawn)} of {sets} data sets simulated at the fit went through the smoother{why}",
             fix="use more particles, or check the fit: the model may leave its domain",
         )
     names = Statistics.__dataclass_fields__
     each = {n: np.stack([s[n] for s in own]) for n in names}
     observed = Statistics(**{n: v.mean(axis=0) for n, v in each.items()})
-    simulated = Statistics(**{n: np.stack([s[n] for s in null]) for n in names})
-    usual = typical(simulated.squares)
-    noise = (each["columns"] / excess(each["squares"], usual)).var(
-        axis=0, ddof=min(1, len(own) - 1)
-    )
-    law = Null.of(
-        simulated.columns / excess(simulated.squares, usual), simulated.nuisance,
-        quadratic=question.quadratic, sided=question.sided, noise=noise,
+    simulated = Statistics(**{n: np.stack([s[n] for s in drawn]) for n in names})
+    typical = typical_squares(simulated.squares)
+    noise = each["columns"] / information_scale(each["squares"], typical)
+    null = Null.of(
+        simulated.columns / information_scale(simulated.squares, typical), simulated.nuisance,
+        quadratic=design.quadratic, sided=design.sided,
+        noise=noise.var(axis=0, ddof=min(1, len(own) - 1)),
     )  # fmt: skip
-    found = compared(law, usual, observed)
+    found = compare_with_null(null, typical, observed)
     family = familywise(
-        found.statistic, found.null, sided=found.sided, groups=groups_of(question.candidates)
+        found.statistic, found.null, sided=found.sided, groups=groups_of(design.candidates)
     )
     return Screen(
-        question, theta, observed, simulated, found, family, law, usual, tuple(experiments)
+        design, theta, observed, simulated, found, family, null, typical, tuple(experiments)
     )
 
 
-def held_against(
+def screen_part(
     whole: Screen, experiments: Sequence[Experiment], theta: np.ndarray,
     seed: np.random.SeedSequence,
 ) -> Screen:  # fmt: skip
     """The screen of a part of the data by the law of the sets that were simulated for all of them.
 
     theta : (P,) fitted to the part. The scale is that of the information which the part holds
-    (`compared`), so that little changes where a tenth is missing, and nothing is simulated.
+    (`compare_with_null`), so that little changes where a tenth is missing, and nothing is
+    simulated.
     """
-    question, at = whole.question, whole.question.theta(theta)
-    one = partial(_one_set, question, tuple(experiments), at, seed, False)
+    design, at = whole.design, whole.design.theta(theta)
+    one = partial(_one_set, design, tuple(experiments), at, seed, False)
     own = [r for r in map(one, range(OWN_RUNS)) if r]
     if not own:
         raise SamplingError(
@@ -358,26 +367,26 @@ def held_against(
         n: np.mean([s[n] for s in own], axis=0) if n != "detection" else empty
         for n in Statistics.__dataclass_fields__
     })  # fmt: skip
-    found = compared(whole.law, whole.usual, observed)
+    found = compare_with_null(whole.null, whole.typical_squares, observed)
     family = familywise(found.statistic, found.null, sided=found.sided, groups=whole.groups)
     return replace(
-        whole, theta=theta, observed=observed, found=found, family=family,
+        whole, theta=theta, observed=observed, efficient=found, family=family,
         experiments=tuple(experiments),
     )  # fmt: skip
 
 
 def _one_set(
-    question: Question, experiments: Sequence[Experiment], theta: np.ndarray,
+    design: ScreenDesign, experiments: Sequence[Experiment], theta: np.ndarray,
     seed: np.random.SeedSequence, checks: bool, number: int,
 ) -> Numbers:  # fmt: skip
     """The statistics of the data (the first `OWN_RUNS`) or of a simulated set; empty where it did
     not go through. theta : of the columns."""
-    smoother, stream = question.smoother, random_state(seed, number)
+    smoother, stream = design.smoother, random_state(seed, number)
     data = list(experiments)
     try:
         if number >= OWN_RUNS:
-            own = theta[: len(question.columns.base.parameter_symbols)]
-            data = question.simulator.sets(experiments, own, stream)
+            own = theta[: len(design.columns.base.parameter_symbols)]
+            data = design.simulator.sets(experiments, own, stream)
         passes = smoother.run(data, theta, stream, predicted=checks, ahead=checks)
     except SamplingError:
         if number < OWN_RUNS:
@@ -386,17 +395,17 @@ def _one_set(
     if not all(np.all(np.isfinite(p.rows)) for p in passes):
         return {}
     with np.errstate(over="ignore", invalid="ignore"):
-        found = question.statistics(data, passes, stream, checks)
+        found = design.statistics(data, passes, stream, checks)
     if not np.all(np.isfinite(found.columns)) or np.any(np.isinf(found.squares)):
         return {}  # rows whose squares are beyond what a number can be
     return dict(vars(found))
 
 
-def compared(law: Null, usual: np.ndarray, seen: Statistics) -> Efficient:
+def compare_with_null(null: Null, typical: np.ndarray, seen: Statistics) -> Efficient:
     """Efficient statistics of the candidates in one data set, each on the scale of the information
     that these data hold."""
-    by = excess(seen.squares, usual)
-    found = efficient(law, seen.columns / by, seen.nuisance)
+    by = information_scale(seen.squares, typical)
+    found = efficient(null, seen.columns / by, seen.nuisance)
     return replace(
         found, score=found.score * by, variance=found.variance * by**2,
         strength=found.strength / by,
@@ -415,6 +424,3 @@ def with_parameters(
         own = symbols("parameter", name, ())
         parameters[name] = Site(name, "parameter", law, own, location)
     return replace(trace, parameters=parameters)
-
-
-__all__ = ["Question", "Screen", "Statistics", "ask", "compared", "groups_of", "with_parameters"]

@@ -3,9 +3,8 @@
 Quadratic forms 1/2 sum_st k(s, t) S_s S_t for the kernel k of a latent process. They take the first
 row of each experiment in `starts`, and cost a pass over the rows. A row without information is 0.
 
-Statistics on the scale of the information that each data set holds of them.
-
-What acts only where a state seldom goes (a stop, an overflow, a curve far out) has next to no
+Scores are compared on the scale of the observed information, that which each data set holds. What
+acts only where a state seldom goes (a stop, an overflow, a curve far out) has next to no
 information in most simulated sets and very much in a few. Its variance over the sets is that of
 the few, and one of them may lie forty standard deviations out: enough to hide everything else in
 the law of the largest. Given where the states went the information is known, and the score is
@@ -22,6 +21,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import WHOLE, segments
+
+FREE = 2.0  # times a typical set's sum of squares, up to which a score is left as it is
 
 
 def autoregressive(
@@ -59,16 +60,13 @@ def random_walk(scores: np.ndarray, starts: Sequence[int] = WHOLE) -> np.ndarray
     return found
 
 
-FREE = 2.0  # times a typical set's sum of squares, up to which a score is left as it is
-
-
-def typical(squares: np.ndarray) -> np.ndarray:
+def typical_squares(squares: np.ndarray) -> np.ndarray:
     """(K,) median of sums of squares (B, K) over the sets that have any; NaN where none has."""
     some = np.where(squares > 0.0, squares, np.nan)
     none = np.all(np.isnan(some), axis=0)
     return np.where(none, np.nan, np.nanmedian(np.where(none, 0.0, some), axis=0))
 
 
-def excess(squares: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """By what scores with these sums of squares (..., K) are to be divided, usual (K,)."""
-    return np.sqrt(np.fmax(squares / (FREE * usual), 1.0))
+def information_scale(squares: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """What scores with sums of squares (..., K) are divided by, where (K,) are typical."""
+    return np.sqrt(np.fmax(squares / (FREE * typical), 1.0))

@@ -1,1 +1,1 @@
-"""Fits and refits, and the choice among candidates."""
+"""Fits and refits, the choice among candidates, and what cannot be separated from it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +12,8 @@ from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.compiling import LOCK
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import lifted
-from ssmppl.diagnosis.model.initial_law import Start, needs_start
+from ssmppl.diagnosis.model.basis import symbolic_shapes
+from ssmppl.diagnosis.model.initial_law import ProperInitialLaw, needs_proper_initial_law
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.screening.screen import with_parameters
 from ssmppl.diagnosis.selection.fit import Fitter
@@ -24,18 +24,18 @@ from ssmppl.language.distributions import Uniform
 from ssmppl.language.model.traced import Trace
 
 
-class Workshop:
+class AugmentedModels:
     """Makes and fits augmented models of one base model.
 
-    start : of those that cannot have the model's flat one.
+    initial_law : of those that cannot have the model's flat one.
     """
 
     def __init__(
         self, trace: Trace, missing: Missing, fixed: Mapping[str, np.ndarray], settings: Settings,
-        start: Start | None = None,
+        initial_law: ProperInitialLaw | None = None,
     ):  # fmt: skip
         self.trace, self.missing, self.fixed, self.settings = trace, missing, dict(fixed), settings
-        self.start = start
+        self.initial_law = initial_law
         self._made: dict[tuple[tuple[str, str], ...], Fitter] = {}
 
     def __getstate__(self) -> dict:  # another process makes what it needs
@@ -44,77 +44,63 @@ class Workshop:
     def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         """The fitter of the model with these effects; shapes are fixed parameters, so that the
         generated code is the same for all data."""
-        made, shapes = lift(candidates)
+        made, shapes = symbolic_shapes(candidates, of_time=True)
         key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
-        if key not in self._made:
-            with LOCK:  # refits in threads ask for the same models
-                if key not in self._made:
-                    trace = self.trace
-                    if made:
-                        trace = with_parameters(augment(trace, made), shapes)
-                    self._made[key] = self.made(trace, shapes)
-        return self._made[key].with_fixed(shapes)
+
+        def trace() -> Trace:
+            return with_parameters(augment(self.trace, made), shapes) if made else self.trace
+
+        return self._cached(key, trace, shapes)
 
     def with_free_shapes(
         self, candidates: Sequence[Candidate], free: Mapping[str, tuple[float, float]]
     ) -> Fitter:
         """The fitter of the model with these effects, some of their shapes between bounds.
 
-        The last parameters are then the shapes' shares of the way between (`share_of`); the bounds
-        are fixed parameters, so that the generated code is the same for all data.
+        The last parameters are then the shapes as fractions of the range (`range_fraction`); the
+        bounds are fixed parameters, so that the generated code is the same for all data.
         """
-        made, shapes = lift(candidates)
+        made, shapes = symbolic_shapes(candidates, of_time=True)
         given = {n: v for n, v in shapes.items() if n not in free}
         inside: dict[Expr, Expr] = {}
         for name, (low, high) in free.items():
             ends = (f"{name}_from", f"{name}_range")
             given |= dict(zip(ends, (low, high - low), strict=True))
-            a, b, u = (symbol("parameter", n, ()) for n in (*ends, share_of(name)))
+            a, b, u = (symbol("parameter", n, ()) for n in (*ends, range_fraction(name)))
             inside[symbol("parameter", name, ())] = a + b * u
         key = (*((c.key, c.strength) for c in made), *((n, "free") for n in free))
+
+        def trace() -> Trace:
+            own = [replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape)) for c in made]
+            whole = with_parameters(augment(self.trace, own), given)
+            return with_parameters(whole, map(range_fraction, free), lambda: Uniform(0, 1))
+
+        return self._cached(key, trace, given)
+
+    def _cached(
+        self, key: tuple[tuple[str, str], ...], trace: Callable[[], Trace],
+        given: Mapping[str, float],
+    ) -> Fitter:  # fmt: skip
+        """The fitter of a trace that is made once for each key, with these parameters given."""
         if key not in self._made:
-            with LOCK:
+            with LOCK:  # refits in threads ask for the same models
                 if key not in self._made:
-                    made = [
-                        replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape))
-                        for c in made
-                    ]
-                    trace = with_parameters(augment(self.trace, made), given)
-                    trace = with_parameters(trace, map(share_of, free), lambda: Uniform(0, 1))
-                    self._made[key] = self.made(trace, given)
+                    self._made[key] = self.fitter_of(trace(), given)
         return self._made[key].with_fixed(given)
 
-    def made(self, trace: Trace, given: Mapping[str, float]) -> Fitter:
+    def fitter_of(self, trace: Trace, given: Mapping[str, float]) -> Fitter:
         """The fitter of an augmented trace, with the values of what it was given besides."""
-        start = self.start if needs_start(trace) else None
-        trace = start.given(trace) if start else trace
+        law = self.initial_law if needs_proper_initial_law(trace) else None
+        trace = law.applied_to(trace) if law else trace
         program = compile_trace(trace, self.missing)
         fixed = self.fixed | {n: np.asarray(v) for n, v in given.items()}
         settings = Settings(self.settings.particles, proposal_of(program), self.settings.lag)
-        return Fitter(Problem(trace, (), program), fixed, settings, start)
+        return Fitter(Problem(trace, (), program), fixed, settings, law)
 
 
-def share_of(shape: str) -> str:
-    """The parameter that says how far a shape is from its lower bound to its upper one."""
+def range_fraction(shape: str) -> str:
+    """The parameter that says how far a shape is from its lower bound (0) to its upper one (1)."""
     return f"{shape}_share"
-
-
-def lift(candidates: Sequence[Candidate]) -> tuple[list[Candidate], dict[str, float]]:
-    """Candidates whose shapes are symbols, dates among them, and the values of these."""
-    made, values = lifted(list(candidates))
-    out = []
-    for c in made:
-        lengths = {n for n in c.effect.states.values() if n is not None}
-        shape = []
-        for name, value in c.shape:
-            if c.effect.profile and not c.held and name not in lengths:
-                own = f"{c.strength}_{name}"
-                values = {**values, own: float(value)}
-                shape.append((name, symbol("parameter", own, ())))
-            else:
-                shape.append((name, value))
-        out.append(replace(c, shape=tuple(shape)))
-    return out, dict(values)
 
 
 def proposal_of(program: Program) -> str:

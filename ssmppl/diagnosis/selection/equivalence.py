@@ -1,10 +1,8 @@
-"""What these data cannot tell apart among the leading candidates, and what input would.
+"""Equivalence classes of candidates that these data do not separate, and the input that would.
 
 The class of the best is its confidence set: the refits that lie no further behind than the truth
-would by chance, and candidates whose scores are so like the best one's that its gain does not
-separate them.
-
-Which candidates these data cannot tell apart, and what input would.
+would by chance, and candidates whose scores correlate so much with the best one's that its gain
+does not separate them.
 
 Near the base model the log-likelihood gains are quadratic: under truth k of strength lambda the
 efficient scores are S~ ~ N(lambda V[:, k], V), so that z ~ N(delta rho[:, k], rho) with delta^2 / 2
@@ -24,21 +22,26 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
-from ssmppl.diagnosis.screening.screen import Question, Screen
+from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.run.seeds import random_state
 
-NATS_APART = 2.7  # 1.645^2: times 1 / (1 - |rho|), the gain that tells two effects apart at 5%
-LEAST_CUT = 2.0  # nats
-DRAWS = 4000
+SEPARATING = 2.7  # 1.645^2: times 1 / (1 - |rho|), the gain that separates two effects at 5%
+LEAST_CUT = 2.0  # nats behind the best that any member of a confidence set may be
+DRAWS = 4000  # of the scores, for the cuts
+
+# Inputs under which a class might separate.
+SETS = 25  # simulated under each input
+MOST_VARIED = 4  # inputs that are replaced in turn
+SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
 
 
-def likeness(rho: np.ndarray, sided: np.ndarray | None = None) -> np.ndarray:
+def similarity(rho: np.ndarray, sided: np.ndarray | None = None) -> np.ndarray:
     """(K, K) how far each candidate can stand in for another: |rho|.
 
     Between two one-sided candidates the sign counts: one that would have to work backwards to
-    mimic the other has likeness 0.
+    mimic the other has similarity 0.
     """
     rho = np.asarray(rho, float)
     if sided is None:
@@ -47,16 +50,16 @@ def likeness(rho: np.ndarray, sided: np.ndarray | None = None) -> np.ndarray:
     return np.where(sign == 0, np.abs(rho), np.maximum(sign * rho, 0.0))
 
 
-def needed_gain(rho: np.ndarray | float) -> np.ndarray:
-    """Nats that tell two effects of this correlation apart at 5%; infinite at 1."""
+def separating_gain(rho: np.ndarray | float) -> np.ndarray:
+    """The gain in nats that separates two effects of this correlation at 5%; infinite at 1."""
     distance = 1.0 - np.abs(np.asarray(rho, float))
-    return np.divide(NATS_APART, distance, out=np.full(distance.shape, np.inf),
+    return np.divide(SEPARATING, distance, out=np.full(distance.shape, np.inf),
                      where=distance > 1e-12)  # fmt: skip
 
 
-def told_apart(gain: np.ndarray | float, rho: np.ndarray | float) -> np.ndarray:
-    """Whether a gain (nats) tells effects of this correlation apart at 5%."""
-    return np.asarray(gain) >= needed_gain(rho)
+def distinguishable(gain: np.ndarray | float, rho: np.ndarray | float) -> np.ndarray:
+    """Whether a gain (nats) separates effects of this correlation at 5%."""
+    return np.asarray(gain) >= separating_gain(rho)
 
 
 @dataclass(frozen=True)
@@ -76,18 +79,20 @@ class Classes:
         return found[np.argsort(-np.abs(self.rho[found]) - (self.leader[found] == found))]
 
 
-def classes(rho: np.ndarray, gains: np.ndarray, sided: np.ndarray | None = None) -> Classes:
-    """The candidate with the largest gain takes all that it is not told apart from; and so on.
+def classes_by_similarity(
+    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray | None = None
+) -> Classes:
+    """The best candidate takes all that its gain does not separate from it; and so on.
 
     rho : (K, K). gains : (K,) nats, of the screen or of the refits.
     """
     rho, gains = np.asarray(rho, float), np.asarray(gains, float)
-    alike = likeness(rho, sided)
+    alike = similarity(rho, sided)
     class_id, leader = np.zeros(len(gains), int), np.full(len(gains), -1)
     for k in np.argsort(-gains, kind="stable"):
         if class_id[k]:
             continue
-        same = (class_id == 0) & ~told_apart(gains[k], alike[k])
+        same = (class_id == 0) & ~distinguishable(gains[k], alike[k])
         same[k] = True
         class_id[same], leader[same] = class_id.max() + 1, k
     return Classes(class_id, leader, rho[leader, np.arange(len(gains))])
@@ -145,18 +150,68 @@ def _gain(z: np.ndarray, signs: np.ndarray) -> np.ndarray:
     return 0.5 * reached**2
 
 
+# --- the classes of a screen ---------------------------------------------------------------------
+
+
+def group_leaders(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """Best shape of each group: the refitted by their penalised gain, then others by height."""
+    done = [r.index[0] for r in refits if len(r.index) == 1]
+    family, groups = screen.family, screen.groups
+    known = {int(groups[k]) for k in done}
+    return done + [
+        k for k in family.leaders if not screen.efficient.status[k] and int(groups[k]) not in known
+    ]
+
+
+def equivalence_classes(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
+    """Classes of the candidates in `order` (of `group_leaders`); each weak one is its own."""
+    refitted = {r.index[0]: max(r.penalised_gain, 0.0) for r in refits if len(r.index) == 1}
+    at = np.array(order, dtype=int)
+    rho, sided = screen.efficient.rho[np.ix_(at, at)], screen.efficient.sided[at]
+    gains = np.array([refitted.get(int(k), screen.efficient.gain[k]) for k in at])
+    strong = np.array(
+        [int(k) in refitted or screen.efficient.gain[k] >= SEPARATING for k in at], bool
+    )
+    class_id, leader = np.zeros(len(at), int), np.arange(len(at))
+    if refitted:
+        first = _of_the_best(rho, gains, sided, len(refitted), strong)
+        class_id[first], leader[first] = 1, 0
+    rest = np.flatnonzero(strong & (class_id == 0))
+    if len(rest):
+        found = classes_by_similarity(rho[np.ix_(rest, rest)], gains[rest], sided[rest])
+        class_id[rest] = found.class_id + class_id.max()
+        leader[rest] = rest[found.leader]
+    weak = np.flatnonzero(class_id == 0)
+    class_id[weak] = class_id.max(initial=0) + 1 + np.arange(len(weak))
+    return Classes(class_id, leader, rho[leader, np.arange(len(at))])
+
+
+def _of_the_best(
+    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray, refitted: int, strong: np.ndarray
+) -> np.ndarray:
+    """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
+    among those that were not."""
+    own = slice(0, refitted)
+    cut = cuts(rho[own, own], gains[own], range(refitted), sided=sided[own])
+    out = np.zeros(len(gains), bool)
+    out[own] = confidence_set(gains[own], cut)
+    alike = ~distinguishable(gains[0], similarity(rho, sided)[0]) & strong
+    out[refitted:] = alike[refitted:]
+    return out
+
+
 # --- the input that would separate ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Separation:
-    """input : which one separates a class best. told_apart : whether it would, at 5%.
+    """The input that separates a class best. separable : whether it would, at 5%.
 
     nats : by input, the least gain (1 - |rho|) over pairs of the class, of which 2.7 is enough.
     """
 
     input: str
-    told_apart: bool
+    separable: bool
     nats: dict[str, float]
 
 
@@ -166,7 +221,7 @@ def separating_input(
     covariances: Mapping[str, np.ndarray],
     sided: np.ndarray | None = None,
 ) -> Separation:
-    """The input under which the members of a class come apart best, the hardest pair counting.
+    """The input that separates the members of a class best, the hardest pair counting.
 
     Parameters
     ----------
@@ -193,87 +248,38 @@ def separating_input(
             v, np.outer(size, size), out=np.ones_like(v), where=np.outer(size, size) > 0
         )
         gain = 0.5 * np.asarray(strengths, float)[which] ** 2 * np.diagonal(v)
-        apart = gain[:, None] * (1.0 - np.minimum(likeness(rho, signs), 1.0))
-        nats[name] = float(np.min(apart[~np.eye(len(which), dtype=bool)]))
+        separation = gain[:, None] * (1.0 - np.minimum(similarity(rho, signs), 1.0))
+        nats[name] = float(np.min(separation[~np.eye(len(which), dtype=bool)]))
     best = max(nats, key=lambda name: nats[name])
-    return Separation(best, nats[best] >= NATS_APART, nats)
+    return Separation(best, nats[best] >= SEPARATING, nats)
 
 
-SETS = 25  # simulated under each input
-MOST_VARIED = 4  # inputs that are replaced in turn
-SLOW, FAST, LEVELS = 0.25, 8.0, 8  # slow period in shares of the rows, fast one in rows, stairs
-
-
-def heads(screen: Screen, refits: Sequence[Refit]) -> list[int]:
-    """Best shape of each group: the refitted by their merit, then the others by their height."""
-    done = [r.index[0] for r in refits if len(r.index) == 1]
-    family, groups = screen.family, screen.groups
-    known = {int(groups[k]) for k in done}
-    return done + [
-        k for k in family.leaders if not screen.found.status[k] and int(groups[k]) not in known
-    ]
-
-
-def told(screen: Screen, refits: Sequence[Refit], order: Sequence[int]) -> Classes:
-    """Classes of the candidates in `order` (of `heads`); one of its own for whatever is weak."""
-    refitted = {r.index[0]: max(r.merit, 0.0) for r in refits if len(r.index) == 1}
-    at = np.array(order, dtype=int)
-    rho, sided = screen.found.rho[np.ix_(at, at)], screen.found.sided[at]
-    gains = np.array([refitted.get(int(k), screen.found.gain[k]) for k in at])
-    strong = np.array([int(k) in refitted or screen.found.gain[k] >= NATS_APART for k in at], bool)
-    class_id, leader = np.zeros(len(at), int), np.arange(len(at))
-    if refitted:
-        first = _of_the_best(rho, gains, sided, len(refitted), strong)
-        class_id[first], leader[first] = 1, 0
-    rest = np.flatnonzero(strong & (class_id == 0))
-    if len(rest):
-        found = classes(rho[np.ix_(rest, rest)], gains[rest], sided[rest])
-        class_id[rest] = found.class_id + class_id.max()
-        leader[rest] = rest[found.leader]
-    weak = np.flatnonzero(class_id == 0)
-    class_id[weak] = class_id.max(initial=0) + 1 + np.arange(len(weak))
-    return Classes(class_id, leader, rho[leader, np.arange(len(at))])
-
-
-def _of_the_best(
-    rho: np.ndarray, gains: np.ndarray, sided: np.ndarray, refitted: int, strong: np.ndarray
-) -> np.ndarray:
-    """(K,) bool: the confidence set among the refitted, who come first, and who is like the best
-    among those that were not."""
-    own = slice(0, refitted)
-    cut = cuts(rho[own, own], gains[own], range(refitted), sided=sided[own])
-    out = np.zeros(len(gains), bool)
-    out[own] = confidence_set(gains[own], cut)
-    alike = ~told_apart(gains[0], likeness(rho, sided)[0]) & strong
-    out[refitted:] = alike[refitted:]
-    return out
-
-
-# -- another input
-def separating(
-    screen: Screen, members: Sequence[int], seed: np.random.SeedSequence, kept: Checkpoint
+def best_separating_input(
+    screen: Screen, members: Sequence[int], seed: np.random.SeedSequence, checkpoint: Checkpoint
 ) -> str:
     """The simple input that would separate these candidates best; "" if none would.
 
     The base model is simulated under each, and its scores say how alike the candidates would be.
     """
-    question, columns = screen.question, np.array(members, dtype=int)
-    inputs = simple_inputs(screen.experiments, list(map(repr, question.trace.input_symbols)))
+    design, columns = screen.design, np.array(members, dtype=int)
+    inputs = simple_inputs(screen.experiments, list(map(repr, design.trace.input_symbols)))
     if not inputs:
         return ""
-    whole = question.theta(screen.theta)
+    whole = design.theta(screen.theta)
     names = list(inputs)
-    one = partial(_tried, question, list(inputs.values()), whole, columns, seed)
-    results = kept.each("trying inputs", SETS * len(names), one)
+    one = partial(_scores_under_input, design, list(inputs.values()), whole, columns, seed)
+    results = checkpoint.map("trying inputs", SETS * len(names), one)
     covariances = {}
     for which, name in enumerate(names):
         own = results[which :: len(names)]
-        done = [r for r in own if not kept.failures.of_task(f"a set under {name}", r) and r]
+        done = [
+            r for r in own if not checkpoint.failures.record_task(f"a set under {name}", r) and r
+        ]
         if not done:
             continue
         law = Null.of(
             np.stack([r["columns"] for r in done]), np.stack([r["nuisance"] for r in done]),
-            quadratic=question.quadratic[columns], sided=question.sided[columns],
+            quadratic=design.quadratic[columns], sided=design.sided[columns],
         )  # fmt: skip
         try:
             nothing = np.zeros(len(columns)), np.zeros(law.nuisance.shape[1])
@@ -283,28 +289,28 @@ def separating(
     if not covariances:
         return ""
     best = separating_input(
-        range(len(columns)), screen.found.strength[columns], covariances,
-        screen.found.sided[columns],
+        range(len(columns)), screen.efficient.strength[columns], covariances,
+        screen.efficient.sided[columns],
     )  # fmt: skip
-    return best.input if best.told_apart else ""
+    return best.input if best.separable else ""
 
 
-def _tried(
-    question: Question, inputs: Sequence[Sequence[Experiment]], theta: np.ndarray,
+def _scores_under_input(
+    design: ScreenDesign, inputs: Sequence[Sequence[Experiment]], theta: np.ndarray,
     columns: np.ndarray, seed: np.random.SeedSequence, k: int,
 ) -> Numbers:  # fmt: skip
     """The scores of a set that is simulated under one of the inputs; empty where there are none."""
     number, which = divmod(k, len(inputs))
     stream = random_state(seed, which, number)
-    own = theta[: len(question.columns.base.parameter_symbols)]
+    own = theta[: len(design.columns.base.parameter_symbols)]
     try:
-        data = question.simulator.sets(inputs[which], own, stream)
-        passes = question.smoother.run(data, theta, stream, predicted=False)
+        data = design.simulator.sets(inputs[which], own, stream)
+        passes = design.smoother.run(data, theta, stream, predicted=False)
     except SamplingError:
         return {}
     if not all(np.all(np.isfinite(p.rows)) for p in passes):
         return {}
-    found = question.statistics(data, passes, stream, checks=False)
+    found = design.statistics(data, passes, stream, checks=False)
     return {"columns": found.columns[columns], "nuisance": found.nuisance}
 
 

@@ -2,21 +2,19 @@
 
 Linear Gaussian models are climbed with their exact score. Others are climbed by the extended Kalman
 filter's log-likelihood where there is one, which is smooth and takes a millisecond, from several
-starts, and from there by the particle smoother's score (`noisy_climb`). How far the top still is is
-told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
+starts, and from there by the particle smoother's score. How far the top still is is told in nats:
+g' H^-1 g / 2 is what a quadratic would still gain.
 
-Scales and shares that a fit has driven to a bound of their support: a process noise of nothing.
+The climb by noisy scores is a quasi-Newton ascent: z <- z + H^-1 g on the unconstrained scale, with
+H an estimate of the information, kept up by damped BFGS updates (Nocedal and Wright 2006, procedure
+18.2); near the top the steps shrink as 1 / k, which averages the noise out (Robbins and Monro
+1951).
 
-There the likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or
-1e-13, as it happened), and a curvature there is no information. Such a number is held at the value
-nearest to where it is of consequence, the farthest inside that costs next to nothing, which keeps
-the other numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their law).
-
-Quasi-Newton ascent by noisy gradients.
-
-z <- z + H^-1 g on the unconstrained scale, with H an estimate of the information, kept up by damped
-BFGS updates (Nocedal and Wright 2006, procedure 18.2); near the top the steps shrink as 1 / k,
-which averages the noise out (Robbins and Monro 1951).
+Scales and shares may be driven to a bound of their support: a process noise of nothing. There the
+likelihood is flat on the unconstrained scale: where the climb ended says nothing (1e-4 or 1e-13, as
+it happened), and a curvature there is no information. Such a number is held at the value nearest to
+where it is of consequence, the farthest inside that costs next to nothing, which keeps the other
+numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their law).
 """
 
 from __future__ import annotations
@@ -31,9 +29,9 @@ import numpy as np
 
 from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.data import Experiment, unpack_parameters
-from ssmppl.diagnosis.model.initial_law import FirstStates, Start
+from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import Columns, score_columns
-from ssmppl.diagnosis.model.smoothing import Settings, Simulator, Smoother
+from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
@@ -53,6 +51,26 @@ from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.transforms import transforms
 
+Point = tuple[float, np.ndarray]  # value and gradient
+
+# Climbs.
+NEAR = 1.0  # nats from the top where the first phase ends
+MOST_STEPS = 20  # of the first phase
+AVERAGED = 6  # steps of the second phase
+TINY = 1e-12  # information in any units, as of a parameter in millions
+CLIFF = 30.0  # nats that a step of it may lose: Monte Carlo noise seldom explains more
+FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
+NOISE_SHARES = (1.0, 0.3, 0.1)  # of the transition's noise, from which climbs start
+ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
+SPREAD = 0.1  # least information of a logarithm that steps are made with
+
+# Likelihoods and information by simulation.
+PILOT_PARTICLES = 300
+PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
+INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
+LARGEST = 1e100  # of a score: what is beyond is an overflow
+
+# Numbers that run to a bound of their support.
 OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
 FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
 COST = 0.05  # nats that the value which is held may cost
@@ -60,134 +78,28 @@ GRID = np.linspace(0.5, 40.0, 80).tolist()  # inwards, where the value that is h
 STEPS = 40  # of halving
 FALL = 0.5  # nats by which the function has to fall inside: else the number is not identified
 
-
-def bounded(
-    function: Callable[[np.ndarray], float], z: np.ndarray, candidates: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(z, mask), each (F,): where a bound is the place of the maximum, and z moved inside there.
-
-    function : what was maximised. candidates : (F,) bool, those that have a bound to run to.
-    """
-    z, mask = np.array(z, dtype=float), np.zeros(len(z), dtype=bool)
-    for i in np.flatnonzero(candidates):
-        here = function(z)
-
-        def at(step: float, i: int = int(i)) -> float:
-            there = z.copy()
-            there[i] += step
-            return function(there)
-
-        for sign in (-1.0, 1.0):
-            # As far as there are values: nothing is resolved any more where a noise is tiny.
-            out = list(takewhile(lambda v: v > -np.inf, (at(sign * s) for s in OUTWARDS)))
-            if not out or min(out) < here - FREE:
-                continue
-            top = max(here, *out)
-            inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
-            if inside is None:  # flat either way: nothing tells of this number
-                continue
-            good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
-            for _ in range(STEPS):
-                middle = 0.5 * (good + bad)
-                good, bad = (middle, bad) if at(-sign * middle) >= top - COST else (good, middle)
-            z[i] -= sign * good
-            mask[i] = True
-            break
-    return z, mask
-
-
-def names_of(space: Space, mask: np.ndarray) -> list[str]:
-    """The components of the free numbers in `mask` (F,), by their text: `q`, `s[0]`."""
-    every: list[str] = []
-    for t in transforms(space.problem.trace):
-        single = len(t.free) == len(t.components)
-        every += (repr(t.components[k]) if single else t.site.name for k in range(len(t.free)))
-    free = [every[i] for i in space.where]
-    return list(dict.fromkeys(n for n, m in zip(free, mask, strict=True) if m))
-
-
-def note(names: Sequence[str], values: dict[str, float], what: str) -> str:
-    """What a report says of parameters at a bound."""
-    if not names:
-        return ""
-    told = ", ".join(f"{n} at {values[n]:.3g}" if n in values else n for n in names)
-    return (
-        f"in {what} the best value of {' and '.join(names)} is a bound: held where it begins to "
-        f"count ({told}, which costs {COST:g} nats), and left out of the information"
-    )
-
-
-MOST_STEPS = 20  # of the first phase
-NEAR = 1.0  # nats from the top where the first phase ends
-AVERAGED = 6  # steps of the second phase
-CLIFF = 30.0  # nats that a step of it may lose: Monte Carlo noise seldom explains more
-FARTHEST = 1.5  # that one step may go on the unconstrained scale, in any coordinate
-
-Point = tuple[float, np.ndarray]  # value and gradient
-
-
-def noisy_climb(
-    gradient: Callable[[np.ndarray], Point | None], z: np.ndarray, found: Point, h: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """(z, H, distance from the top in nats) where the climb from z (F,) ends.
-
-    gradient : value and gradient at a point, with noise; None where there are none. found : these
-    at z. h : (F, F) minus the second derivatives there, about.
-    """
-    value, g = found
-    size = 1.0
-    for _ in range(MOST_STEPS):
-        step = newton_step(g, h)
-        if 0.5 * g @ step < NEAR:
-            break
-        step *= size * _shortened(step)
-        new = gradient(z + step)
-        if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
-            size *= 0.4
-            if size < 0.01:
-                break
-            continue
-        h = _update(h, step, g - new[1])
-        z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
-    distance, size = np.inf, 1.0
-    for k in range(AVERAGED):
-        step = newton_step(g, h)
-        distance = 0.5 * float(g @ step)
-        step *= size * _shortened(step) / (k + 1.0)
-        new = gradient(z + step)
-        if new is None or new[0] < value - CLIFF:
-            size *= 0.4
-            continue
-        z, (value, g) = z + step, new
-    return z, h, distance
-
-
-def _shortened(step: np.ndarray) -> float:
-    """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
-    coordinate at all."""
-    return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
-
-
-def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Damped BFGS: H such that H s is about y, positive definite still (procedure 18.2)."""
-    hs = h @ s
-    curvature, along = float(s @ hs), float(s @ y)
-    if along < 0.2 * curvature:
-        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
-        along = float(s @ y)
-    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along
-
-
-LARGEST = 1e100  # of a score: what is beyond is an overflow
-INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
-PILOT_PARTICLES = 300
-PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
-NUMBERS = (
+NUMBERS = (  # of a fit, in a checkpoint
     "theta", "z", "log_likelihood", "error", "information", "distance", "converged", "at_bound",
 )  # fmt: skip
-QUIETER = (1.0, 0.3, 0.1)  # times the noise of the transition, from which climbs start
-ASTRAY = 3.0  # nats that the climb of the approximation may cost by the particle filter
-SPREAD = 0.1  # least information of a logarithm that steps are made with
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Settings of a fit: how much is done for it.
+
+    pilot : look for a better start around the one that is given. standard_errors : the information
+    at the end is needed. approximate : the top of the extended Kalman filter's likelihood will do,
+    where there is one, for what is fitted many times.
+    """
+
+    pilot: bool = True
+    standard_errors: bool = True
+    approximate: bool = False
+
+
+FROM_START = Effort(pilot=False)
+WITHOUT_ERRORS = Effort(pilot=False, standard_errors=False)
+APPROXIMATELY = Effort(pilot=False, standard_errors=False, approximate=True)
 
 
 @dataclass(frozen=True)
@@ -214,7 +126,7 @@ class Fit:
     @property
     def bounds(self) -> list[str]:
         """Components that ran to a bound of their support, by their text."""
-        return names_of(self.space, self.at_bound)
+        return component_names(self.space, self.at_bound)
 
     @property
     def problem(self) -> Problem:
@@ -241,11 +153,11 @@ class Fitter:
 
     def __init__(
         self, problem: Problem, fixed: Mapping[str, np.ndarray], settings: Settings,
-        start: Start | None = None,
+        initial_law: ProperInitialLaw | None = None,
     ):  # fmt: skip
-        """start : the law of x_1 is that one, in place of a flat one."""
+        """initial_law : of x_1, in place of a flat one."""
         self.problem, self.fixed, self.settings = problem, dict(fixed), settings
-        self.start = start
+        self.initial_law = initial_law
         self.kalman = kalman_model(problem.trace)
         trace = problem.trace
         self.columns: Columns = score_columns(trace, trace, (), self.fixed, problem.program.missing)
@@ -262,8 +174,8 @@ class Fitter:
         return out
 
     @property
-    def few(self) -> int:
-        """Particles where a rough answer will do."""
+    def pilot_particles(self) -> int:
+        """Particles where an approximate answer will do."""
         return min(PILOT_PARTICLES, self.settings.particles)
 
     @property
@@ -273,14 +185,14 @@ class Fitter:
     @cached_property
     def simulator(self) -> Simulator:
         """Draws data sets from the model."""
-        program, held = self.problem.program, self.start.laws if self.start else ()
-        first = FirstStates(self.smoother) if self.start else None
+        program, held = self.problem.program, self.initial_law.laws if self.initial_law else ()
+        first = InitialStateMeans(self.smoother) if self.initial_law else None
         return Simulator(program, program.missing, self.kalman, tuple(held), first)
 
     @property
-    def height(self) -> float:
-        """Nats for each experiment that a law in place of a flat one takes."""
-        return self.start.height if self.start else 0.0
+    def log_correction(self) -> float:
+        """Nats for each experiment that a proper initial law in place of a flat one takes."""
+        return self.initial_law.log_correction if self.initial_law else 0.0
 
     def restored(self, experiments: Sequence[Experiment], numbers: Mapping[str, np.ndarray]) -> Fit:
         """The fit to `experiments` that had these `Fit.numbers`."""
@@ -297,14 +209,12 @@ class Fitter:
 
     def fit(
         self, experiments: Sequence[Experiment], seed: np.random.SeedSequence,
-        start: Mapping[str, np.ndarray], *, searched: bool = False,
-        information: np.ndarray | None = None, quick: bool = False, rough: bool = False,
+        start: Mapping[str, np.ndarray], effort: Effort = Effort(), *,
+        information: np.ndarray | None = None,
     ) -> Fit:  # fmt: skip
-        """The mode from `start`, or, unless that was `searched`, from a pilot's mode near it.
+        """The mode of the posterior, climbed to from `start`.
 
         information : (P, P) of the parameters where it starts, about; None: by simulation.
-        quick : no information is needed at the end. rough : nor more than the extended Kalman
-        filter's top near the start, where there is one: for what is fitted many times.
 
         Raises
         ------
@@ -314,32 +224,34 @@ class Fitter:
         problem = replace(self.problem, experiments=tuple(experiments))
         space = space_of(problem, self.fixed, dict(start))
         if isinstance(self.kalman, KalmanModel):
-            climbs = 0 if searched else 1  # from another start too
-            return self._exactly(self.kalman, space, dict(start), seed, quick or rough, climbs)
+            return self._fit_linear_gaussian(self.kalman, space, dict(start), seed, effort)
         if information is not None:
             information = self._unconstrained(space, space.theta, information, seed)
-        smooth = self._extended(problem)
-        if not searched:
+        smooth = self._extended_log_likelihood(problem)
+        if effort.pilot:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
                 if smooth is not None:
                     return smooth(theta)
-                return self._estimate(problem, theta, self.few, random_state(seed))
+                return self._estimate(problem, theta, self.pilot_particles, random_state(seed))
 
             z, _ = climb_to_mode(space, seed, estimate)
             space = at(space, space.parameters(z)[0].copy())
         if smooth is None:
-            return self._climb(space, seed, information)
-        space, top = self._by_extended(space, smooth, seed, QUIETER[: 1 if rough else None])
+            return self._fit_by_particles(space, seed, information)
+        shares = NOISE_SHARES[: 1 if effort.approximate else None]
+        space, top = self._top_of_extended_filter(space, smooth, seed, shares)
         if top is not None:
-            information = steady(top.information, ~space.on_the_line)
-        fit = None if rough and top is not None else self._climb(space, seed, information)
+            information = positive_definite(top.information, ~space.on_the_line)
+        fit = None
+        if top is None or not effort.approximate:
+            fit = self._fit_by_particles(space, seed, information)
         if top is not None:
-            fit = self._settled(fit, space, top, seed)
+            fit = self._better_of(fit, space, top, seed)
         assert fit is not None
-        if rough:
+        if effort.approximate:
             return fit
-        z, mask = bounded(density_of(space, smooth), fit.z, ~space.on_the_line)
+        z, mask = hold_at_bounds(density_of(space, smooth), fit.z, ~space.on_the_line)
         if not mask.any():
             return fit
         theta = space.parameters(z)[0].copy()
@@ -350,14 +262,14 @@ class Fitter:
     def value(self, experiments: Sequence[Experiment], theta: np.ndarray) -> float:
         """log p(y | theta) as climbs see it: exact, by the extended filter, or by particles."""
         problem = replace(self.problem, experiments=tuple(experiments))
-        smooth = self._extended(problem)
+        smooth = self._extended_log_likelihood(problem)
         if smooth is None and isinstance(self.kalman, KalmanModel):
             return self.kalman.log_likelihood(experiments, theta)
         return smooth(theta) if smooth else self.estimate(experiments, theta, random_state(
             np.random.SeedSequence(0)))  # fmt: skip
 
     # -- by the extended Kalman filter
-    def _extended(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
+    def _extended_log_likelihood(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
         """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no
         number; None where the model has no such filter."""
         twisted = problem.program.twisted if self.settings.proposal == "twisted" else None
@@ -367,12 +279,14 @@ class Fitter:
         def value(theta: np.ndarray) -> float:
             total = 0.0
             for e in problem.experiments:
-                total += twisted.extended_log_likelihood(theta, e.y, e.seen, e.u) + self.height
+                total += (
+                    twisted.extended_log_likelihood(theta, e.y, e.seen, e.u) + self.log_correction
+                )
             return total if np.isfinite(total) else -np.inf
 
         return value
 
-    def _by_extended(
+    def _top_of_extended_filter(
         self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence,
         shares: Sequence[float],
     ) -> tuple[Space, Top | None]:  # fmt: skip
@@ -381,7 +295,7 @@ class Fitter:
         function = density_of(space, smooth)
         tops = []
         for share in shares:
-            begin = self._quieter(space, share)
+            begin = self._with_process_noise(space, share)
             top = climb(function, begin.z[begin.where])
             if top is not None:
                 tops.append(top)
@@ -397,7 +311,7 @@ class Fitter:
                 return there, top
         return space, None
 
-    def _settled(
+    def _better_of(
         self, fit: Fit | None, space: Space, top: Top, seed: np.random.SeedSequence
     ) -> Fit:
         """The fit, or the top of the approximation where the particles' score led to nothing
@@ -414,9 +328,9 @@ class Fitter:
         return Fit(space, space.theta, top.z, value, error, top.information, top.distance,
                    top.distance < 3.0 * NEAR, nowhere)  # fmt: skip
 
-    def _quieter(self, space: Space, share: float) -> Space:
+    def _with_process_noise(self, space: Space, share: float) -> Space:
         """The space with the scales of the transition's noise at a share of what they are."""
-        names = [n for n in self._noises if n not in self.fixed]
+        names = [n for n in self._process_noise_scales if n not in self.fixed]
         if share == 1.0 or not names:
             return space
         trace = space.problem.trace
@@ -427,7 +341,7 @@ class Fitter:
         return at(space, theta)
 
     @cached_property
-    def _noises(self) -> set[str]:
+    def _process_noise_scales(self) -> set[str]:
         """Positive parameters that the noise of the transition is made of."""
         twisted, trace = self.problem.program.twisted, self.problem.trace
         if not isinstance(twisted, TwistedFilter):
@@ -443,32 +357,34 @@ class Fitter:
                     out.add(name)
         return out
 
-    def _exactly(
+    def _fit_linear_gaussian(
         self, kalman: KalmanModel, space: Space, start: dict[str, np.ndarray],
-        seed: np.random.SeedSequence, quick: bool, climbs: int,
+        seed: np.random.SeedSequence, effort: Effort,
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Maximization(problem, space, "posterior", self.fixed, start, seed)
         # The extended filter's is the same here, and needs no matrices to be put together.
-        smooth = self._extended(problem) or partial(kalman.log_likelihood, problem.experiments)
+        smooth = self._extended_log_likelihood(problem) or partial(
+            kalman.log_likelihood, problem.experiments
+        )
         function = density_of(space, smooth)
         top = None
-        if not climbs:  # from near the top, and to within what a decision needs
+        if not effort.pilot:  # from near the top, and to within what a decision needs
             top = climb(function, space.z[space.where])
         if top is not None and top.distance < NEAR:
             theta, converged = space.parameters(top.z)[0].copy(), True
         elif len(space.where):
-            ascent = climb_exactly(setup, DirectOptimization(restarts=climbs))
+            ascent = climb_exactly(setup, DirectOptimization(restarts=int(effort.pilot)))
             theta, converged = ascent.theta, bool(ascent.report["converged"])
         else:
             theta, converged = space.theta, True
-        z, mask = bounded(function, setup.space_at(theta), ~space.on_the_line)
+        z, mask = hold_at_bounds(function, setup.space_at(theta), ~space.on_the_line)
         theta = space.parameters(z)[0].copy() if mask.any() else theta
         value = kalman.log_likelihood(problem.experiments, theta)
         size = len(space.where)
         information = np.full((size, size), np.nan)
         fit = Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged, mask)
-        return fit if quick else self.measured(fit, seed)
+        return self.with_information(fit, seed) if effort.standard_errors else fit
 
     def states(
         self, e: Experiment, theta: np.ndarray, stream: np.ndarray, draws: int = 16
@@ -499,15 +415,19 @@ class Fitter:
             )
         except SamplingError:
             return None
-        score = np.zeros(len(point.theta))
-        score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
-        slope = point.pull(score) + point.d_log_prior
+        slope = point.pull(self._score(passes, len(point.theta))) + point.d_log_prior
         if not np.all(np.isfinite(slope)):
             return None
         value = sum(total_of(p.log_increments) for p in passes)
         return value + point.log_prior, slope
 
-    def _climb(
+    def _score(self, passes: Sequence[Pass], size: int) -> np.ndarray:
+        """(P,) of the data that was passed over; 0 in what is fixed."""
+        score = np.zeros(size)
+        score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
+        return score
+
+    def _fit_by_particles(
         self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
     ) -> Fit:
         stream = random_state(seed, 1)
@@ -523,7 +443,7 @@ class Fitter:
                 fix="check the data for outliers, or give the parameters priors round plausible "
                 "values",
             )
-        z, h, distance = noisy_climb(
+        z, h, distance = stochastic_quasi_newton(
             lambda z: self.gradient(space, z, stream, transform), z, found, information
         )
         theta = space.parameters(z)[0].copy()
@@ -574,19 +494,19 @@ class Fitter:
         settings = FilterSettings(particles, self.settings.proposal)
         try:
             return sum(
-                particle_system(problem, theta, settings, e, stream).log_Z + self.height
+                particle_system(problem, theta, settings, e, stream).log_Z + self.log_correction
                 for e in problem.experiments
             )
         except SamplingError:
             return -np.inf
 
-    def measured(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
+    def with_information(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
         """The fit with an information matrix worth its name: minus the second derivatives where
         they are exact, else that of scores simulated at it; its own was built up on the way."""
         if isinstance(self.kalman, KalmanModel):
             if np.all(np.isfinite(fit.information)):  # known already, or nothing is free
                 return fit
-            smooth = self._extended(fit.problem)
+            smooth = self._extended_log_likelihood(fit.problem)
             if smooth is not None:
                 found = information_at(density_of(fit.space, smooth), fit.z)
             else:
@@ -616,7 +536,9 @@ class Fitter:
         """(F, F) in z: mean square of the scores of data simulated at theta, prior included."""
         problem = space.problem
         smoother = Smoother(
-            self.columns, problem.program.missing, replace(self.settings, particles=self.few)
+            self.columns,
+            problem.program.missing,
+            replace(self.settings, particles=self.pilot_particles),
         )
         smoother.__dict__.update(
             {k: getattr(self.smoother, k) for k in ("program", "module", "problem")}
@@ -630,9 +552,7 @@ class Fitter:
                 passes = smoother.run(sets, theta, stream, predicted=False)
             except SamplingError:
                 return None
-            score = np.zeros(len(theta))
-            score[self.where] = sum(p.rows.sum(axis=0) for p in passes)
-            return score
+            return self._score(passes, len(theta))
 
         scores = [s for s in run_tasks(one, range(INFORMATION_SETS)) if s is not None]
         scores = [s for s in scores if np.all(np.abs(s) < LARGEST)]
@@ -661,11 +581,121 @@ def density_of(
     return value
 
 
-def steady(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
-    """(F, F) positive definite and near to `information`, for the steps of a climb; `logarithms`
-    (F,) are known to have moderate units, and steps of them are kept moderate."""
+def hold_at_bounds(
+    function: Callable[[np.ndarray], float], z: np.ndarray, candidates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(z, mask), each (F,): where a bound is the place of the maximum, and z moved inside there.
+
+    function : what was maximised. candidates : (F,) bool, those that have a bound to run to.
+    """
+    z, mask = np.array(z, dtype=float), np.zeros(len(z), dtype=bool)
+    for i in np.flatnonzero(candidates):
+        here = function(z)
+
+        def at(step: float, i: int = int(i)) -> float:
+            there = z.copy()
+            there[i] += step
+            return function(there)
+
+        for sign in (-1.0, 1.0):
+            # As far as there are values: nothing is resolved any more where a noise is tiny.
+            out = list(takewhile(lambda v: v > -np.inf, (at(sign * s) for s in OUTWARDS)))
+            if not out or min(out) < here - FREE:
+                continue
+            top = max(here, *out)
+            inside = next((s for s in GRID if not at(-sign * s) > top - FALL), None)
+            if inside is None:  # flat either way: this number is not identified
+                continue
+            good, bad = -OUTWARDS[int(np.argmax(out))], inside  # inwards, from what costs nothing
+            for _ in range(STEPS):
+                middle = 0.5 * (good + bad)
+                good, bad = (middle, bad) if at(-sign * middle) >= top - COST else (good, middle)
+            z[i] -= sign * good
+            mask[i] = True
+            break
+    return z, mask
+
+
+def component_names(space: Space, mask: np.ndarray) -> list[str]:
+    """The components of the free numbers in `mask` (F,), by their text: `q`, `s[0]`."""
+    every: list[str] = []
+    for t in transforms(space.problem.trace):
+        single = len(t.free) == len(t.components)
+        every += (repr(t.components[k]) if single else t.site.name for k in range(len(t.free)))
+    free = [every[i] for i in space.where]
+    return list(dict.fromkeys(n for n, m in zip(free, mask, strict=True) if m))
+
+
+def bounds_note(names: Sequence[str], values: dict[str, float], what: str) -> str:
+    """A note on parameters at a bound."""
+    if not names:
+        return ""
+    values_at = ", ".join(f"{n} at {values[n]:.3g}" if n in values else n for n in names)
+    return (
+        f"in {what} the best value of {' and '.join(names)} is a bound: held where it begins to "
+        f"count ({values_at}, which costs {COST:g} nats), and left out of the information"
+    )
+
+
+def stochastic_quasi_newton(
+    gradient: Callable[[np.ndarray], Point | None], z: np.ndarray, found: Point, h: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """(z, H, distance from the top in nats) where the climb from z (F,) ends.
+
+    gradient : value and gradient at a point, with noise; None where there are none. found : these
+    at z. h : (F, F) minus the second derivatives there, about.
+    """
+    value, g = found
+    size = 1.0
+    for _ in range(MOST_STEPS):
+        step = newton_step(g, h, TINY)
+        if 0.5 * g @ step < NEAR:
+            break
+        step *= size * _step_share(step)
+        new = gradient(z + step)
+        if new is None or new[0] < value - 3.0:  # beyond what Monte Carlo noise explains
+            size *= 0.4
+            if size < 0.01:
+                break
+            continue
+        h = _update(h, step, g - new[1])
+        z, (value, g), size = z + step, new, min(1.0, 2.0 * size)
+    distance, size = np.inf, 1.0
+    for k in range(AVERAGED):
+        step = newton_step(g, h, TINY)
+        distance = 0.5 * float(g @ step)
+        step *= size * _step_share(step) / (k + 1.0)
+        new = gradient(z + step)
+        if new is None or new[0] < value - CLIFF:
+            size *= 0.4
+            continue
+        z, (value, g) = z + step, new
+    return z, h, distance
+
+
+def _step_share(step: np.ndarray) -> float:
+    """The share of a step that goes no farther than `FARTHEST`; a step may be 0, or have no
+    coordinate at all."""
+    return FARTHEST / max(FARTHEST, float(np.max(np.abs(step), initial=0.0)))
+
+
+def _update(h: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Damped BFGS: H such that H s is about y, positive definite still (procedure 18.2)."""
+    hs = h @ s
+    curvature, along = float(s @ hs), float(s @ y)
+    if along < 0.2 * curvature:
+        y = (weight := 0.8 * curvature / (curvature - along)) * y + (1.0 - weight) * hs
+        along = float(s @ y)
+    return h - np.outer(hs, hs) / curvature + np.outer(y, y) / along
+
+
+def positive_definite(information: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
+    """The projection of `information` (F, F) on positive definite matrices, for steps of a climb.
+
+    logarithms : (F,) are known to have moderate units, and steps of them are kept moderate.
+    """
     scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), np.where(logarithms, SPREAD, 0.0)))
     scale = np.where(scale > 0.0, scale, 1.0)
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    lifted = (vectors * np.maximum(np.abs(values), 0.05)) @ vectors.T
-    return lifted * np.outer(scale, scale)
+    projected = (vectors * np.maximum(np.abs(values), 0.05)) @ vectors.T
+    return projected * np.outer(scale, scale)

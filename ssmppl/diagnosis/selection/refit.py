@@ -1,4 +1,4 @@
-"""Attribution: the leading candidates and pairs of them, refitted with all parameters.
+"""Refits: candidates that lead the screen, and pairs of them, fitted with all parameters.
 
 The score is a screen only: noise that has grown shrinks it, and near equivalents swap places. What
 ranks is the log-likelihood after refitting, each fit starting where the screen's quadratic
@@ -14,28 +14,42 @@ from functools import partial
 import numpy as np
 
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.effects.candidate import Candidate, sharpened
+from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.run.seeds import child_seed
 from ssmppl.diagnosis.screening.efficient_score import Efficient
-from ssmppl.diagnosis.screening.screen import Question, Screen
-from ssmppl.diagnosis.selection.augmented_models import Workshop
-from ssmppl.diagnosis.selection.fit import Fit, Fitter
+from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.fit import (
+    APPROXIMATELY,
+    FROM_START,
+    WITHOUT_ERRORS,
+    Effort,
+    Fit,
+    Fitter,
+)
 from ssmppl.errors import NotApplicable, SSMError
 from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
-SINGLES, MATES, PAIRS = 5, 4, 3  # candidates refitted, further ones like the best of them, pairs
-ALIKE = 0.8  # correlation from which a candidate is refitted as a class mate
+# Which candidates are refitted.
+SINGLES, CORRELATED, PAIRS = 5, 4, 3  # leading ones, further ones like the best of them, pairs
+PAIRED = 12  # leading ones of which pairs are made
+LEAST_GAIN = 1.0  # nats that the score must promise for a refit
+LEAST_PAIR_GAIN = 2.0  # nats that it must promise of a pair beyond the best single one
+ALIKE = 0.8  # correlation with the best from which a candidate is refitted beside it
 SAME = 0.95  # beyond which two candidates are one to begin with
-SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
+SAME_IN_PAIR = 0.98  # beyond which they make no pair
 NEAR = 25.0  # nats behind the best, up to which other delays are tried
 ONE_SIGN, BELOW = 0.02, 0.15  # quantile of a variable, and how far noise may take it below 0
+
+# How a refit starts, and when it is ranked.
+SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from which a fit may start
 OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
 AGAIN = 2  # times that a fit which left more is taken up where it ended
 LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
 LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
-LEAST_GAIN = 1.0  # nats that the score must promise for a refit
 
 
 @dataclass(frozen=True)
@@ -54,8 +68,8 @@ class Refit:
     cost: float = 0.0
 
     @property
-    def merit(self) -> float:
-        """By which refits are ranked: a date chosen among hundreds gains nats by that alone."""
+    def penalised_gain(self) -> float:
+        """The gain that ranks refits: a date chosen among hundreds gains nats by that alone."""
         return self.gain - self.cost
 
     @property
@@ -76,9 +90,11 @@ class Refit:
 
 
 def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """By the text of each component; 0 for what is fixed, NaN where there is no information: for
-    what ran to a bound of its support, and for all where the information about the others is not
-    positive definite."""
+    """Standard errors by the text of each component; 0 for what is fixed.
+
+    NaN where there is no information: for what ran to a bound of its support, and for all where the
+    information about the others is not positive definite.
+    """
     symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
     nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
     information = fit.information[np.ix_(free, free)]
@@ -102,34 +118,33 @@ def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, floa
 
 
 def refit(
-    workshop: Workshop, base: Fit, screen: Screen, index: Sequence[int],
+    augmented: AugmentedModels, base: Fit, screen: Screen, index: Sequence[int],
     train: Sequence[Experiment], seed: np.random.SeedSequence, candidates: Sequence[Candidate],
-    afresh: bool = False, rough: bool = False,
+    afresh: bool = False, approximate: bool = False,
 ) -> Refit | NotApplicable:  # fmt: skip
     """Fit the model with the effects of `candidates`, of which the last are the screen's at
-    `index`, and the others are in `base`. Several have no standard errors: `Fitter.measured`.
+    `index`, and the others are in `base`.
 
     afresh : from the model's own start, with the strengths that the effects declare for that.
-    rough : as of `Fitter.fit`.
+    approximate : as of `Effort`.
     """
     candidates = tuple(candidates)
+    effort = effort_for(candidates, approximate)
     try:
-        fitter = workshop.fitter(candidates)
+        fitter = augmented.fitter(candidates)
         if afresh:
             strengths = {c.strength: np.asarray(c.effect.afresh) for c in candidates}
             fit = fitter.fit(train, seed, strengths)
         else:
-            start = start_at(base, screen.question, screen.found, index)
+            start = start_at(base, screen.design, screen.efficient, index)
             new = [c.strength for c in candidates[-len(index) :]]
-            start = _shortened(fitter, start, new, train, seed)
+            start = _backtracked(fitter, start, new, train, seed)
             information = None if fitter.exact else _information(fitter, screen, index, train)
-            fit = fitter.fit(train, seed, start, searched=True, information=information,
-                             quick=len(candidates) > 1, rough=rough)  # fmt: skip
+            fit = fitter.fit(train, seed, start, effort, information=information)
         for _ in range(AGAIN):
             if not open_ended(fit, base):
                 break
-            more = fitter.fit(train, seed, fit.start, searched=True, quick=len(candidates) > 1,
-                              rough=rough)  # fmt: skip
+            more = fitter.fit(train, seed, fit.start, effort)
             fit = max(fit, more, key=lambda f: f.log_likelihood)
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
@@ -145,13 +160,21 @@ def refit(
     return Refit(tuple(index), candidates, fitter, fit, gain)
 
 
+def effort_for(candidates: Sequence[Candidate], approximate: bool = False) -> Effort:
+    """The effort of a fit from near its top; several effects have standard errors only once they
+    are chosen (`Fitter.with_information`)."""
+    if approximate:
+        return APPROXIMATELY
+    return FROM_START if len(candidates) < 2 else WITHOUT_ERRORS
+
+
 def open_ended(fit: Fit, base: Fit) -> bool:
     """Whether a fit is so far from its top that what it gains says little."""
     gain = fit.log_likelihood - base.log_likelihood
     return not fit.converged and fit.distance > max(OPEN, OPEN_SHARE * abs(gain))
 
 
-def _shortened(
+def _backtracked(
     fitter: Fitter, start: dict[str, np.ndarray], strengths: Sequence[str],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
 ) -> dict[str, np.ndarray]:  # fmt: skip
@@ -175,12 +198,12 @@ def _information(
 ) -> np.ndarray | None:
     """(P, P) of the fitter's parameters, from the simulated sets of the screen; None where a
     strength scales a process, whose score at zero tells nothing."""
-    at, question = list(index), screen.question
-    if np.any(question.quadratic[at]):
+    at, design = list(index), screen.design
+    if np.any(design.quadratic[at]):
         return None
-    names = [repr(s) for s in question.columns.nuisance]
-    names += [question.candidates[k].strength for k in at]
-    scores = np.concatenate([screen.stacked("nuisance"), screen.stacked("columns")[:, at]], axis=1)
+    names = [repr(s) for s in design.columns.nuisance]
+    names += [design.candidates[k].strength for k in at]
+    scores = np.concatenate([screen.simulated.nuisance, screen.simulated.columns[:, at]], axis=1)
     rows = [sum(e.steps for e in es) for es in (train, screen.experiments)]
     found = scores.T @ scores / len(scores) * rows[0] / rows[1]
     place = {repr(s): i for i, s in enumerate(fitter.problem.trace.parameter_symbols)}
@@ -191,16 +214,17 @@ def _information(
 
 
 def start_at(
-    base: Fit, question: Question, found: Efficient, index: Sequence[int]
+    base: Fit, design: ScreenDesign, found: Efficient, index: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Where the quadratic expects the top: the strengths jointly, the parameters as they are."""
+    """The start of a refit, where the quadratic expects the top: of the strengths jointly, with the
+    parameters as they are."""
     at = list(index)
     v = found.covariance[np.ix_(at, at)]
     strengths = np.linalg.lstsq(v, found.score[at], rcond=1e-6)[0]
     out = base.start
     for k, value in zip(at, strengths, strict=True):
-        c = question.candidates[k]
-        if question.quadratic[k]:
+        c = design.candidates[k]
+        if design.quadratic[k]:
             value = np.sqrt(max(float(value), 1e-12))
         e = c.effect
         if e.profile == "wave":  # its phase has been chosen so
@@ -219,75 +243,75 @@ def leading(screen: Screen) -> list[int]:
     """The best shape of each of the best groups, the highest first; of those that are almost the
     same as one above them none."""
     out: list[int] = []
-    for k in _by_height(screen):
-        if len(out) < SINGLES and all(abs(screen.found.rho[k, j]) < SAME for j in out):
+    for k in _promising(screen):
+        if len(out) < SINGLES and all(abs(screen.efficient.rho[k, j]) < SAME for j in out):
             out.append(k)
     return out
 
 
-def mates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
-    """Candidates that are like the best of the refits, to be refitted beside it."""
+def correlated_candidates(screen: Screen, refits: Sequence[Refit]) -> list[int]:
+    """The columns of candidates that correlate with the best refit, to be refitted beside it."""
     if not refits:
         return []
     best, done = refits[0].index[0], {int(screen.groups[r.index[0]]) for r in refits}
-    like = np.abs(screen.found.rho[best])
-    found = [k for k in _by_height(screen)
+    like = np.abs(screen.efficient.rho[best])
+    found = [k for k in _promising(screen)
              if like[k] >= ALIKE and int(screen.groups[k]) not in done]  # fmt: skip
-    return sorted(found, key=lambda k: -like[k])[:MATES]
+    return sorted(found, key=lambda k: -like[k])[:CORRELATED]
 
 
 def delays(screen: Screen, refits: Sequence[Refit]) -> list[int]:
     """The other numbers of states, as delays are, of those near the best that have one: nothing
     between two of them can be estimated."""
-    near = [r.index[0] for r in refits if refits[0].merit - r.merit <= NEAR]
+    near = [r.index[0] for r in refits if refits[0].penalised_gain - r.penalised_gain <= NEAR]
     out: list[int] = []
     for best in near:
-        c = screen.question.candidates[best]
-        if any(c.effect.states.values()) and len(out) < MATES:
+        c = screen.design.candidates[best]
+        if any(c.effect.states.values()) and len(out) < CORRELATED:
             group = np.flatnonzero(screen.groups == screen.groups[best])
-            out += [int(k) for k in group if k != best and not screen.found.status[k]]
+            out += [int(k) for k in group if k != best and not screen.efficient.status[k]]
     return out
 
 
-def asleep(screen: Screen) -> list[int]:
+def one_signed_candidates(screen: Screen) -> list[int]:
     """Candidates that the fitted model cannot show, as their variable keeps one sign in the data:
     a model of the speed whose sensor gives |speed| fits best where speeds never change theirs."""
     out = []
     for k in screen.family.leaders:
-        c = screen.question.candidates[k]
+        c = screen.design.candidates[k]
         if c.effect.afresh is None:
             continue
-        scale = screen.question.scales.scale.get(c.equation)  # a parameter has none
+        scale = screen.design.scales.scale.get(c.equation)  # a parameter has none
         if scale is None or scale.quantile(ONE_SIGN) >= -BELOW * scale.quantile(1.0 - ONE_SIGN):
             out.append(k)
-    return out[:MATES]
+    return out[:CORRELATED]
 
 
 def best_of_groups(screen: Screen, refits: Sequence[Refit]) -> list[Refit]:
-    """Of refits that differ in their shapes only, the best; best first."""
+    """The best of refits that differ in their shapes only; best first."""
     out: dict[int, Refit] = {}
-    for r in sorted(refits, key=lambda r: -r.merit):
+    for r in sorted(refits, key=lambda r: -r.penalised_gain):
         out.setdefault(int(screen.groups[r.index[0]]), r)
     return list(out.values())
 
 
-def _by_height(screen: Screen) -> list[int]:
+def _promising(screen: Screen) -> list[int]:
     """The best shapes of the groups that promise anything."""
-    found = screen.found
+    found = screen.efficient
     return [k for k in screen.family.leaders if found.gain[k] >= LEAST_GAIN and not found.status[k]]
 
 
 def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
     """Pairs of which the quadratic expects more than of the best single one."""
-    found, family = screen.found, screen.family
+    found, family = screen.efficient, screen.family
     heads = [k for k in family.leaders
-             if not found.status[k] and not screen.question.quadratic[k]][:12]  # fmt: skip
+             if not found.status[k] and not screen.design.quadratic[k]][:PAIRED]  # fmt: skip
     refitted = [r.index[0] for r in refits[:3] if not found.status[r.index[0]]]
     heads = list(dict.fromkeys([*refitted, *heads]))
     best, out = float(np.max(found.gain, initial=0.0)), []
     for i, a in enumerate(heads):
         for b in heads[i + 1 :]:
-            if abs(found.rho[a, b]) > 0.98:
+            if abs(found.rho[a, b]) > SAME_IN_PAIR:
                 continue
             v = found.covariance[np.ix_([a, b], [a, b])]
             s = found.score[[a, b]]
@@ -297,31 +321,31 @@ def pairs(screen: Screen, refits: Sequence[Refit]) -> list[tuple[int, int]]:
                 continue
             out.append((0.5 * float(s @ strength), (a, b)))
     out.sort(reverse=True)
-    return [pair for gain, pair in out if gain > best + 2.0][:PAIRS]
+    return [pair for gain, pair in out if gain > best + LEAST_PAIR_GAIN][:PAIRS]
 
 
 def refit_all(
-    workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
-    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
-    given: Sequence[Candidate] = (), *, afresh: bool = False, rough: bool = False,
+    augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
+    given: Sequence[Candidate] = (), *, afresh: bool = False, approximate: bool = False,
 ) -> tuple[list[Refit], list[str]]:  # fmt: skip
-    """The refits that came to an end, best first, and why the others did not. afresh, rough :
-    `refit`."""
+    """The refits that came to an end, best first, and why the others did not. afresh, approximate :
+    as of `refit`."""
     shaped = _shaped(base, screen, sorted({k for s in sets for k in s}), train, seed)
     added = [(*given, *(shaped[k] for k in index)) for index in sets]
 
-    one = partial(_one, workshop, base, screen, list(sets), tuple(train), seed, added, afresh,
-                  rough)  # fmt: skip
+    one = partial(_one, augmented, base, screen, list(sets), tuple(train), seed, added, afresh,
+                  approximate)  # fmt: skip
     done, reasons = [], []
-    results = kept.each(stage, len(sets), one)
+    results = checkpoint.map(stage, len(sets), one)
     for index, candidates, numbers in zip(sets, added, results, strict=True):
         name = " and ".join(map(str, candidates))
-        if kept.failures.of_task(f"the refit with {name}", numbers):
+        if checkpoint.failures.record_task(f"the refit with {name}", numbers):
             continue
         if "reason" in numbers:
             reasons.append(str(numbers["reason"]))
             continue
-        fitter = workshop.fitter(candidates)
+        fitter = augmented.fitter(candidates)
         fit = fitter.restored(train, numbers)
         gain = fit.log_likelihood - base.log_likelihood
         if gain < -LOST - 3.0 * np.hypot(fit.error, base.error):
@@ -331,18 +355,18 @@ def refit_all(
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)
         done.append(Refit(tuple(index), candidates, fitter, fit, gain, cost))
-    done.sort(key=lambda r: -r.merit)
+    done.sort(key=lambda r: -r.penalised_gain)
     return done, reasons
 
 
 def _one(
-    workshop: Workshop, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
+    augmented: AugmentedModels, base: Fit, screen: Screen, sets: Sequence[Sequence[int]],
     train: Sequence[Experiment], seed: np.random.SeedSequence,
-    added: Sequence[tuple[Candidate, ...]], afresh: bool, rough: bool, k: int,
+    added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
-    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 5, k))
-    found = refit(workshop, base, screen, sets[k], train, own, added[k], afresh, rough)
+    own = child_seed(seed, 5, k)
+    found = refit(augmented, base, screen, sets[k], train, own, added[k], afresh, approximate)
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
     return found.fit.numbers
@@ -354,21 +378,20 @@ def _shaped(
 ) -> dict[int, Candidate]:  # fmt: skip
     """The candidates at `index`; waves among them with their period and phase by all rows that the
     refits see, where a frequency that was near enough in the screen would lose its step."""
-    question = screen.question
-    out = {k: question.candidates[k] for k in index}
+    design = screen.design
+    out = {k: design.candidates[k] for k in index}
     waves = [k for k, c in out.items() if c.effect.profile == "wave" and "period" in dict(c.shape)]
     if not waves:
         return out
-    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 9))
     try:
-        passes = question.smoother.run(
-            train, question.theta(base.theta), random_state(own), predicted=False
+        passes = design.smoother.run(
+            train, design.theta(base.theta), random_state(seed, 9), predicted=False
         )
     except SSMError:
         return out
     rows = np.concatenate([p.rows for p in passes])
-    starts = np.cumsum([0, *(e.steps for e in train[:-1])]).tolist()
+    starts = starts_of(train)
     longest = max(e.steps for e in screen.experiments)
     for k in waves:
-        out[k] = sharpened(out[k], rows[:, question.place[k]], starts, longest)
+        out[k] = refine_wave(out[k], rows[:, design.column_of[k]], starts, longest)
     return out

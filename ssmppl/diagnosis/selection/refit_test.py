@@ -1,12 +1,12 @@
-"""Whether the best refit gains more than chance would.
+"""Tests of the gain of the best refit, by the law of the scores or by parametric bootstrap.
 
 Where noise has grown to swallow what is missing, the score at the fit is far smaller than what a
 refit gains, as the refit lets the noise shrink again (a break in the level of a random walk). So
 the gain itself is tested: by the law of the scores, which is the same to first order (likelihood
-ratio and score tests); in short records, where a fit is quick and first order a poor guide, by its
-own: data sets simulated at theta-hat are fitted, screened and refitted as the data were. That test
-stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika* 78, 1991), and as
-soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
+ratio and score tests); in short records, where a fit takes little time and first order is a poor
+guide, by its own: data sets simulated at theta-hat are fitted, screened and refitted as the data
+were. That test stops as soon as it cannot reject any more (J. Besag and P. Clifford, *Biometrika*
+78, 1991), and as soon as the gain lies far beyond the tail of the simulated ones (`tail_p`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
+from ssmppl.diagnosis.run.seeds import child_seed
 from ssmppl.diagnosis.screening.familywise import tail_p
-from ssmppl.diagnosis.screening.screen import Screen, compared
-from ssmppl.diagnosis.selection.augmented_models import Workshop
-from ssmppl.diagnosis.selection.fit import Fit
+from ssmppl.diagnosis.screening.screen import Screen, compare_with_null
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.fit import APPROXIMATELY, Fit
 from ssmppl.diagnosis.selection.refit import Refit, start_at
 from ssmppl.errors import SSMError
 from ssmppl.inference.run.seeds import random_state
@@ -46,8 +47,8 @@ def gain_p(screen: Screen, refit: Refit) -> float:
 
 
 def refit_p(
-    workshop: Workshop, base: Fit, screen: Screen, alpha: float, seed: np.random.SeedSequence,
-    kept: Checkpoint,
+    augmented: AugmentedModels, base: Fit, screen: Screen, alpha: float,
+    seed: np.random.SeedSequence, checkpoint: Checkpoint,
 ) -> float:  # fmt: skip
     """p of the largest gain among the `TRIED` best, of the data fitted in the way in which the
     simulated sets are; by their count 1 / (sets + 1) at least, smaller by their tail.
@@ -55,18 +56,18 @@ def refit_p(
     base : the model's fit to the screen's experiments.
     """
     beyond, done = 0, 0
-    seen = kept.of(
+    seen = checkpoint.computed(
         "the gain that is tested",
-        lambda: {"gain": np.asarray(_gain(workshop, base, screen, screen.experiments, seed, 0))},
+        lambda: {"gain": np.asarray(_gain(augmented, base, screen, screen.experiments, seed, 0))},
     )
     gain = float(seen["gain"])
     if not np.isfinite(gain):
         return 1.0
-    one = partial(_one, workshop, base, screen, seed)
+    one = partial(_one, augmented, base, screen, seed)
     for last in range(CHUNK, SETS + CHUNK, CHUNK):
-        found = kept.each("refitting simulated data", min(last, SETS), one)
+        found = checkpoint.map("refitting simulated data", min(last, SETS), one)
         for f in found:
-            kept.failures.of_task("a refit of simulated data", f)
+            checkpoint.failures.record_task("a refit of simulated data", f)
         gains = np.array([float(f.get("gain", np.nan)) for f in found])
         done = int(np.sum(np.isfinite(gains)))
         beyond = int(np.sum(gains >= gain))
@@ -81,37 +82,37 @@ def refit_p(
 
 
 def _one(
-    workshop: Workshop, base: Fit, screen: Screen, seed: np.random.SeedSequence, k: int
+    augmented: AugmentedModels, base: Fit, screen: Screen, seed: np.random.SeedSequence, k: int
 ) -> Numbers:
-    """Of one simulated data set."""
-    question, stream = screen.question, random_state(seed, k)
-    given = question.theta(screen.theta)[: len(question.columns.base.parameter_symbols)]
+    """The gain in one simulated data set."""
+    design, stream = screen.design, random_state(seed, k)
+    given = design.theta(screen.theta)[: len(design.columns.base.parameter_symbols)]
     try:
-        data = question.simulator.sets(screen.experiments, given, stream)
+        data = design.simulator.sets(screen.experiments, given, stream)
     except SSMError:
         return {"gain": np.asarray(np.nan)}
-    return {"gain": np.asarray(_gain(workshop, base, screen, data, seed, k + 1))}
+    return {"gain": np.asarray(_gain(augmented, base, screen, data, seed, k + 1))}
 
 
 def _gain(
-    workshop: Workshop, base: Fit, screen: Screen, data: Sequence[Experiment],
+    augmented: AugmentedModels, base: Fit, screen: Screen, data: Sequence[Experiment],
     seed: np.random.SeedSequence, k: int,
 ) -> float:  # fmt: skip
-    """Of one data set; NaN where a fit failed."""
-    question, plain = screen.question, workshop.fitter(())
+    """The largest gain in one data set; NaN where a fit failed."""
+    design, plain = screen.design, augmented.fitter(())
     stream = random_state(seed, 200, k)
-    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 100, k))
+    own = child_seed(seed, 100, k)
     try:
-        fit = plain.fit(data, own, base.start, searched=True, rough=True)
-        at = question.theta(fit.theta)
-        passes = question.smoother.run(data, at, stream, predicted=False)
-        seen = question.statistics(data, passes, stream, checks=False)
-        found = compared(screen.law, screen.usual, seen)
+        fit = plain.fit(data, own, base.start, APPROXIMATELY)
+        at = design.theta(fit.theta)
+        passes = design.smoother.run(data, at, stream, predicted=False)
+        seen = design.statistics(data, passes, stream, checks=False)
+        found = compare_with_null(screen.null, screen.typical_squares, seen)
         out = []
         for j in _best(screen, found.gain, np.array([bool(s) for s in found.status])):
-            fitter = workshop.fitter((question.candidates[j],))
-            start = start_at(fit, screen.question, found, [j])
-            again = fitter.fit(data, own, start, searched=True, rough=True)
+            fitter = augmented.fitter((design.candidates[j],))
+            start = start_at(fit, screen.design, found, [j])
+            again = fitter.fit(data, own, start, APPROXIMATELY)
             out.append(again.log_likelihood - fit.log_likelihood)
     except SSMError:
         return float("nan")
@@ -130,8 +131,8 @@ def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
     return out
 
 
-def quick_enough(workshop: Workshop, experiments: Sequence[Experiment]) -> bool:
+def affordable(augmented: AugmentedModels, experiments: Sequence[Experiment]) -> bool:
     """Whether the fits of the test can be afforded."""
     rows = sum(e.steps for e in experiments)
-    quick = workshop.fitter(()).exact or rows * workshop.settings.particles <= MOST_WORK
-    return quick and rows < MOST_ROWS
+    cheap = augmented.fitter(()).exact or rows * augmented.settings.particles <= MOST_WORK
+    return cheap and rows < MOST_ROWS

@@ -1,4 +1,4 @@
-"""Shapes estimated: the threshold of a stop, the period of a forcing, the memory of a disturbance.
+"""Estimates of shapes: the threshold of a stop, the period of a forcing, a disturbance's memory.
 
 The screen tries a few values of each shape, which is enough to see an effect, and too few to
 predict with it: a period that is off by a quarter of a turn over the record is out of step
@@ -17,9 +17,10 @@ from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import SHORTEST, Candidate
 from ssmppl.diagnosis.model.scales import Scales, value_of
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.selection.augmented_models import Workshop, share_of
+from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, range_fraction
 from ssmppl.diagnosis.selection.fit import Fit
-from ssmppl.diagnosis.selection.refit import Refit
+from ssmppl.diagnosis.selection.refit import Refit, effort_for
 from ssmppl.errors import SSMError
 
 SHAPED = 4  # refits at most
@@ -50,44 +51,43 @@ def shape_bounds(c: Candidate, scales: Scales) -> dict[str, tuple[float, float]]
 
 
 def shaped_all(
-    workshop: Workshop, base: Fit, scales: Scales, refits: Sequence[Refit],
-    train: Sequence[Experiment], seed: np.random.SeedSequence, kept: Checkpoint, stage: str,
+    augmented: AugmentedModels, base: Fit, scales: Scales, refits: Sequence[Refit],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint, stage: str,
 ) -> list[Refit]:  # fmt: skip
     """The refits, best first; those near the best of them with their shapes estimated, where that
     gains more than `PRICE` for each shape."""
     out = list(refits)
-    least = min(out[0].merit - WITHIN, SHARE * out[0].merit)
+    least = min(out[0].penalised_gain - WITHIN, SHARE * out[0].penalised_gain)
     tried = [
         i for i, r in enumerate(out)
-        if r.merit >= least and any(shape_bounds(c, scales) for c in r.candidates)
+        if r.penalised_gain >= least and any(shape_bounds(c, scales) for c in r.candidates)
     ][:SHAPED]  # fmt: skip
 
-    one = partial(_one, workshop, scales, [out[i] for i in tried], tuple(train), seed)
-    for i, numbers in zip(tried, kept.each(stage, len(tried), one), strict=True):
+    one = partial(_one, augmented, scales, [out[i] for i in tried], tuple(train), seed)
+    for i, numbers in zip(tried, checkpoint.map(stage, len(tried), one), strict=True):
         name = " and ".join(map(str, out[i].candidates))
-        kept.failures.of_task(f"the shapes of {name}", numbers)
+        checkpoint.failures.record_task(f"the shapes of {name}", numbers)
         if "shapes" in numbers:
             old, shapes = out[i], numbers["shapes"]
             made = _reshaped(old.candidates, scales, shapes)
-            fitter = workshop.fitter(made)
+            fitter = augmented.fitter(made)
             fit = fitter.restored(train, numbers)
             cost = old.cost + PRICE * len(shapes)
             gain = fit.log_likelihood - base.log_likelihood
-            if gain - cost > old.merit:
+            if gain - cost > old.penalised_gain:
                 out[i] = Refit(old.index, made, fitter, fit, gain, cost)
-    return sorted(out, key=lambda r: -r.merit)
+    return sorted(out, key=lambda r: -r.penalised_gain)
 
 
 def _one(
-    workshop: Workshop, scales: Scales, refits: Sequence[Refit], train: Sequence[Experiment],
-    seed: np.random.SeedSequence, k: int,
+    augmented: AugmentedModels, scales: Scales, refits: Sequence[Refit],
+    train: Sequence[Experiment], seed: np.random.SeedSequence, k: int,
 ) -> Numbers:  # fmt: skip
-    own = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, k))
-    return _shaped(workshop, scales, refits[k], train, own)
+    return _shaped(augmented, scales, refits[k], train, child_seed(seed, k))
 
 
 def _shaped(
-    workshop: Workshop, scales: Scales, r: Refit, train: Sequence[Experiment],
+    augmented: AugmentedModels, scales: Scales, r: Refit, train: Sequence[Experiment],
     seed: np.random.SeedSequence,
 ) -> Numbers:  # fmt: skip
     """The values of the shapes, in order, and the fit with them; empty where there is none, or one
@@ -96,22 +96,22 @@ def _shaped(
     start = {n: v for n, v in r.fit.start.items() if n not in known}
     for name, (low, high, value) in known.items():
         share = (value - low) / (high - low)
-        start[share_of(name)] = np.asarray(np.clip(share, INSIDE, 1.0 - INSIDE))
+        start[range_fraction(name)] = np.asarray(np.clip(share, INSIDE, 1.0 - INSIDE))
     try:
-        fitter = workshop.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
-        fit = fitter.fit(train, seed, start, searched=True, quick=len(r.candidates) > 1)
+        fitter = augmented.with_free_shapes(r.candidates, {n: v[:2] for n, v in known.items()})
+        fit = fitter.fit(train, seed, start, effort_for(r.candidates))
     except SSMError:
         return {}
     if not np.isfinite(fit.log_likelihood):
         return {}
     values = fit.values()
-    shares = np.array([values[share_of(n)] for n in known])
+    shares = np.array([values[range_fraction(n)] for n in known])
     if np.any(np.minimum(shares, 1.0 - shares) < 0.5 * INSIDE):  # it wants to be another effect
         return {}
     shapes = np.array(
         [a + (b - a) * s for (a, b, _), s in zip(known.values(), shares, strict=True)]
     )
-    plain = workshop.fitter(_reshaped(r.candidates, scales, shapes))
+    plain = augmented.fitter(_reshaped(r.candidates, scales, shapes))
     own = {repr(s): s.data[1] for s in plain.problem.trace.parameter_symbols}
     theta = [values[text] if text in values else float(plain.fixed[name])
              for text, name in own.items()]  # fmt: skip
@@ -134,7 +134,7 @@ def _bounded(r: Refit, scales: Scales) -> dict[str, tuple[float, float, float]]:
 def _reshaped(
     candidates: Sequence[Candidate], scales: Scales, shapes: np.ndarray
 ) -> tuple[Candidate, ...]:
-    """With these values of all shapes that can be estimated."""
+    """The candidates with these values of all shapes that can be estimated."""
     rest = list(map(float, shapes))
     out = []
     for c in candidates:

@@ -187,10 +187,10 @@ def _step(slope: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float, 
     return step, 0.5 * float(slope @ step), lowest
 
 
-def newton_step(slope: np.ndarray, information: np.ndarray) -> np.ndarray:
+def newton_step(slope: np.ndarray, information: np.ndarray, flat: float = FLAT) -> np.ndarray:
     """(F,) information^-1 slope, the eigenvalues of the information, scaled to a diagonal of one,
-    by their size and none next to zero."""
-    scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), FLAT))
+    by their size and none next to zero. flat : what on the diagonal is none."""
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(information)), flat))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     values = np.maximum(np.abs(values), LEAST)
     return (vectors @ ((vectors.T @ (slope / scale)) / values)) / scale

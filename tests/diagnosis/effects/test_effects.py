@@ -10,9 +10,10 @@ import ssmppl as ssm
 from ssmppl.diagnosis.effects.catalogue import effects
 from ssmppl.diagnosis.effects.effect import Auxiliary, effect, sds
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.candidates import Scale, Scales, offers
+from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.changed_laws import has_scale
-from ssmppl.diagnosis.model.equations import Anatomy, time_symbol
+from ssmppl.diagnosis.model.equations import Equations, time_symbol
+from ssmppl.diagnosis.model.scales import Scale, Scales
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
@@ -202,7 +203,7 @@ def two_states(step):
         return {"y": ssm.Normal(x, sd=1)}
 
     t = trace(model)
-    return Anatomy(t)
+    return Equations(t)
 
 
 def pull(x, v, u, dt, k, c):

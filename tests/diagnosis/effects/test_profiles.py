@@ -10,11 +10,11 @@ from ssmppl.diagnosis.effects.candidate import (
     SHORTEST,
     WAVES,
     Profiles,
-    dated,
     dates,
-    one_off,
+    is_dated,
     periods,
-    sharpened,
+    refine_wave,
+    with_all_dates,
 )
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.language.trace import trace
@@ -27,7 +27,7 @@ NAMES = ["level break", "parameter break", "parameter drift", "periodic forcing"
 
 def offered(rows):
     model = trace(level())
-    return dated(offers(model, scales(model, rows), NAMES)[0], rows)
+    return with_all_dates(offers(model, scales(model, rows), NAMES)[0], rows)
 
 
 @pytest.mark.parametrize("starts", [[0], [0, 25], [0, 10, 30]])
@@ -50,7 +50,7 @@ def test_every_date_of_a_short_record_is_one_family():
     assert found == [float(d) for d in range(3, 99)]
     assert len({c.group for c in candidates}) == 1
     assert len({c.increment.key for c in candidates}) == 1
-    assert all(map(one_off, candidates))
+    assert all(map(is_dated, candidates))
 
 
 @pytest.mark.parametrize("profile", ["step", "pulse"])
@@ -67,7 +67,7 @@ def test_what_has_no_date_stays():
     candidates = offered(100)
     drifts = [c for c in candidates if c.effect.name == "parameter drift"]
     assert len(drifts) == 2
-    assert not any(map(one_off, drifts))
+    assert not any(map(is_dated, drifts))
 
 
 @pytest.mark.parametrize("rows", [20, 100, 1000])
@@ -96,8 +96,8 @@ def test_more_rows_sharpen_a_wave(starts):
     truth = c.with_shape(period=38.3, phase=0.7)
     ends = [*starts, 600]
     column = np.concatenate([truth.weights(n) for n in np.diff(ends)])
-    column += np.random.default_rng(seed_of("sharpened")).standard_normal(600)
-    found = sharpened(c, column, starts, 200)
+    column += np.random.default_rng(seed_of("refine_wave")).standard_normal(600)
+    found = refine_wave(c, column, starts, 200)
     kept = np.concatenate([found.weights(n) for n in np.diff(ends)])
     plain = np.concatenate([truth.weights(n) for n in np.diff(ends)])
     assert np.corrcoef(kept, plain)[0, 1] > 0.95

@@ -40,13 +40,13 @@ def test_experiments_without_rows_that_count_are_left_out():
     """The densities are those of the rows behind the cut, by the Kalman filter's own increments."""
     problem = pose(level(), [levels(2), levels(400), levels(3), levels(50)])
     base, parts = fitted(problem, [0.1, 1.0]), three_parts(problem.experiments)
-    found = predict(*base, problem.experiments, parts.confirm, np.random.SeedSequence(1))
+    found = predict(*base, problem.experiments, parts.held_out, np.random.SeedSequence(1))
     assert found.starts == (0, 115)
     wanted = []
     for i in (1, 3):
         y, mean, variance = problem.experiments[i].y[:, 0], 0.0, 4.0
         for t, v in enumerate(y):
-            if parts.confirm[i][t]:
+            if parts.held_out[i][t]:
                 wanted.append(stats.norm(mean, np.sqrt(variance + 1.0)).logpdf(v))
             gain = variance / (variance + 1.0)
             mean, variance = mean + gain * (v - mean), (1.0 - gain) * variance + 0.01
@@ -128,11 +128,11 @@ def test_effects_stay_together_where_held_out_rows_cannot_be_predicted(monkeypat
 
     monkeypatch.setattr(diagnose, "predict", impossible)
     run = object.__new__(diagnose._Diagnosis)
-    run.parts, run.experiments = SimpleNamespace(confirm=[]), ()
+    run.parts, run.experiments = SimpleNamespace(held_out=[]), ()
     run.root = np.random.SeedSequence(1)
     both = SimpleNamespace(fitter="both", fit=None, candidates=("drag", "friction"))
     found = SimpleNamespace(chosen=both, fewer=["one"], notes=[])
-    run._borne_out(SimpleNamespace(attribution=found, base="base", fit=None))
+    run._validate_on_held_out_rows(SimpleNamespace(attribution=found, base="base", fit=None))
     assert found.chosen is both
     assert len(asked) == which + 1
     assert found.notes == ["drag and friction fit better together, and whether they predict "

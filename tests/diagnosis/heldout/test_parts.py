@@ -25,7 +25,12 @@ def experiments(*sizes):
 def test_parts_follow_each_other(sizes):
     parts = three_parts(experiments(*sizes))
     for e, a, b, chosen, confirm in zip(
-        parts.screen, parts.first, parts.second, parts.chosen, parts.confirm, strict=True
+        parts.reference_train,
+        parts.first,
+        parts.second,
+        parts.reference_validation,
+        parts.held_out,
+        strict=True,
     ):
         assert e.steps == a < b
         np.testing.assert_array_equal(np.flatnonzero(chosen), np.arange(a + GAP, b))
@@ -40,17 +45,17 @@ def test_short_experiments_beside_a_long_one():
     """No part has more rows than there are, and no row is in two of them."""
     whole = experiments(400, 1, 2, 3, 4, 9)
     parts = three_parts(whole)
-    for part in (parts.screen, parts.train):
+    for part in (parts.reference_train, parts.train):
         for e in part:
             assert len(e.y) == len(e.seen) == len(e.u) == len(e.observed["y"]) == e.steps
     assert [e.steps for e in parts.train] == [280, 1, 2, 3, 3, 6]
-    for e, train, confirm in zip(whole, parts.train, parts.confirm, strict=True):
+    for e, train, confirm in zip(whole, parts.train, parts.held_out, strict=True):
         assert confirm.shape == (e.steps,)
         assert not confirm[: train.steps].any()
         assert confirm.any() == (train.steps < e.steps)
-    for screen, chosen in zip(parts.screen, parts.chosen, strict=True):
+    for screen, chosen in zip(parts.reference_train, parts.reference_validation, strict=True):
         assert not chosen[: screen.steps].any()
-    assert [c.sum() for c in parts.confirm] == [115, 0, 0, 0, 1, 1]
+    assert [c.sum() for c in parts.held_out] == [115, 0, 0, 0, 1, 1]
 
 
 def test_what_is_long_enough():

@@ -8,8 +8,8 @@ import pytest
 from ssmppl.diagnosis.heldout import reference
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.selection.augmented_models import Workshop
-from ssmppl.diagnosis.selection.fit import Fitter
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.fit import FROM_START, Fitter
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.model.test_basis import THETA, asked, simulated
 
@@ -19,18 +19,18 @@ FIXED = {n: np.asarray(v) for n, v in THETA.items() if n != "phi"}
 @pytest.mark.slow
 def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     screen = asked(simulated(lambda x, w, u: 0.15 * x * u, "x and u"))
-    trace, missing = screen.question.trace, screen.question.smoother.missing
-    workshop = Workshop(trace, missing, FIXED, Settings(particles=100))
+    trace, missing = screen.design.trace, screen.design.smoother.missing
+    augmented = AugmentedModels(trace, missing, FIXED, Settings(particles=100))
     start = {n: np.asarray(v) for n, v in THETA.items()}
-    base = workshop.fitter(())
+    base = augmented.fitter(())
     train = list(screen.experiments)
-    fit = base.fit(train, seed_sequence(1), start, searched=True)
+    fit = base.fit(train, seed_sequence(1), start, FROM_START)
     groups = reference.signal(screen, ())
     assert groups
 
     def made():
         return reference.fit_reference(
-            workshop, (), fit, screen, train, seed_sequence(2), Checkpoint(None, {})
+            augmented, (), fit, screen, train, seed_sequence(2), Checkpoint(None, {})
         )
 
     fitter, found = made()

@@ -11,7 +11,7 @@ from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.basis import basis
 from ssmppl.diagnosis.model.binding import bind
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.equations import Anatomy, Augmented, as_it_was
+from ssmppl.diagnosis.model.equations import Augmented, Equations, as_it_was
 from ssmppl.diagnosis.model.initial_law import Start
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.language.distributions import Normal
@@ -37,10 +37,10 @@ def named(where, name, effect, equation):
 )
 def test_hysteresis_finds_its_position_whatever_is_in(model, first):
     t = traced(*model)
-    rate = Anatomy(t).integral_of[next(iter(Anatomy(t).integral_of))]
+    rate = Equations(t).integral_of[next(iter(Equations(t).integral_of))]
     c, hysteresis = named(*model, *first), named(*model, "bouc-wen hysteresis", rate)
     one = augment(t, [c])
-    assert Anatomy(one).integral_of == Anatomy(t).integral_of
+    assert Equations(one).integral_of == Equations(t).integral_of
     both = augment(one, [hysteresis])
     assert not differences(both, augment(t, [c, hysteresis]))
 
@@ -116,7 +116,7 @@ def test_what_cannot_be_bound_is_an_error_of_the_effect():
     with pytest.raises(ModelError, match="no state is the integral of x, whose move it asks for"):
         augment(t, [replace(c, equation="x")])
     with pytest.raises(ModelError, match="nothing is bound to 'u', which is to be 'any input'"):
-        bind(replace(friction, bound=()), Anatomy(t), "transition")
+        bind(replace(friction, bound=()), Equations(t), "transition")
     with pytest.raises(ArgumentError, match="has no 'speed'"):
         augment(t, [replace(c, bound=(("x", "speed"),))])
     with pytest.raises(ArgumentError, match="as is the model's parameter"):

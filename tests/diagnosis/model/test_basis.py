@@ -6,14 +6,14 @@ import pytest
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.diagnosis.heldout import reference
-from ssmppl.diagnosis.heldout.reference import signal
+from ssmppl.diagnosis.heldout.reference import significant_groups
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import CURVES, REACH, TURNS, basis, lifted
+from ssmppl.diagnosis.model.basis import CURVES, REACH, TURNS, basis, symbolic_shapes
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report import tables
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.statistics.checks import seed_of
@@ -64,9 +64,13 @@ def asked(data, sets=100):
     e = problem.experiments[0]
     scales = Scales.of(problem.trace, e.y[:, None, :].repeat(4, 1).reshape(-1, 1), e.y, e.u, STEPS)
     missing = missing_of(problem.experiments)
-    question = Question(problem.trace, scales, missing, tuple(THETA), Settings(), ["constant load"])
+    design = ScreenDesign(
+        problem.trace, scales, missing, tuple(THETA), Settings(), ["constant load"]
+    )
     theta = check_parameters(problem.trace, THETA)
-    return ask(question, problem.experiments, theta, sets, seed_sequence(5), Checkpoint(None, {}))
+    return run_screen(
+        design, problem.experiments, theta, sets, seed_sequence(5), Checkpoint(None, {})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +79,7 @@ def plain():
 
 
 def test_what_it_holds(plain):
-    terms = plain.question.terms
+    terms = plain.design.terms
     found = {(t.equation, t.moment, t.variable): 0 for t in terms}
     for t in terms:
         found[t.equation, t.moment, t.variable] += 1
@@ -91,9 +95,9 @@ def test_what_it_holds(plain):
 
 
 def test_what_is_past_shares_its_states_and_its_scale(plain):
-    trace, scales = plain.question.trace, plain.question.scales
+    trace, scales = plain.design.trace, plain.design.scales
     past = [t.candidate for t in basis(trace, scales) if t.variable == "the past of u"]
-    made, shapes = lifted(past)
+    made, shapes = symbolic_shapes(past)
     assert len(shapes) == 2
     assert len(augment(trace, made).state_symbols) == len(trace.state_symbols) + 3
 
@@ -115,9 +119,9 @@ def ringing(state, z):
 )
 def test_the_score_of_what_is_past_is_the_exact_one(plain, name, filtered):
     """In a linear model, of a function of the input: r' S^-1 (y - m), r the response of y."""
-    question, e = plain.question, plain.experiments[0]
-    (k,) = [i for i, t in enumerate(question.terms) if t.candidate.effect.name == name]
-    scale = question.scales.scale["u"]
+    design, e = plain.design, plain.experiments[0]
+    (k,) = [i for i, t in enumerate(design.terms) if t.candidate.effect.name == name]
+    scale = design.scales.scale["u"]
     u, y = e.u[:, 0], e.y[:, 0]
     t = np.arange(STEPS)
     state, response, mean = (0.0, 0.0), [0.0], [0.0]
@@ -144,7 +148,7 @@ def test_what_no_curve_can_be_is_found(variable, missing):
     assert p <= 0.05
     assert key[0] == "x"  # its mean or, since q is held, its scale: which, hangs on the data set
     # rings that die away within a turn can be a low-pass, too
-    found = {t.variable for terms, _ in signal(screen, ()) for t in terms}
+    found = {t.variable for terms, _ in significant_groups(screen, ()) for t in terms}
     assert any(v == variable or v.startswith(variable.replace("past", "ringing")) for v in found)
     curves = tables.missing_table(screen, ("x", "mean"), ())
     assert set(curves["variable"]) == {"x", "u"}

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmppl.diagnosis.report import report as module
 from ssmppl.diagnosis.report.findings import COLUMNS, MODES, VERDICTS, tabulate
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.report.words import (
@@ -269,9 +268,3 @@ def test_a_report_refuses_what_it_does_not_know():
 def test_a_report_crosses_processes():
     report = effect_found()
     assert str(pickle.loads(pickle.dumps(report))) == str(report)
-
-
-def test_a_report_without_a_presenter_says_what_to_import(monkeypatch):
-    monkeypatch.setattr(module, "PRESENTERS", {})
-    with pytest.raises(ArgumentError, match=r"ssmppl\.plots"):
-        empty().plot()

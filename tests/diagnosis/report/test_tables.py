@@ -12,7 +12,13 @@ from ssmppl.diagnosis.effects.catalogue_motion import (
     quadratic_drag,
     random_walk_load,
 )
-from ssmppl.diagnosis.report.tables import _experiments, _when, causes_table, shared, where_table
+from ssmppl.diagnosis.report.tables import (
+    _experiments,
+    _when,
+    bonferroni,
+    causes_table,
+    where_table,
+)
 from ssmppl.diagnosis.screening.location import localise
 from ssmppl.drawing.numerals import label, span
 from tests.statistics.checks import seed_of
@@ -25,10 +31,10 @@ BREAK = Candidate(level_break, "v", (("date", 2.0),), strength="break")
 
 def table(candidate, strength, variance, refits=(), *, sided=False, quadratic=False):
     screen = SimpleNamespace(
-        question=SimpleNamespace(
+        design=SimpleNamespace(
             candidates=[candidate], sided=np.array([int(sided)]), quadratic=np.array([quadratic])
         ),
-        found=SimpleNamespace(
+        efficient=SimpleNamespace(
             strength=np.array([strength]), variance=np.array([variance]), z=np.array([2.0]),
             gain=np.array([2.0]),
         ),
@@ -101,14 +107,16 @@ def test_the_p_of_where_counts_both_looks():
     null |= {"basis_bins": np.zeros((100, 1, 6)), "nuisance_bins": np.zeros((100, 1, 2))}
     terms = [SimpleNamespace(equation=e, moment=m) for e, m in keys for _ in range(2)]
     screen = SimpleNamespace(
-        observed=SimpleNamespace(basis=basis[-1], nuisance=nuisance[-1]), stacked=null.get,
-        question=SimpleNamespace(terms=terms), experiments=[SimpleNamespace(steps=1, time=None)],
+        observed=SimpleNamespace(basis=basis[-1], nuisance=nuisance[-1]),
+        simulated=SimpleNamespace(**null),
+        design=SimpleNamespace(terms=terms), experiments=[SimpleNamespace(steps=1, time=None)],
+        edges=np.array([0, 1]),
     )  # fmt: skip
     table, _ = where_table(screen, alpha=0.0)
     groups = {k: (basis[:-1, 2 * i : 2 * i + 2], basis[-1, 2 * i : 2 * i + 2])
               for i, k in enumerate(keys)}  # fmt: skip
     wanted = localise(groups, nuisance[:-1], nuisance[-1])[0]
-    np.testing.assert_allclose(sorted(table["p"]), sorted(shared(wanted["p_either"])))
+    np.testing.assert_allclose(sorted(table["p"]), sorted(bonferroni(wanted["p_either"])))
 
 
 @pytest.mark.parametrize(

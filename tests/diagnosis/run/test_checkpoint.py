@@ -81,13 +81,13 @@ def test_tasks_that_are_done_are_left_out(tmp_path):
 
     file = tmp_path / "a.npz"
     with pytest.raises(KeyboardInterrupt):
-        Checkpoint(file, MADE_FROM).within("outer").each("squares", 6, task)
+        Checkpoint(file, MADE_FROM).within("outer").map("squares", 6, task)
     before = set(ran) - {3}
     kept = Checkpoint(file, MADE_FROM)
     assert all(f"outer: squares/{k}" in kept for k in before)
     assert before
     ran += [None] * 5
-    found = kept.within("outer").each("squares", 6, task)
+    found = kept.within("outer").map("squares", 6, task)
     assert [int(f["square"]) for f in found] == [0, 1, 4, 9, 16, 25]
     assert not before & set(ran[ran.index(None) :])
 

@@ -10,7 +10,7 @@ import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
 from ssmppl.diagnosis.heldout import crossfit
 from ssmppl.diagnosis.model import candidates
-from ssmppl.diagnosis.report import panels, tables
+from ssmppl.diagnosis.report import tables
 from ssmppl.diagnosis.report.findings import VERDICTS
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.failures import FAULT, Failures, Tolerant, reason_of
@@ -83,9 +83,9 @@ def _halved(k):
 def test_a_task_that_fails_is_not_kept(tmp_path):
     """The others are; another call tries it again."""
     kept = Checkpoint(tmp_path / "stages.npz", {"mode": "full"})
-    found = kept.each("halves", 3, _halved)
+    found = kept.map("halves", 3, _halved)
     assert [float(found[k]["half"]) for k in (0, 2)] == [0.0, 1.0]
-    assert kept.failures.of_task("the half of 1", found[1])
+    assert kept.failures.record_task("the half of 1", found[1])
     assert list(kept.failures) == [
         ("the half of 1", "ZeroDivisionError: by nothing (a fault of ssmppl)")
     ]
@@ -105,7 +105,7 @@ def test_a_task_raises_what_is_raised_on_purpose():
 
 def test_with_debug_a_task_raises_its_fault():
     with pytest.raises(ZeroDivisionError):
-        Checkpoint(None, {}, failures=Failures(True)).each("halves", 3, _halved)
+        Checkpoint(None, {}, failures=Failures(True)).map("halves", 3, _halved)
 
 
 # -- in a diagnosis
@@ -115,7 +115,7 @@ FAST = [
     (tables, "classes_table", "the table 'classes'"),
     (tables, "map_table", "the table 'residual_map'"),
     (
-        importlib.import_module("ssmppl.diagnosis.report.answer"),
+        importlib.import_module("ssmppl.diagnosis.report.build"),
         "_detection",
         "the table 'detection'",
     ),
@@ -159,7 +159,7 @@ def test_a_candidate_without_columns_leaves_the_others(monkeypatch):
 
 
 def test_simulated_sets_that_fail_leave_the_others(monkeypatch):
-    broken(monkeypatch, screen.Question, "statistics", ZeroDivisionError(),
+    broken(monkeypatch, screen.ScreenDesign, "statistics", ZeroDivisionError(),
            lambda *_: next(counted) % 20 == 19)  # fmt: skip
     counted = iter(range(10**6))
     monkeypatch.setattr(diagnose, "SETS", {"fast": FEW + 10, "full": FEW})
@@ -169,7 +169,7 @@ def test_simulated_sets_that_fail_leave_the_others(monkeypatch):
 
 
 def test_without_a_fit_the_error_is_one_of_ours(monkeypatch):
-    broken(monkeypatch, diagnose, "start_of", IndexError("out of range"))
+    broken(monkeypatch, diagnose, "proper_initial_law", IndexError("out of range"))
     with pytest.raises(SSMError, match=r"'level' could not be finished: IndexError: out of range"):
         run()
     with pytest.raises(IndexError):
@@ -179,11 +179,11 @@ def test_without_a_fit_the_error_is_one_of_ours(monkeypatch):
 FULL = [
     (attribution, "refit_all", "refitting"),
     (attribution, "shaped_all", "estimating shapes"),
-    (attribution, "_best_pair", "pairs of effects"),
-    (attribution, "_forward", "whether a second effect is missing"),
-    (attribution, "_by_refit", "the test of what a refit gains"),
+    (attribution.Selection, "_best_pair", "pairs of effects"),
+    (attribution.Selection, "_forward", "whether a second effect is missing"),
+    (attribution.Selection, "_by_refit", "the test of what a refit gains"),
     (refit, "refit", "the refit with level break in x with date = 31"),
-    (crossfit.CrossFit, "how_far", "how far the gap closes"),
+    (crossfit.CrossFit, "gain", "how far the gap closes"),
     (crossfit.CrossFit, "_one", "block 1 of 5"),
 ]
 
@@ -218,7 +218,6 @@ def test_a_panel_that_fails_is_left_out(monkeypatch, tmp_path):
     assert (tmp_path / "free_run.png").exists()
     assert "Left out, as they failed" in page.read_text()
     assert "ranked_effects" in (tmp_path / "left_out.csv").read_text()
-    assert panels.ranked_effects.__name__ == "ranked_effects"
 
 
 def test_tables_of_the_page_that_fail_are_left_out(monkeypatch):

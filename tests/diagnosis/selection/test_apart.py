@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from ssmppl.data import bind
-from ssmppl.diagnosis.selection.equivalence import LEVELS, MOST_VARIED, separating, simple_inputs
+from ssmppl.diagnosis.selection.equivalence import (
+    LEVELS,
+    MOST_VARIED,
+    best_separating_input,
+    simple_inputs,
+)
 from ssmppl.language.trace import trace
 from tests.diagnosis.small import level, levels
 
@@ -57,6 +62,6 @@ def test_of_many_inputs_a_few_are_tried():
 
 
 def test_where_nothing_varies_no_input_is_named():
-    question = SimpleNamespace(trace=SimpleNamespace(input_symbols=["dt"]))
-    screen = SimpleNamespace(question=question, experiments=experiments(np.ones((T, 1))))
-    assert separating(screen, [0, 1], np.random.SeedSequence(1), None) == ""
+    design = SimpleNamespace(trace=SimpleNamespace(input_symbols=["dt"]))
+    screen = SimpleNamespace(design=design, experiments=experiments(np.ones((T, 1))))
+    assert best_separating_input(screen, [0, 1], np.random.SeedSequence(1), None) == ""

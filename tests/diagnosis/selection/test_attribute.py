@@ -13,12 +13,19 @@ from ssmppl.diagnosis.model.scales import Scale, Scales
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.familywise import familywise, tail_p
-from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection import attribution as module
 from ssmppl.diagnosis.selection import refit as refits_of
-from ssmppl.diagnosis.selection.attribution import Attribution, _rebase, attribute
-from ssmppl.diagnosis.selection.augmented_models import Workshop
-from ssmppl.diagnosis.selection.refit import Refit, asleep, best_of_groups, delays, leading, mates
+from ssmppl.diagnosis.selection.attribution import Attribution, Selection
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.refit import (
+    Refit,
+    best_of_groups,
+    correlated_candidates,
+    delays,
+    leading,
+    one_signed_candidates,
+)
 from ssmppl.diagnosis.selection.refit_test import gain_p
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
@@ -32,7 +39,7 @@ def screen_of(heights, rho, shapes=None):
     heights, count = np.asarray(heights, float), len(heights)
     return SimpleNamespace(
         family=SimpleNamespace(leaders=np.argsort(-heights, kind="stable").tolist()),
-        found=SimpleNamespace(gain=0.5 * heights**2, status=("",) * count, rho=np.asarray(rho)),
+        efficient=SimpleNamespace(gain=0.5 * heights**2, status=("",) * count, rho=np.asarray(rho)),
         groups=np.arange(count),
     )
 
@@ -51,16 +58,16 @@ def test_what_is_like_the_best_refit_comes_next():
         rho[0, k] = rho[k, 0] = r
     screen = screen_of([5.0, 5.0, 4.0, 6.0, 3.0, 5.0], rho)
     done = [SimpleNamespace(index=(0,)), SimpleNamespace(index=(4,))]
-    assert mates(screen, done) == [1, 2]
-    assert mates(screen, []) == []
+    assert correlated_candidates(screen, done) == [1, 2]
+    assert correlated_candidates(screen, []) == []
 
 
 def test_a_choice_among_shapes_costs():
     """A date among hundreds gains nats by that alone: less is enough for one that had no choice."""
     dated = Refit((0,), (), None, None, gain=10.6, cost=np.log(300.0))
     plain = Refit((1,), (), None, None, gain=9.0, cost=0.0)
-    assert plain.merit > dated.merit
-    assert dated.merit == pytest.approx(10.6 - np.log(300.0))
+    assert plain.penalised_gain > dated.penalised_gain
+    assert dated.penalised_gain == pytest.approx(10.6 - np.log(300.0))
 
 
 def test_what_the_fit_cannot_show_is_fitted_anew():
@@ -74,9 +81,9 @@ def test_what_the_fit_cannot_show_is_fitted_anew():
     scale = {"y": Scale.of(values), "z": Scale.of(values - 1.0), "noisy": Scale.of(values - 0.3)}
     screen = SimpleNamespace(
         family=SimpleNamespace(leaders=[3, 1, 4, 2, 0]),
-        question=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
+        design=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
     )
-    assert asleep(screen) == [4, 2, 0]
+    assert one_signed_candidates(screen) == [4, 2, 0]
 
 
 # -- tested
@@ -105,22 +112,22 @@ def asked():
     """The screen of a random walk that is right, at its fit."""
     problem = pose(level(), levels(120, 0.0, "right"))
     missing = missing_of(problem.experiments)
-    workshop = Workshop(problem.trace, missing, {}, Settings())
-    fitter = workshop.fitter(())
+    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
+    fitter = augmented.fitter(())
     fit = fitter.fit(problem.experiments, seed_sequence(1), {})
     e = problem.experiments[0]
     states = fitter.states(e, fit.theta, np.ones(4, np.uint64))
     scales = Scales.of(problem.trace, states, e.y, e.u, e.steps)
-    question = Question(problem.trace, scales, missing, (), Settings(),
+    design = ScreenDesign(problem.trace, scales, missing, (), Settings(),
                         ["constant load", "outliers", "level break"])  # fmt: skip
-    screen = ask(question, problem.experiments, fit.theta, 100, seed_sequence(2),
+    screen = run_screen(design, problem.experiments, fit.theta, 100, seed_sequence(2),
                  Checkpoint(None, {}))  # fmt: skip
-    return workshop, fit, screen
+    return augmented, fit, screen
 
 
-def lower(workshop, fit):
+def lower(augmented, fit):
     """The same fit, stopped at another place, some nats below."""
-    fitter, theta = workshop.fitter(()), fit.theta * np.array([6.0, 0.7])
+    fitter, theta = augmented.fitter(()), fit.theta * np.array([6.0, 0.7])
     experiments = fit.problem.experiments
     value = fitter.kalman.log_likelihood(experiments, theta)
     assert value < fit.log_likelihood - 5.0
@@ -131,7 +138,7 @@ def lower(workshop, fit):
 @pytest.mark.slow
 def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
     """A model with an effect holds the model without it: what ends far below is not ranked."""
-    workshop, fit, screen = asked
+    augmented, fit, screen = asked
     made = refits_of.refit
 
     def lost(*args):
@@ -140,7 +147,7 @@ def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
         return replace(found, fit=replace(found.fit, log_likelihood=value))
 
     own = [[leading(screen)[0]]]
-    given = (workshop, fit, screen, own, screen.experiments, seed_sequence(3))
+    given = (augmented, fit, screen, own, screen.experiments, seed_sequence(3))
     done, reasons = refits_of.refit_all(*given, Checkpoint(None, {}), "refitting")
     assert [len(done), reasons] == [1, []]
     monkeypatch.setattr(refits_of, "refit", lost)
@@ -153,15 +160,15 @@ def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
 def test_a_better_place_for_the_parameters_is_no_effect(asked):
     """A base fit that stopped too early makes every effect gain; the model is fitted again from
     where the best of them ended, and the gains shrink by what that gives."""
-    workshop, fit, screen = asked
-    bad, kept = lower(workshop, fit), Checkpoint(None, {})
+    augmented, fit, screen = asked
+    bad, kept = lower(augmented, fit), Checkpoint(None, {})
     done, _ = refits_of.refit_all(
-        workshop, bad, screen, [[k] for k in leading(screen)], screen.experiments,
+        augmented, bad, screen, [[k] for k in leading(screen)], screen.experiments,
         seed_sequence(3), kept, "refitting",
     )  # fmt: skip
     out = Attribution(bad, list(done))
     assert out.refits[0].gain > 5.0
-    _rebase(out, workshop, screen.experiments, seed_sequence(4), kept, worth=3.0)
+    Selection(augmented, screen, screen.experiments, seed_sequence(4), 0.05, kept)._refit_base(out)
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
     shift = fit.log_likelihood - bad.log_likelihood
     for before, after in zip(done, out.refits, strict=True):
@@ -170,10 +177,10 @@ def test_a_better_place_for_the_parameters_is_no_effect(asked):
 
 @pytest.mark.slow
 def test_a_right_model_is_not_accused_by_a_bad_start(asked):
-    workshop, fit, screen = asked
-    out = Attribution(lower(workshop, fit))
-    attribute(out, workshop, screen, screen.experiments, seed_sequence(5), 0.05,
-              Checkpoint(None, {}))  # fmt: skip
+    augmented, fit, screen = asked
+    out = Attribution(lower(augmented, fit))
+    kept = Checkpoint(None, {})
+    Selection(augmented, screen, screen.experiments, seed_sequence(5), 0.05, kept).run(out)
     assert out.chosen is None
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
 
@@ -182,23 +189,23 @@ def test_a_right_model_is_not_accused_by_a_bad_start(asked):
 def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
     """What is projected out of the basis: a wave whose period no screen has, among others."""
     _, _, screen = asked
-    load = next(c for c in screen.question.candidates if c.effect.name == "constant load")
+    load = next(c for c in screen.design.candidates if c.effect.name == "constant load")
     columns, seen = screen.columns_of([load])
     assert columns.shape == (screen.sets, 1)
-    k = screen.question.candidates.index(load)
-    np.testing.assert_array_equal(columns[:, 0], screen.stacked("columns")[:, k])
+    k = screen.design.candidates.index(load)
+    np.testing.assert_array_equal(columns[:, 0], screen.simulated.columns[:, k])
     assert seen[0] == screen.observed.columns[k]
-    jump = next(c for c in screen.question.candidates if c.effect.name == "level break")
+    jump = next(c for c in screen.design.candidates if c.effect.name == "level break")
     other = replace(jump, shape=(("date", 17.3),))
     found, _ = screen.columns_of([other])
     best = next(int(j) for j in screen.family.best
-                if screen.question.candidates[j].group == jump.group)  # fmt: skip
-    np.testing.assert_array_equal(found[:, 0], screen.stacked("columns")[:, best])
+                if screen.design.candidates[j].group == jump.group)  # fmt: skip
+    np.testing.assert_array_equal(found[:, 0], screen.simulated.columns[:, best])
 
 
 # -- shapes that are whole numbers, and effects that fail
-def refit_at(k, merit):
-    return Refit((k,), (), None, None, gain=merit)
+def refit_at(k, penalised_gain):
+    return Refit((k,), (), None, None, gain=penalised_gain)
 
 
 def delayed_screen():
@@ -206,9 +213,9 @@ def delayed_screen():
     delayed = SimpleNamespace(effect=SimpleNamespace(states={"past": "delay"}))
     plain = SimpleNamespace(effect=SimpleNamespace(states={"held": None}))
     return SimpleNamespace(
-        question=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2),
+        design=SimpleNamespace(candidates=[delayed] * 3 + [plain] + [delayed] * 2),
         groups=np.array([7, 7, 7, 3, 8, 8]),
-        found=SimpleNamespace(status=["", "", "too little", "", "", ""]),
+        efficient=SimpleNamespace(status=["", "", "too little", "", "", ""]),
     )
 
 
@@ -240,11 +247,11 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
         return SimpleNamespace(log_density=np.full((8, 4), ({0: 0.0} | gains)[fitter] / 4.0))
 
     monkeypatch.setattr(diagnosis, "predict", predict)
-    monkeypatch.setattr(diagnosis, "measure", lambda out, *_: None)
+    monkeypatch.setattr(diagnosis, "add_standard_errors", lambda out, *_: None)
     running = object.__new__(diagnosis._Diagnosis)
-    running.parts, running.experiments = SimpleNamespace(confirm=[]), ()
-    running.root, running.kept = seed_sequence(1), Checkpoint(None, {})
-    running._borne_out(results)
+    running.parts, running.experiments = SimpleNamespace(held_out=[]), ()
+    running.root, running.checkpoint = seed_sequence(1), Checkpoint(None, {})
+    running._validate_on_held_out_rows(results)
     assert len(out.chosen.candidates) == left
     assert len(out.notes) == 3 - left
     assert out.left_out is (left < 3)
@@ -274,20 +281,23 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
     """Where one effect stands for the best, and each step forward adds one."""
     taken = []
 
-    def forward(out, *args, rough):
-        taken.append(args[-1])
-        more = args[-1] - len(out.chosen.candidates)
+    def forward(self, out, most):
+        taken.append(most)
+        more = most - len(out.chosen.candidates)
         out.chosen = replace(out.chosen, candidates=out.chosen.candidates + ("more",) * more)
 
     one = Refit((0,), ("first",), None, None, 9.0)
     monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
-    monkeypatch.setattr(module, "_best_pair", lambda *_, **__: None)
-    monkeypatch.setattr(module, "_forward", forward)
+    monkeypatch.setattr(Selection, "_best_pair", lambda *_: None)
+    monkeypatch.setattr(Selection, "_forward", forward)
     screen = screen_of([6.0, 3.0], np.eye(2))
-    screen.question = SimpleNamespace(scales=None)
+    screen.design = SimpleNamespace(scales=None)
     out = Attribution(None)
-    module.attribute(out, None, screen, (), seed_sequence(1), 0.05, Checkpoint(None, {}),
-                     always=True, singles=2, steps=wanted, quick=True)  # fmt: skip
+    kept = Checkpoint(None, {})
+    Selection(
+        None, screen, (), seed_sequence(1), 0.05, kept, always=True, singles=2, most=wanted,
+        approximate=True,
+    ).run(out)  # fmt: skip
     assert len(out.chosen.candidates) == wanted
     assert taken == {1: [], 2: [2, 2], 3: [2, 3]}[wanted]
 
@@ -301,7 +311,7 @@ def test_a_fit_starts_where_the_data_are_likelier(monkeypatch, top, share):
         estimate=lambda _, theta, stream: -((theta["new"] - top) ** 2) + theta["old"],
     )  # fmt: skip
     start = {"old": 3.0, "new": 1.0}
-    found = refits_of._shortened(fitter, start, ["new"], (), seed_sequence(1))
+    found = refits_of._backtracked(fitter, start, ["new"], (), seed_sequence(1))
     assert found == {"old": 3.0, "new": share}
     fitter.exact = True
-    assert refits_of._shortened(fitter, start, ["new"], (), seed_sequence(1)) == start
+    assert refits_of._backtracked(fitter, start, ["new"], (), seed_sequence(1)) == start

@@ -7,7 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import COST, Fitter, bounded, note
+from ssmppl.diagnosis.selection.fit import COST, Fitter, bounds_note, hold_at_bounds
 from ssmppl.diagnosis.selection.refit import standard_errors
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
@@ -21,14 +21,14 @@ def test_a_scale_that_counts_for_nothing_is_held_next_to_where_it_counts():
     def function(z):
         return -np.log1p(np.exp(2.0 * z[0])) - 0.5 * (z[1] - 3.0) ** 2
 
-    z, mask = bounded(function, np.array([-27.0, 3.0]), np.array([True, False]))
+    z, mask = hold_at_bounds(function, np.array([-27.0, 3.0]), np.array([True, False]))
     assert mask.tolist() == [True, False]
     assert np.exp(z[0]) == pytest.approx(np.sqrt(np.expm1(COST)), rel=1e-3)
     assert z[1] == 3.0
 
 
 def test_an_upper_bound_is_one_too():
-    z, mask = bounded(lambda z: -np.log1p(np.exp(-z[0])), np.array([20.0]), np.array([True]))
+    z, mask = hold_at_bounds(lambda z: -np.log1p(np.exp(-z[0])), np.array([20.0]), np.array([True]))
     assert mask.all()
     assert np.log1p(np.exp(-z[0])) == pytest.approx(COST, rel=1e-3)
 
@@ -39,7 +39,7 @@ def test_an_upper_bound_is_one_too():
     ids=["a top inside", "flat", "a wide top inside"],
 )
 def test_what_is_at_no_bound_is_left(function):
-    z, mask = bounded(function, np.array([0.4]), np.array([True]))
+    z, mask = hold_at_bounds(function, np.array([0.4]), np.array([True]))
     assert not mask.any()
     assert z[0] == 0.4
 
@@ -77,7 +77,7 @@ def test_what_is_not_positive_definite_gives_no_error():
 
 
 def test_the_note_names_and_gives_the_value():
-    text = note(["q"], {"q": 1.25e-4, "r": 2.0}, "the fit of 'EMPS'")
+    text = bounds_note(["q"], {"q": 1.25e-4, "r": 2.0}, "the fit of 'EMPS'")
     assert text.startswith("in the fit of 'EMPS' the best value of q is a bound: held")
     assert "q at 0.000125" in text
-    assert note([], {}, "a fit") == ""
+    assert bounds_note([], {}, "a fit") == ""

@@ -7,14 +7,14 @@ import pytest
 from scipy import stats
 
 from ssmppl.diagnosis.selection.equivalence import (
-    NATS_APART,
-    classes,
+    SEPARATING,
+    classes_by_similarity,
     confidence_set,
     cuts,
-    likeness,
-    needed_gain,
+    distinguishable,
+    separating_gain,
     separating_input,
-    told_apart,
+    similarity,
 )
 from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
@@ -31,19 +31,21 @@ def one_factor(width, rho):
 @pytest.mark.parametrize("rho", [0.5, 0.9, -0.8])
 def test_at_the_needed_gain_a_rival_wins_once_in_twenty(rho):
     rng, times = rng_of("needed", rho), 20_000
-    delta = np.sqrt(2 * needed_gain(rho))
+    delta = np.sqrt(2 * separating_gain(rho))
     root = np.linalg.cholesky(np.array([[1.0, rho], [rho, 1.0]]))
     z = rng.standard_normal((times, 2)) @ root.T + delta * np.array([1.0, rho])
     wins = int(np.sum(np.abs(z[:, 1]) > np.abs(z[:, 0])))
-    assert stats.binomtest(wins, times, stats.norm.sf(np.sqrt(NATS_APART))).pvalue > LEVEL
-    assert stats.norm.sf(np.sqrt(NATS_APART)) == pytest.approx(0.05, abs=2e-3)
+    assert stats.binomtest(wins, times, stats.norm.sf(np.sqrt(SEPARATING))).pvalue > LEVEL
+    assert stats.norm.sf(np.sqrt(SEPARATING)) == pytest.approx(0.05, abs=2e-3)
 
 
 def test_needed_gain():
-    np.testing.assert_allclose(needed_gain(np.array([0.0, 0.9, -0.9, 1.0])), [2.7, 27, 27, np.inf])
-    assert told_apart(27.1, 0.9)
-    assert not told_apart(26.9, -0.9)
-    assert not told_apart(1e9, 1.0)
+    np.testing.assert_allclose(
+        separating_gain(np.array([0.0, 0.9, -0.9, 1.0])), [2.7, 27, 27, np.inf]
+    )
+    assert distinguishable(27.1, 0.9)
+    assert not distinguishable(26.9, -0.9)
+    assert not distinguishable(1e9, 1.0)
 
 
 def test_classes_of_a_small_example():
@@ -52,23 +54,23 @@ def test_classes_of_a_small_example():
     for (i, j), value in {(1, 2): -0.9, (2, 3): 0.8, (0, 4): 0.7, (0, 3): 0.1}.items():
         rho[i, j] = rho[j, i] = value
     gains = np.array([6.0, 15.0, 20.0, 14.0, 3.0])
-    found = classes(rho, gains)
+    found = classes_by_similarity(rho, gains)
     np.testing.assert_array_equal(found.class_id, [3, 1, 1, 2, 3])
     np.testing.assert_array_equal(found.leader, [0, 2, 2, 3, 0])
     np.testing.assert_allclose(found.rho, [1.0, -0.9, 1.0, 1.0, 0.7])
     np.testing.assert_array_equal(found.members(1), [2, 1])
-    weaker = classes(rho, gains / 3)  # less is known: 2 takes 3 as well, and so on
+    weaker = classes_by_similarity(rho, gains / 3)  # less is known: 2 takes 3 as well, and so on
     assert weaker.class_id.max() < found.class_id.max()
 
 
 def test_one_sided_rivals_of_the_wrong_sign_are_no_rivals():
     rho = np.array([[1.0, -0.95], [-0.95, 1.0]])
-    np.testing.assert_array_equal(likeness(rho, np.array([1, 1])), np.eye(2))
-    np.testing.assert_array_equal(likeness(rho, np.array([1, -1])), np.abs(rho))
-    np.testing.assert_array_equal(likeness(rho, np.array([1, 0])), np.abs(rho))
+    np.testing.assert_array_equal(similarity(rho, np.array([1, 1])), np.eye(2))
+    np.testing.assert_array_equal(similarity(rho, np.array([1, -1])), np.abs(rho))
+    np.testing.assert_array_equal(similarity(rho, np.array([1, 0])), np.abs(rho))
     gains = np.array([20.0, 19.0])
-    assert classes(rho, gains, np.array([1, 1])).class_id.tolist() == [1, 2]
-    assert classes(rho, gains).class_id.tolist() == [1, 1]
+    assert classes_by_similarity(rho, gains, np.array([1, 1])).class_id.tolist() == [1, 2]
+    assert classes_by_similarity(rho, gains).class_id.tolist() == [1, 1]
 
 
 def test_a_cut_of_two_is_enough_for_two():
@@ -125,8 +127,8 @@ def test_the_input_that_separates():
     found = separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak, "chirp": strong})
     assert found.nats["steps"] == pytest.approx(8 * 0.05)
     assert found.nats["chirp"] == pytest.approx(8 * 0.5)  # the member with less information
-    assert (found.input, found.told_apart) == ("chirp", True)
-    assert not separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak}).told_apart
+    assert (found.input, found.separable) == ("chirp", True)
+    assert not separating_input([0, 1], np.array([2.0, 2.0]), {"steps": weak}).separable
     three = np.eye(3)
     three[0, 2] = three[2, 0] = 0.99
     found = separating_input([0, 1, 2], np.full(3, 4.0), {"a": three})

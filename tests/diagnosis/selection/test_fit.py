@@ -6,7 +6,7 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import Fitter
+from ssmppl.diagnosis.selection.fit import FROM_START, Effort, Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.maximum.ascent import Maximization
@@ -49,7 +49,7 @@ def test_particles_find_the_exact_mode(name):
     seed = seed_sequence(seed_of("fit", name))
     top = exact.fit(problem.experiments, seed, {})
     start = {n: v * 1.4 for n, v in top.start.items() if n not in exact.fixed and n != "phi"}
-    found = particles.fit(problem.experiments, seed, start, searched=True)
+    found = particles.fit(problem.experiments, seed, start, FROM_START)
     lost = log_posterior(exact, top, top.z) - log_posterior(exact, top, found.z)
     # The last steps average the score's noise out: no worse than the noise of one score alone.
     slopes = [particles.gradient(found.space, top.z, random_state(seed, 50, r))[1]
@@ -79,7 +79,9 @@ def test_numbers_restore_a_fit():
 def test_a_quick_fit_is_the_same_without_information():
     problem, fitter = fitter_of("level", exact=True)
     fit = fitter.fit(problem.experiments, seed_sequence(seed_of("quick")), {})
-    quick = fitter.fit(problem.experiments, seed_sequence(seed_of("quick")), {}, quick=True)
+    quick = fitter.fit(
+        problem.experiments, seed_sequence(seed_of("quick")), {}, Effort(standard_errors=False)
+    )
     np.testing.assert_array_equal(quick.theta, fit.theta)
     assert np.isnan(quick.information).all()
     assert np.all(np.linalg.eigvalsh(fit.information) > 0.0)
@@ -125,13 +127,11 @@ def test_a_fit_may_start_with_an_information_matrix():
     setup = Maximization(top.problem, top.space, "posterior", {}, {}, np.random.SeedSequence(0))
     back = np.linalg.inv(setup.transform.at(top.z).jacobian)
     information = back.T @ top.information @ back
-    found = particles.fit(
-        problem.experiments, seed, top.start, searched=True, information=information
-    )
+    found = particles.fit(problem.experiments, seed, top.start, FROM_START, information=information)
     assert "simulator" not in particles.__dict__
     lost = log_posterior(exact, top, top.z) - log_posterior(exact, top, found.z)
     assert lost < 1.0
-    measured = particles.measured(found, seed)
+    measured = particles.with_information(found, seed)
     assert "simulator" in particles.__dict__
     # Expected, not observed: against that of the exact scores, each by 24 simulated sets.
     expected = exact._simulated_information(top.space, top.theta, seed)
@@ -153,7 +153,7 @@ def test_a_step_over_a_cliff_is_taken_back(monkeypatch, after):
         return (value - 1e5, 1e5 * slope) if len(calls) == after + 1 else (value, slope)
 
     monkeypatch.setattr(particles, "gradient", gradient)
-    found = particles.fit(problem.experiments, seed, start, searched=True)
+    found = particles.fit(problem.experiments, seed, start, FROM_START)
     assert len(calls) > after
     assert np.max(np.abs(found.z - calls[0])) < 2.0
     assert found.log_likelihood > -200.0

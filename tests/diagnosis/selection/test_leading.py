@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.diagnosis.heldout.gain_ratio import Gain, HowFar
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, HeldOutGain
 from ssmppl.diagnosis.heldout.parts import GAP, head, three_parts
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report import tables
-from ssmppl.diagnosis.report.answer import Results, answer, labels
+from ssmppl.diagnosis.report.build import Results, build_report, labels
 from ssmppl.diagnosis.report.panels import bars, ranked_effects
 from ssmppl.diagnosis.report.text import cause_rows
 from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, which
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.screening.screen import Question, ask
+from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.attribution import Attribution
-from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.refit import refit, refit_all
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -61,22 +61,24 @@ def loaded():
     y = v + 0.3 * rng.normal(size=v.shape) + [0.0, 1.0]
     problem = pose(pair(), {"y1": y[:, 0], "y2": y[:, 1]})
     train, missing = problem.experiments, missing_of(problem.experiments)
-    workshop = Workshop(problem.trace, missing, {}, Settings())
-    base, kept = workshop.fitter(()), Checkpoint(None, {})
+    augmented = AugmentedModels(problem.trace, missing, {}, Settings())
+    base, kept = augmented.fitter(()), Checkpoint(None, {})
     fit = base.fit(train, seed_sequence(1), {})
     states = base.states(train[0], fit.theta, random_state(seed_sequence(2)))
     scales = Scales.of(problem.trace, states, train[0].y, train[0].u, 120)
-    question = Question(problem.trace, scales, missing, (), Settings(), EFFECTS)
-    screen = ask(question, train, fit.theta, 60, seed_sequence(3), kept)
-    where = {(c.effect.name, c.equation): k for k, c in enumerate(question.candidates)}
+    design = ScreenDesign(problem.trace, scales, missing, (), Settings(), EFFECTS)
+    screen = run_screen(design, train, fit.theta, 60, seed_sequence(3), kept)
+    where = {(c.effect.name, c.equation): k for k, c in enumerate(design.candidates)}
     load, bias = where["constant load", "v1"], where["sensor bias", "y2"]
     singles, failed = refit_all(
-        workshop, fit, screen, [[k] for k in range(4)], train, seed_sequence(4), kept, "one"
+        augmented, fit, screen, [[k] for k in range(4)], train, seed_sequence(4), kept, "one"
     )
     assert not failed
-    both = [question.candidates[k] for k in (load, bias)]
-    found = refit(workshop, fit, screen, [load, bias], train, seed_sequence(5), both)
-    found = dataclasses.replace(found, fit=found.fitter.measured(found.fit, seed_sequence(6)))
+    both = [design.candidates[k] for k in (load, bias)]
+    found = refit(augmented, fit, screen, [load, bias], train, seed_sequence(5), both)
+    found = dataclasses.replace(
+        found, fit=found.fitter.with_information(found.fit, seed_sequence(6))
+    )
     attribution = Attribution(fit, singles, [], found)
     return Results(
         problem.trace, train, None, "full", 0.05, base, fit, screen, {"model": "pair"}, [],
@@ -86,7 +88,7 @@ def loaded():
 
 @pytest.mark.slow
 def test_the_report_names_what_was_chosen_where_it_was_chosen(loaded):
-    report = answer(loaded, 1.0)
+    report = build_report(loaded, 1.0)
     assert report.verdict == "effect"
     assert report.chosen == ["constant load on v1", "sensor bias on y2"]
     # The bias of y1 stands before that of y2: a load on v1 looks like it.
@@ -109,11 +111,11 @@ def test_the_report_names_what_was_chosen_where_it_was_chosen(loaded):
 @pytest.mark.slow
 def test_what_stands_out_and_could_not_be_fitted_is_named(loaded):
     """Nothing else in its place: the gap is there, and is not measured."""
-    (load,) = [k for k, c in enumerate(loaded.screen.question.candidates)
+    (load,) = [k for k, c in enumerate(loaded.screen.design.candidates)
                if (c.effect.name, c.equation) == ("constant load", "v1")]  # fmt: skip
     rest = [r for r in loaded.refits if r.index != (load,)]
     found = Attribution(loaded.fit, rest, unfitted=load, notes=["not refitted: it failed"])
-    report = answer(dataclasses.replace(loaded, attribution=found), 1.0)
+    report = build_report(dataclasses.replace(loaded, attribution=found), 1.0)
     assert report.verdict == "effect"
     assert report.model is None
     assert [(r["effect"], r["equation"]) for r in leaders(report)] == [("constant load", "v1")]
@@ -128,10 +130,10 @@ def test_what_stands_out_and_could_not_be_fitted_is_named(loaded):
 @pytest.mark.slow
 def test_the_p_of_a_screen_at_another_fit_is_not_told(loaded):
     """Of a model that a refit led to a better fit of: only what refits were tested for is known."""
-    base = answer(loaded, 1.0).causes
+    base = build_report(loaded, 1.0).causes
     tested = {loaded.refits[0].index[0]: 0.3}
     found = Attribution(loaded.fit, loaded.refits, p=tested, rebased=True)
-    report = answer(dataclasses.replace(loaded, attribution=found), 1.0)
+    report = build_report(dataclasses.replace(loaded, attribution=found), 1.0)
     assert base["p"].min() < 0.001
     assert report.causes["p"].iloc[0] == pytest.approx(0.6)  # the larger of two tests
     assert report.causes["p"].iloc[1:].isna().all()
@@ -147,23 +149,23 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     two = (head(e, 20), e)
     parts = three_parts(two)
     results = dataclasses.replace(loaded, experiments=two, parts=parts)
-    report = answer(results, 1.0)
+    report = build_report(results, 1.0)
     assert report.parts == {"screen": (1, 84)}
     assert "How far the gap closes has not been measured." in headline(report)
     assert "took no part" not in str(report)
     run = SimpleNamespace(mean=e.y, low=e.y, high=e.y)
     short = SimpleNamespace(mean=e.y[:20], low=e.y[:20], high=e.y[:20])
     row = {"effect": "x", "F": 0.9, "F_low": 0.8, "F_high": 1.0, "nats_per_sample": 0.1}
-    far = HowFar([row], None, [short, run])
-    report = answer(dataclasses.replace(results, far=far), 1.0)
-    first = int(np.flatnonzero(parts.confirm[1])[0]) + 1
+    far = HeldOutGain([row], None, [short, run])
+    report = build_report(dataclasses.replace(results, held_out=far), 1.0)
+    first = int(np.flatnonzero(parts.held_out[1])[0]) + 1
     assert report.parts == {"screen": (1, 84), "confirm": (first, 120)}
     assert first == 84 + GAP + 1
     assert f"t = {first} to 120 of experiment 2, and likewise of the others" in how_far(report)[0]
     assert "t = 1 to 84 of experiment 2" in how_sure(report)[0]
     assert "Likewise of the other experiments. No row served twice." in how_sure(report)[0]
     results.attribution.left_out = True
-    report = answer(dataclasses.replace(results, far=far), 1.0)
+    report = build_report(dataclasses.replace(results, held_out=far), 1.0)
     results.attribution.left_out = False
     assert "No row served twice" not in str(report)
     assert "took no part" not in str(report)
@@ -179,8 +181,10 @@ def test_an_effect_that_gained_is_not_denied_where_the_share_is_open(loaded, mon
     row = {"effect": "x", "F_low": np.nan, "F_high": np.nan}
     verdicts = {}
     for share, gained in ((np.nan, 0.4), (np.nan, -0.1), (0.5, 0.4)):
-        far = HowFar([{**row, "F": share, "nats_per_sample": gained}], Gain(9.0, 1.0, 0.1), [run])
-        report = answer(dataclasses.replace(loaded, far=far), 1.0)
+        far = HeldOutGain(
+            [{**row, "F": share, "nats_per_sample": gained}], Gain(9.0, 1.0, 0.1), [run]
+        )
+        report = build_report(dataclasses.replace(loaded, held_out=far), 1.0)
         verdicts[share, gained] = report.verdict
         assert (report.model is not None) == (report.verdict == "effect")
     # What gained nothing is no effect; that its place stands out is a gap all the same.
@@ -189,7 +193,7 @@ def test_an_effect_that_gained_is_not_denied_where_the_share_is_open(loaded, mon
 
 @pytest.mark.slow
 def test_an_effect_offered_once_needs_no_equation(loaded):
-    offered = loaded.screen.question.candidates
+    offered = loaded.screen.design.candidates
     assert labels(offered[:1], offered[:1]) == ["constant load"]
     assert labels(offered[:1], offered) == ["constant load on v1"]
 

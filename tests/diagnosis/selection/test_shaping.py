@@ -9,7 +9,8 @@ from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.selection import shapes
-from ssmppl.diagnosis.selection.augmented_models import Workshop, share_of
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, range_fraction
+from ssmppl.diagnosis.selection.fit import FROM_START
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.selection.shapes import PRICE, shape_bounds, shaped_all
 from ssmppl.inference.run.problem import missing_of, pose
@@ -62,22 +63,22 @@ def test_a_period_moves_within_the_resolution_of_the_record():
 
 # -- fitted, the likelihoods exact
 def setting(extra):
-    """An oscillator's data with `extra` (T,) added to its force, its model's fit and workshop."""
+    """An oscillator's data with `extra` (T,) added to its force, its model's fit and augmented."""
     inputs = models.inputs_of("oscillator", ROWS)
     force = {"u": inputs["u"] + extra}
     model, theta = models.build("oscillator"), models.THETA["oscillator"]
     drawn = models.ssm.simulate(model, theta, steps=ROWS, inputs=force, seed=5)
     problem = pose(model, inputs | {"y": drawn["y"].values[0]})
-    workshop = Workshop(problem.trace, missing_of(problem.experiments), {}, Settings())
-    return workshop, problem.experiments, workshop.fitter(()).fit(
+    augmented = AugmentedModels(problem.trace, missing_of(problem.experiments), {}, Settings())
+    return augmented, problem.experiments, augmented.fitter(()).fit(
         problem.experiments, seed_sequence(1), {}
     )  # fmt: skip
 
 
-def refitted(workshop, base, c, experiments, strength):
-    fitter = workshop.fitter((c,))
+def refitted(augmented, base, c, experiments, strength):
+    fitter = augmented.fitter((c,))
     start = base.start | {c.strength: np.asarray(strength)}
-    fit = fitter.fit(experiments, seed_sequence(2), start, searched=True)
+    fit = fitter.fit(experiments, seed_sequence(2), start, FROM_START)
     return Refit((0,), (c,), fitter, fit, fit.log_likelihood - base.log_likelihood)
 
 
@@ -85,29 +86,29 @@ def refitted(workshop, base, c, experiments, strength):
 def forced():
     """A forcing of period 33.3, found at 36: an eighth of a turn in each 60 rows off."""
     t = np.arange(1.0, ROWS + 1.0)
-    workshop, experiments, base = setting(3.0 * np.cos(2 * np.pi * t / 33.3 - 0.7))
+    augmented, experiments, base = setting(3.0 * np.cos(2 * np.pi * t / 33.3 - 0.7))
     c = candidate("periodic forcing").with_shape(period=36.0, phase=0.2)
-    return workshop, experiments, base, refitted(workshop, base, c, experiments, 0.1)
+    return augmented, experiments, base, refitted(augmented, base, c, experiments, 0.1)
 
 
 def shapes_of(forced, refits=None):
-    workshop, experiments, base, found = forced
-    where = scales(workshop.trace, ROWS)
+    augmented, experiments, base, found = forced
+    where = scales(augmented.trace, ROWS)
     kept = Checkpoint(None, {})
-    return shaped_all(workshop, base, where, refits or [found], experiments, seed_sequence(3),
+    return shaped_all(augmented, base, where, refits or [found], experiments, seed_sequence(3),
                       kept, "shapes")  # fmt: skip
 
 
 def test_a_share_of_the_way_between_bounds_is_the_shape(forced):
     """The code with free shapes, held at one place, has the likelihood of that shape's own."""
-    workshop, experiments, _, found = forced
+    augmented, experiments, _, found = forced
     (c,) = found.candidates
     limits = {f"{c.strength}_{n}": b for n, b in bounds(c).items()}
-    free = workshop.with_free_shapes((c,), limits)
+    free = augmented.with_free_shapes((c,), limits)
     values = found.fit.values()
     for n, (low, high) in limits.items():
         name = n.removeprefix(f"{c.strength}_")
-        values |= {share_of(n): (dict(c.shape)[name] - low) / (high - low)}
+        values |= {range_fraction(n): (dict(c.shape)[name] - low) / (high - low)}
         values |= {f"{n}_from": low, f"{n}_range": high - low}
     theta = np.array([values[repr(s)] for s in free.problem.trace.parameter_symbols])
     assert free.kalman.log_likelihood(experiments, theta) == pytest.approx(
@@ -116,7 +117,7 @@ def test_a_share_of_the_way_between_bounds_is_the_shape(forced):
 
 
 def test_the_period_ends_where_the_likelihood_is_highest(forced):
-    workshop, experiments, base, found = forced
+    augmented, experiments, base, found = forced
     (new,) = shapes_of(forced)
     (c,) = new.candidates
     shape = dict(c.shape)
@@ -128,9 +129,9 @@ def test_the_period_ends_where_the_likelihood_is_highest(forced):
     )
     for change in (-0.3, 0.3):  # all else fitted again: a top in the period too
         other = c.with_shape(period=shape["period"] + change)
-        again = refitted(workshop, base, other, experiments, 0.1)
+        again = refitted(augmented, base, other, experiments, 0.1)
         assert again.fit.log_likelihood < new.fit.log_likelihood
-    measured = new.fitter.measured(new.fit, seed_sequence(4))
+    measured = new.fitter.with_information(new.fit, seed_sequence(4))
     assert measured.information.shape == (len(new.fit.z),) * 2
     assert np.all(np.linalg.eigvalsh(measured.information) > 0.0)
 
@@ -152,7 +153,7 @@ def test_the_best_first_and_those_far_behind_as_they_were(forced):
     new = shapes_of(forced, [ahead, behind, far])
     assert [r.index for r in new][-1] == (3,)
     assert new[-1] is far
-    assert [r.merit for r in new] == sorted((r.merit for r in new), reverse=True)
+    assert [r.penalised_gain for r in new] == sorted((r.penalised_gain for r in new), reverse=True)
 
 
 def test_an_estimate_that_runs_to_its_bound_is_none(forced, monkeypatch):

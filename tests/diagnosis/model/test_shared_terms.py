@@ -7,7 +7,7 @@ import ssmppl as ssm
 from ssmppl.analysis.density import Missing
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.equations import Anatomy, carried, flows
+from ssmppl.diagnosis.model.equations import Equations, carried, shared_terms
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
@@ -48,8 +48,8 @@ def cart(extra):
 def means(t, at):
     """Every state's mean after one step, at random points or as given."""
     out = {}
-    for part in Anatomy(t).of_role("state"):
-        mean = Anatomy(t).mean(part)
+    for part in Equations(t).of_role("state"):
+        mean = Equations(t).mean(part)
         known = {s: at(s.data[1]) for s in symbols_of(mean)}
         out[part.label] = evaluate(mean, known) + np.zeros(20)
     return out
@@ -77,14 +77,14 @@ def test_a_friction_on_the_cart_is_felt_by_the_pole():
 
 def test_what_leaves_one_tank_enters_the_next():
     t = traced("gap", "two_tanks")
-    found = flows(Anatomy(t))
+    found = shared_terms(Equations(t))
     assert [[(label, repr(f)) for label, f in r] for r in found["h1"]] == [[("h2", "-1")]]
     assert [[(label, repr(f)) for label, f in r] for r in found["h2"]] == [[("h1", "-1")]]
 
 
 @pytest.mark.parametrize("name", ["oscillator", "pendulum", "ar1", "local_level"])
 def test_one_equation_has_nothing_to_share(name):
-    assert not any(flows(Anatomy(traced("gap", name))).values())
+    assert not any(shared_terms(Equations(traced("gap", name))).values())
 
 
 def two_states(step):
@@ -128,7 +128,7 @@ def of_parameters(a, b, k):
      (geometry, None), (of_parameters, None)],
 )  # fmt: skip
 def test_a_flow_enters_its_own_equation_with_a_constant_factor_the_others_linearly(step, of_a):
-    found = flows(Anatomy(two_states(step))).get("a", [])
+    found = shared_terms(Equations(two_states(step))).get("a", [])
     assert [{k: evaluate(f, {}) for k, f in r} for r in found] == ([of_a] if of_a else [])
 
 
@@ -175,7 +175,7 @@ def test_a_force_moves_what_integrates_the_new_speed_in_the_same_step():
 
 
 def test_an_explicit_step_carries_nothing():
-    assert carried(Anatomy(traced("gap", "oscillator"))) == {}
+    assert carried(Equations(traced("gap", "oscillator"))) == {}
 
 
 def test_the_pole_on_a_cart_in_semi_implicit_steps():
@@ -194,9 +194,9 @@ def test_the_pole_on_a_cart_in_semi_implicit_steps():
     start = {n: ssm.Normal(0, sd=1) for n in ("x", "v", "th", "w")}
     given = {n: ssm.HalfNormal(sd=1) for n in ("b", "c", "d")}
     t = system(start, step, lambda x: {"y": ssm.Normal(x, sd=1)}, "u", **given)
-    anatomy = Anatomy(t)
-    assert [[label for label, _ in r] for r in flows(anatomy)["v"]] == [["w"]]
-    assert [label for label, _ in carried(anatomy)["v"]] == ["x"]
+    equations = Equations(t)
+    assert [[label for label, _ in r] for r in shared_terms(equations)["v"]] == [["w"]]
+    assert [label for label, _ in carried(equations)["v"]] == ["x"]
 
 
 def test_a_flow_within_a_flow():
@@ -210,7 +210,7 @@ def test_a_flow_within_a_flow():
 
     start = {n: ssm.Normal(0, sd=1) for n in "abc"}
     t = system(start, step, lambda a: {"y": ssm.Normal(a, sd=1)}, k=ssm.HalfNormal(sd=1))
-    found = [{label: evaluate(f, {}) for label, f in r} for r in flows(Anatomy(t))["a"]]
+    found = [{label: evaluate(f, {}) for label, f in r} for r in shared_terms(Equations(t))["a"]]
     assert found == [{"b": -1.0}, {"b": -1.0, "c": -2.0}]
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
-from ssmppl.diagnosis.heldout.gain_ratio import Fieller, block_length, closed, fieller
+from ssmppl.diagnosis.heldout.gain_ratio import ConfidenceSet, block_length, fieller, gain_ratio
 from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
 
@@ -48,7 +48,7 @@ def test_fieller_is_the_set_it_claims(n, d, covariance, kind):
 
 def test_fieller_without_error_in_the_denominator():
     found = fieller(3.0, 6.0, np.array([[1.0, 0.0], [0.0, 0.0]]), 2.0)
-    assert found == Fieller("bounded", pytest.approx(1 / 6), pytest.approx(5 / 6))
+    assert found == ConfidenceSet("bounded", pytest.approx(1 / 6), pytest.approx(5 / 6))
 
 
 @pytest.mark.parametrize(("n", "d"), [(20.0, 25.0), (5.0, 1.0), (0.3, 0.5)])
@@ -101,7 +101,7 @@ def coverage(name, rows, rho, nats, share, heavy, times):
     for r in range(times):
         effect, reference = gains(rng, rows, rho, nats, share, heavy)
         base = rng.standard_normal(rows)
-        found = closed(base, base + effect, base + reference, seed=r, replicates=500)
+        found = gain_ratio(base, base + effect, base + reference, seed=r, replicates=500)
         measurable += found.measurable
         held += found.measurable and found.low <= share <= found.high
     print(f"{name}: covers {held / measurable:.3f} of {measurable}")
@@ -137,7 +137,7 @@ def test_no_measurable_gap():
     for r in range(200):
         base = rng.standard_normal(100)
         x = rng.standard_normal((2, 100))
-        found = closed(base, base + x[0], base + x[1], seed=r, replicates=300)
+        found = gain_ratio(base, base + x[0], base + x[1], seed=r, replicates=300)
         assert found.measurable == np.isfinite(found.F)
         assert found.measurable != found.reason.startswith("no measurable gap")
         silent += not found.measurable
@@ -149,14 +149,14 @@ def test_shares_are_reported_as_they_are():
     effect, reference = gains(rng, 400, 0.0, 80.0, 1.0)
     base = rng.standard_normal(400)
     for share in (-0.5, 1.4):
-        found = closed(base, base + share * effect, base + reference)
+        found = gain_ratio(base, base + share * effect, base + reference)
         assert pytest.approx(share * effect.sum() / reference.sum()) == found.F
         assert found.low < found.F < found.high
         assert found.gain.nats_per_sample == pytest.approx(share * effect.mean())
     measured = np.arange(400) % 4 == 0  # rows without data are 0 in all three
-    holed = closed(*(measured * v for v in (base, base + effect, base + reference)), block=20)
+    holed = gain_ratio(*(measured * v for v in (base, base + effect, base + reference)), block=20)
     assert holed.gain.nats_per_sample == pytest.approx(effect[measured].mean())
-    same = closed(base, base + reference, base + reference)
+    same = gain_ratio(base, base + reference, base + reference)
     assert (same.F, same.low, same.high) == pytest.approx((1.0, 1.0, 1.0))
 
 
@@ -164,7 +164,7 @@ def test_error_of_a_total_is_that_of_independent_blocks():
     """block=1: the rows are blocks already; sqrt(n) times their standard deviation."""
     rng = rng_of("blocks")
     base, x = np.zeros(60), 1.0 + rng.standard_normal((2, 60))
-    found = closed(base, x[0], x[1], block=1, replicates=20_000)
+    found = gain_ratio(base, x[0], x[1], block=1, replicates=20_000)
     np.testing.assert_allclose(found.covariance, 60 * np.cov(x), rtol=0.06, atol=1.5)
 
 
@@ -174,10 +174,10 @@ def test_monte_carlo_noise_enters_the_covariance():
     base = np.zeros((runs, 50)) + 2.0 * rng.standard_normal((runs, 1))
     effect = 1.0 + rng.standard_normal((runs, 1)) + np.zeros(50)
     reference = 2.0 + np.zeros((runs, 50))
-    found = closed(base, effect, reference, block=1)
+    found = gain_ratio(base, effect, reference, block=1)
     exact = 50**2 / runs * np.array([[5.0, 4.0], [4.0, 4.0]])
     assert np.all(np.abs(found.covariance / exact - 1) < 4 * np.sqrt(2 / runs))
-    stated = closed(base[0], effect[0], reference[0], block=1, noise=(0.2, 0.1, 0.3))
+    stated = gain_ratio(base[0], effect[0], reference[0], block=1, noise=(0.2, 0.1, 0.3))
     np.testing.assert_allclose(stated.covariance, [[0.05, 0.04], [0.04, 0.13]], atol=1e-12)
 
 
@@ -185,7 +185,7 @@ def test_experiments_are_not_mixed():
     """Two experiments whose levels differ: only the spread within them counts."""
     rng = rng_of("experiments")
     x = rng.standard_normal(200) + np.repeat([0.0, 50.0], 100)
-    found = closed(np.zeros(200), x, x + 1.0, block=2, starts=(0, 100))
+    found = gain_ratio(np.zeros(200), x, x + 1.0, block=2, starts=(0, 100))
     assert found.gain.error == pytest.approx(np.sqrt(200.0), rel=0.3)
 
 
@@ -199,4 +199,4 @@ def test_experiments_are_not_mixed():
 )
 def test_errors(arrays, options, match):
     with pytest.raises(ArgumentError, match=match):
-        closed(*arrays, **options)
+        gain_ratio(*arrays, **options)

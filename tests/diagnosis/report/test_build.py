@@ -8,10 +8,10 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout.gain_ratio import Gain, closed, interval_of
+from ssmppl.diagnosis.heldout.gain_ratio import Gain, gain_ratio
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.report import answer, tables
-from ssmppl.diagnosis.report.answer import _curves_beat
+from ssmppl.diagnosis.report import build, tables
+from ssmppl.diagnosis.report.build import _curves_beat
 from ssmppl.diagnosis.report.words import headline
 from ssmppl.drawing.numerals import interval
 from ssmppl.language.trace import trace
@@ -32,9 +32,9 @@ from tests.diagnosis.small import level, levels
     ],
 )
 def test_curves_beat_the_catalogue(nats, error, share, chosen, expected):
-    far = SimpleNamespace(beyond=Gain(nats, error, nats / 150), rows=[{"F": share}])
+    far = SimpleNamespace(beyond_catalogue=Gain(nats, error, nats / 150), rows=[{"F": share}])
     assert _curves_beat(far, chosen) is expected
-    assert _curves_beat(SimpleNamespace(beyond=None, rows=[]), chosen) is False
+    assert _curves_beat(SimpleNamespace(beyond_catalogue=None, rows=[]), chosen) is False
 
 
 # -- a verdict agrees with the checks
@@ -58,14 +58,14 @@ def test_where_nothing_stands_out_no_gap_is_measurable(few_sets):
 
 def test_a_check_that_fails_is_a_gap(few_sets, monkeypatch):
     """z = 39 and "no measurable gap" stood in one report."""
-    whole = answer._detection
+    whole = build._detection
 
     def failed(screen):
         table = whole(screen)
         table.loc[table.index[0], ["z", "p"]] = 39.0, 1e-6
         return table
 
-    monkeypatch.setattr(answer, "_detection", failed)
+    monkeypatch.setattr(build, "_detection", failed)
     report = quiet()
     assert report.verdict == "none of these"
     first = report.detection.iloc[0]
@@ -92,7 +92,7 @@ def test_a_place_that_stands_out_is_a_gap_with_its_stretch_and_curve(few_sets, m
 
 def test_places_and_checks_share_the_error_rate():
     """A fifth of it each, so that their p is five times the family's own."""
-    assert tables.shared([0.004, 0.02, 0.5]).tolist() == pytest.approx([0.02, 0.1, 1.0])
+    assert tables.bonferroni([0.004, 0.02, 0.5]).tolist() == pytest.approx([0.02, 0.1, 1.0])
 
 
 # -- the chosen effects need not have the shape that led the screen
@@ -103,10 +103,10 @@ def test_a_chosen_effect_of_another_shape_has_its_numbers():
     refit = SimpleNamespace(
         candidates=(other,), strengths=[0.25], errors={"coulomb_friction_v_2": 0.01}, bounds=[]
     )
-    question = SimpleNamespace(candidates=[head])
-    screen = SimpleNamespace(question=question, experiments=[SimpleNamespace(time=None)])
+    design = SimpleNamespace(candidates=[head])
+    screen = SimpleNamespace(design=design, experiments=[SimpleNamespace(time=None)])
     results = SimpleNamespace(chosen=refit, screen=screen, unfitted=None)
-    (found,) = answer._leading(results, [0])
+    (found,) = build._leading(results, [0])
     assert found == {"row": 0, "form": "v0 = 0.123", "sign": "one-sided", "estimate": 0.25,
                      "se": 0.01}  # fmt: skip
 
@@ -122,9 +122,9 @@ def test_a_share_of_the_reference_itself_is_no_comparison():
     rng = np.random.default_rng(1)
     gains = 1.0 + 0.1 * rng.standard_normal((1, 200))
     base = np.zeros((1, 200))
-    share = closed(base, gains, gains)
+    share = gain_ratio(base, gains, gains)
     assert share.F == 1.0
-    assert np.isnan(interval_of(share)).all()
-    assert interval(*interval_of(share)) == "no comparison: the reference is this model itself"
-    other = closed(base, 0.9 * gains, gains)
-    assert np.isfinite(interval_of(other)).all()
+    assert np.isnan(share.interval).all()
+    assert interval(*share.interval) == "no comparison: the reference is this model itself"
+    other = gain_ratio(base, 0.9 * gains, gains)
+    assert np.isfinite(other.interval).all()

@@ -10,13 +10,18 @@ from scipy.stats import norm
 import ssmppl as ssm
 from ssmppl.diagnosis.heldout.predictions import predict
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.initial_law import FirstStates, Start, needs_start, start_of
+from ssmppl.diagnosis.model.initial_law import (
+    InitialStateMeans,
+    ProperInitialLaw,
+    needs_proper_initial_law,
+    proper_initial_law,
+)
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.report.answer import _written
+from ssmppl.diagnosis.report.build import _written
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.screening.screen import Question, ask
-from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.refit import refit_all
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.run.problem import pose
@@ -80,11 +85,11 @@ def dragged(data, particles=1000):
     problem = pose(driven(), data)
     e = problem.experiments[0]
     missing = replace(problem.program.missing, none=False)
-    start = start_of(problem.trace, [e.y[0]], [e.y])
-    workshop = Workshop(problem.trace, missing, {}, Settings(particles), start)
+    start = proper_initial_law(problem.trace, [e.y[0]], [e.y])
+    augmented = AugmentedModels(problem.trace, missing, {}, Settings(particles), start)
     scales = Scales.of(problem.trace, e.y, e.y, e.u, e.steps)
     (c,), _ = offers(problem.trace, scales, ["quadratic drag"])
-    fitter = workshop.fitter([c])
+    fitter = augmented.fitter([c])
     own = {**VALUES, c.strength: DRAG}
     names = [s.data[1] for s in fitter.problem.trace.parameter_symbols]
     return fitter, np.array([own[n] for n in names]), problem.experiments
@@ -97,8 +102,11 @@ def test_the_height_puts_a_wide_law_on_the_scale_of_the_flat_one():
     flat = kalman_model(problem.trace)
     first = flat.smooth(e, theta)
     m, s = 1.0, 2.0
-    start = Start({"v": (np.array(m), np.array(s))})
-    other = kalman_model(start.given(problem.trace)).log_likelihood([e], theta) + start.height
+    start = ProperInitialLaw({"v": (np.array(m), np.array(s))})
+    other = (
+        kalman_model(start.applied_to(problem.trace)).log_likelihood([e], theta)
+        + start.log_correction
+    )
     at, p = first.mean[0, 0], first.covariance[0, 0, 0]
     lost = -0.5 * np.log1p(p / s**2) - 0.5 * (at - m) ** 2 / (s**2 + p)
     assert other - flat.log_likelihood([e], theta) == pytest.approx(lost, abs=1e-9)
@@ -110,8 +118,8 @@ def test_the_likelihood_with_an_effect_is_that_of_a_flat_start():
     fitter, theta, experiments = dragged(data)
     assert not fitter.exact
     exact, mean = on_a_grid(data, DRAG)
-    (spread,) = (s for _, s in fitter.start.laws.values())
-    near = 0.5 * ((mean - fitter.start.laws["v"][0]) ** 2 + 0.1**2) / spread**2
+    (spread,) = (s for _, s in fitter.initial_law.laws.values())
+    near = 0.5 * ((mean - fitter.initial_law.laws["v"][0]) ** 2 + 0.1**2) / spread**2
     value, error = fitter.log_likelihood(experiments, theta, seed_sequence(1))
     assert abs(value - exact) < 4.0 * error + near
     # The held-out rows have it too, the first among them.
@@ -130,7 +138,7 @@ def test_what_is_simulated_starts_where_the_data_do():
     data = recorded(15)
     fitter, theta, experiments = dragged(data)
     exact = on_a_grid(data, DRAG)[1]
-    found = FirstStates(fitter.smoother)(experiments[0], theta)
+    found = InitialStateMeans(fitter.smoother)(experiments[0], theta)
     assert abs(found[0] - exact) < 4.0 * VALUES["r"] / np.sqrt(100)
     drawn = fitter.simulator.observations(
         experiments[0], theta, random_state(seed_sequence(3)), 400
@@ -141,19 +149,21 @@ def test_what_is_simulated_starts_where_the_data_do():
 
 def test_a_start_is_given_only_where_a_flat_one_cannot_be():
     flat, other = (pose(m, recorded(15)).trace for m in (driven(), driven(ssm.Normal(0, sd=2))))
-    assert not needs_start(flat)
-    assert start_of(other, [np.zeros(1)], [np.ones((4, 1))]) is None
-    start = start_of(flat, [np.array([100.0]), np.array([104.0])], [np.full((4, 1), 112.0)] * 2)
+    assert not needs_proper_initial_law(flat)
+    assert proper_initial_law(other, [np.zeros(1)], [np.ones((4, 1))]) is None
+    start = proper_initial_law(
+        flat, [np.array([100.0]), np.array([104.0])], [np.full((4, 1), 112.0)] * 2
+    )
     mean, spread = start.laws["v"]
     assert (mean, spread) == (102.0, 50.0)  # five times as far as the states are from the mean
     assert str(start) == "v ~ Normal(102, sd=50)"
     problem = pose(driven(), recorded(15))
-    workshop = Workshop(problem.trace, problem.program.missing, {}, Settings(), start)
+    augmented = AugmentedModels(problem.trace, problem.program.missing, {}, Settings(), start)
     scales = Scales.of(problem.trace, np.ones((9, 1)), np.ones((9, 1)), np.ones((9, 1)), 15)
     (load,), _ = offers(problem.trace, scales, ["constant load"])
-    fitter = workshop.fitter([load])
+    fitter = augmented.fitter([load])
     assert fitter.exact
-    assert fitter.start is None
+    assert fitter.initial_law is None
 
 
 @pytest.mark.slow
@@ -162,20 +172,20 @@ def test_drag_is_refitted_though_the_model_starts_flat():
     data = recorded(150)
     problem = pose(driven(), data)
     (e,), missing, settings = problem.experiments, problem.program.missing, Settings(200)
-    base = Workshop(problem.trace, missing, {}, settings).fitter(())
+    base = AugmentedModels(problem.trace, missing, {}, settings).fitter(())
     fit = base.fit([e], seed_sequence(1), {})
     states = base.states(e, fit.theta, random_state(seed_sequence(2)))
-    start = start_of(problem.trace, [states[0].mean(axis=0)], [states])
-    workshop = Workshop(problem.trace, missing, {}, settings, start)
+    start = proper_initial_law(problem.trace, [states[0].mean(axis=0)], [states])
+    augmented = AugmentedModels(problem.trace, missing, {}, settings, start)
     scales = Scales.of(problem.trace, states, e.y, e.u, e.steps)
-    question = Question(problem.trace, scales, missing, (), settings, ["quadratic drag"])
+    design = ScreenDesign(problem.trace, scales, missing, (), settings, ["quadratic drag"])
     kept = Checkpoint(None, {})
-    screen = ask(question, [e], fit.theta, 60, seed_sequence(3), kept)
+    screen = run_screen(design, [e], fit.theta, 60, seed_sequence(3), kept)
     (found,), failed = refit_all(
-        workshop, fit, screen, [[0]], [e], seed_sequence(4), kept, "refitting"
+        augmented, fit, screen, [[0]], [e], seed_sequence(4), kept, "refitting"
     )
     assert not failed
-    found = replace(found, fit=found.fitter.measured(found.fit, seed_sequence(5)))
+    found = replace(found, fit=found.fitter.with_information(found.fit, seed_sequence(5)))
     error = found.errors["quadratic_drag_v"]
     assert abs(found.strengths[0] - DRAG) < 4.0 * error < 2.0 * DRAG
     assert found.gain > 10.0
@@ -186,7 +196,7 @@ def test_drag_is_refitted_though_the_model_starts_flat():
     assert not notes
     assert "ssm.Flat()" not in text.split("@model.initial")[1]
     given = {n: v for n, v in found.fit.values().items() if not n.startswith("size")}
-    told = ssm.log_likelihood(model, data, given, particles=2000, seed=1)[0] + start.height
+    told = ssm.log_likelihood(model, data, given, particles=2000, seed=1)[0] + start.log_correction
     assert told == pytest.approx(found.fit.log_likelihood, abs=4.0 * (found.fit.error + 0.1))
 
 
@@ -203,7 +213,7 @@ def test_starts_that_lie_apart_lose_nothing(places):
     problem = pose(driven(), data)
     flat, theta = kalman_model(problem.trace), np.array([0.2, 0.1, 0.9, 0.5])
     es = problem.experiments
-    start = start_of(problem.trace, [e.y[0] for e in es], [e.y for e in es])
-    other = kalman_model(start.given(problem.trace)).log_likelihood(es, theta)
-    lost = other + len(es) * start.height - flat.log_likelihood(es, theta)
+    start = proper_initial_law(problem.trace, [e.y[0] for e in es], [e.y for e in es])
+    other = kalman_model(start.applied_to(problem.trace)).log_likelihood(es, theta)
+    lost = other + len(es) * start.log_correction - flat.log_likelihood(es, theta)
     assert -0.03 < lost < 0.0

@@ -1,4 +1,4 @@
-"""From the results of the stages to the report."""
+"""The results of the stages turned into the report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.heldout.gain_ratio import HowFar
+from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
 from ssmppl.diagnosis.heldout.parts import Parts
 from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.report import tables
@@ -22,8 +22,8 @@ from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.diagnosis.screening.detection import Statistics, detection
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.attribution import Attribution
-from ssmppl.diagnosis.selection.equivalence import Classes, heads, told
-from ssmppl.diagnosis.selection.fit import Fit, Fitter, note
+from ssmppl.diagnosis.selection.equivalence import Classes, equivalence_classes, group_leaders
+from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
 from ssmppl.diagnosis.selection.refit import Refit, standard_errors
 from ssmppl.errors import SSMError
 from ssmppl.language.model.model import Model
@@ -31,13 +31,13 @@ from ssmppl.language.model.traced import Trace
 
 CLEARLY = 2.0  # standard errors
 MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
-LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows bear it out
+LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows validate it
 UNLIKE, NOTHING = "none of these", "no measurable gap"
 
 
 @dataclass
 class Results:
-    """What is known so far. attribution, far : None where that stage is not done.
+    """The results of the stages so far. attribution, held_out : None where not done.
 
     blocks : left out in turn, 0 for three parts. separating : by class, the input that would
     separate it.
@@ -54,7 +54,7 @@ class Results:
     settings: dict[str, Any]
     notes: list[str]
     attribution: Attribution | None = None
-    far: HowFar | None = None
+    held_out: HeldOutGain | None = None
     blocks: int = 0
     separating: dict[int, str] = field(default_factory=dict)
     interrupted: bool = False
@@ -71,12 +71,12 @@ class Results:
     @property
     def names(self) -> list[str]:
         """Labels of the chosen effects."""
-        offered = self.screen.question.candidates
+        offered = self.screen.design.candidates
         return labels(self.chosen.candidates, offered) if self.chosen else []
 
     @property
     def label(self) -> str:
-        """Of what the share that is closed is about."""
+        """What the share that is closed is about."""
         return " + ".join(self.names) if self.chosen else CURVES
 
     @property
@@ -86,7 +86,7 @@ class Results:
 
     @property
     def screened(self) -> bool:
-        """Whether the screen was asked at the model's fit as it is known now."""
+        """Whether the screen was run at the model's fit as it is known now."""
         return not (self.attribution and self.attribution.rebased)
 
     @property
@@ -96,11 +96,11 @@ class Results:
 
     def classes(self) -> tuple[list[int], Classes]:
         """The leading shapes of all groups, best first, and their classes."""
-        order = heads(self.screen, self.refits)
-        return order, told(self.screen, self.refits, order)
+        order = group_leaders(self.screen, self.refits)
+        return order, equivalence_classes(self.screen, self.refits, order)
 
 
-def answer(r: Results, seconds: float) -> GapReport:
+def build_report(r: Results, seconds: float) -> GapReport:
     """The report of what is done; a table that an error ends is empty, and said to be left out."""
     screen, notes = r.screen, list(r.notes)
 
@@ -112,28 +112,15 @@ def answer(r: Results, seconds: float) -> GapReport:
     where = table("where", lambda: tables.where_table(screen, r.alpha)[0])
     checks = table("detection", lambda: _detection(screen))
     order, found = table("classes", r.classes, ([], None))
-    verdict, missing = _verdict(r, where)
+    verdict, missing = _revised(r, *_verdict(r, where), where, checks)
     share, runs = tabulate("closed"), None
     if r.attribution:
         notes += r.attribution.notes
         notes += filter(None, [_bound(r)])
-    if r.far is not None:
-        notes += r.far.notes
-        runs = (r.far.before, r.far.after)
-        if r.far.rows:
-            share = tabulate("closed", r.far.rows)
-            # Few held-out rows leave the share open where the test of the effect does not; what
-            # gains nothing on them was chance, and what curves gain beyond it is as open.
-            open_, gained = not np.isfinite(share["F"].iloc[0]), share["nats_per_sample"].iloc[0]
-            if not r.blocks and open_:
-                if gained <= 0.0 or (verdict == UNLIKE and r.chosen is None):
-                    verdict, missing = NOTHING, None
-                elif verdict == UNLIKE:
-                    verdict, missing = _effect(r, where)
-    if verdict == NOTHING and not r.screened:  # they tell of a fit that was not the best one
-        where["p"], checks["p"] = np.nan, np.nan
-    elif verdict == NOTHING and _stands_out(r.alpha, where, checks):
-        verdict, missing = UNLIKE, _curve_of(r, where)
+    if r.held_out is not None:
+        notes += r.held_out.notes
+        runs = (r.held_out.before, r.held_out.after)
+        share = tabulate("closed", r.held_out.rows)
     augmented, text = None, ""
     estimates: dict[str, Any] = {"before": _estimates(r.base, r.fit)}
     if r.chosen is not None and verdict == "effect":
@@ -154,9 +141,11 @@ def answer(r: Results, seconds: float) -> GapReport:
             screen, found, order, r.separating))  # fmt: skip
         if len(causes) and (text or r.unfitted is not None):
             leading = table("leading", lambda: _leading(r, order), leading)
-    started = next((x.fitter.start for x in [*r.refits, r.chosen] if x and x.fitter.start), None)
-    if started:
-        notes.append(f"only linear Gaussian models can start flat: others start with {started}")
+    initial_law = next(
+        (x.fitter.initial_law for x in [*r.refits, r.chosen] if x and x.fitter.initial_law), None
+    )
+    if initial_law:
+        notes.append(f"only linear Gaussian models can start flat: others start with {initial_law}")
     return GapReport(
         verdict=verdict, where=where, causes=causes, classes=classes, closed=share,
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
@@ -164,7 +153,7 @@ def answer(r: Results, seconds: float) -> GapReport:
         model=augmented, model_text=text, chosen=r.names if text else [], estimates=estimates,
         leading=leading, parts=_parts(r), notes=notes,
         settings={**r.settings, "candidates": len(set(screen.groups.tolist())),
-                  "shapes": len(screen.question.candidates),
+                  "shapes": len(screen.design.candidates),
                   "samples": sum(e.steps for e in r.experiments), "simulated sets": screen.sets,
                   "experiment": _longest(r.experiments) + 1 if len(r.experiments) > 1 else ""},
         seconds=seconds, mode=r.mode, interrupted=r.interrupted, failures=r.failures,
@@ -177,11 +166,11 @@ def _stands_out(alpha: float, *found: Any) -> bool:
 
 
 def _bound(r: Results) -> str:
-    """Of the parameters of the chosen model that ran to a bound of their support."""
+    """A note on parameters of the chosen model that ran to a bound of their support."""
     if r.chosen is None:
         return ""
     names = " and ".join(r.names)
-    return note(r.chosen.fit.bounds, r.chosen.fit.values(), f"the fit with {names}")
+    return bounds_note(r.chosen.fit.bounds, r.chosen.fit.values(), f"the fit with {names}")
 
 
 def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> list[str]:
@@ -196,14 +185,14 @@ def labels(candidates: Sequence[Candidate], offered: Sequence[Candidate]) -> lis
 def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
     """The chosen effects: their rows in `causes`, and what the model with all of them says; or the
     one that stands out and could not be refitted."""
-    chosen, offered = r.chosen, r.screen.question.candidates
+    chosen, offered = r.chosen, r.screen.design.candidates
     groups = [offered[k].group for k in order]
     if r.unfitted is not None:
         return [{"row": groups.index(offered[r.unfitted].group), "unfitted": True}]
     if chosen is None:
         return []
     return [
-        {"row": groups.index(c.group), **tables.estimated(r.screen, chosen, c)}
+        {"row": groups.index(c.group), **tables.estimated_strength(r.screen, chosen, c)}
         for c in chosen.candidates
         if c.group in groups
     ]
@@ -212,25 +201,42 @@ def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
 def _verdict(r: Results, where: Any) -> tuple[str, Any]:
     """The verdict but for whether a gap can be measured at all, and the missing curve."""
     least = float(np.min(r.screen.family.p, initial=1.0))
-    asked = r.attribution is not None and r.mode == "full" and r.unfitted is None
-    if r.far is not None and _curves_beat(r.far, r.chosen is not None):
+    refitted = r.attribution is not None and r.mode == "full" and r.unfitted is None
+    if r.held_out is not None and _curves_beat(r.held_out, r.chosen is not None):
         best = r.chosen or (r.refits[0] if r.refits else None)
         tried = list(best.candidates) if best else []
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= r.alpha and key is not None:
             return UNLIKE, _curve(r, key, tried)
-    if r.chosen is not None or (least <= r.alpha and not asked):
+    if r.chosen is not None or (least <= r.alpha and not refitted):
         return _effect(r, where)
-    if not asked:  # nothing is held out: what all of the catalogue leaves
-        tried = tables.catalogue(r.screen)
+    if not refitted:  # nothing is held out: what all of the catalogue leaves
+        tried = tables.testable_candidates(r.screen)
         residual, key = tables.residual_group(r.screen, tried)
         if residual <= LEFT * r.alpha and key is not None:
             return UNLIKE, _curve(r, key, tried)
     return NOTHING, None
 
 
+def _revised(r: Results, verdict: str, missing: Any, where: Any, checks: Any) -> tuple[str, Any]:
+    """The verdict in the light of the gain on held-out rows and of what else stands out."""
+    rows = r.held_out.rows if r.held_out else []
+    # Few held-out rows leave the share open where the test of the effect does not; what gains
+    # nothing on them was chance, and what curves gain beyond it is as open.
+    if rows and not r.blocks and not np.isfinite(rows[0]["F"]):
+        if rows[0]["nats_per_sample"] <= 0.0 or (verdict == UNLIKE and r.chosen is None):
+            verdict, missing = NOTHING, None
+        elif verdict == UNLIKE:
+            verdict, missing = _effect(r, where)
+    if verdict == NOTHING and not r.screened:  # they are of a fit that was not the best one
+        where["p"], checks["p"] = np.nan, np.nan
+    elif verdict == NOTHING and _stands_out(r.alpha, where, checks):
+        verdict, missing = UNLIKE, _curve_of(r, where)
+    return verdict, missing
+
+
 def _effect(r: Results, where: Any) -> tuple[str, Any]:
-    """That verdict, with the curve of the equation where most is missing."""
+    """The verdict "effect", with the curve of the equation where most is missing."""
     return "effect", _curve_of(r, where)
 
 
@@ -242,10 +248,13 @@ def _curve_of(r: Results, where: Any) -> Any:
     return None
 
 
-def _curves_beat(far: HowFar, chosen: bool) -> bool:
+def _curves_beat(far: HeldOutGain, chosen: bool) -> bool:
     """Whether smooth curves predict the held-out rows better than the best of the catalogue: more
     than chance explains, and, where effects were chosen, by more than a trifle of the gap."""
-    if far.beyond is None or not far.beyond.nats > CLEARLY * far.beyond.error:
+    if (
+        far.beyond_catalogue is None
+        or not far.beyond_catalogue.nats > CLEARLY * far.beyond_catalogue.error
+    ):
         return False
     share = float(far.rows[0]["F"]) if chosen and far.rows else np.nan
     return not share > 1.0 - MATTERS
@@ -259,12 +268,12 @@ def _curve(r: Results, key: tuple[str, str], others: Sequence[Candidate]) -> Any
 
 
 def _detection(screen: Screen) -> Any:
-    names = screen.question.detection_names(screen.experiments)
+    names = screen.design.detection_names(screen.experiments)
     found = detection(
         Statistics(names.names, screen.observed.detection, names.quadratic),
-        screen.stacked("detection"), screen.observed.nuisance, screen.stacked("nuisance"),
+        screen.simulated.detection, screen.observed.nuisance, screen.simulated.nuisance,
     )  # fmt: skip
-    found["p"] = tables.shared(found["p"])
+    found["p"] = tables.bonferroni(found["p"])
     return found
 
 
@@ -272,8 +281,8 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
     names = " and ".join(r.names)
     try:
         added = augment(r.trace, list(chosen.candidates))
-        if chosen.fitter.start:
-            added = chosen.fitter.start.given(added)
+        if chosen.fitter.initial_law:
+            added = chosen.fitter.initial_law.applied_to(added)
         values = {n: v for n, v in chosen.fit.values().items() if n.split("[")[0] in
                   added.parameters}  # fmt: skip
         text = model_text(
@@ -284,7 +293,7 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
     except SSMError as error:
         notes.append(f"the augmented model is not written: {error.found}")
     except Exception as error:
-        r.failures.met("the augmented model", error)
+        r.failures.record("the augmented model", error)
     return None, ""
 
 
@@ -297,19 +306,19 @@ def _not_applicable(screen: Screen) -> Any:
     return tabulate("not_applicable", [
         {"part": f"{r.effect}{f' ({r.form})' if r.form else ''}", "equation": r.equation,
          "reason": r.reason}
-        for r in screen.question.refused
+        for r in screen.design.refused
     ])  # fmt: skip
 
 
 def _parts(r: Results) -> dict[str, Any]:
     """What the rows were used for; those of the longest experiment stand for all."""
     i = _longest(r.experiments)
-    e, measured = r.experiments[i], r.far is not None and bool(r.far.rows)
+    e, measured = r.experiments[i], r.held_out is not None and bool(r.held_out.rows)
     blocks = {"cross-fitting": r.blocks} if r.blocks and measured else {}
     if r.parts is None:
         return blocks or {"screen": _span(e, 0, None)}
     out: dict[str, Any] = {"screen": _span(e, 0, r.parts.second[i]), **blocks}
-    rows = np.flatnonzero(r.parts.confirm[i])
+    rows = np.flatnonzero(r.parts.held_out[i])
     if measured and not blocks and len(rows):
         out["confirm"] = _span(e, int(rows[0]), int(rows[-1]) + 1)
     if r.attribution and r.attribution.left_out:

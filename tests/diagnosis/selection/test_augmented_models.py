@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.augmented_models import Workshop
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.inference.run.problem import missing_of, pose
 from tests.diagnosis import models
 from tests.diagnosis.harness import scales
@@ -19,7 +19,7 @@ def test_threads_that_ask_at_once_get_one_model():
         model, models.THETA["oscillator"], steps=ROWS, inputs=inputs, seed=1
     )
     problem = pose(model, inputs | {"y": drawn["y"].values[0]})
-    workshop = Workshop(problem.trace, missing_of(problem.experiments), {}, Settings())
+    augmented = AugmentedModels(problem.trace, missing_of(problem.experiments), {}, Settings())
     offered, _ = offers(
         problem.trace, scales(problem.trace, ROWS), ["periodic forcing", "constant load"]
     )
@@ -28,7 +28,7 @@ def test_threads_that_ask_at_once_get_one_model():
 
     def ask(k):
         together.wait(60)
-        return {c: workshop.fitter(c) for c in wanted[k:] + wanted[:k]}
+        return {c: augmented.fitter(c) for c in wanted[k:] + wanted[:k]}
 
     with ThreadPoolExecutor(THREADS) as threads:
         found = list(threads.map(ask, range(THREADS)))

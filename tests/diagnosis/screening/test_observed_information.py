@@ -7,7 +7,7 @@ import pytest
 
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
 from ssmppl.diagnosis.screening.familywise import tail_p
-from ssmppl.diagnosis.screening.statistics import FREE, excess, typical
+from ssmppl.diagnosis.screening.statistics import FREE, information_scale, typical_squares
 from tests.statistics.checks import seed_of
 
 ROWS = 200
@@ -23,16 +23,16 @@ def seldom(rng, sets):
 
 def test_division():
     usual = np.array([2.0, 2.0, 2.0, np.nan])
-    by = excess(np.array([1.0, 4.0 * FREE, 36.0 * FREE, 5.0]), usual)
+    by = information_scale(np.array([1.0, 4.0 * FREE, 36.0 * FREE, 5.0]), usual)
     np.testing.assert_allclose(by, [1.0, np.sqrt(2.0), np.sqrt(18.0), 1.0])
-    assert np.all(excess(np.zeros(4), usual) == 1.0)
+    assert np.all(information_scale(np.zeros(4), usual) == 1.0)
 
 
 def test_typical_is_of_one_set():
     squares = np.array(
         [[1.0, np.nan, 0.0, 0.0], [2.0, np.nan, 0.0, 7.0], [900.0, np.nan, 0.0, 0.0]]
     )
-    np.testing.assert_array_equal(typical(squares), [2.0, np.nan, np.nan, 7.0])
+    np.testing.assert_array_equal(typical_squares(squares), [2.0, np.nan, np.nan, 7.0])
 
 
 def test_a_statistic_that_seldom_knows_anything_does_not_lie_far_out():
@@ -43,7 +43,7 @@ def test_a_statistic_that_seldom_knows_anything_does_not_lie_far_out():
     for _ in range(20):
         rows = seldom(rng, 200)
         s, squares = rows.sum(axis=1), np.sum(rows**2, axis=1)
-        by = excess(squares[:, None], typical(squares[:, None]))[:, 0]
+        by = information_scale(squares[:, None], typical_squares(squares[:, None]))[:, 0]
         for values, out in ((s, raw), (s / by, scaled)):
             law = Null.of(values[:, None], np.zeros((200, 0)))
             found = efficient(law, np.zeros(1), np.zeros(0))
@@ -61,13 +61,15 @@ def test_level_and_power(strength):
     for _ in range(300):
         rows = seldom(rng, 200)
         squares = np.sum(rows**2, axis=1, keepdims=True)
-        usual = typical(squares)
+        usual = typical_squares(squares)
         own = seldom(rng, 1)[0] if strength == 0.0 else None
         if own is None:  # a set in which the state was up there, and the effect acted
             active = np.maximum(1.5 + rng.standard_normal(ROWS) - 1.0, 0.0)
             own = active * (rng.standard_normal(ROWS) + strength * active)
-        law = Null.of(rows.sum(axis=1, keepdims=True) / excess(squares, usual), np.zeros((200, 0)))
-        by = excess(np.array([np.sum(own**2)]), usual)
+        law = Null.of(
+            rows.sum(axis=1, keepdims=True) / information_scale(squares, usual), np.zeros((200, 0))
+        )
+        by = information_scale(np.array([np.sum(own**2)]), usual)
         seen = efficient(law, np.array([own.sum()]) / by, np.zeros(0))
         found.append(tail_p(abs(seen.statistic[0]), np.abs(seen.null[:, 0])))
     share = np.mean(np.array(found) <= 0.05)
