@@ -1,9 +1,8 @@
 """Updates in words: what is drawn, from which law, with which statistics.
 
-Updates of vectors and matrices in words: sums of outer products, not their many entries.
-
-What is said is read off the laws (Normal or MvNormal, mean affine in the block) that the block
-enters. Where they are of another kind, the functions are told one by one (`describe.py`).
+A block of few numbers is told function by function. One of vectors or matrices is told by sums of
+outer products, read off the laws (Normal or MvNormal, mean affine in the block) that it enters; by
+its functions where these laws are of another kind.
 """
 
 from __future__ import annotations
@@ -14,17 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmppl.analysis.conjugacy.families import (
-    Beta,
-    Dirichlet,
-    Family,
-    Gamma,
-    MatrixNormalWishart,
-    Normal,
-    NormalGamma,
-    Wishart,
-)
-from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, Factor
+from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, Factor, shorten
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import Separation, affine, separate, split_constant
 from ssmppl.expressions.arrays import ExprArray, array
@@ -40,8 +29,10 @@ from ssmppl.expressions.expr import (
 from ssmppl.language import distributions as laws
 from ssmppl.language.model.traced import Site, Trace
 
-MAX_LENGTH = 100
 MAX_STATISTICS = 12
+MAX_NAMES = 6  # of a block
+MATRIX_LENGTH = 80  # of the text of a matrix or a vector
+ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
 
 
 @dataclass(frozen=True)
@@ -160,9 +151,6 @@ def _is_number(e: Expr, value: float) -> bool:
     return e.op == "const" and e.data == value
 
 
-_ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
-
-
 def tidy(coefficient: Expr) -> tuple[float, str]:
     """A coefficient as number times text, a polynomial in its lowest terms.
 
@@ -174,7 +162,7 @@ def tidy(coefficient: Expr) -> tuple[float, str]:
     opaque = {
         n: symbol("parameter", to_text(n))
         for n in topological([coefficient])
-        if n.op not in _ARITHMETIC and not _whole_power(n)
+        if n.op not in ARITHMETIC and not _whole_power(n)
     }
     (plain,) = substitute([coefficient], opaque)
     form = separate(plain, symbols_of(plain))
@@ -222,88 +210,31 @@ def _atoms(form: Separation) -> list[tuple[Expr, float]]:
     return [pair for m in form.terms for pair in m]
 
 
-def shorten(text: str, length: int = MAX_LENGTH) -> str:
-    return text if len(text) <= length else text[: length - 4] + " ..."
-
-
 # -- the law
-def conditional(family: Family, form: BlockForm, name: str) -> str:
-    """The law of the block given all else, its parameters in terms of the statistics."""
-    names = [to_text(c) for c in form.components]
+@dataclass(frozen=True)
+class Wording:
+    """What a family writes its law with. name : of the block as a whole."""
 
-    def stat(i: int, factor: float = 1.0, plus: float = 0.0) -> str:
-        return _linear(form, i, factor, plus)
+    form: BlockForm
+    name: str
 
-    def c(i: int) -> str:
-        return f"C[{to_text(form.functions[i])}]" if i >= 0 else "0"
+    @property
+    def names(self) -> list[str]:
+        """Of the components."""
+        return [to_text(c) for c in self.form.components]
 
-    if isinstance(family, Gamma):
-        shape = stat(family.log, 1.0 / family.power, 1.0 / family.power)
-        return f"{_variate(names[0], family.power)}, shape = {shape}, rate = -{c(family.pow)}"
-    if isinstance(family, Beta):
-        a, b = stat(family.first, 1.0, 1.0), stat(family.second, 1.0, 1.0)
-        return f"{names[0]} ~ Beta({a}, {b})"
-    if isinstance(family, Dirichlet):
-        inside = ", ".join(stat(i, 1.0, 1.0) for i in family.logs)
-        return f"{joined(form.components)} ~ Dirichlet({shorten(inside)})"
-    if isinstance(family, Wishart):
-        p = family.size
-        sign, plus = (-2.0, -p - 1.0) if family.inverse else (2.0, p + 1.0)
-        matrix = "scale S" if family.inverse else "inverse scale S"
-        law = "inverse Wishart" if family.inverse else "Wishart"
-        return f"{name} ~ {law}(df = {stat(family.log, sign, plus)}, {matrix})"
-    if isinstance(family, NormalGamma):
-        *thetas, v = names
-        n = len(thetas)
-        shape = stat(family.log, 1.0 / family.power, 1.0 / family.power - 0.5 * n)
-        scale = v if family.power == 1.0 else f"{v}**{family.power:g}"
-        normal = family.normal
-        if n == 1:
-            precision = stat(normal.quadratic[0][0], -2.0)
-            h = c(normal.linear[0])
-            rate = (
-                f"-{c(family.pow)} - {h}**2 / (2*H)"
-                if normal.linear[0] >= 0
-                else f"-{c(family.pow)}"
-            )
-            return (
-                f"{_variate(v, family.power)}, shape = {shape}, rate = {rate}; {thetas[0]} | {v} ~ "
-                f"Normal({h} / H, precision = {scale}*H), H = {precision}"
-            )
-        block = f"({', '.join(thetas)})"
-        return (
-            f"{_variate(v, family.power)}, shape = {shape}, "
-            f"rate = -{c(family.pow)} - h' H^-1 h / 2; "
-            f"{block} | {v} ~ Normal(H^-1 h, precision = {scale}*H), h and H from the linear and "
-            "quadratic statistics"
-        )
-    if isinstance(family, MatrixNormalWishart):
-        return _matrix_normal(family, form)
-    if len(names) == 1:
-        h = c(family.linear[0])
-        return (
-            f"{names[0]} ~ Normal({h} / H, precision = H), H = {stat(family.quadratic[0][0], -2.0)}"
-        )
-    return f"{name} ~ Normal(H^-1 h, precision = H), {len(names)} numbers"
+    @property
+    def block(self) -> str:
+        """The components' names together."""
+        return joined(self.form.components)
 
+    def linear(self, i: int, factor: float = 1.0, plus: float = 0.0) -> str:
+        """plus + factor * C_i as the sums that it is made of."""
+        return _linear(self.form, i, factor, plus)
 
-def _matrix_normal(family: MatrixNormalWishart, form: BlockForm) -> str:
-    wishart, name = family.wishart, form.components[-1].data[1]
-    sign, plus = (-2.0, -1.0) if wishart.inverse else (2.0, 1.0)
-    df = _linear(form, wishart.log, sign, plus * (wishart.size + 1.0) - len(family.rows[0]))
-    law, scale = ("inverse Wishart", "scale S") if wishart.inverse else ("Wishart", "scale S^-1")
-    rows = name if wishart.inverse else f"{name}^-1"
-    return (
-        f"{name} ~ {law}(df = {df}, {scale}), S = S_yy - S_yz K^-1 S_yz'; A | {name} ~ Normal("
-        f"mean = S_yz K^-1, covariance = {rows} (x) K^-1)"
-    )
-
-
-def _variate(name: str, power: float) -> str:
-    base = name if abs(power) == 1.0 else f"{name}**{abs(power):g}"
-    if power > 0.0:
-        return f"{base} ~ Gamma"
-    return f"{base} ~ inverse Gamma"
+    def statistic(self, i: int) -> str:
+        """C_i by its function."""
+        return f"C[{to_text(self.form.functions[i])}]" if i >= 0 else "0"
 
 
 def _linear(form: BlockForm, i: int, factor: float, plus: float) -> str:
@@ -378,27 +309,6 @@ def correction_text(form: BlockForm, positions: Sequence[int]) -> str:
     return " * ".join(rest) or "1"
 
 
-FEW = 3  # numbers whose functions are told one by one
-LENGTH = 80
-
-
-def shown_as_matrices(family: Family) -> bool:
-    """Whether the functions of a block are too many to be told one by one."""
-    if isinstance(family, Normal):
-        return len(family.linear) > FEW
-    return isinstance(family, (Wishart, MatrixNormalWishart))
-
-
-def matrix_statistics(family: Family, form: BlockForm, trace: Trace) -> tuple[str, ...] | None:
-    """One line for each matrix that the law is made of; None where that cannot be told."""
-    teller = _Teller(form, trace)
-    if isinstance(family, Normal):
-        return teller.normal()
-    if isinstance(family, MatrixNormalWishart):
-        return teller.matrix_normal(family)
-    return teller.wishart() if isinstance(family, Wishart) else None
-
-
 def named(components: Sequence[Expr], trace: Trace) -> str:
     """The components' names, a parameter that is there as a whole by its own."""
     names: list[str] = []
@@ -406,13 +316,13 @@ def named(components: Sequence[Expr], trace: Trace) -> str:
         mine = [c for c in components if c.data[1] == name]
         whole = len(mine) == len(trace.parameters[name].components)
         names += [name] if whole else [to_text(c) for c in mine]
-    if len(names) > 6:
+    if len(names) > MAX_NAMES:
         names = [*names[:3], "...", names[-1]]
     return names[0] if len(names) == 1 else f"({', '.join(names)})"
 
 
-class _Teller:
-    """The laws that hold a block, in the order of their roles, and how to speak of them."""
+class MatrixWording:
+    """The statistics of a block as sums of outer products; None where they cannot be told so."""
 
     def __init__(self, form: BlockForm, trace: Trace):
         self.form, self.block = form, form.components
@@ -459,13 +369,13 @@ class _Teller:
                 notes.append(f"z = ({self._list(z)}) in the mean of {site.name}")
         return (f"H: {' + '.join(h)}", f"h: {' + '.join(linear)}", *notes)
 
-    def matrix_normal(self, family: MatrixNormalWishart) -> tuple[str, ...] | None:
-        """S_yy, S_yz and K."""
+    def matrix_normal(self, thetas: int, row: Sequence[int]) -> tuple[str, ...] | None:
+        """S_yy, S_yz and K, of a matrix A; thetas : how many entries it has, row : its first."""
         first = ["prior"] if self._told_by_prior() else []
         yy, yz, zz, notes = [*first], [*first], [*first], []
-        thetas = self.block[: family.thetas]
+        block = self.block[:thetas]
         for factor, site in self.others:
-            found, scale = self._regression(site, thetas), self._scale(site)
+            found, scale = self._regression(site, block), self._scale(site)
             z = None if found is None else _kronecker(found[0])
             if found is None or z is None or scale is None:
                 return None
@@ -474,7 +384,7 @@ class _Teller:
             yz.append(_summed(factor, f"{scale}{rest} z'"))
             zz.append(_summed(factor, f"{scale}z z'"))
             notes.append(f"z = ({self._list(z)}) in the mean of {site.name}")
-        columns = dict.fromkeys(thetas[i].data[1] for i in family.rows[0])
+        columns = dict.fromkeys(block[i].data[1] for i in row)
         if len(columns) > 1:
             notes.append(f"A = [{' '.join(columns)}]")
         return (
@@ -580,8 +490,10 @@ class _Teller:
     def _vector(self, v: Sequence[Expr]) -> str:
         if all(e.op == "const" and e.data == 0.0 for e in v):
             return "0"
-        text = self._collapsed(v) if len(v) > 1 else to_text(v[0])
-        return text if text is not None else _short(f"({', '.join(map(to_text, v))})")
+        if len(v) == 1:
+            return to_text(v[0])
+        entries = f"({', '.join(map(to_text, v))})"
+        return self._collapsed(v) or shorten(entries, MATRIX_LENGTH)
 
     def _collapsed(self, v: Sequence[Expr]) -> str | None:
         """0.5*x of (0.5*x[0], 0.5*x[1]), where x has these elements and no others."""
@@ -603,12 +515,12 @@ def matrix_text(m: ExprArray) -> str:
     if first.op == "item":
         text = to_text(first.args[0])
         same = all(e.op == "item" and e.args[0] is first.args[0] for e in entries)
-        return text if same and len(text) < LENGTH else "C"
+        return text if same and len(text) < MATRIX_LENGTH else "C"
     names = {e.data[1] for e in entries if e.op == "symbol"}
     if len(names) == 1 and all(e.op == "symbol" for e in entries):
         return names.pop()
     rows = [f"[{', '.join(map(to_text, row))}]" for row in m]
-    return _short(f"[{', '.join(rows)}]")
+    return shorten(f"[{', '.join(rows)}]", MATRIX_LENGTH)
 
 
 def _multiple(m: ExprArray, block: Sequence[Expr]) -> Expr | None:
@@ -656,7 +568,3 @@ def _summed(factor: Factor, text: str) -> str:
 
 def _tight(text: str) -> str:
     return text if re.fullmatch(r"[\w.]+(\[[\d, ]+\])?|\(.*\)", text) else f"({text})"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= LENGTH else text[: LENGTH - 4] + " ..."

@@ -32,7 +32,6 @@ from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.elimination.eliminable import Eliminable
 from ssmppl.analysis.elimination.moments import ZERO
-from ssmppl.analysis.elimination.normalisers import draw_of, log_parts
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
 from ssmppl.analysis.structure import deterministic
 from ssmppl.errors import Location, NotApplicable
@@ -172,7 +171,7 @@ class _Build:
         total = ZERO
         for update, c in self._blocks(self._all(which, carried)):
             assert update.conditional is not None
-            for part in filter(_of_states, log_parts(update.conditional, c)):
+            for part in filter(_of_states, update.conditional.log_normaliser(c)):
                 total = total + part
         return total
 
@@ -190,12 +189,11 @@ class _Build:
         source, drawn = Draws("eliminated"), dict[Expr, Expr]()
         for update, c in self._blocks(self._all("before", earlier)):
             assert update.conditional is not None
-            drawn.update(
-                zip(update.components, draw_of(update.conditional, c, source), strict=True)
-            )
+            own = update.conditional.written_draw(c, source)
+            drawn.update(zip(update.components, own, strict=True))
         x = dict(zip(draws, substitute(list(draws.values()), drawn), strict=True))
-        own = zip((self.sums[k] for k in self.carried), substitute(sums, x), strict=True)
-        return {**x, **dict(own)}
+        carried = (self.sums[k] for k in self.carried)
+        return {**x, **dict(zip(carried, substitute(sums, x), strict=True))}
 
     # -- what is free of the block
     def _rest(self, role: str) -> tuple[Term, ...] | NotApplicable:

@@ -52,7 +52,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.proposals.noises import Noises, noises
-from ssmppl.analysis.slices import comparable
 from ssmppl.codegen.modules.interweaving import compile_noises
 from ssmppl.codegen.modules.twisted import TwistedFilter, backward_passes
 from ssmppl.codegen.native.loading import Loaded
@@ -67,6 +66,7 @@ from ssmppl.inference.preparation.exact_models import ExactModel
 from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.updates.slices import comparable
 from ssmppl.language.model.transforms import constant_bounds, free_number, transforms, unconstrain
 
 Paths = list[np.ndarray]

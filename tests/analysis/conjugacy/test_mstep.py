@@ -5,20 +5,14 @@ import pytest
 from scipy.optimize import minimize
 
 from ssmppl.analysis.conjugacy.check import random_series
-from ssmppl.analysis.conjugacy.families import (
-    Beta,
-    Dirichlet,
-    Gamma,
-    Normal,
-    NormalGamma,
-    Wishart,
-    symmetric,
-)
-from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step, mode
+from ssmppl.analysis.conjugacy.families import Beta, Dirichlet, Gamma, Normal, NormalGamma
+from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step
+from ssmppl.analysis.conjugacy.matrix_families import Wishart, symmetric
 from ssmppl.analysis.conjugacy.sufficient import complete_data
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
+from ssmppl.inference.updates.q_function import QFunction
 from ssmppl.language.distributions import Gamma as GammaLaw
 from ssmppl.language.distributions import Normal as NormalLaw
 from ssmppl.language.distributions import Uniform
@@ -92,14 +86,14 @@ def test_no_search_finds_a_larger_density(name, posterior):
     written = Written(model, posterior, seed_of("m-step", name, posterior))
     step = derive_m_step(written.trace, posterior=posterior)
     assert step, step
-    s = written.statistics(step)
-    theta = step.maximise(s, written.theta)
+    s, q = written.statistics(step), QFunction(step)
+    theta = q.maximise(s, written.theta)
     reached, began = written.log_density(theta), written.log_density(written.theta)
-    gain = step.value(s, theta) - step.value(s, written.theta)
+    gain = q.value(s, theta) - q.value(s, written.theta)
     assert gain == pytest.approx(reached - began, abs=1e-8 * (1 + abs(reached)))
     for start in (written.theta, theta):
         assert reached >= written.searched(start) - 1e-6 * (1 + abs(reached)), (name, start)
-    again = step.maximise(s, theta)
+    again = q.maximise(s, theta)
     np.testing.assert_allclose(again, theta, rtol=1e-6)
 
 
@@ -185,7 +179,7 @@ def test_mode_of_a_family(name):
     start = np.full(n, 1.0 / n) if simplex else np.array([*([0.6] * n)])
     if isinstance(family, Wishart):
         start = np.array([1.0, 0.0, 1.0])
-    found = mode(family, [*c, 0.0], limits, start)
+    found = family.mode([*c, 0.0], limits, start)
     best = _span(family, c, found)
     low, high = np.array(limits).T
     assert np.all((found > low) & (found < high))
@@ -217,13 +211,13 @@ def test_mode_of_a_family(name):
 )
 def test_no_mode_where_the_sum_has_no_maximum(family, c):
     n = 3 if isinstance(family, Wishart) else 1
-    assert mode(family, [*c, 0.0], [WHOLE] * n, np.ones(n)) is None
+    assert family.mode([*c, 0.0], [WHOLE] * n, np.ones(n)) is None
 
 
 def test_flat_directions_keep_the_present_value():
     """x = a + b on one regressor only: a - b is not told by the data."""
     c = [-0.5, -1.0, -0.5, 2.0, 2.0]
-    found = mode(PAIR, [*c, 0.0], [WHOLE, WHOLE], np.array([3.0, 0.0]))
+    found = PAIR.mode([*c, 0.0], [WHOLE, WHOLE], np.array([3.0, 0.0]))
     np.testing.assert_allclose(found, [2.5, -0.5])
 
 
@@ -231,7 +225,7 @@ def test_fixed_parameters_stay_and_the_others_are_told_by_them():
     model, _, _ = build("varves")
     written = Written(model, False, seed_of("fixed"))
     step = derive_m_step(written.trace, fixed=["phi"])
-    theta = step.maximise(written.statistics(step), written.theta)
+    theta = QFunction(step).maximise(written.statistics(step), written.theta)
     assert theta[0] == written.theta[0]
     assert theta[1] != written.theta[1]
     assert step.groups[0].closed
@@ -266,7 +260,7 @@ def test_bounds_of_another_parameter_bind():
     y = next(s for s in written.rows["observation"] if s.data[:2] == ("observation", "y"))
     written.rows["observation"][y] = written.rows["observation"][y] + 4.0
     step = derive_m_step(written.trace)
-    theta = step.maximise(written.statistics(step), written.theta)
+    theta = QFunction(step).maximise(written.statistics(step), written.theta)
     assert theta[index["b"]] < theta[index["a"]]
     reached = written.log_density(theta)
     assert reached > written.log_density(written.theta)

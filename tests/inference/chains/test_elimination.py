@@ -12,9 +12,9 @@ from scipy import integrate, stats
 
 import ssmppl as ssm
 from ssmppl.analysis.conjugacy.families import Beta, Dirichlet, Gamma, Normal, NormalGamma
+from ssmppl.analysis.conjugacy.family import sum_of
 from ssmppl.analysis.elimination.eliminable import eliminable
 from ssmppl.analysis.elimination.elimination import eliminate
-from ssmppl.analysis.elimination.normalisers import draw_of, log_normaliser
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
@@ -63,7 +63,7 @@ def log_kernel(family, c, v):
 
 
 def constant_of(family, c):
-    return float(evaluate(log_normaliser(family, [*map(constant, c), constant(0.0)]), {}))
+    return float(evaluate(sum_of(family.log_normaliser([*map(constant, c), constant(0.0)])), {}))
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -93,7 +93,7 @@ def test_draws_have_the_law_that_the_gibbs_updates_draw_from(name):
     """Of the written-out draw and of `families.py`: means and variances of each component."""
     family, c, _ = {**FAMILIES, "dirichlet": (Dirichlet((0, 1, 2)), [0.4, 2.0, 1.1], 0)}[name]
     n, rng = 20_000, np.random.default_rng(4)
-    drawn = draw_of(family, [*map(constant, c), constant(0.0)], Draws("test"))
+    drawn = family.written_draw([*map(constant, c), constant(0.0)], Draws("test"))
     nodes = [e for e in topological(drawn) if e.op == "random"]
     values = {}
     for e in nodes:

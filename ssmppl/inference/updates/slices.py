@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.families import lower_half, symmetric
+from ssmppl.analysis.conjugacy.matrix_families import lower_half, symmetric
 
 Density = Callable[[Sequence[float]], float]
 _DOUBLINGS = 60
