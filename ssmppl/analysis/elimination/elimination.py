@@ -33,7 +33,7 @@ from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.elimination.eliminable import Eliminable
 from ssmppl.analysis.elimination.moments import ZERO
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
-from ssmppl.analysis.structure import deterministic
+from ssmppl.analysis.structure import component_means, deterministic, unused_name
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import ONE, Separation, separate
 from ssmppl.expressions.arrays import array
@@ -95,21 +95,15 @@ class _Build:
             k for k in range(found.functions) if any(_of_states(self.c[r][k]) for r in roles)
         )
         taken = {s.data[1] for s in trace.state_symbols} | set(trace.inputs)
-        name = _free("statistics", taken)
+        name = unused_name("statistics", taken)
         self.sums = {k: symbol("state", name, (i,)) for i, k in enumerate(self.carried)}
         self.column = {
             which: [
-                symbol("guide", _free(which, taken), (k,)) for k in range(found.functions)
+                symbol("guide", unused_name(which, taken), (k,)) for k in range(found.functions)
             ]
             for which in COLUMNS
         }  # fmt: skip
-        known = deterministic(list(trace.transition.values()))
-        self.values = {
-            s: e
-            for site in known
-            for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(),
-                            strict=True)
-        }  # fmt: skip
+        self.values = component_means(deterministic(list(trace.transition.values())))
 
     def elimination(self) -> Elimination | NotApplicable:
         connected = self._rest("transition")
@@ -273,12 +267,3 @@ def _or_nothing(log_ratio: Expr) -> Expr:
     """A log weight of statistics; -inf where these are beyond floating point."""
     finite = apply("lt", apply("abs", log_ratio), constant(INFINITY))
     return apply("where", finite, log_ratio, constant(-INFINITY))
-
-
-def _free(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name
-
-
-__all__ = ["COLUMNS", "Elimination", "eliminate"]

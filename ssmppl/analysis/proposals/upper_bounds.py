@@ -1,4 +1,4 @@
-"""How high the transition density of a given x_t can get over all x_{t-1}.
+"""Upper bounds of the transition density of a given x_t over all x_{t-1}.
 
 What rejection sampling of backward indices needs (Douc, Garivier, Moulines and Olsson 2011): for
 each law, the density with those parameters that depend on x_{t-1} at the values that maximise it.
@@ -26,10 +26,7 @@ from ssmppl.language.model.traced import Site, Trace
 
 Estimate = Callable[[Any, ExprArray], Any]
 
-
 TINY = 1e-12  # in place of a rate or probability of zero, where logs would not be finite
-
-
 # law -> parameter -> its maximising value, given the law and the value, the others fixed
 _MAXIMISERS: dict[type, dict[str, Estimate]] = {
     laws.Normal: {"mean_": lambda d, v: v},
@@ -60,7 +57,7 @@ _SPREADS = {
 }  # fmt: skip
 
 
-def transition_height(trace: Trace) -> Expr | NotApplicable:
+def transition_upper_bound(trace: Trace) -> Expr | NotApplicable:
     """An upper bound over x_{t-1} of the log density of the noisy components of x_t.
 
     An expression in x_t, theta, inputs and time; or the reason why there is none.
@@ -77,14 +74,14 @@ def transition_height(trace: Trace) -> Expr | NotApplicable:
         if site.name in skipped:
             continue
         with attributed(trace.locations, site.distribution.location):
-            height = _height(site, trace.state_prev_symbols)
-        if isinstance(height, NotApplicable):
-            return height
-        total = total + height
+            bound = _upper_bound(site, trace.state_prev_symbols)
+        if isinstance(bound, NotApplicable):
+            return bound
+        total = total + bound
     return total
 
 
-def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
+def _upper_bound(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     d, where = site.distribution, site.distribution.location
     free = {n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())}
     if not free:
@@ -105,10 +102,12 @@ def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
         elif (spread := _spread(site, name, prev)) is not None:
             best = spread
         else:
-            reason = f"{_plain(name)} of {site.name} ({kind.__name__}) depends on the state before"
+            reason = (
+                f"{name.rstrip('_')} of {site.name} ({kind.__name__}) depends on the state before"
+            )
             return NotApplicable(reason, where)
         changed[name] = best if d.joint else _replaced(d.parameters[name], best, prev)
-    return _with(d, changed).log_density(site.value, guard=False)
+    return d.rebuilt(changed).log_density(site.value, guard=False)
 
 
 def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
@@ -117,7 +116,7 @@ def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
 
 
 def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApplicable:
-    """The sum of the components' own heights; a weight that depends on the state is at most 1."""
+    """The sum of the components' own bounds; a weight that depends on the state is at most 1."""
     whole, total = d.support(), constant(0.0)
     for law in d.components:
         own = law.support()
@@ -129,15 +128,15 @@ def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApp
                 f"the components of {site.name} (Mixture) have different supports", d.location
             )
     for i in np.ndindex(site.shape):
-        height = None
+        bound = None
         for law, weight in zip(d.components, d.weights, strict=True):
-            part = _height(_element(site, law, i), prev)
+            part = _upper_bound(_element(site, law, i), prev)
             if isinstance(part, NotApplicable):
                 return part
             if not depends_on(weight[i], prev):
                 part = apply("log", weight[i]) + part
-            height = part if height is None else apply("logaddexp", height, part)
-        total = total + height
+            bound = part if bound is None else apply("logaddexp", bound, part)
+        total = total + bound
     return total
 
 
@@ -146,7 +145,7 @@ def _zero_inflated(site: Site, d: laws.ZeroInflated, prev: Sequence[Expr]) -> Ex
     state."""
     total = constant(0.0)
     for i in np.ndindex(site.shape):
-        part = _height(_element(site, d.base, i), prev)
+        part = _upper_bound(_element(site, d.base, i), prev)
         if isinstance(part, NotApplicable):
             return part
         if not depends_on(d.p[i], prev):
@@ -212,12 +211,3 @@ def _replaced(old: ExprArray, best: ExprArray, prev: Sequence[Expr]) -> ExprArra
     for i in np.ndindex(old.shape):
         out[i] = wide[i] if depends_on(old[i], prev) else old[i]
     return array(out)
-
-
-def _with(d: Distribution, changed: dict[str, ExprArray]) -> Distribution:
-    """The same law with other values for some parameters."""
-    return d.rebuilt(changed)
-
-
-def _plain(name: str) -> str:
-    return name.rstrip("_")
