@@ -190,8 +190,8 @@ class NoiseMove:
     @cached_property
     def data_told_by(self) -> bool:
         """Whether a parameter is in the law of an observation."""
-        assert not isinstance(self.found.guide, NotApplicable)
-        return any(s.data[0] == "parameter" for s in symbols_of(self.found.guide.observed))
+        assert not isinstance(self.found.lookahead, NotApplicable)
+        return any(s.data[0] == "parameter" for s in symbols_of(self.found.lookahead.observed))
 
 
 _NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
@@ -406,7 +406,7 @@ def interweaving(
     if setting == "auto" and adapting < LEAST_WARMUP:
         return None, f"none: fewer than {LEAST_WARMUP} sweeps of warmup, too few to tune them"
     near = space.parameters(pilot.z)[0]
-    steered = not isinstance(found.guide, NotApplicable)
+    steered = not isinstance(found.lookahead, NotApplicable)
     moves: list[Any] = []
     if model is not None:
         moves = [Collapsed(setup.problem, model)]
@@ -415,7 +415,7 @@ def interweaving(
         if not moves[0].stands_near():
             reason = "the Gaussian approximation to the states' posterior comes to no number"
             none = NotApplicable(reason)
-            found, steered, moves = replace(found, guide=none), False, []
+            found, steered, moves = replace(found, lookahead=none), False, []
             if not found.parameters:
                 if setting is True:
                     raise _refused(none)
@@ -440,7 +440,7 @@ def describe(found: Noises, model: ExactModel | None) -> str:
     if model is not None:
         return "the states integrated out"
     held = []
-    if not isinstance(found.guide, NotApplicable):
+    if not isinstance(found.lookahead, NotApplicable):
         held.append("the noises of a Gaussian approximation to the states' posterior")
     if found.parameters:
         held.append("the noises of the transition")
@@ -450,13 +450,13 @@ def describe(found: Noises, model: ExactModel | None) -> str:
 
 def with_states(found: Noises) -> str:
     """Who may move with the trajectory, how and why: a line of the plan."""
-    steered = not isinstance(found.guide, NotApplicable)
+    steered = not isinstance(found.lookahead, NotApplicable)
     who = ", ".join(found.tied if steered else found.parameters)
     text = (
         f"{who}: may mix slowly given the states, which carry what the data tell of them; if the "
     )
     text += f"warmup finds it so, moved with the trajectory, {describe(found, None)}"
-    if isinstance(found.guide, NotApplicable):
-        text += f" (no approximation: {found.guide.reason})"
-    stays = dict.fromkeys((*found.initial.stays, *found.transition.stays))
-    return text + (f"; stays where it is: {', '.join(stays)}" if stays else "")
+    if isinstance(found.lookahead, NotApplicable):
+        text += f" (no approximation: {found.lookahead.reason})"
+    centred = dict.fromkeys((*found.initial.centred, *found.transition.centred))
+    return text + (f"; stays where it is: {', '.join(centred)}" if centred else "")
