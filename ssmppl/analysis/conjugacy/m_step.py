@@ -36,7 +36,7 @@ import numpy as np
 from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, joined
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.search import Found, Search, kind_of
+from ssmppl.analysis.conjugacy.search import Found, Search, connected, kind_of
 from ssmppl.analysis.conjugacy.sufficient import (
     NOTHING_MISSING,
     ROLES,
@@ -203,14 +203,7 @@ def _joined(
     ]
     ties += [(symbols_of(bounds) & members) | {c} for c, bounds in search.bound.items()]
     used = frozenset().union(*(symbols_of(f) & members for f in form.functions))
-    groups: list[frozenset[Expr]] = [frozenset({c}) for c in free]
-    for tie in ties:
-        met = [g for g in groups if g & tie]
-        if len(met) > 1:
-            groups = [g for g in groups if not g & tie] + [frozenset().union(*met)]
-    order = {c: i for i, c in enumerate(free)}
-    ordered = [tuple(sorted(g, key=order.__getitem__)) for g in groups if g & used]
-    return sorted(ordered, key=lambda g: order[g[0]])
+    return [g for g in connected(free, ties) if not used.isdisjoint(g)]
 
 
 def _group(search: Search, components: tuple[Expr, ...], form: BlockForm) -> Group:

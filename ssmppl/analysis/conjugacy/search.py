@@ -7,7 +7,7 @@ time (a number, a simplex, a matrix). Which family holds a block is told by its 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -173,11 +173,11 @@ class Search:
         blocks: list[tuple[Expr, ...]] = []
         whole = self._quadratic(tuple(candidates)) if len(candidates) > 1 else None
         if whole is not None:
-            return _connected(candidates, whole)
+            return connected(candidates, _ties(whole))
         for c in candidates:  # greedily: into the first block that it is jointly quadratic with
             for k, block in enumerate(blocks):
                 form = self._quadratic((*block, c))
-                if form is not None and len(_connected((*block, c), form)) == 1:
+                if form is not None and len(connected((*block, c), _ties(form))) == 1:
                     blocks[k] = (*block, c)
                     break
             else:
@@ -269,14 +269,20 @@ def _grows(form: BlockForm, i: int) -> bool:
     return bool(form.roles(form.monomials[i]) - set(BOUNDED_ROLES))
 
 
-def _connected(components: Iterable[Expr], form: BlockForm) -> list[tuple[Expr, ...]]:
-    """The components in groups that share a function."""
-    groups = [{c} for c in components]
-    for monomial in form.monomials:
-        atoms = symbols_of([a for a, _ in monomial])
-        met = [g for g in groups if g & atoms]
+def _ties(form: BlockForm) -> list[frozenset[Expr]]:
+    """The symbols of each function."""
+    return [symbols_of([a for a, _ in monomial]) for monomial in form.monomials]
+
+
+def connected(
+    components: Sequence[Expr], ties: Iterable[frozenset[Expr]]
+) -> list[tuple[Expr, ...]]:
+    """The components in groups, those together that are in one tie."""
+    groups = [frozenset({c}) for c in components]
+    for tie in ties:
+        met = [g for g in groups if g & tie]
         if len(met) > 1:
-            groups = [g for g in groups if not g & atoms] + [set().union(*met)]
+            groups = [g for g in groups if not g & tie] + [frozenset().union(*met)]
     order = {c: i for i, c in enumerate(components)}
     ordered = [tuple(sorted(g, key=order.__getitem__)) for g in groups]
     return sorted(ordered, key=lambda g: order[g[0]])

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.analysis.density import Missing, terms
-from ssmppl.analysis.proposals.twisted import LookaheadModel, given_draws, lookahead_model
+from ssmppl.analysis.proposals.twisted import GivenDraws, LookaheadModel, lookahead_model
 from ssmppl.analysis.structure import component_means
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
@@ -142,7 +142,7 @@ def _by_noise(site: Site, noise: list[Expr]) -> tuple[ExprArray, ExprArray] | No
     """(x as a function of e, e as a function of x), None where the law is not of that kind."""
     d, x = site.distribution, site.value
     if isinstance(d, GAUSSIAN):
-        return array(d.sample(given_draws(site.name, noise))), array(d.standard(x))
+        return array(d.sample(GivenDraws(site.name, noise))), array(d.standard(x))
     found = _location_and_scale(d)
     if found is None:
         return None

@@ -24,8 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.proposals.proposals import LARGEST_EXPONENT, Proposal, drawn, written_cholesky
-from ssmppl.analysis.structure import component_means, flat_start
+from ssmppl.analysis.proposals.proposals import (
+    Proposal,
+    drawn,
+    log_mixture,
+    without_start,
+    written_cholesky,
+)
+from ssmppl.analysis.structure import component_means
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import (
@@ -124,14 +130,14 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
             return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new
-        sample = drawn(site, given_draws(site.name, new)).ravel()
+        sample = drawn(site, GivenDraws(site.name, new)).ravel()
         value.update(zip(own, sample, strict=True))
         recovered += list(d.standard(site.value).ravel())
     return NoiseForm(tuple(noise), array([value[s] for s in states]), array(recovered))
 
 
-class _Given(Draws):
-    """Draws that are these symbols, in turn."""
+class GivenDraws(Draws):
+    """Draws of a sampler that takes normals only, which are these symbols, in turn."""
 
     def __init__(self, site: str, symbols: list[Expr]):
         super().__init__(site)
@@ -141,19 +147,13 @@ class _Given(Draws):
         return next(self._next)
 
 
-def given_draws(site: str, symbols: list[Expr]) -> Draws:
-    """Draws of a sampler that takes normals only, which are these symbols, in turn."""
-    return _Given(site, symbols)
-
-
 def lookahead_model(trace: Trace, missing: Missing) -> LookaheadModel | NotApplicable:
     """What a twisting function can be found from; the reason where there is none."""
     if not trace.observations:
         return NotApplicable("there is no observation")
-    flat = flat_start(trace)
-    if flat:
-        reason = f"the initial law of {flat[0].name!r} is Flat: no particle can be drawn from it"
-        return NotApplicable(reason, flat[0].distribution.location)
+    unstarted = without_start(trace)
+    if unstarted is not None:
+        return unstarted
     states = trace.state_symbols
     initial = noise_form(list(trace.initial.values()), states)
     transition = noise_form(list(trace.transition.values()), states)
@@ -303,9 +303,7 @@ def _twisted_law(
     e = form.recovered
     inward = array(factor.T @ array(e - mean))
     distance = 0.5 * (np.sum(array(e**2)) - np.sum(array(inward**2)))
-    ratio = volume * apply("exp", apply("minimum", distance, LARGEST_EXPONENT))
-    log_ratio = apply("log", DEFENSIVE + (1.0 - DEFENSIVE) * ratio)
-    log_ratio = log_ratio + np.maximum(distance - LARGEST_EXPONENT, 0.0)
+    log_ratio = log_mixture(volume, distance, DEFENSIVE)
     fit = (*mean, *(factor[i, j] for i in range(r) for j in range(i + 1)))
     draw = dict(zip(states, value, strict=True))
     return _Law(draw, log_ratio, ahead - apply("log", volume), fit)
