@@ -87,14 +87,14 @@ def model_of(law, shape=()):
 def test_above_and_attained(label):
     law, values, attained = LAWS[label]
     traced = model_of(law)
-    bound = transition_upper_bound(traced)
-    assert not isinstance(bound, NotApplicable)
-    assert not depends_on(bound, traced.state_prev_symbols)
+    found = transition_upper_bound(traced)
+    assert not isinstance(found, NotApplicable)
+    assert not depends_on(found, traced.state_prev_symbols)
     (term,) = terms(traced, "transition")
     (x,), (x_prev,) = traced.state_symbols, traced.state_prev_symbols
     for value in values:
         density = np.asarray(evaluate([term.log_density], {x: value, x_prev: GRID})[0])
-        (bound,) = evaluate([bound], {x: value})
+        (bound,) = evaluate([found], {x: value})
         top = np.max(density)
         assert top <= bound + 1e-9, (label, value, top, bound)
         if attained:
@@ -116,7 +116,7 @@ def test_vector_of_which_one_component_depends():
     traced = model_of(
         lambda x: ssm.MvNormal(np.array([1.0, 1.0]) * x[0], covariance=covariance), (2,)
     )
-    rng = np.random.default_rng(seed_of("upper bounds", "vector"))
+    rng = np.random.default_rng(seed_of("heights", "vector"))
     (bound,), (term,) = [transition_upper_bound(traced)], terms(traced, "transition")
     one = model_of(
         lambda x: ssm.MvNormal(np.array([0.3, 0.0]) + np.array([0.0, 1.0]) * x[0],
@@ -137,7 +137,7 @@ def test_a_vector_of_which_one_spread_depends():
         lambda x: ssm.Normal(np.stack([x[0], 0.4]), sd=0.2 + np.abs(x[0]) * np.ones(2)), (2,)
     )
     bound, (term,) = transition_upper_bound(traced), terms(traced, "transition")
-    rng = np.random.default_rng(seed_of("upper bounds", "spread of a vector"))
+    rng = np.random.default_rng(seed_of("heights", "spread of a vector"))
     for value in 3 * rng.normal(size=(20, 2)):
         known = dict(zip(traced.state_symbols, value, strict=True))
         before = dict(zip(traced.state_prev_symbols, [GRID, 0.0], strict=True))
