@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Statistics = Sequence[float]
 Values = tuple[float, ...]
 Limits = Sequence[Interval]
+Function = Callable[[float], float]
 
 POSITIVE: Interval = (0.0, math.inf)
 UNIT: Interval = (0.0, 1.0)
@@ -136,7 +137,7 @@ class Family(ABC):
     @property
     def as_matrices(self) -> bool:
         """Whether the functions are too many to be told one by one."""
-        return False
+        return self.matrix_size > 0
 
     def matrix_statistics(self, words: MatrixWording) -> tuple[str, ...] | None:
         """One line for each matrix that the law is made of; None where that cannot be told."""
@@ -182,13 +183,9 @@ def inside(value: float, low: float, high: float) -> float:
 
 
 def draw_between(
-    cdf: Callable[[float], float],
-    survival: Callable[[float], float],
-    quantile: Callable[[float], float],
-    survival_quantile: Callable[[float], float],
-    limits: Interval,
-    rng: np.random.Generator,
-) -> float | None:
+    cdf: Function, survival: Function, quantile: Function, survival_quantile: Function,
+    limits: Interval, rng: np.random.Generator,
+) -> float | None:  # fmt: skip
     """A draw by inversion in whichever tail keeps the digits; None where the mass underflows."""
     low, high = limits
     below, above = float(cdf(low)), float(cdf(high))

@@ -120,10 +120,6 @@ class Wishart(Family):
         law = "inverse Wishart" if self.inverse else "Wishart"
         return f"{words.name} ~ {law}(df = {words.linear(self.log, sign, plus)}, {matrix})"
 
-    @property
-    def as_matrices(self) -> bool:
-        return True
-
     def matrix_statistics(self, words: MatrixWording) -> tuple[str, ...] | None:
         return words.wishart()
 
@@ -286,10 +282,6 @@ class MatrixNormalWishart(ScaledFamily):
             f"{name} ~ {law}(df = {df}, {scale}), S = S_yy - S_yz K^-1 S_yz'; A | {name} ~ Normal("
             f"mean = S_yz K^-1, covariance = {rows} (x) K^-1)"
         )
-
-    @property
-    def as_matrices(self) -> bool:
-        return True
 
     def matrix_statistics(self, words: MatrixWording) -> tuple[str, ...] | None:
         return words.matrix_normal(self.thetas, self.rows[0])

@@ -83,7 +83,7 @@ def transition_upper_bound(trace: Trace) -> Expr | NotApplicable:
 
 def _upper_bound(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     d, where = site.distribution, site.distribution.location
-    free = {n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())}
+    free = [n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())]
     if not free:
         return d.log_density(site.value, guard=False)
     kind = type(d)

@@ -6,9 +6,9 @@ The draw leaves the exact conditional invariant, whatever path it takes:
   independent draw from the conditional itself;
 - after `MAX_TRIES` refusals a sweep of slice steps instead. How many refusals there were does not
   depend on the current value, so this mixes two kernels that both leave the conditional invariant;
-- a correction without a known upper bound, or one that does not separate and is taken from the
-  log joint density: a Metropolis-Hastings step that proposes from the
-  conjugate part, then always a sweep of slice steps, so that no value is held for long;
+- a correction without a known upper bound, or one that does not separate and is taken from the log
+  joint density: a Metropolis-Hastings step that proposes from the conjugate part, then always a
+  sweep of slice steps, so that no value is held for long;
 - statistics under which the conjugate part is improper: slice steps. A Normal-Gamma block is then
   updated separately, v by its Gamma given theta (where nothing outside the family holds v) and
   theta by slices.
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 from weakref import WeakKeyDictionary, ref
 
@@ -126,28 +127,24 @@ class Sampler:
         return all(low < x < high for x, (low, high) in zip(v, self.natural, strict=True))
 
     def draw(
-        self,
-        totals: np.ndarray,
-        current: np.ndarray,
-        rest: Mapping[Expr, float],
-        rng: np.random.Generator,
-        log_joint: LogJoint | None = None,
-    ) -> tuple[np.ndarray, DrawInfo]:
-        update = self.update
+        self, totals: np.ndarray, current: np.ndarray, rest: Mapping[Expr, float],
+        rng: np.random.Generator, log_joint: LogJoint | None = None,
+    ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
+        """See `draw` below."""
+        update, truncated = self.update, self.truncated
         limits = self.limits(rest)
-        if update.conditional is None:
-            return self.slices(totals, current, limits, rng, log_joint, 0)
         c = totals.tolist()
         c.append(0.0)
+        if update.conditional is None:
+            return self.slices(c, current, limits, rng, log_joint, 0)
         weights = [c[j] for j in self.corrections]
         ceiling = self.ceiling(c) if weights else 0.0
         if update.left or not ceiling < math.inf:
-            return self.metropolis(totals, c, weights, current, limits, rng, log_joint)
-        truncated = self.truncated
+            return self.metropolis(c, current, limits, rng, log_joint)
         for tries in range(1, MAX_TRIES + 1):
             v = self.conjugate(c, limits, rng)
             if v is None:
-                return self.slices(totals, current, limits, rng, None, tries - 1)
+                return self.slices(c, current, limits, rng, None, tries - 1)
             if not self.possible(v) or (truncated and not _inside(v, limits)):
                 continue
             if weights:
@@ -155,25 +152,21 @@ class Sampler:
                 if not (excess >= 0.0 or rng.standard_exponential() >= -excess):
                     continue
             return np.array(v), DrawInfo("conjugate", tries, True)
-        return self.slices(totals, current, limits, rng, None, MAX_TRIES)
+        return self.slices(c, current, limits, rng, None, MAX_TRIES)
 
     def metropolis(
-        self,
-        totals: np.ndarray,
-        c: list[float],
-        weights: list[float],
-        current: np.ndarray,
-        limits: list[Interval],
-        rng: np.random.Generator,
-        log_joint: LogJoint | None = None,
-    ) -> tuple[np.ndarray, DrawInfo]:
+        self, c: list[float], current: np.ndarray, limits: list[Interval],
+        rng: np.random.Generator, log_joint: LogJoint | None,
+    ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
+        """A step that proposes from the conjugate part, then a sweep of slice steps."""
+        weights = [c[j] for j in self.corrections]
+
         def excess(v: Sequence[float]) -> float:
             """Log of the conditional over the conjugate part's density."""
             correction = self.correct(v, weights) if weights else 0.0
             if not self.update.left:
                 return correction
-            whole = self.exactly(log_joint)(v)
-            return whole - self.log_density(v, c) + correction
+            return self.exactly(log_joint)(v) - self.log_density(v, c) + correction
 
         accepted, tries = False, 0
         while tries < MAX_TRIES:
@@ -185,10 +178,9 @@ class Sampler:
                 continue
             change = excess(v) - excess(current.tolist())
             accepted = change >= 0.0 or rng.standard_exponential() > -change
-            if accepted:
-                current = np.array(v)
+            current = np.array(v) if accepted else current
             break
-        value, _ = self.slices(totals, current, limits, rng, log_joint, tries)
+        value, _ = self.slices(c, current, limits, rng, log_joint, tries)
         return value, DrawInfo("metropolis", tries, accepted)
 
     def exactly(self, log_joint: LogJoint | None) -> Density:
@@ -201,70 +193,49 @@ class Sampler:
             )
         return lambda v: comparable(float(log_joint(np.array(v))))
 
-    def _what(self, log_joint: LogJoint | None, values: list[float]) -> str:
-        """What the density is where it is no positive number."""
-        infinite = log_joint is not None and log_joint(np.array(values)) == math.inf
-        return "infinite" if infinite else "zero"
-
     def slices(
-        self,
-        totals: np.ndarray,
-        current: np.ndarray,
-        limits: list[Interval],
-        rng: np.random.Generator,
-        log_joint: LogJoint | None,
-        tries: int,
-    ) -> tuple[np.ndarray, DrawInfo]:
+        self, c: list[float], current: np.ndarray, limits: list[Interval],
+        rng: np.random.Generator, log_joint: LogJoint | None, tries: int,
+    ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
         """A sweep of slice steps over the exact conditional."""
-        update = self.update
-        c = totals.tolist() if totals is not None else []
-        if update.needs_log_joint or update.left:
-            at = self.exactly(log_joint)
-        else:
-
-            def at(v: Sequence[float]) -> float:
-                return self.log_density(v, c)
-
-        values = current.tolist()
+        update, values = self.update, current.tolist()
+        exact = update.needs_log_joint or bool(update.left)
+        at: Density = self.exactly(log_joint) if exact else partial(self._separated, c)
         if not at(values) > -math.inf:
-            named = ", ".join(
-                f"{to_text(s)} = {x:.6g}" for s, x in zip(update.components, values, strict=True)
-            )
-            raise SamplingError(
-                f"the conditional density is {self._what(log_joint, values)} at the current value: "
-                f"{named}",
-                fix="start inside the support; given these states no value near is possible. Where "
-                "a covariance is singular no density exists: give components that follow without "
-                "a noise of their own the law Dirac",
-                where=update.where,
-            )
+            raise self._impossible(values, log_joint)
         if update.kind == "simplex":
             new = sweep_simplex(at, values, rng)
-        elif self.matrix_size:
-            new = self._sweep_in_turn(at, values, limits, rng)
+        elif p := self.matrix_size:  # the numbers given the matrix, then the matrix
+            n = len(values) - p * (p + 1) // 2
+            matrix = values[n:]
+            new = sweep_real(lambda v: at([*v, *matrix]), values[:n], limits[:n], rng)
+            new += sweep_matrix(lambda v: at([*new[:n], *v]), matrix, p, rng)
         else:
             natural = [
                 (max(a, n[0]), min(b, n[1])) for (a, b), n in zip(limits, self.natural, strict=True)
             ]
             if update.conditional is not None and not self.last_is_held:
-                last = update.conditional.draw_last([*c, 0.0], values, limits, rng)
+                last = update.conditional.draw_last(c, values, limits, rng)
                 values[-1] = values[-1] if last is None else last
             new = sweep_real(at, values, natural, rng)
         return np.array(new), DrawInfo("slice", tries, True)
 
-    def _sweep_in_turn(
-        self,
-        at: Density,
-        values: list[float],
-        limits: list[Interval],
-        rng: np.random.Generator,
-    ) -> list[float]:
-        """Slice steps on the numbers of a block given its matrix, then on the matrix."""
-        p = self.matrix_size
-        n = len(values) - p * (p + 1) // 2
-        matrix = values[n:]
-        thetas = sweep_real(lambda v: at([*v, *matrix]), values[:n], limits[:n], rng)
-        return thetas + sweep_matrix(lambda v: at([*thetas, *v]), matrix, p, rng)
+    def _separated(self, c: list[float], v: Sequence[float]) -> float:
+        return self.log_density(v, c)
+
+    def _impossible(self, values: list[float], log_joint: LogJoint | None) -> SamplingError:
+        """The density is zero, or infinite, where the chain stands."""
+        infinite = log_joint is not None and log_joint(np.array(values)) == math.inf
+        pairs = zip(self.update.components, values, strict=True)
+        named = ", ".join(f"{to_text(s)} = {x:.6g}" for s, x in pairs)
+        return SamplingError(
+            f"the conditional density is {'infinite' if infinite else 'zero'} at the current "
+            f"value: {named}",
+            fix="start inside the support; given these states no value near is possible. Where "
+            "a covariance is singular no density exists: give components that follow without "
+            "a noise of their own the law Dirac",
+            where=self.update.where,
+        )
 
 
 _samplers: WeakKeyDictionary[Update, Sampler] = WeakKeyDictionary()
