@@ -73,9 +73,11 @@ def joined(components: Sequence[Expr]) -> str:
 
 def statistics(form: BlockForm) -> tuple[str, ...]:
     """One line for each function of the block: how its statistic is summed."""
-    lines = []
-    for i, function in enumerate(form.functions[:MAX_STATISTICS]):
-        lines.append(f"{shorten(to_text(function))}: " + _linear(form, i, 1.0, 0.0))
+    words = Wording(form, "")
+    lines = [
+        f"{shorten(to_text(function))}: {words.linear(i)}"
+        for i, function in enumerate(form.functions[:MAX_STATISTICS])
+    ]
     hidden = len(form.functions) - MAX_STATISTICS
     return tuple(lines) + ((f"... and {hidden} more",) if hidden > 0 else ())
 
@@ -167,10 +169,11 @@ def tidy(coefficient: Expr) -> tuple[float, str]:
     (plain,) = substitute([coefficient], opaque)
     form = separate(plain, symbols_of(plain))
     number, core = split_constant(coefficient)
-    written = (number, to_text(core))
     if isinstance(form, Separation) and 0 < len(form.terms) <= 4:
         pairs = form.items()
-        if all(c.op == "const" for _, c in pairs) and all(e == int(e) for _, e in _atoms(form)):
+        if all(c.op == "const" for _, c in pairs) and all(
+            e == int(e) for m in form.terms for _, e in m
+        ):
             numbers = [c.data for _, c in pairs]
             scale = numbers[0] if all(abs(n) == abs(numbers[0]) for n in numbers) else 1.0
             total = constant(0.0)
@@ -178,7 +181,7 @@ def tidy(coefficient: Expr) -> tuple[float, str]:
                 total = total + constant(n / scale) * function
             if _sums(total) <= _sums(core):  # (y - x)**2 rather than its three terms
                 return scale, shorten(to_text(total))
-    return number, shorten(written[1])
+    return number, shorten(to_text(core))
 
 
 def _sums(e: Expr) -> int:
@@ -203,11 +206,7 @@ def _vanishes_anyway(node: Expr) -> bool:
 def _whole_power(node: Expr) -> bool:
     if node.op == "div":
         return node.args[1].op in ("const", "symbol")
-    return node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0
-
-
-def _atoms(form: Separation) -> list[tuple[Expr, float]]:
-    return [pair for m in form.terms for pair in m]
+    return node.op == "pow" and _is_number(node.args[1], 2.0)
 
 
 # -- the law
@@ -229,33 +228,28 @@ class Wording:
         return joined(self.form.components)
 
     def linear(self, i: int, factor: float = 1.0, plus: float = 0.0) -> str:
-        """plus + factor * C_i as the sums that it is made of."""
-        return _linear(self.form, i, factor, plus)
+        """plus + factor * C_i as the sums that it is made of, numbers gathered."""
+        parts, total = [], plus
+        by_role = {
+            role: constant(factor) * c[i] if i >= 0 else constant(0.0)
+            for role, c in self.form.coefficients.items()
+        }
+        for role in ("prior", "initial"):
+            if by_role[role].op == "const":
+                total += by_role.pop(role).data
+        merged = _merged(by_role.get("initial"), by_role["transition"])
+        if merged:
+            del by_role["initial"], by_role["transition"]
+            parts.append(merged)
+        for role, e in by_role.items():
+            parts += _part(role, e)
+        if abs(total) > 1e-12 or not parts:
+            parts.insert(0, f"{total:.6g}")
+        return _sum(parts)
 
     def statistic(self, i: int) -> str:
         """C_i by its function."""
         return f"C[{to_text(self.form.functions[i])}]" if i >= 0 else "0"
-
-
-def _linear(form: BlockForm, i: int, factor: float, plus: float) -> str:
-    """plus + factor * C_i, numbers gathered."""
-    parts, total = [], plus
-    by_role = {
-        role: constant(factor) * c[i] if i >= 0 else constant(0.0)
-        for role, c in form.coefficients.items()
-    }
-    for role in ("prior", "initial"):
-        if by_role[role].op == "const":
-            total += by_role.pop(role).data
-    merged = _merged(by_role.get("initial"), by_role["transition"])
-    if merged:
-        del by_role["initial"], by_role["transition"]
-        parts.append(merged)
-    for role, e in by_role.items():
-        parts += _part(role, e)
-    if abs(total) > 1e-12 or not parts:
-        parts.insert(0, f"{total:.6g}")
-    return _sum(parts)
 
 
 def _merged(initial: Expr | None, transition: Expr) -> str | None:
@@ -270,7 +264,7 @@ def _merged(initial: Expr | None, transition: Expr) -> str | None:
     before = {s: _next(s) for s in symbols_of(transition) if s.data[0].endswith("_prev")}
     if not before and first == text and a == b:
         return _times(b, f"sum_{{t=1}}^T [{text}]")
-    if before and len(before) == len(symbols_of(transition) - _parameters(transition)):
+    if before and len(before) == sum(s.data[0] != "parameter" for s in symbols_of(transition)):
         (moved,) = substitute([transition], before)
         if tidy(moved) == (-a, first):
             return _times(-a, f"sum_{{t=2}}^{{T-1}} [{first}]")
@@ -280,10 +274,6 @@ def _merged(initial: Expr | None, transition: Expr) -> str | None:
 def _next(s: Expr) -> Expr:
     kind, name, index = s.data
     return symbol(kind.removesuffix("_prev"), name, index)
-
-
-def _parameters(e: Expr) -> frozenset[Expr]:
-    return frozenset(s for s in symbols_of(e) if s.data[0] == "parameter")
 
 
 def _times(number: float, text: str) -> str:
@@ -304,7 +294,7 @@ def correction_text(form: BlockForm, positions: Sequence[int]) -> str:
             value = _sum(parts)
             value = f"({value})" if len(parts) > 1 else value
             rest.append(f"exp({value}*{shorten(to_text(function))})")
-    if not (total.op == "const" and total.data == 1.0):
+    if not _is_number(total, 1.0):
         rest.insert(0, to_text(total))
     return " * ".join(rest) or "1"
 
@@ -456,7 +446,7 @@ class MatrixWording:
         if number is None:
             return None
         times = number if law.spread == "precision" else 1.0 / number
-        return "" if times.op == "const" and times.data == 1.0 else f"{_tight(to_text(times))} "
+        return "" if _is_number(times, 1.0) else f"{_tight(to_text(times))} "
 
     def _product(self, mean: list[Expr]) -> str:
         """A mean as a sum of matrices times vectors: A x_prev + B u_prev + c."""
@@ -468,7 +458,7 @@ class MatrixWording:
             z = None if isinstance(found, NotApplicable) else _kronecker(found[0])
             if z is None or isinstance(found, NotApplicable):
                 continue
-            one = len(z) == 1 and z[0].op == "const" and z[0].data == 1.0
+            one = len(z) == 1 and _is_number(z[0], 1.0)
             text = self._list(z)
             parts.append(name if one else f"{name} {text if len(z) == 1 else _tight(text)}")
             rest = list(found[1])
@@ -488,7 +478,7 @@ class MatrixWording:
         return ", ".join(out)
 
     def _vector(self, v: Sequence[Expr]) -> str:
-        if all(e.op == "const" and e.data == 0.0 for e in v):
+        if all(_is_number(e, 0.0) for e in v):
             return "0"
         if len(v) == 1:
             return to_text(v[0])
@@ -535,7 +525,7 @@ def _multiple(m: ExprArray, block: Sequence[Expr]) -> Expr | None:
             found.append(e / e)
             continue
         (row,), (rest,) = terms
-        if len(row) != 1 or not (rest.op == "const" and rest.data == 0.0):
+        if len(row) != 1 or not _is_number(rest, 0.0):
             return None
         found.append(row[0])
     return found[0] if all(f is found[0] for f in found) else None
@@ -545,7 +535,7 @@ def _kronecker(j: ExprArray) -> list[Expr] | None:
     """z where each row of J holds z at places of its own, all in one order; else None."""
     rows: list[list[Expr]] = [[] for _ in range(len(j))]
     for column in j.T:
-        held = [i for i, e in enumerate(column) if not (e.op == "const" and e.data == 0.0)]
+        held = [i for i, e in enumerate(column) if not _is_number(e, 0.0)]
         if len(held) != 1:
             return None
         rows[held[0]].append(column[held[0]])
