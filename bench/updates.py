@@ -14,10 +14,11 @@ import numpy as np
 from table import show
 
 import ssmppl as ssm
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
 from ssmppl.demo import varves
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
+from ssmppl.inference.updates.conjugate_draw import draw
 from ssmppl.language.trace import trace
 
 STEPS, DRAWS, ROUNDS = 600, 1_000, 20

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssmppl.analysis.structure import component_means, deterministic
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
@@ -82,12 +83,12 @@ def _values(site: Site) -> list[tuple[float, ...]] | NotApplicable:
 
 def _follow(trace: Trace, domain: dict[Expr, tuple[float, ...]]) -> NotApplicable | None:
     """Add the values of the deterministic components to `domain`; or say why they are not few."""
-    pairs: list[tuple[Site, Expr, Expr]] = []
-    for sites in (trace.initial, trace.transition):
-        for site in sites.values():
-            if isinstance(site.distribution, Dirac):
-                means = array(site.distribution.mean()).ravel()
-                pairs += [(site, s, e) for s, e in zip(site.value.ravel(), means, strict=True)]
+    pairs = [
+        (site, s, e)
+        for sites in (trace.initial, trace.transition)
+        for site in deterministic(list(sites.values()))
+        for s, e in component_means([site]).items()
+    ]
     before = {previous(s): s for s in trace.state_symbols}
     states = set(trace.state_symbols)
     for site, _, e in pairs:

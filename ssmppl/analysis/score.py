@@ -19,7 +19,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from ssmppl.analysis.density import Missing, terms
-from ssmppl.analysis.structure import deterministic
+from ssmppl.analysis.structure import component_means, deterministic
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import FLAT, differentiate
@@ -60,13 +60,7 @@ class CompleteScore:
         self.inert = frozenset(inert)
         self.value: dict[str, dict[Expr, Expr]] = {}
         for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
-            self.value[role] = {
-                s: e
-                for site in deterministic(list(sites.values()))
-                for s, e in zip(
-                    site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True
-                )
-            }
+            self.value[role] = component_means(deterministic(list(sites.values())))
         self.density = {role: self._density(role) for role in ROLES}
         self.moving = self._moving()
         self._second: set[Sensitivity] = set()

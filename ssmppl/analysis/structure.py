@@ -4,7 +4,7 @@ and which observations are affine and Gaussian in them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,16 +33,16 @@ class GaussianBlock:
 def gaussian_block(sites: Sequence[Site]) -> GaussianBlock:
     """The Normal and MvNormal sites stacked; empty where there are none."""
     symbols: list[Expr] = []
-    means: list[Expr] = []
+    stacked: list[Expr] = []
     blocks: list[np.ndarray] = []
     for site in sites:
         d = site.distribution
         if isinstance(d, Normal):
             blocks += [np.array([[v]], dtype=object) for v in d.variance_in_range().ravel()]
-            means += list(array(d.mean()).ravel())
+            stacked += list(array(d.mean()).ravel())
         elif isinstance(d, MvNormal):
             blocks.append(d.covariance_matrix().view(np.ndarray))
-            means += list(d.mean())
+            stacked += list(d.mean())
         else:
             continue
         symbols += list(site.value.ravel())
@@ -54,12 +54,28 @@ def gaussian_block(sites: Sequence[Site]) -> GaussianBlock:
         covariance[at : at + k, at : at + k] = block
         at += k
     diagonal = all(len(b) == 1 for b in blocks)
-    return GaussianBlock(tuple(symbols), array(means), array(covariance), diagonal)
+    return GaussianBlock(tuple(symbols), array(stacked), array(covariance), diagonal)
 
 
 def deterministic(sites: Sequence[Site]) -> list[Site]:
     """The Dirac sites."""
     return [s for s in sites if isinstance(s.distribution, Dirac)]
+
+
+def component_means(sites: Iterable[Site]) -> dict[Expr, Expr]:
+    """Component -> its mean, which is the value of a Dirac one."""
+    return {
+        s: e
+        for site in sites
+        for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True)
+    }
+
+
+def unused_name(name: str, taken: Container[str]) -> str:
+    """The name, with underscores behind it where it is taken."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 @dataclass(frozen=True)
@@ -136,10 +152,10 @@ def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
     states, prev = trace.state_symbols, trace.state_prev_symbols
     laws = []
     for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
-        means, covariance = _gaussian_law(role, list(sites.values()), states)
-        if isinstance(means, NotApplicable):
-            return means
-        laws.append((means, covariance))
+        law = _gaussian_law(role, list(sites.values()), states)
+        if isinstance(law, NotApplicable):
+            return law
+        laws.append(law)
     for site in trace.transition.values():
         reason = _not_affine(site, "transition", prev)
         if reason is not None:
@@ -163,7 +179,7 @@ def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
 
 def _gaussian_law(
     role: str, sites: list[Site], states: list[Expr]
-) -> tuple[ExprArray | NotApplicable, ExprArray]:
+) -> tuple[ExprArray, ExprArray] | NotApplicable:
     """Mean and covariance over `states`; Dirac components with zero variance, Flat ones zero."""
     zero = constant(0.0)
     n = len(states)
@@ -176,14 +192,14 @@ def _gaussian_law(
         d = site.distribution
         if not isinstance(d, (Normal, MvNormal, Dirac)) and type(d) is not Flat:
             reason = f"the {role} law of {site.name} is {type(d).__name__}"
-            return NotApplicable(reason, d.location), array(covariance)
+            return NotApplicable(reason, d.location)
     block = gaussian_block(sites)
     index = [place[s] for s in block.symbols]
     mean[index] = list(block.mean)
     if index:
         covariance[np.ix_(index, index)] = block.covariance.view(np.ndarray)
-    for site in deterministic(sites):
-        mean[[place[s] for s in site.value.ravel()]] = list(array(site.distribution.mean()).ravel())
+    for s, e in component_means(deterministic(sites)).items():
+        mean[place[s]] = e
     return array(mean), array(covariance)
 
 
@@ -253,12 +269,7 @@ def deterministic_memory(trace: Trace) -> int | None:
 
     0 where there are none; None where they never do (a position that integrates a velocity).
     """
-    sites = deterministic(list(trace.transition.values()))
-    value = {
-        s: e
-        for site in sites
-        for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True)
-    }
+    value = component_means(deterministic(list(trace.transition.values())))
     prev = {previous(s): s for s in trace.state_symbols}
     feeds = {s: {prev[p] for p in symbols_of(e) if p in prev} for s, e in value.items()}
     depth: dict[Expr, int] = {}

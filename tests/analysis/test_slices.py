@@ -9,9 +9,9 @@ import pytest
 from scipy import stats
 
 from ssmppl.analysis.lambdify import python_sum
-from ssmppl.analysis.sampler import _guarded
-from ssmppl.analysis.slices import slice_step
 from ssmppl.expressions.expr import apply, symbol
+from ssmppl.inference.updates.conjugate_draw import _guarded
+from ssmppl.inference.updates.slices import slice_step
 from tests.statistics.checks import seed_of
 
 ENOUGH = 10_000  # calls of a density in one step

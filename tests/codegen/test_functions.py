@@ -8,7 +8,7 @@ import pytest
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals.channels import channel_draws, observation_draws
 from ssmppl.analysis.proposals.proposals import bootstrap
-from ssmppl.analysis.proposals.twisted import guided, jacobian
+from ssmppl.analysis.proposals.twisted import jacobian, lookahead_model
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.text.kernel_functions import filter_kit
 from ssmppl.codegen.text.module import Layout
@@ -175,7 +175,7 @@ def test_joining_a_reference(case):
 def test_guide_of_the_twisted_filter(case):
     """The model by its noise, with its derivatives, of one particle at a time."""
     program, numbers = case
-    found = guided(program.trace, program.missing)
+    found = lookahead_model(program.trace, program.missing)
     if isinstance(found, NotApplicable):
         assert isinstance(program.twisted, NotApplicable)
         return
@@ -205,7 +205,7 @@ def test_guide_of_the_twisted_filter(case):
 def test_moves_in_loops(case):
     """What the loops know of a model of many noises, for every particle."""
     program, numbers = case
-    found = guided(program.trace, program.missing)
+    found = lookahead_model(program.trace, program.missing)
     if isinstance(found, NotApplicable) or found.written_out:
         return
     rng, d = np.random.default_rng(10), len(program.trace.state_symbols)

@@ -16,7 +16,6 @@ import pytest
 from scipy import stats
 
 import ssmppl as ssm
-from ssmppl.analysis.conjugacy.conjugacy import draw
 from ssmppl.analysis.density import terms
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN
 from ssmppl.errors import NotApplicable
@@ -28,6 +27,7 @@ from ssmppl.inference.particles.backward import pair_failure
 from ssmppl.inference.particles.filtering import failure
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.problem import pose
+from ssmppl.inference.updates.conjugate_draw import draw
 from ssmppl.language.model.traced import seen
 from ssmppl.language.trace import trace
 from tests.statistics.checks import seed_of

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.families import lower_half
+from ssmppl.analysis.conjugacy.matrix_families import lower_half
 from ssmppl.analysis.conjugacy.sufficient import ROLES, CompleteData, Factor
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.errors import Location, NotApplicable

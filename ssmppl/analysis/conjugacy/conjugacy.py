@@ -12,19 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 
 from ssmppl.analysis.conjugacy import describe
 from ssmppl.analysis.conjugacy.check import verify
-from ssmppl.analysis.conjugacy.describe import (
-    Explanation,
-    joined,
-    matrix_statistics,
-    named,
-    shown_as_matrices,
-)
-from ssmppl.analysis.conjugacy.families import Gamma, Normal, NormalGamma
+from ssmppl.analysis.conjugacy.describe import Explanation, MatrixWording, Wording, joined, named
+from ssmppl.analysis.conjugacy.family import Family
 from ssmppl.analysis.conjugacy.search import Found, Search, kind_of
 from ssmppl.analysis.conjugacy.sufficient import (
+    BOUNDED_ROLES,
     NOTHING_MISSING,
     ROLES,
     BlockForm,
@@ -32,14 +28,11 @@ from ssmppl.analysis.conjugacy.sufficient import (
     degenerate,
     separate_block,
 )
-from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.conjugacy.update import Update, correction_ranges, natural_bounds
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.sampler import draw, natural_bounds, sampler_of
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, to_text
 from ssmppl.language.model.traced import Trace
-
-__all__ = ["Update", "conjugate_update", "derive_updates", "draw"]
 
 
 def derive_updates(
@@ -114,21 +107,22 @@ def conjugate_update(search: Search, found: Found) -> Update:
         return replace(update, explanation=told)
     title = name = joined(found.components)
     lines = None
-    if shown_as_matrices(family):
+    if family.as_matrices:
         title = name = named(found.components, search.data.trace)
-        lines = matrix_statistics(family, form, search.data.trace)
+        lines = family.matrix_statistics(MatrixWording(form, search.data.trace))
     if len(update.block) > 1:
         title += " jointly"
     explanation = Explanation(
         title,
-        describe.conditional(family, form, name),
+        family.law(Wording(form, name)),
         describe.statistics(form) if lines is None else lines,
-        tuple(_notes(update, form)),
+        tuple(_notes(update, family, form)),
     )
     return replace(update, explanation=explanation)
 
 
-def _notes(update: Update, form: BlockForm) -> list[str]:
+def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
+    """Truncation, correction, and what is done where the family is improper."""
     notes = []
     cut = [
         f"{to_text(c)} to ({to_text(low)}, {to_text(high)})"
@@ -140,8 +134,6 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
-    if isinstance(update.conditional, Gamma) and _may_be_improper(update, update.conditional):
-        notes.append("slice steps where the shape or the rate is not positive")
     if update.left:
         laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
         notes.append(
@@ -161,26 +153,20 @@ def _notes(update: Update, form: BlockForm) -> list[str]:
             )
         if update.where is not None:
             notes.append(update.where.short)
-    if isinstance(update.conditional, NormalGamma):
-        notes.append("separate updates where the precision H or the rate is not positive")
-    elif isinstance(update.conditional, Normal):
-        notes.append("slice steps where the precision H is not positive definite")
-    return notes
+    improper = family.when_improper(partial(_known, update))
+    return [*notes, improper] if improper else notes
 
 
-def _may_be_improper(update: Update, family: Gamma) -> bool:
-    """Whether prior and initial law alone do not give the Gamma a positive shape."""
-    parts = [update.coefficients[r][family.log] for r in ("prior", "initial")]
-    if any(e.op != "const" for e in parts):
-        return False
-    return (math.fsum(e.data for e in parts) + 1.0) / family.power <= 0.0
+def _known(update: Update, i: int) -> float | None:
+    """The statistic at a position that prior and initial law alone give, if it is a number."""
+    parts = [update.coefficients[r][i] for r in BOUNDED_ROLES] if i >= 0 else []
+    return math.fsum(e.data for e in parts) if all(e.op == "const" for e in parts) else None
 
 
 def _may_be_bounded(update: Update) -> bool:
     """Whether the correction has a known bound, for whatever sign its coefficients can have."""
-    for (low, high), j in zip(sampler_of(update).ranges, update.correction, strict=True):
-        parts = [update.coefficients[r][j] for r in ("prior", "initial")]
-        total = math.fsum(e.data for e in parts) if all(e.op == "const" for e in parts) else None
+    for (low, high), j in zip(correction_ranges(update), update.correction, strict=True):
+        total = _known(update, j)
         if (total is None or total > 0.0) and high == math.inf:
             return False
         if (total is None or total < 0.0) and low == -math.inf:

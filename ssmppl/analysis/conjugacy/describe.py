@@ -1,9 +1,8 @@
 """Updates in words: what is drawn, from which law, with which statistics.
 
-Updates of vectors and matrices in words: sums of outer products, not their many entries.
-
-What is said is read off the laws (Normal or MvNormal, mean affine in the block) that the block
-enters. Where they are of another kind, the functions are told one by one (`describe.py`).
+A block of few numbers is told function by function. One of vectors or matrices is told by sums of
+outer products, read off the laws (Normal or MvNormal, mean affine in the block) that it enters; by
+its functions where these laws are of another kind.
 """
 
 from __future__ import annotations
@@ -14,17 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmppl.analysis.conjugacy.families import (
-    Beta,
-    Dirichlet,
-    Family,
-    Gamma,
-    MatrixNormalWishart,
-    Normal,
-    NormalGamma,
-    Wishart,
-)
-from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, Factor
+from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, Factor, shorten
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import Separation, affine, separate
 from ssmppl.expressions.arrays import ExprArray, array
@@ -41,8 +30,10 @@ from ssmppl.expressions.expr import (
 from ssmppl.language import distributions as laws
 from ssmppl.language.model.traced import Site, Trace
 
-MAX_LENGTH = 100
 MAX_STATISTICS = 12
+MAX_NAMES = 6  # of a block
+MATRIX_LENGTH = 80  # of the text of a matrix or a vector
+ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
 
 
 @dataclass(frozen=True)
@@ -83,9 +74,11 @@ def joined(components: Sequence[Expr]) -> str:
 
 def statistics(form: BlockForm) -> tuple[str, ...]:
     """One line for each function of the block: how its statistic is summed."""
-    lines = []
-    for i, function in enumerate(form.functions[:MAX_STATISTICS]):
-        lines.append(f"{shorten(to_text(function))}: " + _linear(form, i, 1.0, 0.0))
+    words = Wording(form, "")
+    lines = [
+        f"{shorten(to_text(function))}: {words.linear(i)}"
+        for i, function in enumerate(form.functions[:MAX_STATISTICS])
+    ]
     hidden = len(form.functions) - MAX_STATISTICS
     return tuple(lines) + ((f"... and {hidden} more",) if hidden > 0 else ())
 
@@ -161,9 +154,6 @@ def _is_number(e: Expr, value: float) -> bool:
     return e.op == "const" and e.data == value
 
 
-_ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
-
-
 def tidy(coefficient: Expr) -> tuple[float, str]:
     """A coefficient as number times text, a polynomial in its lowest terms.
 
@@ -175,15 +165,16 @@ def tidy(coefficient: Expr) -> tuple[float, str]:
     opaque = {
         n: symbol("parameter", to_text(n))
         for n in topological([coefficient])
-        if n.op not in _ARITHMETIC and not _whole_power(n)
+        if n.op not in ARITHMETIC and not _whole_power(n)
     }
     (plain,) = substitute([coefficient], opaque)
     form = separate(plain, symbols_of(plain))
     number, core = split_constant(coefficient)
-    written = (number, to_text(core))
     if isinstance(form, Separation) and 0 < len(form.terms) <= 4:
         pairs = form.items()
-        if all(c.op == "const" for _, c in pairs) and all(e == int(e) for _, e in _atoms(form)):
+        if all(c.op == "const" for _, c in pairs) and all(
+            e == int(e) for m in form.terms for _, e in m
+        ):
             numbers = [c.data for _, c in pairs]
             scale = numbers[0] if all(abs(n) == abs(numbers[0]) for n in numbers) else 1.0
             total = constant(0.0)
@@ -191,7 +182,7 @@ def tidy(coefficient: Expr) -> tuple[float, str]:
                 total = total + constant(n / scale) * function
             if _sums(total) <= _sums(core):  # (y - x)**2 rather than its three terms
                 return scale, shorten(to_text(total))
-    return number, shorten(written[1])
+    return number, shorten(to_text(core))
 
 
 def _sums(e: Expr) -> int:
@@ -216,116 +207,50 @@ def _vanishes_anyway(node: Expr) -> bool:
 def _whole_power(node: Expr) -> bool:
     if node.op == "div":
         return node.args[1].op in ("const", "symbol")
-    return node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0
-
-
-def _atoms(form: Separation) -> list[tuple[Expr, float]]:
-    return [pair for m in form.terms for pair in m]
-
-
-def shorten(text: str, length: int = MAX_LENGTH) -> str:
-    return text if len(text) <= length else text[: length - 4] + " ..."
+    return node.op == "pow" and _is_number(node.args[1], 2.0)
 
 
 # -- the law
-def conditional(family: Family, form: BlockForm, name: str) -> str:
-    """The law of the block given all else, its parameters in terms of the statistics."""
-    names = [to_text(c) for c in form.components]
+@dataclass(frozen=True)
+class Wording:
+    """What a family writes its law with. name : of the block as a whole."""
 
-    def stat(i: int, factor: float = 1.0, plus: float = 0.0) -> str:
-        return _linear(form, i, factor, plus)
+    form: BlockForm
+    name: str
 
-    def c(i: int) -> str:
-        return f"C[{to_text(form.functions[i])}]" if i >= 0 else "0"
+    @property
+    def names(self) -> list[str]:
+        """Of the components."""
+        return [to_text(c) for c in self.form.components]
 
-    if isinstance(family, Gamma):
-        shape = stat(family.log, 1.0 / family.power, 1.0 / family.power)
-        return f"{_variate(names[0], family.power)}, shape = {shape}, rate = -{c(family.pow)}"
-    if isinstance(family, Beta):
-        a, b = stat(family.first, 1.0, 1.0), stat(family.second, 1.0, 1.0)
-        return f"{names[0]} ~ Beta({a}, {b})"
-    if isinstance(family, Dirichlet):
-        inside = ", ".join(stat(i, 1.0, 1.0) for i in family.logs)
-        return f"{joined(form.components)} ~ Dirichlet({shorten(inside)})"
-    if isinstance(family, Wishart):
-        p = family.size
-        sign, plus = (-2.0, -p - 1.0) if family.inverse else (2.0, p + 1.0)
-        matrix = "scale S" if family.inverse else "inverse scale S"
-        law = "inverse Wishart" if family.inverse else "Wishart"
-        return f"{name} ~ {law}(df = {stat(family.log, sign, plus)}, {matrix})"
-    if isinstance(family, NormalGamma):
-        *thetas, v = names
-        n = len(thetas)
-        shape = stat(family.log, 1.0 / family.power, 1.0 / family.power - 0.5 * n)
-        scale = v if family.power == 1.0 else f"{v}**{family.power:g}"
-        normal = family.normal
-        if n == 1:
-            precision = stat(normal.quadratic[0][0], -2.0)
-            h = c(normal.linear[0])
-            rate = (
-                f"-{c(family.pow)} - {h}**2 / (2*H)"
-                if normal.linear[0] >= 0
-                else f"-{c(family.pow)}"
-            )
-            return (
-                f"{_variate(v, family.power)}, shape = {shape}, rate = {rate}; {thetas[0]} | {v} ~ "
-                f"Normal({h} / H, precision = {scale}*H), H = {precision}"
-            )
-        block = f"({', '.join(thetas)})"
-        return (
-            f"{_variate(v, family.power)}, shape = {shape}, "
-            f"rate = -{c(family.pow)} - h' H^-1 h / 2; "
-            f"{block} | {v} ~ Normal(H^-1 h, precision = {scale}*H), h and H from the linear and "
-            "quadratic statistics"
-        )
-    if isinstance(family, MatrixNormalWishart):
-        return _matrix_normal(family, form)
-    if len(names) == 1:
-        h = c(family.linear[0])
-        return (
-            f"{names[0]} ~ Normal({h} / H, precision = H), H = {stat(family.quadratic[0][0], -2.0)}"
-        )
-    return f"{name} ~ Normal(H^-1 h, precision = H), {len(names)} numbers"
+    @property
+    def block(self) -> str:
+        """The components' names together."""
+        return joined(self.form.components)
 
+    def linear(self, i: int, factor: float = 1.0, plus: float = 0.0) -> str:
+        """plus + factor * C_i as the sums that it is made of, numbers gathered."""
+        parts, total = [], plus
+        by_role = {
+            role: constant(factor) * c[i] if i >= 0 else constant(0.0)
+            for role, c in self.form.coefficients.items()
+        }
+        for role in ("prior", "initial"):
+            if by_role[role].op == "const":
+                total += by_role.pop(role).data
+        merged = _merged(by_role.get("initial"), by_role["transition"])
+        if merged:
+            del by_role["initial"], by_role["transition"]
+            parts.append(merged)
+        for role, e in by_role.items():
+            parts += _part(role, e)
+        if abs(total) > 1e-12 or not parts:
+            parts.insert(0, f"{total:.6g}")
+        return _sum(parts)
 
-def _matrix_normal(family: MatrixNormalWishart, form: BlockForm) -> str:
-    wishart, name = family.wishart, form.components[-1].data[1]
-    sign, plus = (-2.0, -1.0) if wishart.inverse else (2.0, 1.0)
-    df = _linear(form, wishart.log, sign, plus * (wishart.size + 1.0) - len(family.rows[0]))
-    law, scale = ("inverse Wishart", "scale S") if wishart.inverse else ("Wishart", "scale S^-1")
-    rows = name if wishart.inverse else f"{name}^-1"
-    return (
-        f"{name} ~ {law}(df = {df}, {scale}), S = S_yy - S_yz K^-1 S_yz'; A | {name} ~ Normal("
-        f"mean = S_yz K^-1, covariance = {rows} (x) K^-1)"
-    )
-
-
-def _variate(name: str, power: float) -> str:
-    base = name if abs(power) == 1.0 else f"{name}**{abs(power):g}"
-    if power > 0.0:
-        return f"{base} ~ Gamma"
-    return f"{base} ~ inverse Gamma"
-
-
-def _linear(form: BlockForm, i: int, factor: float, plus: float) -> str:
-    """plus + factor * C_i, numbers gathered."""
-    parts, total = [], plus
-    by_role = {
-        role: constant(factor) * c[i] if i >= 0 else constant(0.0)
-        for role, c in form.coefficients.items()
-    }
-    for role in ("prior", "initial"):
-        if by_role[role].op == "const":
-            total += by_role.pop(role).data
-    merged = _merged(by_role.get("initial"), by_role["transition"])
-    if merged:
-        del by_role["initial"], by_role["transition"]
-        parts.append(merged)
-    for role, e in by_role.items():
-        parts += _part(role, e)
-    if abs(total) > 1e-12 or not parts:
-        parts.insert(0, f"{total:.6g}")
-    return _sum(parts)
+    def statistic(self, i: int) -> str:
+        """C_i by its function."""
+        return f"C[{to_text(self.form.functions[i])}]" if i >= 0 else "0"
 
 
 def _merged(initial: Expr | None, transition: Expr) -> str | None:
@@ -340,7 +265,7 @@ def _merged(initial: Expr | None, transition: Expr) -> str | None:
     before = {s: _next(s) for s in symbols_of(transition) if s.data[0].endswith("_prev")}
     if not before and first == text and a == b:
         return _times(b, f"sum_{{t=1}}^T [{text}]")
-    if before and len(before) == len(symbols_of(transition) - _parameters(transition)):
+    if before and len(before) == sum(s.data[0] != "parameter" for s in symbols_of(transition)):
         (moved,) = substitute([transition], before)
         if tidy(moved) == (-a, first):
             return _times(-a, f"sum_{{t=2}}^{{T-1}} [{first}]")
@@ -350,10 +275,6 @@ def _merged(initial: Expr | None, transition: Expr) -> str | None:
 def _next(s: Expr) -> Expr:
     kind, name, index = s.data
     return symbol(kind.removesuffix("_prev"), name, index)
-
-
-def _parameters(e: Expr) -> frozenset[Expr]:
-    return frozenset(s for s in symbols_of(e) if s.data[0] == "parameter")
 
 
 def _times(number: float, text: str) -> str:
@@ -374,30 +295,9 @@ def correction_text(form: BlockForm, positions: Sequence[int]) -> str:
             value = _sum(parts)
             value = f"({value})" if len(parts) > 1 else value
             rest.append(f"exp({value}*{shorten(to_text(function))})")
-    if not (total.op == "const" and total.data == 1.0):
+    if not _is_number(total, 1.0):
         rest.insert(0, to_text(total))
     return " * ".join(rest) or "1"
-
-
-FEW = 3  # numbers whose functions are told one by one
-LENGTH = 80
-
-
-def shown_as_matrices(family: Family) -> bool:
-    """Whether the functions of a block are too many to be told one by one."""
-    if isinstance(family, Normal):
-        return len(family.linear) > FEW
-    return isinstance(family, (Wishart, MatrixNormalWishart))
-
-
-def matrix_statistics(family: Family, form: BlockForm, trace: Trace) -> tuple[str, ...] | None:
-    """One line for each matrix that the law is made of; None where that cannot be told."""
-    teller = _Teller(form, trace)
-    if isinstance(family, Normal):
-        return teller.normal()
-    if isinstance(family, MatrixNormalWishart):
-        return teller.matrix_normal(family)
-    return teller.wishart() if isinstance(family, Wishart) else None
 
 
 def named(components: Sequence[Expr], trace: Trace) -> str:
@@ -407,13 +307,13 @@ def named(components: Sequence[Expr], trace: Trace) -> str:
         mine = [c for c in components if c.data[1] == name]
         whole = len(mine) == len(trace.parameters[name].components)
         names += [name] if whole else [to_text(c) for c in mine]
-    if len(names) > 6:
+    if len(names) > MAX_NAMES:
         names = [*names[:3], "...", names[-1]]
     return names[0] if len(names) == 1 else f"({', '.join(names)})"
 
 
-class _Teller:
-    """The laws that hold a block, in the order of their roles, and how to speak of them."""
+class MatrixWording:
+    """The statistics of a block as sums of outer products; None where they cannot be told so."""
 
     def __init__(self, form: BlockForm, trace: Trace):
         self.form, self.block = form, form.components
@@ -460,13 +360,13 @@ class _Teller:
                 notes.append(f"z = ({self._list(z)}) in the mean of {site.name}")
         return (f"H: {' + '.join(h)}", f"h: {' + '.join(linear)}", *notes)
 
-    def matrix_normal(self, family: MatrixNormalWishart) -> tuple[str, ...] | None:
-        """S_yy, S_yz and K."""
+    def matrix_normal(self, thetas: int, row: Sequence[int]) -> tuple[str, ...] | None:
+        """S_yy, S_yz and K, of a matrix A; thetas : how many entries it has, row : its first."""
         first = ["prior"] if self._told_by_prior() else []
         yy, yz, zz, notes = [*first], [*first], [*first], []
-        thetas = self.block[: family.thetas]
+        block = self.block[:thetas]
         for factor, site in self.others:
-            found, scale = self._regression(site, thetas), self._scale(site)
+            found, scale = self._regression(site, block), self._scale(site)
             z = None if found is None else _kronecker(found[0])
             if found is None or z is None or scale is None:
                 return None
@@ -475,7 +375,7 @@ class _Teller:
             yz.append(_summed(factor, f"{scale}{rest} z'"))
             zz.append(_summed(factor, f"{scale}z z'"))
             notes.append(f"z = ({self._list(z)}) in the mean of {site.name}")
-        columns = dict.fromkeys(thetas[i].data[1] for i in family.rows[0])
+        columns = dict.fromkeys(block[i].data[1] for i in row)
         if len(columns) > 1:
             notes.append(f"A = [{' '.join(columns)}]")
         return (
@@ -547,7 +447,7 @@ class _Teller:
         if number is None:
             return None
         times = number if law.spread == "precision" else 1.0 / number
-        return "" if times.op == "const" and times.data == 1.0 else f"{_tight(to_text(times))} "
+        return "" if _is_number(times, 1.0) else f"{_tight(to_text(times))} "
 
     def _product(self, mean: list[Expr]) -> str:
         """A mean as a sum of matrices times vectors: A x_prev + B u_prev + c."""
@@ -559,7 +459,7 @@ class _Teller:
             z = None if isinstance(found, NotApplicable) else _kronecker(found[0])
             if z is None or isinstance(found, NotApplicable):
                 continue
-            one = len(z) == 1 and z[0].op == "const" and z[0].data == 1.0
+            one = len(z) == 1 and _is_number(z[0], 1.0)
             text = self._list(z)
             parts.append(name if one else f"{name} {text if len(z) == 1 else _tight(text)}")
             rest = list(found[1])
@@ -579,10 +479,12 @@ class _Teller:
         return ", ".join(out)
 
     def _vector(self, v: Sequence[Expr]) -> str:
-        if all(e.op == "const" and e.data == 0.0 for e in v):
+        if all(_is_number(e, 0.0) for e in v):
             return "0"
-        text = self._collapsed(v) if len(v) > 1 else to_text(v[0])
-        return text if text is not None else _short(f"({', '.join(map(to_text, v))})")
+        if len(v) == 1:
+            return to_text(v[0])
+        entries = f"({', '.join(map(to_text, v))})"
+        return self._collapsed(v) or shorten(entries, MATRIX_LENGTH)
 
     def _collapsed(self, v: Sequence[Expr]) -> str | None:
         """0.5*x of (0.5*x[0], 0.5*x[1]), where x has these elements and no others."""
@@ -604,12 +506,12 @@ def matrix_text(m: ExprArray) -> str:
     if first.op == "item":
         text = to_text(first.args[0])
         same = all(e.op == "item" and e.args[0] is first.args[0] for e in entries)
-        return text if same and len(text) < LENGTH else "C"
+        return text if same and len(text) < MATRIX_LENGTH else "C"
     names = {e.data[1] for e in entries if e.op == "symbol"}
     if len(names) == 1 and all(e.op == "symbol" for e in entries):
         return names.pop()
     rows = [f"[{', '.join(map(to_text, row))}]" for row in m]
-    return _short(f"[{', '.join(rows)}]")
+    return shorten(f"[{', '.join(rows)}]", MATRIX_LENGTH)
 
 
 def _multiple(m: ExprArray, block: Sequence[Expr]) -> Expr | None:
@@ -624,7 +526,7 @@ def _multiple(m: ExprArray, block: Sequence[Expr]) -> Expr | None:
             found.append(e / e)
             continue
         (row,), (rest,) = terms
-        if len(row) != 1 or not (rest.op == "const" and rest.data == 0.0):
+        if len(row) != 1 or not _is_number(rest, 0.0):
             return None
         found.append(row[0])
     return found[0] if all(f is found[0] for f in found) else None
@@ -634,7 +536,7 @@ def _kronecker(j: ExprArray) -> list[Expr] | None:
     """z where each row of J holds z at places of its own, all in one order; else None."""
     rows: list[list[Expr]] = [[] for _ in range(len(j))]
     for column in j.T:
-        held = [i for i, e in enumerate(column) if not (e.op == "const" and e.data == 0.0)]
+        held = [i for i, e in enumerate(column) if not _is_number(e, 0.0)]
         if len(held) != 1:
             return None
         rows[held[0]].append(column[held[0]])
@@ -657,7 +559,3 @@ def _summed(factor: Factor, text: str) -> str:
 
 def _tight(text: str) -> str:
     return text if re.fullmatch(r"[\w.]+(\[[\d, ]+\])?|\(.*\)", text) else f"({text})"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= LENGTH else text[: LENGTH - 4] + " ..."

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -96,6 +97,11 @@ class BlockForm:
     origins: dict[Monomial, tuple[Factor, ...]] = field(repr=False)
     left: tuple[tuple[Factor, NotApplicable], ...] = ()
 
+    @cached_property
+    def places(self) -> dict[Monomial, int]:
+        """Function, as a monomial -> position."""
+        return {m: i for i, m in enumerate(self.monomials)}
+
     def roles(self, monomial: Monomial) -> frozenset[str]:
         """The roles of the factors that a function comes from."""
         return frozenset(f.role for f in self.origins[monomial])
@@ -173,7 +179,7 @@ def separate_block(
     for factor in data.holding(components):
         form = separate(factor.density, wanted)
         if not isinstance(form, Separation):
-            why = NotApplicable(f"{_law(factor)}: {_shorten(form.reason)}", factor.where)
+            why = NotApplicable(f"{_law(factor)}: {shorten(form.reason, 160)}", factor.where)
             if not leave or factor.role not in BOUNDED_ROLES:
                 return why
             left.append((factor, why))
@@ -218,7 +224,7 @@ def restricted(data: CompleteData, block: Iterable[Expr]) -> NotApplicable | Non
         if inside:
             return NotApplicable(
                 f"{_names(inside)} bounds the support of {r.site} ({to_text(r.value)} and "
-                f"{_shorten(to_text(r.bound))}): the bound is in no separated factor",
+                f"{shorten(to_text(r.bound), 160)}): the bound is in no separated factor",
                 r.where,
             )
     return None
@@ -232,5 +238,6 @@ def _names(symbols: Iterable[Expr]) -> str:
     return ", ".join(sorted({to_text(s) for s in symbols}))
 
 
-def _shorten(text: str, length: int = 160) -> str:
+def shorten(text: str, length: int = 100) -> str:
+    """A text, or its beginning."""
     return text if len(text) <= length else text[: length - 4] + " ..."

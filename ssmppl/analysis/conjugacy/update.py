@@ -1,11 +1,12 @@
-"""One Gibbs update of a block of parameters, as data."""
+"""One Gibbs update of a block of parameters, as data, and where its components may lie."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ssmppl.analysis.bounds import WHOLE, Interval, interval
 from ssmppl.analysis.conjugacy.describe import Explanation
-from ssmppl.analysis.conjugacy.families import Family
+from ssmppl.analysis.conjugacy.family import Family
 from ssmppl.analysis.conjugacy.sufficient import Factor
 from ssmppl.errors import Location
 from ssmppl.expressions.expr import Expr
@@ -43,3 +44,24 @@ class Update:
     left: tuple[Factor, ...] = ()
     kind: str = "real"  # or "simplex", "matrix"
     conditional: Family | None = field(default=None, repr=False)
+
+
+def natural_bounds(update: Update) -> list[Interval]:
+    """Where the family itself lives, component by component."""
+    family = update.conditional
+    return [WHOLE] * len(update.components) if family is None else family.support
+
+
+def constant_bounds(update: Update) -> list[Interval | None]:
+    """The bounds of each component that are numbers; None where one depends on a parameter."""
+    return [
+        (low.data, high.data) if low.op == high.op == "const" else None
+        for low, high in update.bounds
+    ]
+
+
+def correction_ranges(update: Update) -> list[Interval]:
+    """An enclosure of each function that the family does not hold, over the bounds."""
+    bounds = zip(update.components, constant_bounds(update), strict=True)
+    known = {c: WHOLE if b is None else b for c, b in bounds}
+    return [interval(update.functions[j], known) for j in update.correction]

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ssmppl.analysis.structure import GaussianBlock, gaussian_block
+from ssmppl.analysis.structure import GaussianBlock, component_means, gaussian_block
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import array
@@ -162,12 +162,9 @@ def _noisy(trace: Trace, linear: set[Expr]) -> set[Expr]:
     grown = True
     while grown:
         before = len(reached)
-        for site in trace.transition.values():
-            for s, e in zip(
-                site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True
-            ):
-                if s in linear and any(previous(r) in symbols_of([e]) for r in reached):
-                    reached.add(s)
+        for s, e in component_means(trace.transition.values()).items():
+            if s in linear and any(previous(r) in symbols_of([e]) for r in reached):
+                reached.add(s)
         grown = len(reached) > before
     return reached
 
@@ -175,12 +172,9 @@ def _noisy(trace: Trace, linear: set[Expr]) -> set[Expr]:
 def _coupled(trace: Trace, linear: set[Expr]) -> set[Expr]:
     """Components of x that are Gaussian jointly with z."""
     sites = [s for s in trace.transition.values() if gaussian(s)]
-    found: set[Expr] = set()
     before = {previous(s) for s in linear}
-    for site in sites:
-        for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True):
-            if s not in linear and before & set(symbols_of([e])):
-                found.add(s)
+    depending = {s for s, e in component_means(sites).items() if before & set(symbols_of([e]))}
+    found = depending - linear
     return found | correlated(gaussian_block(sites), linear | found) - linear
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.conjugacy import conjugate_update
 from ssmppl.analysis.conjugacy.describe import joined
-from ssmppl.analysis.conjugacy.families import Beta, Dirichlet, Family, Gamma, Normal, NormalGamma
+from ssmppl.analysis.conjugacy.families import Gamma, NormalGamma
+from ssmppl.analysis.conjugacy.family import Family
 from ssmppl.analysis.conjugacy.search import Found, Search
 from ssmppl.analysis.conjugacy.sufficient import (
     BlockForm,
@@ -20,15 +21,13 @@ from ssmppl.analysis.conjugacy.sufficient import (
     complete_data,
     separate_block,
 )
-from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.conjugacy.update import Update, natural_bounds
 from ssmppl.analysis.density import Missing
-from ssmppl.analysis.elimination.normalisers import LARGEST
-from ssmppl.analysis.sampler import natural_bounds
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.model.traced import Trace
 
-FAMILIES = (Gamma, Normal, NormalGamma, Beta, Dirichlet)
+LARGEST = 8  # numbers that are jointly Normal: their Cholesky factor is written out
 
 
 @dataclass(frozen=True)
@@ -101,11 +100,10 @@ def _exact(
     name = joined(found.components)
     if update.left or update.correction:
         return NotApplicable(update.reason, update.where)
-    if not isinstance(family, FAMILIES):
+    if not family.written_out:
         return NotApplicable(f"a law of matrices, {family.name}, is not written out in scalars")
-    normal = family.normal if isinstance(family, NormalGamma) else family
-    if isinstance(normal, Normal) and len(normal.linear) > LARGEST:
-        return NotApplicable(f"{len(normal.linear)} numbers jointly Normal, more than {LARGEST}")
+    if family.normals > LARGEST:
+        return NotApplicable(f"{family.normals} numbers jointly Normal, more than {LARGEST}")
     if update.kind == "real":
         for (low, high), natural in zip(update.bounds, natural_bounds(update), strict=True):
             constant_ = low.op == high.op == "const"

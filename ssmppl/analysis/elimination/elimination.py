@@ -32,9 +32,8 @@ from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.elimination.eliminable import Eliminable
 from ssmppl.analysis.elimination.moments import ZERO
-from ssmppl.analysis.elimination.normalisers import draw_of, log_parts
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
-from ssmppl.analysis.structure import deterministic
+from ssmppl.analysis.structure import component_means, deterministic, unused_name
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import ONE, Separation, separate
 from ssmppl.expressions.arrays import array
@@ -96,21 +95,15 @@ class _Build:
             k for k in range(found.functions) if any(_of_states(self.c[r][k]) for r in roles)
         )
         taken = {s.data[1] for s in trace.state_symbols} | set(trace.inputs)
-        name = _free("statistics", taken)
+        name = unused_name("statistics", taken)
         self.sums = {k: symbol("state", name, (i,)) for i, k in enumerate(self.carried)}
         self.column = {
             which: [
-                symbol("guide", _free(which, taken), (k,)) for k in range(found.functions)
+                symbol("guide", unused_name(which, taken), (k,)) for k in range(found.functions)
             ]
             for which in COLUMNS
         }  # fmt: skip
-        known = deterministic(list(trace.transition.values()))
-        self.values = {
-            s: e
-            for site in known
-            for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(),
-                            strict=True)
-        }  # fmt: skip
+        self.values = component_means(deterministic(list(trace.transition.values())))
 
     def elimination(self) -> Elimination | NotApplicable:
         connected = self._rest("transition")
@@ -172,7 +165,7 @@ class _Build:
         total = ZERO
         for update, c in self._blocks(self._all(which, carried)):
             assert update.conditional is not None
-            for part in filter(_of_states, log_parts(update.conditional, c)):
+            for part in filter(_of_states, update.conditional.log_normaliser(c)):
                 total = total + part
         return total
 
@@ -190,12 +183,11 @@ class _Build:
         source, drawn = Draws("eliminated"), dict[Expr, Expr]()
         for update, c in self._blocks(self._all("before", earlier)):
             assert update.conditional is not None
-            drawn.update(
-                zip(update.components, draw_of(update.conditional, c, source), strict=True)
-            )
+            own = update.conditional.written_draw(c, source)
+            drawn.update(zip(update.components, own, strict=True))
         x = dict(zip(draws, substitute(list(draws.values()), drawn), strict=True))
-        own = zip((self.sums[k] for k in self.carried), substitute(sums, x), strict=True)
-        return {**x, **dict(own)}
+        carried = (self.sums[k] for k in self.carried)
+        return {**x, **dict(zip(carried, substitute(sums, x), strict=True))}
 
     # -- what is free of the block
     def _rest(self, role: str) -> tuple[Term, ...] | NotApplicable:
@@ -275,12 +267,3 @@ def _or_nothing(log_ratio: Expr) -> Expr:
     """A log weight of statistics; -inf where these are beyond floating point."""
     finite = apply("lt", apply("abs", log_ratio), constant(INFINITY))
     return apply("where", finite, log_ratio, constant(-INFINITY))
-
-
-def _free(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name
-
-
-__all__ = ["COLUMNS", "Elimination", "eliminate"]

@@ -31,8 +31,14 @@ from ssmppl.analysis.elimination.conditional import (
     correlated,
     gaussian,
 )
-from ssmppl.analysis.elimination.moments import ZERO, Belief, absorb, block_diagonal, objects
-from ssmppl.analysis.structure import LinearGaussian, gaussian_block
+from ssmppl.analysis.elimination.moments import (
+    ZERO,
+    GaussianMoments,
+    block_diagonal,
+    objects,
+    updated_by_channels,
+)
+from ssmppl.analysis.structure import LinearGaussian, component_means, gaussian_block, unused_name
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
@@ -84,7 +90,7 @@ class _Build:
         self.order = [*split.coupled, *split.linear]
         taken = {s.data[1] for s in trace.state_symbols}
         n = len(split.linear)
-        mean, covariance = _free("mean", taken), _free("covariance", taken)
+        mean, covariance = unused_name("mean", taken), unused_name("covariance", taken)
         self.mean = tuple(symbol("state", mean, (i,)) for i in range(n))
         self.covariance = np.empty((n, n), dtype=object)
         for i in range(n):
@@ -112,11 +118,11 @@ class _Build:
         return [s for s in self.trace.observations.values() if channels & set(s.components)]
 
     # -- the observation: y_t given x_t, m_t, P_t
-    def _observe(self) -> tuple[Belief, dict[str, Site]]:
+    def _observe(self) -> tuple[GaussianMoments, dict[str, Site]]:
         """What is known of z_t after y_t, and the laws of the channels."""
         telling, z = self._telling(), list(self.split.linear)
-        belief = Belief(objects(self.mean), self.covariance)
-        before = belief
+        moments = GaussianMoments(objects(self.mean), self.covariance)
+        before = moments
         single = len(telling) == 1 and len(telling[0].components) == 1
         sites: dict[str, Site] = {}
         for name, site in self.trace.observations.items():
@@ -124,20 +130,24 @@ class _Build:
                 sites[name] = site
                 continue
             c, d, r = _affine(site, z)
-            belief, laws = absorb(belief, c, d, r, list(site.value.ravel()), self.missing)
+            moments, laws = updated_by_channels(
+                moments, c, d, r, list(site.value.ravel()), self.missing
+            )
             alone = [self._predicted(before, c[i], d[i], r[i, i]) for i in range(len(d))]
             sites[name] = replace(site, distribution=_observed(laws, alone, site, single=single))
-        return belief, sites
+        return moments, sites
 
     @staticmethod
-    def _predicted(belief: Belief, row: np.ndarray, offset: Expr, noise: Expr) -> tuple:
-        return belief.by(row, offset, noise, ZERO, None)[1:]
+    def _predicted(moments: GaussianMoments, row: np.ndarray, offset: Expr, noise: Expr) -> tuple:
+        return moments.updated(row, offset, noise, ZERO, None)[1:]
 
     # -- x_t and the moments of z_t given what came before
-    def _sites(self, sites: Mapping[str, Site], filtered: Belief | None) -> dict[str, Site]:
+    def _sites(
+        self, sites: Mapping[str, Site], filtered: GaussianMoments | None
+    ) -> dict[str, Site]:
         """The laws of x, then of the moments; `filtered` is None for the first row."""
         joint, coupled = self._joint(sites, filtered)
-        moments = joint.given_exactly(coupled)
+        given = joint.given_exactly(coupled)
         found: dict[str, Site] = {}
         for name, site in sites.items():
             free = [s for s in site.components if s not in self.linear and s not in set(coupled)]
@@ -155,35 +165,35 @@ class _Build:
             else:
                 law = MvNormal(array(joint.mean[:k]), covariance=array(joint.covariance[:k, :k]))
             where_coupled = sites[coupled[0].data[1]].distribution.location
-            found[_free("coupled", set(found))] = _site(
+            found[unused_name("coupled", set(found))] = _site(
                 "coupled", first.role, law, coupled, where_coupled
             )
         lower = [(i, j) for i in range(len(self.mean)) for j in range(i + 1)]
         for symbols, values in (
-            (list(self.mean), list(moments.mean)),
-            ([self.covariance[i] for i in lower], [moments.covariance[i] for i in lower]),
+            (list(self.mean), list(given.mean)),
+            ([self.covariance[i] for i in lower], [given.covariance[i] for i in lower]),
         ):
             name = symbols[0].data[1]
             found[name] = _site(name, first.role, Dirac(array(values)), symbols, where)
         return found
 
     def _joint(
-        self, sites: Mapping[str, Site], filtered: Belief | None
-    ) -> tuple[Belief, list[Expr]]:
+        self, sites: Mapping[str, Site], filtered: GaussianMoments | None
+    ) -> tuple[GaussianMoments, list[Expr]]:
         """The law of (coupled x, z) given the past, and which x these are."""
         block = gaussian_block(list(sites.values()))
         if filtered is None:
             coupled = correlated(block, self.linear)
             order = [*(s for s in self.trace.state_symbols if s in coupled), *self.split.linear]
             mean, q = _law(sites, order)
-            return Belief(mean, q), order[: len(coupled)]
+            return GaussianMoments(mean, q), order[: len(coupled)]
         mean, q = _law(sites, self.order)
         a, b = self._transition(mean)
-        earlier = Belief(
+        earlier = GaussianMoments(
             objects(_previous(filtered.mean)),
             objects(_previous(filtered.covariance.ravel())).reshape(filtered.covariance.shape),
         )
-        return earlier.moved(a, b, q), list(self.split.coupled)
+        return earlier.predicted(a, b, q), list(self.split.coupled)
 
     def _transition(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A, b of mean = A z_{t-1} + b."""
@@ -226,12 +236,6 @@ class _Build:
 # -- the parts
 
 
-def _free(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name
-
-
 def _previous(expressions: Iterable[Expr]) -> list[Expr]:
     """The same one step earlier."""
     expressions = list(expressions)
@@ -242,19 +246,14 @@ def _previous(expressions: Iterable[Expr]) -> list[Expr]:
 def _law(sites: Mapping[str, Site], order: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of components with Gaussian or deterministic laws, in this order."""
     own = [s for s in sites.values() if gaussian(s) and set(s.components) & set(order)]
-    means = {
-        s: e
-        for site in own
-        for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True)
-    }
-    block = gaussian_block(own)
+    block, mean = gaussian_block(own), component_means(own)
     place = {s: i for i, s in enumerate(block.symbols)}
     q = np.full((len(order), len(order)), ZERO, dtype=object)
     for i, a in enumerate(order):
         for j, b in enumerate(order):
             if a in place and b in place:
                 q[i, j] = block.covariance[place[a], place[b]]
-    return objects([means[s] for s in order]), q
+    return objects([mean[s] for s in order]), q
 
 
 def _affine(site: Site, z: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

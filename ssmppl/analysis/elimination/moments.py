@@ -19,15 +19,15 @@ ZERO = constant(0.0)
 
 
 @dataclass(frozen=True)
-class Belief:
-    """A Gaussian: mean (n,), covariance (n, n), as arrays of Exprs."""
+class GaussianMoments:
+    """A Gaussian law of z: mean (n,), covariance (n, n), as arrays of Exprs."""
 
     mean: np.ndarray
     covariance: np.ndarray
 
-    def by(
+    def updated(
         self, row: np.ndarray, offset: Expr, noise: Expr, value: Expr, measured: Expr | None
-    ) -> tuple[Belief, Expr, Expr]:
+    ) -> tuple[GaussianMoments, Expr, Expr]:
         """After value = row @ z + offset + N(0, noise); and its predicted mean and variance.
 
         measured : 1 where the value is there; None: always.
@@ -47,9 +47,9 @@ class Belief:
         for i in range(n):
             for j in range(i + 1):
                 new[i, j] = new[j, i] = self.covariance[i, j] - gain[i] * cross[j]
-        return Belief(new_mean, new), mean, variance
+        return GaussianMoments(new_mean, new), mean, variance
 
-    def moved(self, a: np.ndarray, b: np.ndarray, q: np.ndarray) -> Belief:
+    def predicted(self, a: np.ndarray, b: np.ndarray, q: np.ndarray) -> GaussianMoments:
         """Of a z + b + N(0, q)."""
         rows = [[_dot(a[i], self.covariance[:, j]) for j in range(len(self.mean))]
                 for i in range(len(b))]  # fmt: skip
@@ -58,15 +58,15 @@ class Belief:
             for j in range(i + 1):
                 new[i, j] = new[j, i] = _dot(rows[i], a[j]) + q[i, j]
         mean = objects([_dot(a[i], self.mean) + b[i] for i in range(len(b))])
-        return Belief(mean, new)
+        return GaussianMoments(mean, new)
 
-    def given_exactly(self, values: Sequence[Expr]) -> Belief:
+    def given_exactly(self, values: Sequence[Expr]) -> GaussianMoments:
         """Of the later components, given the first ones."""
         k, found = len(values), self
         for value in values:
             row = np.array([constant(1.0)] + [ZERO] * (len(found.mean) - 1), dtype=object)
-            found = found.by(row, ZERO, ZERO, value, None)[0]
-            found = Belief(found.mean[1:], found.covariance[1:, 1:])
+            found = found.updated(row, ZERO, ZERO, value, None)[0]
+            found = GaussianMoments(found.mean[1:], found.covariance[1:, 1:])
         assert len(found.mean) == len(self.mean) - k
         return found
 
@@ -95,17 +95,17 @@ def block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
     return out
 
 
-def absorb(
-    belief: Belief, c: np.ndarray, d: np.ndarray, r: np.ndarray, values: Sequence[Expr],
+def updated_by_channels(
+    moments: GaussianMoments, c: np.ndarray, d: np.ndarray, r: np.ndarray, values: Sequence[Expr],
     missing: Missing,
-) -> tuple[Belief, list[tuple[Expr, Expr]]]:  # fmt: skip
-    """The belief after y = c z + d + N(0, r); and (mean, variance) of each channel given the
-    earlier ones. Correlated noise joins the belief for as long as it takes."""
-    n, k = len(belief.mean), len(d)
+) -> tuple[GaussianMoments, list[tuple[Expr, Expr]]]:  # fmt: skip
+    """Moments of z after y = c z + d + N(0, r); and (mean, variance) of each channel given the
+    earlier ones. Correlated noise joins z for as long as it takes."""
+    n, k = len(moments.mean), len(d)
     together = any(r[i, j] is not ZERO for i in range(k) for j in range(i))
     if together:
-        mean = objects([*belief.mean, *[ZERO] * k])
-        belief = Belief(mean, block_diagonal([belief.covariance, r]))
+        mean = objects([*moments.mean, *[ZERO] * k])
+        moments = GaussianMoments(mean, block_diagonal([moments.covariance, r]))
     laws: list[tuple[Expr, Expr]] = []
     for i, value in enumerate(values):
         row: np.ndarray = c[i]
@@ -114,6 +114,6 @@ def absorb(
             unit = [constant(1.0) if j == i else ZERO for j in range(k)]
             row, noise = np.concatenate([row, objects(unit)]), ZERO
         measured = None if missing.none else seen(value)
-        belief, *law = belief.by(row, d[i], noise, value, measured)
+        moments, *law = moments.updated(row, d[i], noise, value, measured)
         laws.append((law[0], law[1]))
-    return Belief(belief.mean[:n], belief.covariance[:n, :n]), laws
+    return GaussianMoments(moments.mean[:n], moments.covariance[:n, :n]), laws

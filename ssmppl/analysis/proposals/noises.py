@@ -1,11 +1,11 @@
-"""The states of a model as what drives them: x_1 = F_1(e_1; theta), x_t = F(x_{t-1}, e_t; theta).
+"""The states of a model by their noises: x_1 = F_1(e_1; theta), x_t = F(x_{t-1}, e_t; theta).
 
 With a law of location and scale, x = m + S e, the noise e has a law that is free of the parameters
-in m and S. A move of theta that holds the noises fixed takes the trajectory along (non-centred
-parametrisation: Papaspiliopoulos, Roberts and Sköld 2007, "A general framework for the
+in m and S: the state is non-centred. A move of theta that holds the noises fixed takes the
+trajectory along (Papaspiliopoulos, Roberts and Sköld 2007, "A general framework for the
 parametrization of hierarchical models", *Statistical Science* 22). Nothing is asked of the law of e
 itself: the Jacobian of x in e is all that such a move needs, so a Student t may even have its
-degrees of freedom moved. States of other laws stay where they are, deterministic ones follow.
+degrees of freedom moved. States of other laws stay centred, deterministic ones follow.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing, terms
-from ssmppl.analysis.proposals.twisted import Guided, given_draws, guided
+from ssmppl.analysis.proposals.twisted import GivenDraws, LookaheadModel, lookahead_model
+from ssmppl.analysis.structure import component_means
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import differentiate
@@ -27,20 +28,20 @@ from ssmppl.language.model.traced import Site, Trace
 
 
 @dataclass(frozen=True)
-class Driven:
-    """A law by the noise that drives it.
+class NonCentred:
+    """A law by its noise.
 
     noise : symbols of e (R,). value : F by component, in the order of the trace's states, as a
-    function of x_{t-1} and e; a state that stays is its own symbol. recovered : (R,) e as a
-    function of x_{t-1} and x. log_volume : log |dx / de| over the states with noise. stays : names
-    of the states that are neither driven nor deterministic.
+    function of x_{t-1} and e; a centred state is its own symbol. recovered : (R,) e as a function
+    of x_{t-1} and x. log_volume : log |dx / de| over the states with noise. centred : names of the
+    states that have no such noise and are not deterministic.
     """
 
     noise: tuple[Expr, ...]
     value: ExprArray
     recovered: ExprArray
     log_volume: Expr
-    stays: tuple[str, ...]
+    centred: tuple[str, ...]
 
     @property
     def parameters(self) -> frozenset[str]:
@@ -54,23 +55,23 @@ class Driven:
 class Noises:
     """Both laws of a model by noise; parameters : names of those that move the states with them.
 
-    tied : names of all parameters that stand in a factor with a state. guide : what a Gaussian
-    guide of the states can be made from, or why there is none.
+    tied : names of all parameters that stand in a factor with a state. lookahead : what a Gaussian
+    approximation to the states' posterior can be found from, or why there is none.
     """
 
-    initial: Driven
-    transition: Driven
+    initial: NonCentred
+    transition: NonCentred
     parameters: tuple[str, ...]
     tied: tuple[str, ...]
-    guide: Guided | NotApplicable
+    lookahead: LookaheadModel | NotApplicable
 
 
 def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
     """The model by its noises; NotApplicable where no state has noise of its own that can be told
     from it."""
     states = trace.state_symbols
-    initial = driven(list(trace.initial.values()), states)
-    transition = driven(list(trace.transition.values()), states)
+    initial = non_centred(list(trace.initial.values()), states)
+    transition = non_centred(list(trace.transition.values()), states)
     if not transition.noise:
         site = next(iter(trace.transition.values()))
         kinds = sorted({type(s.distribution).__name__ for s in trace.transition.values()})
@@ -85,29 +86,29 @@ def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
             inside = symbols_of(term.log_density)
             if any(s.data[0] in ("state", "state_prev") for s in inside):
                 tied |= {s.data[1] for s in inside if s.data[0] == "parameter"}
-    guide = guided(trace, missing)
-    if not (tied if isinstance(guide, Guided) else held):
+    lookahead = lookahead_model(trace, missing)
+    if not (tied if isinstance(lookahead, LookaheadModel) else held):
         site = next(iter(trace.transition.values()))
         return NotApplicable("no parameter is in the law of a state", site.distribution.location)
     first, second = ([p for p in trace.parameters if p in names] for names in (held, tied))
-    return Noises(initial, transition, tuple(first), tuple(second), guide)
+    return Noises(initial, transition, tuple(first), tuple(second), lookahead)
 
 
-def driven(sites: Sequence[Site], states: Sequence[Expr]) -> Driven:
+def non_centred(sites: Sequence[Site], states: Sequence[Expr]) -> NonCentred:
     """The laws of one role by their noises."""
     value: dict[Expr, Expr] = {s: s for s in states}
     noise: list[Expr] = []
     recovered: list[Expr] = []
-    log_volume, stays = constant(0.0), []
+    log_volume, centred = constant(0.0), []
     for site in sites:
         d, own = site.distribution, site.value.ravel()
         if isinstance(d, Dirac):
-            value.update(zip(own, array(d.mean()).ravel(), strict=True))
+            value.update(component_means([site]))
             continue
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         pair = _by_noise(site, new)
         if pair is None:
-            stays.append(site.name)
+            centred.append(site.name)
             continue
         noise += new
         value.update(zip(own, pair[0].ravel(), strict=True))
@@ -117,7 +118,7 @@ def driven(sites: Sequence[Site], states: Sequence[Expr]) -> Driven:
             (slope,) = differentiate([e], s)
             log_volume = log_volume - apply("log", apply("abs", slope))
     ordered = array([value[s] for s in states])
-    return Driven(tuple(noise), ordered, array(recovered), log_volume, tuple(stays))
+    return NonCentred(tuple(noise), ordered, array(recovered), log_volume, tuple(centred))
 
 
 def _by_noise(site: Site, noise: list[Expr]) -> tuple[ExprArray, ExprArray] | None:
@@ -125,7 +126,7 @@ def _by_noise(site: Site, noise: list[Expr]) -> tuple[ExprArray, ExprArray] | No
     d: Any = site.distribution
     x = site.value
     if d.gaussian_noise:
-        return array(d.sample(given_draws(site.name, noise))), array(d.standard(x))
+        return array(d.sample(GivenDraws(site.name, noise))), array(d.standard(x))
     found = d.location_and_scale()
     if found is None:
         return None

@@ -18,6 +18,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
+from ssmppl.analysis.structure import unused_name
 from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed, substitute, symbol, symbols_of
@@ -56,7 +57,7 @@ def perturbed(
     n, where = len(form.z), _location(trace)
     taken = {*trace.parameters, *trace.initial, *trace.observations, *trace.inputs}
     z_name, spread_name, counts_name = (
-        _fresh(n, taken) for n in ("unconstrained", "perturbation", "prior_counts")
+        unused_name(n, taken) for n in ("unconstrained", "perturbation", "prior_counts")
     )
     z = symbols("state", z_name, (n,))
     walk = Normal(array([previous(s) for s in z]), sd=symbols("input", spread_name, (n,)))
@@ -94,12 +95,6 @@ def _location(trace: Trace) -> Location:
     """A line to attribute the walk to: that of the first prior."""
     site = next(iter((trace.parameters or trace.initial).values()))
     return site.distribution.location
-
-
-def _fresh(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name
 
 
 def _values(form: Unconstrained, at: list[Expr]) -> dict[Expr, Expr]:

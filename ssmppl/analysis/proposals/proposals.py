@@ -1,20 +1,17 @@
-"""Proposals of the particle filter, derived from the model.
+"""Proposals of the particle filter, derived from the model: how particles move and what they weigh.
+
+A `Proposal` holds, as expressions,
+
+* `draw`, x_t from x_{t-1} and random draws, and `initial_draw`, x_1;
+* `weight`, the terms of log [ f(x_t | x_{t-1}) g(y_t | x_t) / q(x_t | x_{t-1}, y_t) ];
+* `look_ahead`, an approximation to log p(y_t | x_{t-1}), the auxiliary weight of Pitt and Shephard
+  (1999);
+* `fit`, subexpressions of these, functions of x_{t-1} and y_t, that are computed once.
 
 Tiers, best first (Doucet, Godsill and Andrieu 2000, section II): the locally optimal proposal of
-a Gaussian transition with an observation affine in the state; a Laplace approximation to it
-(a few Newton steps per particle, curvature clipped to its concave part, in a defensive mixture
-with the transition); the transition itself (bootstrap).
-
-How particles move: what a proposal is, the transition itself, the laws taken apart.
-
-A `Proposal` says how a particle moves and what it weighs, as expressions:
-
-* `draw` gives x_t from x_{t-1} and random draws, `initial_draw` gives x_1;
-* `weight` are the terms of log [ f(x_t | x_{t-1}) g(y_t | x_t) / q(x_t | x_{t-1}, y_t) ];
-* `look_ahead` approximates log p(y_t | x_{t-1}), the auxiliary weight of Pitt and Shephard (1999);
-* `fit` are subexpressions of these, functions of x_{t-1} and y_t, that are computed once.
-
-Gaussian fits to f(x_t | x_{t-1}) g(y_t | x_t) for a Gaussian f, by Newton's method.
+a Gaussian transition with an observation affine in the state; a Laplace approximation to it (a few
+Newton steps per particle, curvature clipped to its concave part, in a defensive mixture with the
+transition); the transition itself (bootstrap).
 """
 
 from __future__ import annotations
@@ -51,6 +48,11 @@ from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite
 from ssmppl.language.model.traced import Site, Trace, seen
 
+NEWTON_STEPS = 3
+LONGEST_STEP = 2.0  # in standard deviations of the transition
+DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
+LARGEST_EXPONENT = 600.0  # of q / f where exp is taken
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -66,6 +68,53 @@ class Proposal:
     fit: tuple[Expr, ...] = ()
     explanation: str = ""
     looped: int = 0  # multiplications per particle, of a proposal that is not written out
+
+
+def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:
+    """All proposals by name: "bootstrap", "guided", "auxiliary", and the user's own."""
+    reason = without_start(trace)
+    if reason is not None:
+        names = ("bootstrap", "guided", "auxiliary", *(["user"] if trace.proposal else []))
+        return dict.fromkeys(names, reason)
+    found: dict[str, Proposal | NotApplicable] = {"bootstrap": bootstrap(trace, missing)}
+    if trace.proposal:
+        found["user"] = _user(trace, missing)
+    guided = _locally_optimal(trace, missing)
+    if isinstance(guided, NotApplicable):
+        affine_reason = guided
+        guided = _laplace(trace, missing)
+        if isinstance(guided, NotApplicable):
+            same = affine_reason.reason == guided.reason
+            both = guided.reason if same else f"{affine_reason.reason}; {guided.reason}"
+            guided = NotApplicable(both, affine_reason.where)
+    found["guided"] = guided
+    if isinstance(guided, NotApplicable):
+        found["auxiliary"] = guided
+    elif guided.look_ahead is None:
+        found["auxiliary"] = NotApplicable(
+            "a state with neither a Gaussian nor a deterministic law stands between x_{t-1} and y_t"
+        )
+    else:
+        found["auxiliary"] = replace(
+            guided,
+            name="auxiliary",
+            explanation=guided.explanation + ", and resampled by how well their successors are "
+            "expected to fit y_t",
+        )
+        found["guided"] = replace(guided, look_ahead=None)
+    return found
+
+
+def without_start(trace: Trace) -> NotApplicable | None:
+    """Why no particle can be drawn at the first row, if none can."""
+    flat = flat_start(trace)
+    if not flat:
+        return None
+    reason = f"the initial law of {flat[0].name!r} is Flat: no particle can be drawn from it"
+    return NotApplicable(reason, flat[0].distribution.location)
+
+
+# -- tier 1: the transition
 
 
 def bootstrap(trace: Trace, missing: Missing) -> Proposal:
@@ -151,124 +200,6 @@ def split(trace: Trace, sites: list[Site]) -> Split:
     following = {s: e for s, e in others.items() if depends_on(e, block.symbols)}
     random = any(n.op == "random" for n in topological(others.values()))
     return Split(block, others, random, following)
-
-
-NEWTON_STEPS = 3
-LONGEST_STEP = 2.0  # in standard deviations of the transition
-
-
-def gaussian_fit(
-    block: GaussianBlock, slope: ExprArray, curvature: ExprArray, precision: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """Mode (n,) after a few Newton steps from the transition's mean, and the Cholesky factor (n, n)
-    of the precision there, without the part of g that is not concave.
-
-    slope, curvature : of log g in the block's symbols. precision : of the transition.
-    """
-    n = len(block)
-    x = block.mean
-    spread = array([apply("sqrt", block.covariance[i, i]) for i in range(n)])
-    for _ in range(NEWTON_STEPS):
-        g, w = _at(block, x, slope, curvature)
-        pull = g - precision @ (x - block.mean)
-        if n == 1:
-            step = pull / (precision[0] + np.maximum(w[0], 0.0))
-        else:
-            root = lower_inverse(_factor(w, precision))
-            step = array(root.T @ (root @ pull))
-        limit = LONGEST_STEP * spread
-        x = array(x + np.minimum(np.maximum(step, -limit), limit))
-    _, w = _at(block, x, slope, curvature)
-    factor = _factor(w, precision)
-    # slope or curvature over- or underflowed: the transition itself is a valid proposal
-    total = constant(0.0)
-    for e in (*x, *np.diagonal(factor.view(np.ndarray))):
-        total = total + e
-    finite: Any = apply("lt", apply("abs", total), np.inf)
-    return array(np.where(finite, x, block.mean)), array(
-        np.where(finite, factor, written_cholesky(precision))
-    )
-
-
-def _at(
-    block: GaussianBlock, x: ExprArray, slope: ExprArray, curvature: ExprArray
-) -> tuple[ExprArray, ExprArray]:
-    """Slope (n,) of log g at x, and minus its curvature (n, n)."""
-    n = len(block)
-    at = dict(zip(block.symbols, x, strict=True))
-    flat = substitute([*slope, *curvature.ravel()], at)
-    return array(flat[:n]), array(-array(flat[n:]).reshape(n, n))
-
-
-def _factor(w: ExprArray, precision: ExprArray) -> ExprArray:
-    """Cholesky factor of precision + w, or of precision + the positive part of w's diagonal."""
-    n = len(w)
-    diagonal = np.diag(array(np.maximum(array(np.diagonal(w.view(np.ndarray))), 0.0)))
-    safe = written_cholesky(array(precision + diagonal))
-    if n == 1:
-        return safe
-    full = written_cholesky(array(precision + w))
-    last = full[n - 1, n - 1]
-    concave: Any = apply("eq", last, last)  # nan where the matrix is not positive definite
-    return array(np.where(concave, full, safe))
-
-
-def written_cholesky(a: ExprArray) -> ExprArray:
-    """Cholesky factor written out in scalars (nan where a is not positive definite)."""
-    n, zero = len(a), constant(0.0)
-    out = np.empty((n, n), dtype=object)
-    out[...] = [[zero] * n] * n
-    for j in range(n):
-        total = a[j, j]
-        for k in range(j):
-            total = total - out[j, k] ** 2
-        out[j, j] = apply("sqrt", total)
-        for i in range(j + 1, n):
-            total = a[i, j]
-            for k in range(j):
-                total = total - out[i, k] * out[j, k]
-            out[i, j] = total / out[j, j]
-    return array(out)
-
-
-DEFENSIVE = 0.05  # share of the transition in the Laplace proposal's mixture
-LARGEST_EXPONENT = 600.0  # of q / f where exp is taken
-
-
-def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:
-    """All proposals by name: "bootstrap", "guided", "auxiliary", and the user's own."""
-    flat = flat_start(trace)
-    if flat:
-        reason = f"the initial law of {flat[0].name!r} is Flat: no particle can be drawn from it"
-        names = ("bootstrap", "guided", "auxiliary", *(["user"] if trace.proposal else []))
-        return dict.fromkeys(names, NotApplicable(reason, flat[0].distribution.location))
-    found: dict[str, Proposal | NotApplicable] = {"bootstrap": bootstrap(trace, missing)}
-    if trace.proposal:
-        found["user"] = _user(trace, missing)
-    guided = _locally_optimal(trace, missing)
-    if isinstance(guided, NotApplicable):
-        affine_reason = guided
-        guided = _laplace(trace, missing)
-        if isinstance(guided, NotApplicable):
-            same = affine_reason.reason == guided.reason
-            reason = guided.reason if same else f"{affine_reason.reason}; {guided.reason}"
-            guided = NotApplicable(reason, affine_reason.where)
-    found["guided"] = guided
-    if isinstance(guided, NotApplicable):
-        found["auxiliary"] = guided
-    elif guided.look_ahead is None:
-        found["auxiliary"] = NotApplicable(
-            "a state with neither a Gaussian nor a deterministic law stands between x_{t-1} and y_t"
-        )
-    else:
-        found["auxiliary"] = replace(
-            guided,
-            name="auxiliary",
-            explanation=guided.explanation + ", and resampled by how well their successors are "
-            "expected to fit y_t",
-        )
-        found["guided"] = replace(guided, look_ahead=None)
-    return found
 
 
 # -- tier 2: locally optimal
@@ -449,10 +380,7 @@ def _newton(
     narrower = spread[0] if n == 1 else apply("exp", 0.5 * log_determinant(block.covariance))
     for i in range(n):
         narrower = narrower * factor[i, i]
-    ratio = narrower * apply("exp", apply("minimum", distance, LARGEST_EXPONENT))
-    log_ratio = apply("log", DEFENSIVE + (1.0 - DEFENSIVE) * ratio)
-    # beyond the cap the transition's share counts for nothing, and log q / f goes on as distance
-    log_ratio = log_ratio + np.maximum(distance - LARGEST_EXPONENT, 0.0)
+    log_ratio = log_mixture(narrower, distance, DEFENSIVE)
     at_mode = dict(zip(block.symbols, x, strict=True))
     (g_mode,) = substitute([total], at_mode)
     to_mode = array(x - block.mean)
@@ -462,6 +390,90 @@ def _newton(
     if depends_on(look_ahead, list(move.others)):  # the fit is no function of x_{t-1} alone
         fit = ()
     return move.complete(chosen), fit, log_ratio, ahead
+
+
+def gaussian_fit(
+    block: GaussianBlock, slope: ExprArray, curvature: ExprArray, precision: ExprArray
+) -> tuple[ExprArray, ExprArray]:
+    """A Gaussian fitted to f(x_t | x_{t-1}) g(y_t | x_t) for a Gaussian f: its mode (n,) after a
+    few Newton steps from the mean of f, and the Cholesky factor (n, n) of its precision, without
+    the part of g that is not concave.
+
+    slope, curvature : of log g in the block's symbols. precision : of the transition.
+    """
+    n = len(block)
+    x = block.mean
+    spread = array([apply("sqrt", block.covariance[i, i]) for i in range(n)])
+    for _ in range(NEWTON_STEPS):
+        g, w = _at(block, x, slope, curvature)
+        pull = g - precision @ (x - block.mean)
+        if n == 1:
+            step = pull / (precision[0] + np.maximum(w[0], 0.0))
+        else:
+            root = lower_inverse(_factor(w, precision))
+            step = array(root.T @ (root @ pull))
+        limit = LONGEST_STEP * spread
+        x = array(x + np.minimum(np.maximum(step, -limit), limit))
+    _, w = _at(block, x, slope, curvature)
+    factor = _factor(w, precision)
+    # slope or curvature over- or underflowed: the transition itself is a valid proposal
+    total = constant(0.0)
+    for e in (*x, *np.diagonal(factor.view(np.ndarray))):
+        total = total + e
+    finite: Any = apply("lt", apply("abs", total), np.inf)
+    return array(np.where(finite, x, block.mean)), array(
+        np.where(finite, factor, written_cholesky(precision))
+    )
+
+
+def _at(
+    block: GaussianBlock, x: ExprArray, slope: ExprArray, curvature: ExprArray
+) -> tuple[ExprArray, ExprArray]:
+    """Slope (n,) of log g at x, and minus its curvature (n, n)."""
+    n = len(block)
+    at = dict(zip(block.symbols, x, strict=True))
+    flat = substitute([*slope, *curvature.ravel()], at)
+    return array(flat[:n]), array(-array(flat[n:]).reshape(n, n))
+
+
+def _factor(w: ExprArray, precision: ExprArray) -> ExprArray:
+    """Cholesky factor of precision + w, or of precision + the positive part of w's diagonal."""
+    n = len(w)
+    diagonal = np.diag(array(np.maximum(array(np.diagonal(w.view(np.ndarray))), 0.0)))
+    safe = written_cholesky(array(precision + diagonal))
+    if n == 1:
+        return safe
+    full = written_cholesky(array(precision + w))
+    last = full[n - 1, n - 1]
+    concave: Any = apply("eq", last, last)  # nan where the matrix is not positive definite
+    return array(np.where(concave, full, safe))
+
+
+def log_mixture(volume: Expr, distance: Expr, share: float) -> Expr:
+    """log (q / f) of a fit mixed with a share of f, where fit / f = volume * exp(distance)."""
+    ratio = volume * apply("exp", apply("minimum", distance, LARGEST_EXPONENT))
+    log_ratio = apply("log", share + (1.0 - share) * ratio)
+    # beyond the cap the share of f counts for nothing, and log q / f goes on as distance
+    mixture: Expr = log_ratio + np.maximum(distance - LARGEST_EXPONENT, 0.0)
+    return mixture
+
+
+def written_cholesky(a: ExprArray) -> ExprArray:
+    """Cholesky factor written out in scalars (nan where a is not positive definite)."""
+    n, zero = len(a), constant(0.0)
+    out = np.empty((n, n), dtype=object)
+    out[...] = [[zero] * n] * n
+    for j in range(n):
+        total = a[j, j]
+        for k in range(j):
+            total = total - out[j, k] ** 2
+        out[j, j] = apply("sqrt", total)
+        for i in range(j + 1, n):
+            total = a[i, j]
+            for k in range(j):
+                total = total - out[i, k] * out[j, k]
+            out[i, j] = total / out[j, j]
+    return array(out)
 
 
 # -- the user's own

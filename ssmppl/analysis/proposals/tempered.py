@@ -14,7 +14,7 @@ from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.structure import deterministic, flat_start, without_density
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import Expr, depends_on
+from ssmppl.expressions.expr import Expr, depends_on, symbols_of
 from ssmppl.language.model.traced import Site, Trace
 
 MOVABLE = ("real", "interval")  # supports that a random walk can move about in
@@ -62,18 +62,13 @@ def tempered(trace: Trace, missing: Missing) -> Tempered | NotApplicable:
     where = next(iter(trace.transition.values())).distribution.location
     if not later:
         return NotApplicable("no state has a continuous transition to move about in", where)
-    if not depends_on_any(observed, later):
+    if later.isdisjoint(symbols_of(observed)):
         return NotApplicable(
             "the observation depends on no state that has a continuous transition", where
         )
     return Tempered(
         tuple(s in first for s in states), tuple(s in later for s in states), *densities
     )
-
-
-def depends_on_any(expressions: list[Expr], symbols: set[Expr]) -> bool:
-    """Whether some expression depends on some symbol."""
-    return any(depends_on(e, list(symbols)) for e in expressions)
 
 
 def _continuous(site: Site) -> bool:

@@ -1,19 +1,20 @@
 """The twisted proposal: particles that are drawn and resampled by all that the data will say.
 
 N. Whiteley and A. Lee, "Twisted particle filters", *Annals of Statistics* 42 (2014); P. Guarniero,
-A. M. Johansen and A. Lee, "The iterated auxiliary particle filter", *JASA* 112 (2017). With a guide
+A. M. Johansen and A. Lee, "The iterated auxiliary particle filter", *JASA* 112 (2017). With a
+twisting function
 
     log psi_t(x) = g_t' (x - m_t) - (x - m_t)' A_t (x - m_t) / 2 + constant,
 
-about log p(y_t, ..., y_T | x_t = x), particles move by f(x_t | x_{t-1}) psi_t(x_t), normalised, and
-are resampled by how much of psi_t they can expect. The guide comes from a Gaussian approximation to
-the whole smoothing problem (`codegen/kernels/twisted/lookahead.py`), so a velocity is steered by
-the positions that follow it, where a look at y_t alone says nothing.
+about log p(y_t, ..., y_T | x_t = x), particles are proposed from f(x_t | x_{t-1}) psi_t(x_t),
+normalised, and resampled by how much of psi_t they can expect. It comes from a Gaussian
+approximation to the whole smoothing problem (`codegen/kernels/twisted/lookahead.py`), so that a
+velocity is drawn by the positions that follow it, where a look at y_t alone says nothing.
 
 All is done on standard normal noise e with x_t = F(x_{t-1}, e), F affine in e about e = 0: with
-f = F(x_{t-1}, 0) and L = dF / de, e is Gaussian of precision I + L' A L under the guide. So states
-that follow without noise of their own need no density, and a singular covariance is no trouble. A
-small share of the particles moves by the transition, which bounds the weights.
+f = F(x_{t-1}, 0) and L = dF / de, e is Gaussian of precision I + L' A L under the twisted law. So
+states that follow without noise of their own need no density, and a singular covariance is no
+trouble. A small share of the particles is drawn from the transition, which bounds the weights.
 """
 
 from __future__ import annotations
@@ -24,8 +25,14 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.proposals.proposals import LARGEST_EXPONENT, Proposal, drawn, written_cholesky
-from ssmppl.analysis.structure import flat_start
+from ssmppl.analysis.proposals.proposals import (
+    Proposal,
+    drawn,
+    log_mixture,
+    without_start,
+    written_cholesky,
+)
+from ssmppl.analysis.structure import component_means
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import (
@@ -85,8 +92,8 @@ class NoiseForm:
 
 
 @dataclass(frozen=True)
-class Guided:
-    """What the guide's kernel needs to know of a model.
+class LookaheadModel:
+    """What the lookahead pass, which finds the twisting function, needs to know of a model.
 
     initial, transition : its laws by noise. observed : log g(y_t | x_t), 0 where nothing was seen.
     slope (D,), curvature (D, D) : of it, the latter with the sign changed. flat : whether the
@@ -102,7 +109,7 @@ class Guided:
 
     @property
     def written_out(self) -> bool:
-        """Whether the matrices of the moves are few enough to be written out in scalars."""
+        """Whether the noises are few enough for matrices to be written out in scalars."""
         return len(self.transition.noise) <= WRITTEN_OUT and len(self.initial.noise) <= WRITTEN_OUT
 
 
@@ -115,7 +122,7 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
         d: Any = site.distribution
         own = site.value.ravel()
         if isinstance(d, Dirac):
-            value.update(zip(own, array(d.mean()).ravel(), strict=True))
+            value.update(component_means([site]))
             continue
         if not d.gaussian_noise:
             reason = f"the law of {site.name} is {type(d).__name__}, not one of a Gaussian noise"
@@ -125,14 +132,14 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
             return NotApplicable(reason, d.location)
         new = [symbol("noise", "noise", (len(noise) + i,)) for i in range(len(own))]
         noise += new
-        sample = drawn(site, given_draws(site.name, new)).ravel()
+        sample = drawn(site, GivenDraws(site.name, new)).ravel()
         value.update(zip(own, sample, strict=True))
         recovered += list(d.standard(site.value).ravel())
     return NoiseForm(tuple(noise), array([value[s] for s in states]), array(recovered))
 
 
-class _Given(Draws):
-    """Draws that are these symbols, in turn."""
+class GivenDraws(Draws):
+    """Draws of a sampler that takes normals only, which are these symbols, in turn."""
 
     def __init__(self, site: str, symbols: list[Expr]):
         super().__init__(site)
@@ -142,19 +149,13 @@ class _Given(Draws):
         return next(self._next)
 
 
-def given_draws(site: str, symbols: list[Expr]) -> Draws:
-    """Draws of a sampler that takes normals only, which are these symbols, in turn."""
-    return _Given(site, symbols)
-
-
-def guided(trace: Trace, missing: Missing) -> Guided | NotApplicable:
-    """What a Gaussian guide can be made from; the reason where there is none."""
+def lookahead_model(trace: Trace, missing: Missing) -> LookaheadModel | NotApplicable:
+    """What a twisting function can be found from; the reason where there is none."""
     if not trace.observations:
         return NotApplicable("there is no observation")
-    flat = flat_start(trace)
-    if flat:
-        reason = f"the initial law of {flat[0].name!r} is Flat: no particle can be drawn from it"
-        return NotApplicable(reason, flat[0].distribution.location)
+    unstarted = without_start(trace)
+    if unstarted is not None:
+        return unstarted
     states = trace.state_symbols
     initial = noise_form(list(trace.initial.values()), states)
     transition = noise_form(list(trace.transition.values()), states)
@@ -184,7 +185,7 @@ def guided(trace: Trace, missing: Missing) -> Guided | NotApplicable:
     except NotDifferentiable as error:
         return NotApplicable(f"the transition is not differentiable: {error.found}", where)
     same = not any(depends_on(e, states) for e in curvature.ravel())
-    return Guided(initial, transition, total, slope, curvature, same)
+    return LookaheadModel(initial, transition, total, slope, curvature, same)
 
 
 def jacobian(transition: NoiseForm, trace: Trace) -> ExprArray:
@@ -193,8 +194,8 @@ def jacobian(transition: NoiseForm, trace: Trace) -> ExprArray:
     return array(array([differentiate(rest, p) for p in trace.state_prev_symbols]).T)
 
 
-def guide_symbols(d: int) -> tuple[ExprArray, ExprArray, ExprArray]:
-    """A (D, D), g (D,), m (D,) of the guide at a step."""
+def twisting_symbols(d: int) -> tuple[ExprArray, ExprArray, ExprArray]:
+    """A (D, D), g (D,), m (D,) of the twisting function at a step."""
     a = np.empty((d, d), dtype=object)
     for i in range(d):
         for j in range(i + 1):
@@ -205,7 +206,7 @@ def guide_symbols(d: int) -> tuple[ExprArray, ExprArray, ExprArray]:
 
 
 def start_symbols(r: int) -> tuple[ExprArray, ExprArray]:
-    """Mean (R,) of the noise of x_1 under the guide, and the lower factor (R, R) of its
+    """Mean (R,) of the noise of x_1 under the twisted law, and the lower factor (R, R) of its
     precision."""
     factor = np.full((r, r), constant(0.0), dtype=object)
     for i in range(r):
@@ -214,18 +215,18 @@ def start_symbols(r: int) -> tuple[ExprArray, ExprArray]:
     return array([symbol("guide", "start", (i,)) for i in range(r)]), array(factor)
 
 
-def guide_order(d: int, r: int) -> list[Expr]:
-    """The symbols of the guide as they stand in a row, of D states and R noises of x_1: A's lower
-    half, g, m, mean and lower half of the factor of the start."""
-    a, g, m = guide_symbols(d)
+def twisting_order(d: int, r: int) -> list[Expr]:
+    """The symbols of the twisting function as they stand in a row, of D states and R noises of x_1:
+    A's lower half, g, m, mean and lower half of the factor of the start."""
+    a, g, m = twisting_symbols(d)
     start, factor = start_symbols(r)
     halves = [[x[i, j] for i in range(n) for j in range(i + 1)] for x, n in ((a, d), (factor, r))]
     return [*halves[0], *g, *m, *start, *halves[1]]
 
 
 def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
-    """The proposal, in terms of the guide's symbols; its laws only where they are written out."""
-    found = guided(trace, missing)
+    """The proposal in the twisting function's symbols; its laws where they are written out."""
+    found = lookahead_model(trace, missing)
     if isinstance(found, NotApplicable):
         return found
     explanation = (
@@ -263,28 +264,28 @@ class _Law:
 
 
 def _start(form: NoiseForm, states: list[Expr]) -> _Law:
-    """x_1 under the guide, which the kernel has worked out: it depends on no particle."""
+    """x_1 under the twisted law, which the kernel has worked out: it depends on no particle."""
     mean, factor = start_symbols(len(form.noise))
     root = lower_inverse(factor) if form.noise else factor
-    return _steered(form, states, mean, factor, root, constant(0.0))
+    return _twisted_law(form, states, mean, factor, root, constant(0.0))
 
 
 def _move(form: NoiseForm, states: list[Expr]) -> _Law:
-    """x_t under the guide, given x_{t-1}."""
+    """x_t under the twisted law, given x_{t-1}."""
     r = len(form.noise)
-    precision, pull, centre = guide_symbols(len(states))
+    precision, pull, centre = twisting_symbols(len(states))
     away = array(form.at_rest() - centre)
-    steered = array(pull - precision @ away)
+    tilt = array(pull - precision @ away)
     spread = form.spread()
     middle = array(np.eye(r) + array(spread.T @ precision @ spread))
     factor = written_cholesky(middle)
     root = lower_inverse(factor)
-    half = array(root @ array(spread.T @ steered))  # C^-1 h, C C' = I + L'AL
+    half = array(root @ array(spread.T @ tilt))  # C^-1 h, C C' = I + L'AL
     ahead = pull @ away - 0.5 * (away @ precision @ away) + 0.5 * np.sum(array(half**2))
-    return _steered(form, states, array(root.T @ half), factor, root, ahead)
+    return _twisted_law(form, states, array(root.T @ half), factor, root, ahead)
 
 
-def _steered(
+def _twisted_law(
     form: NoiseForm, states: list[Expr], mean: ExprArray, factor: ExprArray, root: ExprArray,
     ahead: Expr,
 ) -> _Law:  # fmt: skip
@@ -298,15 +299,13 @@ def _steered(
     draws = Draws("twisted")
     z = array([draws.normal() for _ in range(r)])
     defend = apply("lt", draws.uniform(), DEFENSIVE)
-    by_guide = array(mean + root.T @ z)
-    chosen = [apply("where", defend, a, b) for a, b in zip(z, by_guide, strict=True)]
+    tilted = array(mean + root.T @ z)
+    chosen = [apply("where", defend, a, b) for a, b in zip(z, tilted, strict=True)]
     value = substitute(list(form.value), dict(zip(form.noise, chosen, strict=True)))
     e = form.recovered
     inward = array(factor.T @ array(e - mean))
     distance = 0.5 * (np.sum(array(e**2)) - np.sum(array(inward**2)))
-    ratio = volume * apply("exp", apply("minimum", distance, LARGEST_EXPONENT))
-    log_ratio = apply("log", DEFENSIVE + (1.0 - DEFENSIVE) * ratio)
-    log_ratio = log_ratio + np.maximum(distance - LARGEST_EXPONENT, 0.0)
+    log_ratio = log_mixture(volume, distance, DEFENSIVE)
     fit = (*mean, *(factor[i, j] for i in range(r) for j in range(i + 1)))
     draw = dict(zip(states, value, strict=True))
     return _Law(draw, log_ratio, ahead - apply("log", volume), fit)

@@ -1,4 +1,4 @@
-"""How high the transition density of a given x_t can get over all x_{t-1}.
+"""Upper bounds of the transition density of a given x_t over all x_{t-1}.
 
 What rejection sampling of backward indices needs (Douc, Garivier, Moulines and Olsson 2011): for
 each law, the density with those parameters that depend on x_{t-1} at the values that maximise it.
@@ -25,7 +25,7 @@ from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.model.traced import Site, Trace
 
 
-def transition_height(trace: Trace) -> Expr | NotApplicable:
+def transition_upper_bound(trace: Trace) -> Expr | NotApplicable:
     """An upper bound over x_{t-1} of the log density of the noisy components of x_t.
 
     An expression in x_t, theta, inputs and time; or the reason why there is none.
@@ -42,16 +42,16 @@ def transition_height(trace: Trace) -> Expr | NotApplicable:
         if site.name in skipped:
             continue
         with attributed(trace.locations, site.distribution.location):
-            height = _height(site, trace.state_prev_symbols)
-        if isinstance(height, NotApplicable):
-            return height
-        total = total + height
+            bound = _upper_bound(site, trace.state_prev_symbols)
+        if isinstance(bound, NotApplicable):
+            return bound
+        total = total + bound
     return total
 
 
-def _height(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
+def _upper_bound(site: Site, prev: Sequence[Expr]) -> Expr | NotApplicable:
     d, where = site.distribution, site.distribution.location
-    free = {n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())}
+    free = [n for n, p in d.parameters.items() if any(depends_on(e, prev) for e in p.ravel())]
     if not free:
         return d.log_density(site.value, guard=False)
     if isinstance(d, laws.Mixture):
@@ -81,7 +81,7 @@ def _element(site: Site, law: Distribution, index: tuple[int, ...]) -> Site:
 
 
 def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApplicable:
-    """The sum of the components' own heights; a weight that depends on the state is at most 1."""
+    """The sum of the components' own bounds; a weight that depends on the state is at most 1."""
     whole, total = d.support(), constant(0.0)
     for law in d.components:
         own = law.support()
@@ -93,15 +93,15 @@ def _mixture(site: Site, d: laws.Mixture, prev: Sequence[Expr]) -> Expr | NotApp
                 f"the components of {site.name} (Mixture) have different supports", d.location
             )
     for i in np.ndindex(site.shape):
-        height = None
+        bound = None
         for law, weight in zip(d.components, d.weights, strict=True):
-            part = _height(_element(site, law, i), prev)
+            part = _upper_bound(_element(site, law, i), prev)
             if isinstance(part, NotApplicable):
                 return part
             if not depends_on(weight[i], prev):
                 part = apply("log", weight[i]) + part
-            height = part if height is None else apply("logaddexp", height, part)
-        total = total + height
+            bound = part if bound is None else apply("logaddexp", bound, part)
+        total = total + bound
     return total
 
 
@@ -110,7 +110,7 @@ def _zero_inflated(site: Site, d: laws.ZeroInflated, prev: Sequence[Expr]) -> Ex
     state."""
     total = constant(0.0)
     for i in np.ndindex(site.shape):
-        part = _height(_element(site, d.base, i), prev)
+        part = _upper_bound(_element(site, d.base, i), prev)
         if isinstance(part, NotApplicable):
             return part
         if not depends_on(d.p[i], prev):

@@ -28,15 +28,15 @@ def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     counts = f"({len(found.initial.noise)}, {len(found.transition.noise)})"
     own = {"steered": str(steered), "noises": counts}
     if steered:
-        assert not isinstance(found.guide, NotApplicable)
-        linear_passes(section, trace, found.guide)
+        assert not isinstance(found.lookahead, NotApplicable)
+        linear_passes(section, trace, found.lookahead)
     else:
         own |= {name: name for name in STEERED}
     what = "of a Gaussian approximation to their posterior" if steered else "of their laws"
     out.add(f"the states by the noises {what}", section)
     if steered:
-        assert not isinstance(found.guide, NotApplicable)
-        along = {"flat": str(found.guide.flat)}
+        assert not isinstance(found.lookahead, NotApplicable)
+        along = {"flat": str(found.lookahead.flat)}
         out.algorithm(lookahead.look_at, "look_at", section, "exact", along)
         along |= {"look_at": "look_at"}
         out.algorithm(interweaving.linearise, "linearise", section, "entry", along)

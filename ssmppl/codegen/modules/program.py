@@ -18,7 +18,7 @@ from typing import Any
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.proposals.twisted import twisted
-from ssmppl.analysis.proposals.upper_bounds import transition_height
+from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
 from ssmppl.analysis.structure import check_start, deterministic_memory
 from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
 from ssmppl.codegen.kernels.particle.backward import (
@@ -255,7 +255,7 @@ def _write(
 
 def _backward(out: ModuleText, trace: Trace, layout: Layout, plain: Proposal) -> None:
     """The entry points of backward simulation."""
-    height, memory = transition_height(trace), deterministic_memory(trace)
+    height, memory = transition_upper_bound(trace), deterministic_memory(trace)
     section = backward_kit(trace, layout, plain, height)
     why = f"; no rejection: {height.reason}" if isinstance(height, NotApplicable) else ""
     out.add(f"backward simulation{why}", section)

@@ -19,7 +19,13 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
-from ssmppl.analysis.proposals.twisted import Guided, guide_order, guided, jacobian, twisted
+from ssmppl.analysis.proposals.twisted import (
+    LookaheadModel,
+    jacobian,
+    lookahead_model,
+    twisted,
+    twisting_order,
+)
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
 from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, filtered_path
@@ -46,11 +52,13 @@ from ssmppl.expressions.expr import Expr, constant, symbol
 from ssmppl.language.model.traced import Trace
 
 
-def steered_section(trace: Trace, layout: Layout, found: Guided, plain: Proposal) -> Section:
+def steered_section(
+    trace: Trace, layout: Layout, found: LookaheadModel, plain: Proposal
+) -> Section:
     """What the moves need to know of the model: its laws by their noise, and back."""
     section = Section(layout, "twisted")
     first, later = found.initial, found.transition
-    guide = guide_order(len(trace.state_symbols), len(first.noise))
+    guide = twisting_order(len(trace.state_symbols), len(first.noise))
     section.s.update((e, k) for k, e in enumerate([constant(float(len(later.noise))), *guide]))
     section.normals, section.uniforms = len(later.noise), 1
     section.fits.update((e, k) for k, e in enumerate(later.noise))
@@ -80,14 +88,14 @@ def steered_section(trace: Trace, layout: Layout, found: Guided, plain: Proposal
     return section
 
 
-def varies(found: Guided) -> bool:
+def varies(found: LookaheadModel) -> bool:
     """Whether dx_t / de depends on the particle."""
     spread = list(found.transition.spread().ravel())
     level = depends(spread, level_of)
     return any(level[e] == PARTICLE for e in spread)
 
 
-def steered_moves(out: ModuleText, section: Section, found: Guided) -> dict[str, str]:
+def steered_moves(out: ModuleText, section: Section, found: LookaheadModel) -> dict[str, str]:
     """Write the moves; what the filters' parameters for them stand for."""
     own = {"varies": str(varies(found))}
     for name in twisting.SPECIALISED:
@@ -109,7 +117,7 @@ class TwistedFilter:
     """
 
     trace: Trace
-    found: Guided
+    found: LookaheadModel
     module: Loaded = field(repr=False)
     _room: threading.local = field(default_factory=threading.local, repr=False, compare=False)
 
@@ -159,7 +167,7 @@ class TwistedFilter:
     @cached_property
     def order(self) -> list[Expr]:
         """The guide's symbols, in the order of its columns."""
-        return guide_order(len(self.trace.state_symbols), len(self.found.initial.noise))
+        return twisting_order(len(self.trace.state_symbols), len(self.found.initial.noise))
 
     def mode(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
@@ -273,11 +281,11 @@ class _Back:
 @one_at_a_time
 def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplicable:
     """Generate, write and import the twisted filter; the reason where there is none."""
-    found, proposal = guided(trace, missing), twisted(trace, missing)
+    found, proposal = lookahead_model(trace, missing), twisted(trace, missing)
     if isinstance(found, NotApplicable):
         return found
     assert isinstance(proposal, Proposal)
-    layout = Layout(trace, guide_order(len(trace.state_symbols), len(found.initial.noise)))
+    layout = Layout(trace, twisting_order(len(trace.state_symbols), len(found.initial.noise)))
     out = ModuleText(layout)
     section = guide_kit(layout, trace, found)
     out.add("the guide", section)
@@ -314,7 +322,7 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     return TwistedFilter(trace, found, module)
 
 
-def guide_kit(layout: Layout, trace: Trace, found: Guided) -> Section:
+def guide_kit(layout: Layout, trace: Trace, found: LookaheadModel) -> Section:
     """The functions by which the guide's kernels know the model; all of one particle."""
     section = Section(layout, "guide")
     for role, form, arguments in (
@@ -329,7 +337,7 @@ def guide_kit(layout: Layout, trace: Trace, found: Guided) -> Section:
     return section
 
 
-def linear_passes(section: Section, trace: Trace, found: Guided) -> None:
+def linear_passes(section: Section, trace: Trace, found: LookaheadModel) -> None:
     """The model and the observation's density made linear and quadratic, of one particle."""
     d = len(trace.state_symbols)
     first, later = found.initial, found.transition

@@ -44,7 +44,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.proposals.noises import Noises, noises
-from ssmppl.analysis.slices import comparable
 from ssmppl.codegen.modules.interweaving import compile_noises
 from ssmppl.codegen.modules.twisted import TwistedFilter, backward_passes
 from ssmppl.codegen.native.loading import Loaded
@@ -59,6 +58,7 @@ from ssmppl.inference.preparation.exact_models import ExactModel
 from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.updates.slices import comparable
 from ssmppl.language.model.transforms import constant_bounds, free_number, transforms, unconstrain
 
 Paths = list[np.ndarray]
@@ -195,8 +195,8 @@ class NoiseMove:
     @cached_property
     def data_told_by(self) -> bool:
         """Whether a parameter is in the law of an observation."""
-        assert not isinstance(self.found.guide, NotApplicable)
-        return any(s.data[0] == "parameter" for s in symbols_of(self.found.guide.observed))
+        assert not isinstance(self.found.lookahead, NotApplicable)
+        return any(s.data[0] == "parameter" for s in symbols_of(self.found.lookahead.observed))
 
 
 @dataclass(frozen=True)
@@ -402,7 +402,7 @@ def interweaving(
     if setting == "auto" and adapting < LEAST_WARMUP:
         return None, f"none: fewer than {LEAST_WARMUP} sweeps of warmup, too few to tune them"
     near = space.parameters(pilot.z)[0]
-    steered = not isinstance(found.guide, NotApplicable)
+    steered = not isinstance(found.lookahead, NotApplicable)
     moves: list[Any] = []
     if model is not None:
         moves = [Collapsed(setup.problem, model)]
@@ -411,7 +411,7 @@ def interweaving(
         if not moves[0].stands_near():
             reason = "the Gaussian approximation to the states' posterior comes to no number"
             none = NotApplicable(reason)
-            found, steered, moves = replace(found, guide=none), False, []
+            found, steered, moves = replace(found, lookahead=none), False, []
             if not found.parameters:
                 if setting is True:
                     raise _refused(none)
@@ -436,7 +436,7 @@ def describe_interweaving(found: Noises, model: ExactModel | None) -> str:
     if model is not None:
         return "the states integrated out"
     held = []
-    if not isinstance(found.guide, NotApplicable):
+    if not isinstance(found.lookahead, NotApplicable):
         held.append("the noises of a Gaussian approximation to the states' posterior")
     if found.parameters:
         held.append("the noises of the transition")
@@ -446,13 +446,13 @@ def describe_interweaving(found: Noises, model: ExactModel | None) -> str:
 
 def with_states(found: Noises) -> str:
     """Who may move with the trajectory, how and why: a line of the plan."""
-    steered = not isinstance(found.guide, NotApplicable)
+    steered = not isinstance(found.lookahead, NotApplicable)
     who = ", ".join(found.tied if steered else found.parameters)
     text = (
         f"{who}: may mix slowly given the states, which carry what the data tell of them; if the "
     )
     text += f"warmup finds it so, moved with the trajectory, {describe_interweaving(found, None)}"
-    if isinstance(found.guide, NotApplicable):
-        text += f" (no approximation: {found.guide.reason})"
-    stays = dict.fromkeys((*found.initial.stays, *found.transition.stays))
-    return text + (f"; stays where it is: {', '.join(stays)}" if stays else "")
+    if isinstance(found.lookahead, NotApplicable):
+        text += f" (no approximation: {found.lookahead.reason})"
+    centred = dict.fromkeys((*found.initial.centred, *found.transition.centred))
+    return text + (f"; stays where it is: {', '.join(centred)}" if centred else "")

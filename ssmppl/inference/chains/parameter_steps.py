@@ -13,7 +13,8 @@ from types import ModuleType
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.conjugacy import Update, derive_updates, draw
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.codegen.modules.trajectories import compile_updates, statistics_name
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
@@ -21,6 +22,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.ranges import without_density
+from ssmppl.inference.updates.conjugate_draw import draw
 
 
 @dataclass(frozen=True)

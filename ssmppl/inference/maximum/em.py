@@ -23,7 +23,6 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
-from ssmppl.analysis.climber import Unconstrained
 from ssmppl.analysis.conjugacy.m_step import (
     IN_TIME,
     ExpectedDensity,
@@ -48,6 +47,7 @@ from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import filter_name
 from ssmppl.inference.preparation.vanishing import without_maximum
+from ssmppl.inference.updates.symbolic_newton import Unconstrained
 from ssmppl.language.model.traced import Trace, previous, seen
 
 
@@ -92,7 +92,8 @@ class FiniteSteps:
 
     def __init__(self, setup: Maximization, model: HiddenMarkov):
         self.setup, self.model = setup, model
-        self.step: MStep | NotApplicable = maximiser(setup, "EM").step
+        self.maximum = maximiser(setup, "EM")
+        self.step: MStep | NotApplicable = self.maximum.step
         self.free = [
             s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held
         ]
@@ -101,13 +102,13 @@ class FiniteSteps:
         laws = self.model.laws(self.setup.problem.experiments, theta)
         if not isinstance(self.step, MStep):
             return maximise_expectation(self.setup, theta, lambda at: self._density(laws, at), True)
-        total = np.array(self.step.prior(theta.tolist()), dtype=float)
+        total = self.maximum.q.prior(theta)
         for role, summands in self.step.update.coefficients.items():
             if role in IN_TIME:
                 for h, law, pairs in laws:
                     own = pairs if role == "transition" else law
                     total += self.model.expected(h, theta, role, summands, own)
-        return self.step.maximise(total, theta)
+        return self.maximum.q.maximise(total, theta)
 
     def _density(
         self, laws: list[tuple[Histories, np.ndarray, np.ndarray]], at: np.ndarray
@@ -171,7 +172,8 @@ class ExactSteps:
     def __init__(self, setup: Maximization, kalman: KalmanModel):
         self.setup, self.kalman = setup, kalman
         trace = setup.problem.trace
-        self.step: MStep | NotApplicable = maximiser(setup, "EM").step
+        self.maximum = maximiser(setup, "EM")
+        self.step: MStep | NotApplicable = self.maximum.step
         self.density: ExpectedDensity | None = None
         self.coefficients: dict[str, list[Expr]] = {}
         if isinstance(self.step, MStep):
@@ -194,13 +196,12 @@ class ExactSteps:
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
         if isinstance(self.step, MStep):
-            return self.step.maximise(self.statistics(theta), theta)
+            return self.maximum.q.maximise(self.statistics(theta), theta)
         return self._climbed(theta)
 
     def statistics(self, theta: np.ndarray) -> np.ndarray:
         """S = E[C | y, theta], summed over rows and experiments, with the prior's part."""
-        assert isinstance(self.step, MStep)
-        total = np.array(self.step.prior(theta.tolist()), dtype=float)
+        total = self.maximum.q.prior(theta)
         for e, rows in zip(self.setup.problem.experiments, self.rows, strict=True):
             values = self._values(e, rows, theta)
             for role, summands in self.coefficients.items():

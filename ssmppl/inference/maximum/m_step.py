@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ssmppl.analysis.climber import LONGEST_STEP, Unconstrained, uphill
 from ssmppl.analysis.conjugacy.m_step import MStep, counted, derive_m_step, unsuited
 from ssmppl.analysis.conjugacy.sufficient import complete_data, restricted
 from ssmppl.codegen.modules.trajectories import compile_statistics
@@ -38,6 +37,8 @@ from ssmppl.inference.preparation.space import Space, at
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import Block, stack
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.updates.q_function import QFunction
+from ssmppl.inference.updates.symbolic_newton import LONGEST_STEP, Unconstrained, uphill
 
 STEPS, HALVINGS, BFGS_STEPS = 30, 20, 50
 LAST_STEP = 1e-6  # squared length, in standard errors of the complete data; what is left after it
@@ -118,7 +119,7 @@ class _Mean:
         return out + bent.log_prior if self.posterior else out
 
     def newton(self, z: np.ndarray) -> np.ndarray:
-        """The top by Newton's steps, halved until the mean rises; see `analysis/climber.py`."""
+        """The top by Newton's steps, halved until the mean rises."""
         here = self.first(z)
         if here is None:
             return z
@@ -188,6 +189,11 @@ class Maximiser:
         return derive_m_step(self.problem.trace, self.fixed, missing, self.posterior)
 
     @once_property
+    def q(self) -> QFunction:
+        assert isinstance(self.step, MStep)
+        return QFunction(self.step)
+
+    @once_property
     def module(self) -> ModuleType:
         assert isinstance(self.step, MStep)
         return compile_statistics(self.step)
@@ -205,8 +211,7 @@ class Maximiser:
         self, theta: np.ndarray, paths: Sequence[np.ndarray], weights: Sequence[np.ndarray]
     ) -> np.ndarray:
         """The C_i averaged over weighted paths, (M, T, D) and (M,) of each experiment."""
-        assert isinstance(self.step, MStep)
-        total = np.array(self.step.prior(theta.tolist()), dtype=float)
+        total = self.q.prior(theta)
         part = np.empty(len(total))
         run = self.module.weighted_statistics
         for e, some, w in zip(self.problem.experiments, paths, weights, strict=True):
@@ -223,7 +228,7 @@ class Maximiser:
         m = len(paths[0]) // log_z.shape[1]
         if isinstance(self.step, MStep):
             weights = [np.repeat(ratio_weights(row) / m, m) for row in log_z]
-            return self.step.maximise(self.statistics(theta, paths, weights), theta)
+            return self.q.maximise(self.statistics(theta, paths, weights), theta)
         w = np.repeat(ratio_weights(log_z.sum(axis=0)) / m, m)
         return maximise_over_paths(
             self.transform, self.scores, paths, w, self._unconstrained(theta), self.posterior

@@ -120,8 +120,7 @@ def saem_block(
         fresh, paths, rate = averaged_sweep(maximum, settings, theta, paths, stream)
         gamma = step_size(k, method)
         total = fresh if gamma == 1.0 else (1.0 - gamma) * total + gamma * fresh
-        assert not isinstance(maximum.step, NotApplicable)
-        theta = maximum.step.maximise(total, theta)
+        theta = maximum.q.maximise(total, theta)
         thetas.append(theta)
         rates.append(rate)
     block = Block({"theta": np.array(thetas)}, {"update_rate": np.array(rates)})

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.analysis.proposals.upper_bounds import transition_height
+from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
 from ssmppl.analysis.structure import deterministic_memory
 from ssmppl.codegen.kernels.math.random import fill_uniform
 from ssmppl.codegen.kernels.particle.backward import ABOVE_BOUND
@@ -111,7 +111,7 @@ def choose_kernel(
             f"kernel={kernel!r} is unknown",
             fix=f"use one of: {listing(str(kernel), ['auto', *KERNELS])}",
         )
-    height = transition_height(problem.trace)
+    height = transition_upper_bound(problem.trace)
     if kernel == "rejection" and isinstance(height, NotApplicable):
         raise ArgumentError(
             f'kernel="rejection" needs a bound of the transition density over the state before: '

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssmppl import markup
-from ssmppl.analysis.conjugacy.conjugacy import Update, derive_updates
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
 from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable

@@ -4,13 +4,12 @@ import numpy as np
 from scipy import stats
 
 from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.conjugacy import draw
-from ssmppl.analysis.conjugacy.families import lower_half
+from ssmppl.analysis.conjugacy.matrix_families import lower_half
 from ssmppl.analysis.density import terms
 from ssmppl.analysis.lambdify import DOMAIN, python_function
-from ssmppl.analysis.sampler import sampler_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbols_of
+from ssmppl.inference.updates.conjugate_draw import draw, sampler_of
 
 
 class Conditional:

@@ -14,9 +14,9 @@ from scipy import stats
 
 from ssmppl.analysis.conjugacy import check
 from ssmppl.analysis.conjugacy.conjugacy import derive_updates
-from ssmppl.analysis.conjugacy.families import MatrixNormalWishart
+from ssmppl.analysis.conjugacy.matrix_families import MatrixNormalWishart
 from ssmppl.analysis.conjugacy.sufficient import complete_data
-from ssmppl.analysis.sampler import sampler_of
+from ssmppl.inference.updates.conjugate_draw import sampler_of
 from ssmppl.language.trace import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 from tests.analysis.conjugacy.exact import Conditional, kolmogorov_smirnov, matrices

@@ -14,9 +14,9 @@ import pytest
 from scipy import stats
 
 from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
 from ssmppl.analysis.conjugacy.sufficient import complete_data
-from ssmppl.analysis.sampler import sampler_of
+from ssmppl.inference.updates.conjugate_draw import draw, sampler_of
 from ssmppl.language.distributions import (
     Beta,
     Binomial,

@@ -1,24 +1,16 @@
-"""The M-step against the density as it was written, and each closed form against a search."""
+"""The M-step against the density as it was written."""
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from ssmppl.analysis.conjugacy.check import random_series
-from ssmppl.analysis.conjugacy.families import (
-    Beta,
-    Dirichlet,
-    Gamma,
-    Normal,
-    NormalGamma,
-    Wishart,
-    symmetric,
-)
-from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step, mode
+from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step
 from ssmppl.analysis.conjugacy.sufficient import complete_data
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
+from ssmppl.inference.updates.q_function import QFunction
 from ssmppl.language.distributions import Gamma as GammaLaw
 from ssmppl.language.distributions import Normal as NormalLaw
 from ssmppl.language.distributions import Uniform
@@ -92,14 +84,14 @@ def test_no_search_finds_a_larger_density(name, posterior):
     written = Written(model, posterior, seed_of("m-step", name, posterior))
     step = derive_m_step(written.trace, posterior=posterior)
     assert step, step
-    s = written.statistics(step)
-    theta = step.maximise(s, written.theta)
+    s, q = written.statistics(step), QFunction(step)
+    theta = q.maximise(s, written.theta)
     reached, began = written.log_density(theta), written.log_density(written.theta)
-    gain = step.value(s, theta) - step.value(s, written.theta)
+    gain = q.value(s, theta) - q.value(s, written.theta)
     assert gain == pytest.approx(reached - began, abs=1e-8 * (1 + abs(reached)))
     for start in (written.theta, theta):
         assert reached >= written.searched(start) - 1e-6 * (1 + abs(reached)), (name, start)
-    again = step.maximise(s, theta)
+    again = q.maximise(s, theta)
     np.testing.assert_allclose(again, theta, rtol=1e-6)
 
 
@@ -112,126 +104,11 @@ def test_what_does_not_separate_says_where(name):
     assert found.where.function == "observation"
 
 
-# -- each family by itself, with and without bounds that bind
-WHOLE, HALF = (-np.inf, np.inf), (0.0, np.inf)
-H = np.array([[2.0, 0.6, 0.1], [0.6, 1.5, -0.3], [0.1, -0.3, 0.8]])
-SMALL = [-0.5 * H[0, 0], -H[0, 1], -0.5 * H[1, 1], 1.0, -2.0]  # t0^2, t0 t1, t1^2, t0, t1
-PAIR = Normal((3, 4), ((0, 1), (1, 2)))
-S2 = np.array([[3.0, 0.7], [0.7, 2.0]])
-
-FAMILIES = {
-    "Gamma": (Gamma(1.0, 0, 1), [4.0, -2.0], [HALF]),
-    "Gamma, bound above": (Gamma(1.0, 0, 1), [4.0, -2.0], [(0.0, 1.5)]),
-    "Gamma, rising": (Gamma(1.0, 0, -1), [4.0, 0.0], [(0.0, 3.0)]),
-    "Gamma, falling": (Gamma(1.0, -1, 1), [0.0, -2.0], [(0.5, 3.0)]),
-    "inverse Gamma": (Gamma(-1.0, 0, 1), [-6.0, -2.5], [HALF]),
-    "inverse Gamma, bound below": (Gamma(-1.0, 0, 1), [-6.0, -2.5], [(1.0, np.inf)]),
-    "inverse Gamma of the square": (Gamma(-2.0, 0, 1), [-6.0, -2.5], [(0.0, 10.0)]),
-    "Normal": (Normal((1,), ((0,),)), [-0.7, 1.3], [WHOLE]),
-    "Normal, bound": (Normal((1,), ((0,),)), [-0.7, 1.3], [(-1.0, 0.5)]),
-    "joint Normal": (PAIR, SMALL, [WHOLE, WHOLE]),
-    "joint Normal, one bound": (PAIR, SMALL, [(-1.0, 0.4), WHOLE]),
-    "joint Normal, corner": (PAIR, SMALL, [(-1.0, 0.4), (-1.0, 1.0)]),
-    "Normal-Gamma": (NormalGamma(1.0, 5, 6, PAIR), [*SMALL, 7.0, -4.0], [WHOLE, WHOLE, HALF]),
-    "Normal-Gamma, bounds": (
-        NormalGamma(1.0, 5, 6, PAIR), [*SMALL, 7.0, -4.0], [(-1.0, 0.4), WHOLE, (0.0, 1.1)],
-    ),
-    "Normal-inverse-Gamma": (
-        NormalGamma(-1.0, 5, 6, PAIR), [*SMALL, -7.0, -4.0], [WHOLE, WHOLE, HALF],
-    ),
-    "Beta": (Beta(0, 1), [3.0, 5.0], [(0.0, 1.0)]),
-    "Beta, bounds": (Beta(0, 1), [3.0, 5.0], [(0.5, 0.9)]),
-    "Dirichlet": (Dirichlet((0, 1, 2)), [3.0, 5.0, 0.5], [WHOLE] * 3),
-    "Wishart": (Wishart(2, 0, (1, -1, 2, 3), False), [2.5, -1.5, -0.7, -1.0], [WHOLE] * 3),
-    "inverse Wishart": (
-        Wishart(2, 0, (1, 2, 3, 4), True), [-2.5, -1.5, -0.35, -0.35, -1.0], [WHOLE] * 3,
-    ),
-}  # fmt: skip
-
-
-def _span(family, c, v):
-    """sum_i C_i s_i(v), by the table in the docstring of families.py; nan outside."""
-    c = [*c, 0.0]
-    if isinstance(family, Gamma):
-        return c[family.log] * np.log(v[0]) + c[family.pow] * v[0] ** family.power
-    if isinstance(family, Normal):
-        n = len(v)
-        total = sum(c[family.linear[i]] * v[i] for i in range(n))
-        cells = [(i, j) for i in range(n) for j in range(i + 1)]
-        return total + sum(c[family.quadratic[i][j]] * v[i] * v[j] for i, j in cells)
-    if isinstance(family, NormalGamma):
-        inner = _span(family.normal, c, v[:-1]) + c[family.pow]
-        return c[family.log] * np.log(v[-1]) + v[-1] ** family.power * inner
-    if isinstance(family, Beta):
-        return c[family.first] * np.log(v[0]) + c[family.second] * np.log1p(-v[0])
-    if isinstance(family, Dirichlet):
-        return sum(c[i] * np.log(p) for i, p in zip(family.logs, v, strict=True))
-    m = symmetric(v, family.size)
-    if np.linalg.eigvalsh(m)[0] <= 0:
-        return np.nan
-    linear = np.linalg.inv(m) if family.inverse else m
-    cells = [(i, j) for i in range(family.size) for j in range(family.size)]
-    entries = sum(c[k] * linear[cell] for k, cell in zip(family.entries, cells, strict=True))
-    return c[family.log] * np.log(np.linalg.det(m)) + entries
-
-
-@pytest.mark.parametrize("name", FAMILIES)
-def test_mode_of_a_family(name):
-    """No other point within the limits has a larger sum: near by, far, and on a line to each."""
-    family, c, limits = FAMILIES[name]
-    rng = np.random.default_rng(seed_of("mode", name))
-    simplex = isinstance(family, Dirichlet)
-    n = len(limits)
-    start = np.full(n, 1.0 / n) if simplex else np.array([*([0.6] * n)])
-    if isinstance(family, Wishart):
-        start = np.array([1.0, 0.0, 1.0])
-    found = mode(family, [*c, 0.0], limits, start)
-    best = _span(family, c, found)
-    low, high = np.array(limits).T
-    assert np.all((found > low) & (found < high))
-    compared = 0
-    for size in (1e-4, 1e-2, 1.0, 10.0):
-        for _ in range(400):
-            other = found * np.exp(size * rng.standard_normal(n)) if simplex else (
-                found + size * rng.standard_normal(n)
-            )  # fmt: skip
-            other = other / other.sum() if simplex else np.clip(other, low, high)
-            with np.errstate(all="ignore"):
-                value = _span(family, c, other)
-            if np.isfinite(value):
-                compared += 1
-                assert value <= best + 1e-7 * (1 + abs(best)), (found, other)
-    assert compared > 400
-
-
-@pytest.mark.parametrize(
-    ("family", "c"),
-    [
-        (Gamma(1.0, 0, 1), [4.0, 2.0]),  # rises for ever
-        (Gamma(-1.0, 0, 1), [6.0, -2.0]),
-        (Normal((1,), ((0,),)), [0.7, 1.3]),
-        (Normal((1,), ((0,),)), [0.0, 1.3]),
-        (Beta(0, 1), [-1.0, 2.0]),
-        (Wishart(2, 0, (1, -1, 2, 3), False), [2.5, -1.5, -4.0, -1.0]),
-    ],
-)
-def test_no_mode_where_the_sum_has_no_maximum(family, c):
-    n = 3 if isinstance(family, Wishart) else 1
-    assert mode(family, [*c, 0.0], [WHOLE] * n, np.ones(n)) is None
-
-
-def test_flat_directions_keep_the_present_value():
-    """x = a + b on one regressor only: a - b is not told by the data."""
-    c = [-0.5, -1.0, -0.5, 2.0, 2.0]
-    found = mode(PAIR, [*c, 0.0], [WHOLE, WHOLE], np.array([3.0, 0.0]))
-    np.testing.assert_allclose(found, [2.5, -0.5])
-
-
 def test_fixed_parameters_stay_and_the_others_are_told_by_them():
     model, _, _ = build("varves")
     written = Written(model, False, seed_of("fixed"))
     step = derive_m_step(written.trace, fixed=["phi"])
-    theta = step.maximise(written.statistics(step), written.theta)
+    theta = QFunction(step).maximise(written.statistics(step), written.theta)
     assert theta[0] == written.theta[0]
     assert theta[1] != written.theta[1]
     assert step.groups[0].closed
@@ -266,7 +143,7 @@ def test_bounds_of_another_parameter_bind():
     y = next(s for s in written.rows["observation"] if s.data[:2] == ("observation", "y"))
     written.rows["observation"][y] = written.rows["observation"][y] + 4.0
     step = derive_m_step(written.trace)
-    theta = step.maximise(written.statistics(step), written.theta)
+    theta = QFunction(step).maximise(written.statistics(step), written.theta)
     assert theta[index["b"]] < theta[index["a"]]
     reached = written.log_density(theta)
     assert reached > written.log_density(written.theta)

@@ -11,10 +11,10 @@ import pickle
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates, draw
-from ssmppl.analysis.sampler import MAX_TRIES, sampler_of
+from ssmppl.analysis.conjugacy.conjugacy import derive_updates
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, to_text
+from ssmppl.inference.updates.conjugate_draw import MAX_TRIES, draw, sampler_of
 from ssmppl.language.trace import trace
 from tests.analysis.conjugacy.corpus import build
 from tests.statistics.checks import some

@@ -13,15 +13,15 @@ from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals.proposals import LARGEST_EXPONENT
 from ssmppl.analysis.proposals.twisted import (
     DEFENSIVE,
-    Guided,
+    LookaheadModel,
     NoiseForm,
-    guide_order,
-    guide_symbols,
-    guided,
     jacobian,
+    lookahead_model,
     noise_form,
     start_symbols,
     twisted,
+    twisting_order,
+    twisting_symbols,
 )
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
@@ -181,8 +181,8 @@ def test_slope_and_curvature_of_the_observation(mask):
         lambda x: {"y": D.MvNormal(np.stack([np.sin(x[0]), x[0] * x[1]]), covariance=Q),
                    "n": D.Poisson(np.exp(x[1]))},
     )  # fmt: skip
-    found = guided(traced, Missing(False, frozenset({"y"})))
-    assert isinstance(found, Guided)
+    found = lookahead_model(traced, Missing(False, frozenset({"y"})))
+    assert isinstance(found, LookaheadModel)
     assert not found.flat
     y, order = [0.4, -1.2, 2.0], traced.state_symbols
     known = values(traced, y=y, mask=mask)
@@ -209,10 +209,12 @@ def test_slope_and_curvature_of_the_observation(mask):
 
 def test_a_curvature_that_is_the_same_everywhere():
     traced = position(lambda p: {"y": D.Normal(2 * p + 1, sd=0.5)})
-    assert guided(traced, COMPLETE).flat
-    assert guided(traced, Missing()).flat  # a missing row is no matter of where the state is
-    assert not guided(position(lambda p: {"y": D.Normal(p**2, sd=0.5)}), COMPLETE).flat
-    assert not guided(position(lambda p: {"y": D.Normal(p, sd=np.exp(p))}), COMPLETE).flat
+    assert lookahead_model(traced, COMPLETE).flat
+    assert lookahead_model(
+        traced, Missing()
+    ).flat  # a missing row is no matter of where the state is
+    assert not lookahead_model(position(lambda p: {"y": D.Normal(p**2, sd=0.5)}), COMPLETE).flat
+    assert not lookahead_model(position(lambda p: {"y": D.Normal(p, sd=np.exp(p))}), COMPLETE).flat
 
 
 # -- where there is none
@@ -277,7 +279,7 @@ def test_reasons(name):
     assert words in found.reason
     if line:
         assert line in found.where.text
-    assert guided(traced, COMPLETE).reason == found.reason
+    assert lookahead_model(traced, COMPLETE).reason == found.reason
 
 
 # -- the identities that make the filter right
@@ -314,10 +316,10 @@ def guide_of(traced, rng):
     factor = np.tril(rng.normal(size=(r, r)), -1) + np.diag(rng.uniform(0.8, 2.0, r))
     parts = half @ half.T, rng.normal(size=d), rng.normal(size=d), rng.normal(size=r), factor
     known = {}
-    for symbols, part in zip((*guide_symbols(d), *start_symbols(r)), parts, strict=True):
+    for symbols, part in zip((*twisting_symbols(d), *start_symbols(r)), parts, strict=True):
         known |= {s: v for s, v in zip(symbols.ravel(), part.ravel(), strict=True)
                   if s.op == "symbol"}  # fmt: skip
-    assert set(known) == set(guide_order(d, r))
+    assert set(known) == set(twisting_order(d, r))
     return known, parts
 
 
@@ -433,7 +435,7 @@ def test_a_guide_that_says_nothing(name):
     """Particles move by the transition, are not steered, and are weighed by the observation."""
     traced = traced_of(name)
     found, d, rng = twisted(traced, COMPLETE), len(traced.state_symbols), np.random.default_rng(6)
-    flat = dict.fromkeys(guide_order(d, len(form_of(traced, "initial").noise)), 0.0)
+    flat = dict.fromkeys(twisting_order(d, len(form_of(traced, "initial").noise)), 0.0)
     _, factor = start_symbols(d)
     flat |= {factor[i, i]: 1.0 for i in range(d)}
     y = rng.normal(size=d)
@@ -450,7 +452,7 @@ def test_a_guide_far_from_the_transition():
     """Where exp(log q / f) has no number the weight is still right on the log scale."""
     traced = AFFINE["autoregression"]()
     found, (x,) = twisted(traced, COMPLETE), traced.state_symbols
-    a, g, m = (s.ravel()[0] for s in guide_symbols(1))
+    a, g, m = (s.ravel()[0] for s in twisting_symbols(1))
     # psi says that x is 60 with an sd of 0.1; the transition, 0.45 with an sd of 0.6
     known = {previous(x): 0.5, a: 100.0, g: 0.0, m: 60.0}
     psi = st.norm(60.0, 0.1)

@@ -1,4 +1,4 @@
-"""PGAS without the parameters that are integrated out: constants, weights, invariance, settings."""
+"""PGAS without the parameters that are integrated out: weights, invariance, settings."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ import pytest
 from scipy import integrate, stats
 
 import ssmppl as ssm
-from ssmppl.analysis.conjugacy.families import Beta, Dirichlet, Gamma, Normal, NormalGamma
+from ssmppl.analysis.conjugacy.family import sum_of
 from ssmppl.analysis.elimination.eliminable import eliminable
 from ssmppl.analysis.elimination.elimination import eliminate
-from ssmppl.analysis.elimination.normalisers import draw_of, log_normaliser
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import constant, symbol, symbols_of, topological
+from ssmppl.expressions.expr import constant, symbol, symbols_of
 from ssmppl.inference.chains.elimination import (
     Eliminating,
     EliminationState,
@@ -28,89 +27,11 @@ from ssmppl.inference.chains.elimination import (
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.distributions import Draws
 from ssmppl.language.model.traced import previous, seen
 from tests.inference import elimination_models as models
 from tests.inference.elimination_models import GONE, MODELS, STEPS, joint_draws
 from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some
 from tests.statistics.checks import deviations as deviations_of
-
-# --- normalising constants against quadrature ---------------------------------------------------
-
-NORMAL = Normal((0, 1), ((2, 3), (3, 4)))
-FAMILIES = {
-    "precision": (Gamma(1.0, 0, 1), [2.3, -1.7], [(0, np.inf)]),
-    "variance": (Gamma(-1.0, 0, 1), [-4.3, -1.7], [(0, np.inf)]),
-    "sd": (Gamma(-2.0, 0, 1), [-6.3, -0.7], [(0, np.inf)]),
-    "normal": (Normal((0,), ((1,),)), [0.8, -0.6], [(-np.inf, np.inf)]),
-    "joint normal": (NORMAL, [0.4, -0.9, -0.7, 0.3, -1.1], [(-9, 9)] * 2),
-    "normal-gamma": (
-        NormalGamma(1.0, 0, 1, Normal((2,), ((3,),))), [3.1, -2.0, 0.7, -0.8],
-        [(-np.inf, np.inf), (0, np.inf)],
-    ),
-    "beta": (Beta(0, 1), [1.4, 0.3], [(0, 1)]),
-}  # fmt: skip
-
-
-def log_kernel(family, c, v):
-    """sum_i C_i s_i, spelled out."""
-    if isinstance(family, Gamma):
-        return c[0] * np.log(v[0]) + c[1] * v[0] ** family.power
-    if isinstance(family, Beta):
-        return c[0] * np.log(v[0]) + c[1] * np.log(1 - v[0])
-    if isinstance(family, NormalGamma):
-        theta, tau = v
-        return c[0] * np.log(tau) + tau * (c[1] + c[2] * theta + c[3] * theta**2)
-    if len(v) == 1:
-        return c[0] * v[0] + c[1] * v[0] ** 2
-    a, b = v
-    return c[0] * a + c[1] * b + c[2] * a * a + c[3] * a * b + c[4] * b * b
-
-
-def constant_of(family, c):
-    return float(evaluate(log_normaliser(family, [*map(constant, c), constant(0.0)]), {}))
-
-
-@pytest.mark.parametrize("name", FAMILIES)
-def test_ratios_of_normalising_constants_are_integrals(name):
-    """Z(C + c) / Z(C), by quadrature over the block."""
-    family, c, ranges = FAMILIES[name]
-    more = [v * f for v, f in zip(c, (1.3, 1.2, 1.4, 1.1, 1.25), strict=False)]
-
-    def log_integral(values):
-        def density(*v):
-            return np.exp(log_kernel(family, values, v))
-
-        return np.log(integrate.nquad(density, ranges)[0])
-
-    expected = log_integral(more) - log_integral(c)
-    assert constant_of(family, more) - constant_of(family, c) == pytest.approx(expected, abs=1e-6)
-
-
-def test_constant_of_a_dirichlet():
-    family, c = Dirichlet((0, 1, 2)), np.array([0.4, 2.0, 1.1])
-    known = stats.dirichlet(c + 1).logpdf([0.2, 0.5, 0.3])
-    assert c @ np.log([0.2, 0.5, 0.3]) - constant_of(family, c) == pytest.approx(known)
-
-
-@pytest.mark.parametrize("name", [*FAMILIES, "dirichlet"])
-def test_draws_have_the_law_that_the_gibbs_updates_draw_from(name):
-    """Of the written-out draw and of `families.py`: means and variances of each component."""
-    family, c, _ = {**FAMILIES, "dirichlet": (Dirichlet((0, 1, 2)), [0.4, 2.0, 1.1], 0)}[name]
-    n, rng = 20_000, np.random.default_rng(4)
-    drawn = draw_of(family, [*map(constant, c), constant(0.0)], Draws("test"))
-    nodes = [e for e in topological(drawn) if e.op == "random"]
-    values = {}
-    for e in nodes:
-        if e.data[0] == "gamma_by":
-            values[e] = rng.standard_gamma(float(evaluate(e.args[0], {})), n)
-        else:
-            values[e] = rng.standard_normal(n) if e.data[0] == "normal" else rng.uniform(size=n)
-    written = np.array(evaluate(drawn, values))
-    other = np.array([family.draw([*c, 0.0], rng) for _ in range(n)]).T
-    for a, b in zip(written, other, strict=True):
-        assert stats.ks_2samp(a, b).pvalue > LEVEL
-
 
 # --- the model without the block is the integral over it ----------------------------------------
 
@@ -144,6 +65,10 @@ def values_at(problem, theta, path, t):
     if t:
         out |= dict(zip(map(previous, trace.state_symbols), path[t - 1], strict=True))
     return out | {symbol("time", "t", ()): t + 1.0, symbol("time_prev", "t", ()): float(t)}
+
+
+def constant_of(family, c):
+    return float(evaluate(sum_of(family.log_normaliser([*map(constant, c), constant(0.0)])), {}))
 
 
 QUADRATURE = {"scale": {"tau": (0.0, 60.0)}, "shared": {"r": (0.0, 60.0), "rate": (0.0, 40.0)}}

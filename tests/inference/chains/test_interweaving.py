@@ -99,7 +99,7 @@ def test_volume_is_that_of_finite_differences(name, steered):
         t * x.shape[1] + k
         for t in range(STEPS)
         for k, s in enumerate(problem.trace.state_symbols)
-        if s not in deterministic and s.data[1] not in move.found.transition.stays
+        if s not in deterministic and s.data[1] not in move.found.transition.centred
     ]
     assert len(own) == jacobian.shape[1]
     _, log_det = np.linalg.slogdet(jacobian[own])

@@ -53,7 +53,7 @@ def test_the_closed_form(objective, start):
     maximum = maximiser(setup, "ParticleEM")
     theta = check_parameters(setup.problem.trace, dict(zip("aqr", start, strict=True)))
     paths, w = trajectories(seed_of("closed form"), (20, 35))
-    exact = maximum.step.maximise(maximum.statistics(theta, paths, [w, w]), theta)
+    exact = maximum.q.maximise(maximum.statistics(theta, paths, [w, w]), theta)
     found = maximise_over_paths(
         setup.transform, maximum.scores, paths, w, setup.space_at(theta), objective == "posterior"
     )

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.families import lower_half, symmetric
+from ssmppl.analysis.conjugacy.matrix_families import lower_half, symmetric
 
 Density = Callable[[Sequence[float]], float]
 _DOUBLINGS = 60
@@ -34,13 +34,9 @@ def comparable(log_density: float) -> float:
 
 
 def slice_step(
-    log_density: Callable[[float], float],
-    x: float,
-    rng: np.random.Generator,
-    lower: float = -math.inf,
-    upper: float = math.inf,
-    width: float = 1.0,
-) -> float:
+    log_density: Callable[[float], float], x: float, rng: np.random.Generator,
+    lower: float = -math.inf, upper: float = math.inf, width: float = 1.0,
+) -> float:  # fmt: skip
     """One draw that leaves exp(log_density) on (lower, upper) invariant.
 
     Returns x unmoved where the density at x is not positive and finite: there is no slice to draw
@@ -85,14 +81,9 @@ def slice_step(
 
 
 def _acceptable(
-    log_density: Callable[[float], float],
-    x: float,
-    new: float,
-    level: float,
-    left: float,
-    right: float,
-    width: float,
-) -> bool:
+    log_density: Callable[[float], float], x: float, new: float, level: float, left: float,
+    right: float, width: float,
+) -> bool:  # fmt: skip
     """Whether doubling started from `new` could have given the same interval."""
     differ = False
     while right - left > 1.1 * width:
@@ -110,11 +101,9 @@ def _acceptable(
 
 
 def sweep_real(
-    log_density: Density,
-    values: Sequence[float],
-    bounds: Sequence[tuple[float, float]],
+    log_density: Density, values: Sequence[float], bounds: Sequence[tuple[float, float]],
     rng: np.random.Generator,
-) -> list[float]:
+) -> list[float]:  # fmt: skip
     """Slice steps over the components of a vector, each within its own bounds."""
     v = list(values)
     for i, (lower, upper) in enumerate(bounds):

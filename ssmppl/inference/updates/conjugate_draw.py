@@ -6,9 +6,9 @@ The draw leaves the exact conditional invariant, whatever path it takes:
   independent draw from the conditional itself;
 - after `MAX_TRIES` refusals a sweep of slice steps instead. How many refusals there were does not
   depend on the current value, so this mixes two kernels that both leave the conditional invariant;
-- a correction without a known upper bound, or one that does not separate and is taken from the
-  log joint density: a Metropolis-Hastings step that proposes from the
-  conjugate part, then always a sweep of slice steps, so that no value is held for long;
+- a correction without a known upper bound, or one that does not separate and is taken from the log
+  joint density: a Metropolis-Hastings step that proposes from the conjugate part, then always a
+  sweep of slice steps, so that no value is held for long;
 - statistics under which the conjugate part is improper: slice steps. A Normal-Gamma block is then
   updated separately, v by its Gamma given theta (where nothing outside the family holds v) and
   theta by slices.
@@ -18,27 +18,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from ssmppl.analysis.bounds import WHOLE, interval
-from ssmppl.analysis.conjugacy.families import (
-    Beta,
-    Dirichlet,
-    Gamma,
-    MatrixNormalWishart,
-    Normal,
-    NormalGamma,
-    Values,
+from ssmppl.analysis.bounds import Interval
+from ssmppl.analysis.conjugacy.family import Limits, Values
+from ssmppl.analysis.conjugacy.matrix_families import size_of_matrix
+from ssmppl.analysis.conjugacy.update import (
+    Update,
+    constant_bounds,
+    correction_ranges,
+    natural_bounds,
 )
-from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.lambdify import DOMAIN, python_function, python_sum
-from ssmppl.analysis.slices import Density, comparable, sweep_matrix, sweep_real, sweep_simplex
-from ssmppl.analysis.truncated_draws import truncated_draw
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.expr import Expr, symbols_of, to_text
+from ssmppl.inference.updates.slices import (
+    Density,
+    comparable,
+    sweep_matrix,
+    sweep_real,
+    sweep_simplex,
+)
 
 MAX_TRIES = 100
 LogJoint = Callable[[np.ndarray], float]
@@ -65,25 +69,23 @@ class Sampler:
         self.log_density = _guarded(python_sum(functions, components))
         self.corrections = update.correction
         self.correct = _guarded(python_sum([functions[j] for j in update.correction], components))
-        self.bounds = [_constant_bounds(b) for b in update.bounds]
+        self.bounds = constant_bounds(update)
         self.open_bounds = [
             (i, *_open_bounds(b))
             for i, (b, fixed) in enumerate(zip(update.bounds, self.bounds, strict=True))
             if fixed is None
         ]
-        natural = natural_bounds(update)
+        self.natural = natural_bounds(update)
         self.truncated = bool(self.open_bounds) or any(
             b is not None and (b[0] > n[0] or b[1] < n[1])
-            for b, n in zip(self.bounds, natural, strict=True)
+            for b, n in zip(self.bounds, self.natural, strict=True)
         )
-        known = {c: WHOLE if b is None else b for c, b in zip(components, self.bounds, strict=True)}
-        self.ranges = [interval(functions[j], known) for j in update.correction]
-        v = components[-1]
+        self.ranges = correction_ranges(update)
         beside = [*(functions[j] for j in update.correction), *(f.density for f in update.left)]
-        self.v_is_gamma = isinstance(update.conditional, NormalGamma) and not any(
-            v in symbols_of(e) for e in beside
-        )
-        self.natural = natural
+        self.last_is_held = any(components[-1] in symbols_of(e) for e in beside)
+        self.matrix_size = size_of_matrix(len(components)) if update.kind == "matrix" else 0
+        if update.conditional is not None:
+            self.matrix_size = update.conditional.matrix_size or self.matrix_size
 
     @property
     def update(self) -> Update:
@@ -93,7 +95,7 @@ class Sampler:
         return found
 
     # -- the pieces of one draw
-    def limits(self, rest: Mapping[Expr, float]) -> list[tuple[float, float]]:
+    def limits(self, rest: Mapping[Expr, float]) -> list[Interval]:
         """Bounds of the components, those that depend on other parameters evaluated."""
         if not self.open_bounds:
             return self.bounds  # type: ignore[return-value]
@@ -112,15 +114,12 @@ class Sampler:
         return total
 
     def conjugate(
-        self, c: Sequence[float], limits: list[tuple[float, float]], rng: np.random.Generator
+        self, c: Sequence[float], limits: list[Interval], rng: np.random.Generator
     ) -> Values | None:
         """A draw of the conjugate part; None where it is improper."""
         family = self.update.conditional
         assert family is not None
-        if self.truncated and isinstance(family, (Gamma, Normal, Beta)) and len(limits) == 1:
-            value = truncated_draw(family, c, *limits[0], rng)
-            return None if value is None else (value,)
-        return family.draw(c, rng)
+        return family.draw_within(c, limits, rng) if self.truncated else family.draw(c, rng)
 
     def possible(self, v: Sequence[float]) -> bool:
         """Whether a draw of the conjugate part is inside of the family's support: a scale of zero,
@@ -128,28 +127,24 @@ class Sampler:
         return all(low < x < high for x, (low, high) in zip(v, self.natural, strict=True))
 
     def draw(
-        self,
-        totals: np.ndarray,
-        current: np.ndarray,
-        rest: Mapping[Expr, float],
-        rng: np.random.Generator,
-        log_joint: LogJoint | None = None,
-    ) -> tuple[np.ndarray, DrawInfo]:
-        update = self.update
+        self, totals: np.ndarray, current: np.ndarray, rest: Mapping[Expr, float],
+        rng: np.random.Generator, log_joint: LogJoint | None = None,
+    ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
+        """See `draw` below."""
+        update, truncated = self.update, self.truncated
         limits = self.limits(rest)
-        if update.conditional is None:
-            return self.slices(totals, current, limits, rng, log_joint, 0)
         c = totals.tolist()
         c.append(0.0)
+        if update.conditional is None:
+            return self.slices(c, current, limits, rng, log_joint, 0)
         weights = [c[j] for j in self.corrections]
         ceiling = self.ceiling(c) if weights else 0.0
         if update.left or not ceiling < math.inf:
-            return self.metropolis(totals, c, weights, current, limits, rng, log_joint)
-        truncated = self.truncated
+            return self.metropolis(c, current, limits, rng, log_joint)
         for tries in range(1, MAX_TRIES + 1):
             v = self.conjugate(c, limits, rng)
             if v is None:
-                return self.slices(totals, current, limits, rng, None, tries - 1)
+                return self.slices(c, current, limits, rng, None, tries - 1)
             if not self.possible(v) or (truncated and not _inside(v, limits)):
                 continue
             if weights:
@@ -157,25 +152,21 @@ class Sampler:
                 if not (excess >= 0.0 or rng.standard_exponential() >= -excess):
                     continue
             return np.array(v), DrawInfo("conjugate", tries, True)
-        return self.slices(totals, current, limits, rng, None, MAX_TRIES)
+        return self.slices(c, current, limits, rng, None, MAX_TRIES)
 
     def metropolis(
-        self,
-        totals: np.ndarray,
-        c: list[float],
-        weights: list[float],
-        current: np.ndarray,
-        limits: list[tuple[float, float]],
-        rng: np.random.Generator,
-        log_joint: LogJoint | None = None,
-    ) -> tuple[np.ndarray, DrawInfo]:
+        self, c: list[float], current: np.ndarray, limits: list[Interval],
+        rng: np.random.Generator, log_joint: LogJoint | None,
+    ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
+        """A step that proposes from the conjugate part, then a sweep of slice steps."""
+        weights = [c[j] for j in self.corrections]
+
         def excess(v: Sequence[float]) -> float:
             """Log of the conditional over the conjugate part's density."""
             correction = self.correct(v, weights) if weights else 0.0
             if not self.update.left:
                 return correction
-            whole = self.exactly(log_joint)(v)
-            return whole - self.log_density(v, c) + correction
+            return self.exactly(log_joint)(v) - self.log_density(v, c) + correction
 
         accepted, tries = False, 0
         while tries < MAX_TRIES:
@@ -187,10 +178,9 @@ class Sampler:
                 continue
             change = excess(v) - excess(current.tolist())
             accepted = change >= 0.0 or rng.standard_exponential() > -change
-            if accepted:
-                current = np.array(v)
+            current = np.array(v) if accepted else current
             break
-        value, _ = self.slices(totals, current, limits, rng, log_joint, tries)
+        value, _ = self.slices(c, current, limits, rng, log_joint, tries)
         return value, DrawInfo("metropolis", tries, accepted)
 
     def exactly(self, log_joint: LogJoint | None) -> Density:
@@ -203,88 +193,49 @@ class Sampler:
             )
         return lambda v: comparable(float(log_joint(np.array(v))))
 
-    def _what(self, log_joint: LogJoint | None, values: list[float]) -> str:
-        """What the density is where it is no positive number."""
-        infinite = log_joint is not None and log_joint(np.array(values)) == math.inf
-        return "infinite" if infinite else "zero"
-
     def slices(
-        self,
-        totals: np.ndarray,
-        current: np.ndarray,
-        limits: list[tuple[float, float]],
-        rng: np.random.Generator,
-        log_joint: LogJoint | None,
-        tries: int,
-    ) -> tuple[np.ndarray, DrawInfo]:
+        self, c: list[float], current: np.ndarray, limits: list[Interval],
+        rng: np.random.Generator, log_joint: LogJoint | None, tries: int,
+    ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
         """A sweep of slice steps over the exact conditional."""
-        update = self.update
-        c = totals.tolist() if totals is not None else []
-        if update.needs_log_joint or update.left:
-            at = self.exactly(log_joint)
-        else:
-
-            def at(v: Sequence[float]) -> float:
-                return self.log_density(v, c)
-
-        values = current.tolist()
+        update, values = self.update, current.tolist()
+        exact = update.needs_log_joint or bool(update.left)
+        at: Density = self.exactly(log_joint) if exact else partial(self._separated, c)
         if not at(values) > -math.inf:
-            named = ", ".join(
-                f"{to_text(s)} = {x:.6g}" for s, x in zip(update.components, values, strict=True)
-            )
-            raise SamplingError(
-                f"the conditional density is {self._what(log_joint, values)} at the current value: "
-                f"{named}",
-                fix="start inside the support; given these states no value near is possible. Where "
-                "a covariance is singular no density exists: give components that follow without "
-                "a noise of their own the law Dirac",
-                where=update.where,
-            )
+            raise self._impossible(values, log_joint)
         if update.kind == "simplex":
             new = sweep_simplex(at, values, rng)
-        elif update.kind == "matrix":
-            new = sweep_matrix(at, values, _size(len(values)), rng)
-        elif isinstance(update.conditional, MatrixNormalWishart):
-            new = self._sweep_in_turn(at, values, limits, rng)
+        elif p := self.matrix_size:  # the numbers given the matrix, then the matrix
+            n = len(values) - p * (p + 1) // 2
+            matrix = values[n:]
+            new = sweep_real(lambda v: at([*v, *matrix]), values[:n], limits[:n], rng)
+            new += sweep_matrix(lambda v: at([*new[:n], *v]), matrix, p, rng)
         else:
             natural = [
                 (max(a, n[0]), min(b, n[1])) for (a, b), n in zip(limits, self.natural, strict=True)
             ]
-            if self.v_is_gamma:
-                values[-1] = self._gamma_given(c, values, limits[-1], rng)
+            if update.conditional is not None and not self.last_is_held:
+                last = update.conditional.draw_last(c, values, limits, rng)
+                values[-1] = values[-1] if last is None else last
             new = sweep_real(at, values, natural, rng)
         return np.array(new), DrawInfo("slice", tries, True)
 
-    def _sweep_in_turn(
-        self,
-        at: Density,
-        values: list[float],
-        limits: list[tuple[float, float]],
-        rng: np.random.Generator,
-    ) -> list[float]:
-        """Slice steps on the numbers of a block given its matrix, then on the matrix."""
-        family = self.update.conditional
-        assert isinstance(family, MatrixNormalWishart)
-        n = family.thetas
-        matrix = values[n:]
-        thetas = sweep_real(lambda v: at([*v, *matrix]), values[:n], limits[:n], rng)
-        size = family.wishart.size
-        return thetas + sweep_matrix(lambda v: at([*thetas, *v]), matrix, size, rng)
+    def _separated(self, c: list[float], v: Sequence[float]) -> float:
+        return self.log_density(v, c)
 
-    def _gamma_given(
-        self,
-        c: list[float],
-        values: list[float],
-        limits: tuple[float, float],
-        rng: np.random.Generator,
-    ) -> float:
-        """v from its law given theta, if that is a proper Gamma; else as it was."""
-        family = self.update.conditional
-        assert isinstance(family, NormalGamma)
-        shape, rate = family.given([*c, 0.0], np.array(values[:-1]))
-        gamma = Gamma(family.power, 0, 1)
-        v = truncated_draw(gamma, [shape * family.power - 1.0, -rate], *limits, rng)
-        return values[-1] if v is None else v
+    def _impossible(self, values: list[float], log_joint: LogJoint | None) -> SamplingError:
+        """The density is zero, or infinite, where the chain stands."""
+        infinite = log_joint is not None and log_joint(np.array(values)) == math.inf
+        pairs = zip(self.update.components, values, strict=True)
+        named = ", ".join(f"{to_text(s)} = {x:.6g}" for s, x in pairs)
+        return SamplingError(
+            f"the conditional density is {'infinite' if infinite else 'zero'} at the current "
+            f"value: {named}",
+            fix="start inside the support; given these states no value near is possible. Where "
+            "a covariance is singular no density exists: give components that follow without "
+            "a noise of their own the law Dirac",
+            where=self.update.where,
+        )
 
 
 _samplers: WeakKeyDictionary[Update, Sampler] = WeakKeyDictionary()
@@ -332,33 +283,10 @@ def _guarded(function: Callable[..., float]) -> Callable[..., float]:
     return run
 
 
-def _inside(v: Sequence[float], limits: Sequence[tuple[float, float]]) -> bool:
+def _inside(v: Sequence[float], limits: Limits) -> bool:
     return all(low <= x <= high for x, (low, high) in zip(v, limits, strict=True))
-
-
-def _constant_bounds(bounds: tuple[Expr, Expr]) -> tuple[float, float] | None:
-    low, high = bounds
-    return (low.data, high.data) if low.op == high.op == "const" else None
 
 
 def _open_bounds(bounds: tuple[Expr, Expr]) -> tuple[list[Expr], Callable]:
     symbols = list(symbols_of(bounds))
     return symbols, python_function(bounds, symbols)
-
-
-def natural_bounds(update: Update) -> list[tuple[float, float]]:
-    """Where the family itself lives."""
-    n, family = len(update.components), update.conditional
-    if isinstance(family, Gamma):
-        return [(0.0, math.inf)]
-    if isinstance(family, Beta):
-        return [(0.0, 1.0)]
-    if isinstance(family, NormalGamma):
-        return [WHOLE] * (n - 1) + [(0.0, math.inf)]
-    if isinstance(family, Dirichlet):
-        return [(0.0, 1.0)] * n
-    return [WHOLE] * n
-
-
-def _size(components: int) -> int:
-    return round((math.sqrt(8.0 * components + 1.0) - 1.0) / 2.0)

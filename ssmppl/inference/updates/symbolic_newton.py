@@ -1,8 +1,8 @@
-"""The numerical M-step: a function of parameters climbed on the unconstrained scale.
+"""An expression of parameters maximised on the unconstrained scale, from given values on.
 
-Newton's method with the symbolic gradient and Hessian. Directions of wrong or no curvature are
-climbed by the size of their curvature (Nocedal and Wright 2006, "Numerical optimization", section
-3.4), steps are shortened and halved until the function rises. Many parameters: BFGS with the
+Newton's method with the symbolic gradient and Hessian. In directions of wrong or no curvature steps
+go uphill by the size of the curvature (Nocedal and Wright 2006, "Numerical optimization", section
+3.4); they are shortened and halved until the expression rises. Many parameters: BFGS with the
 gradient. Where there is no derivative in closed form: the simplex of Nelder and Mead.
 """
 
@@ -64,7 +64,7 @@ class Unconstrained:
         return python_function([_free(*b) for b in limits if b[0] in self.members], symbols)
 
 
-class Climber:
+class SymbolicNewton:
     """A function of some components of theta, of the other parameters and of given numbers.
 
     value : the function; statistics : the symbols of the given numbers.
@@ -100,7 +100,7 @@ class Climber:
         except NotDifferentiable:
             return python_function([value], self.arguments), 0
 
-    def climb(self, s: Sequence[float], theta: np.ndarray) -> np.ndarray:
+    def maximise(self, s: Sequence[float], theta: np.ndarray) -> np.ndarray:
         """theta with the members moved to where the function is largest, going up from here."""
         try:
             z = self.unconstrained(theta)

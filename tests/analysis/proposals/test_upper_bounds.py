@@ -7,7 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.analysis.density import terms
-from ssmppl.analysis.proposals.upper_bounds import transition_height
+from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import depends_on
@@ -76,7 +76,7 @@ UNBOUNDED = {
 
 
 def model_of(law, shape=()):
-    model = ssm.Model("heights")
+    model = ssm.Model("upper bounds")
     model.initial(lambda: {"x": ssm.Normal(np.zeros(shape), sd=1)})
     model.transition(lambda x: {"x": law(x)})
     model.observation(lambda x: {"y": ssm.Normal(np.sum(x), sd=1)})
@@ -87,14 +87,14 @@ def model_of(law, shape=()):
 def test_above_and_attained(label):
     law, values, attained = LAWS[label]
     traced = model_of(law)
-    height = transition_height(traced)
-    assert not isinstance(height, NotApplicable)
-    assert not depends_on(height, traced.state_prev_symbols)
+    found = transition_upper_bound(traced)
+    assert not isinstance(found, NotApplicable)
+    assert not depends_on(found, traced.state_prev_symbols)
     (term,) = terms(traced, "transition")
     (x,), (x_prev,) = traced.state_symbols, traced.state_prev_symbols
     for value in values:
         density = np.asarray(evaluate([term.log_density], {x: value, x_prev: GRID})[0])
-        (bound,) = evaluate([height], {x: value})
+        (bound,) = evaluate([found], {x: value})
         top = np.max(density)
         assert top <= bound + 1e-9, (label, value, top, bound)
         if attained:
@@ -104,7 +104,7 @@ def test_above_and_attained(label):
 @pytest.mark.parametrize("label", UNBOUNDED)
 def test_reason(label):
     law, reason = UNBOUNDED[label]
-    found = transition_height(model_of(law))
+    found = transition_upper_bound(model_of(law))
     assert isinstance(found, NotApplicable)
     assert reason in found.reason
     assert found.where is not None
@@ -117,12 +117,12 @@ def test_vector_of_which_one_component_depends():
         lambda x: ssm.MvNormal(np.array([1.0, 1.0]) * x[0], covariance=covariance), (2,)
     )
     rng = np.random.default_rng(seed_of("heights", "vector"))
-    (height,), (term,) = [transition_height(traced)], terms(traced, "transition")
+    (bound,), (term,) = [transition_upper_bound(traced)], terms(traced, "transition")
     one = model_of(
         lambda x: ssm.MvNormal(np.array([0.3, 0.0]) + np.array([0.0, 1.0]) * x[0],
                                covariance=covariance), (2,)
     )  # fmt: skip
-    for t, h in ((traced, height), (one, transition_height(one))):
+    for t, h in ((traced, bound), (one, transition_upper_bound(one))):
         (term,) = terms(t, "transition")
         for value in rng.normal(size=(20, 2)):
             known = dict(zip(t.state_symbols, value, strict=True))
@@ -136,13 +136,13 @@ def test_a_vector_of_which_one_spread_depends():
     traced = model_of(
         lambda x: ssm.Normal(np.stack([x[0], 0.4]), sd=0.2 + np.abs(x[0]) * np.ones(2)), (2,)
     )
-    height, (term,) = transition_height(traced), terms(traced, "transition")
+    bound, (term,) = transition_upper_bound(traced), terms(traced, "transition")
     rng = np.random.default_rng(seed_of("heights", "spread of a vector"))
     for value in 3 * rng.normal(size=(20, 2)):
         known = dict(zip(traced.state_symbols, value, strict=True))
         before = dict(zip(traced.state_prev_symbols, [GRID, 0.0], strict=True))
         top = np.max(evaluate([term.log_density], known | before)[0])
-        assert top <= evaluate([height], known)[0] + 1e-9
+        assert top <= evaluate([bound], known)[0] + 1e-9
 
 
 def test_memory_of_a_deterministic_component():
@@ -150,6 +150,6 @@ def test_memory_of_a_deterministic_component():
     model.initial(lambda: {"x": ssm.Normal(0, sd=1), "last": ssm.Dirac(0.0)})
     model.transition(lambda x: {"x": ssm.Normal(x, sd=1), "last": ssm.Dirac(x)})
     model.observation(lambda last: {"y": ssm.Normal(last, sd=1)})
-    found = transition_height(trace(model))
+    found = transition_upper_bound(trace(model))
     assert isinstance(found, NotApplicable)
     assert "deterministic component last" in found.reason
