@@ -212,11 +212,11 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     singular = without_density(trace)
     if singular is not None:
         return singular
-    move = split(trace, list(trace.transition.values()))
-    if not len(move.gaussian):
+    transition = split(trace, list(trace.transition.values()))
+    if not len(transition.gaussian):
         where = next(iter(trace.transition.values())).distribution.location
         return NotApplicable("no state has a Gaussian transition", where)
-    observation = affine_observation(sites, move.gaussian.symbols, move.following)
+    observation = affine_observation(sites, transition.gaussian.symbols, transition.following)
     if isinstance(observation, NotApplicable):
         return observation
     if all(e.op == "const" and e.data == 0.0 for e in observation.matrix.ravel()):
@@ -242,12 +242,12 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
             predictive = where_definite(array(r), predictive)
         return split.complete(draw), predictive
 
-    draw, predictive = law(move)
+    draw, predictive = law(transition)
     start = split(trace, list(trace.initial.values()))
-    same = set(start.gaussian.symbols) == set(move.gaussian.symbols)
-    if same and not move.following:
+    same = set(start.gaussian.symbols) == set(transition.gaussian.symbols)
+    if same and not transition.following:
         place = {s: i for i, s in enumerate(start.gaussian.symbols)}  # no .index: == is symbolic
-        order = [place[s] for s in move.gaussian.symbols]
+        order = [place[s] for s in transition.gaussian.symbols]
         start = replace(start, gaussian=_reorder(start.gaussian, order))
         initial_draw, initial_predictive = law(start)
         site = sites[0]
@@ -256,7 +256,9 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
         initial_draw = resolved(draws_of(trace, list(trace.initial.values())))
         initial_weight = tuple(terms(trace, "observation", missing))
     weight = Term(sites[0], predictive, None)
-    look_ahead = None if move.random else move.insert({predictive: predictive})[predictive]
+    look_ahead = (
+        None if transition.random else transition.insert({predictive: predictive})[predictive]
+    )
     return Proposal(
         "guided",
         initial_draw,
@@ -324,22 +326,22 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     singular = without_density(trace)
     if singular is not None:
         return singular
-    move = split(trace, list(trace.transition.values()))
-    (total,) = substitute([total], move.following)
+    transition = split(trace, list(trace.transition.values()))
+    (total,) = substitute([total], transition.following)
     where = sites[0].distribution.location
-    if not len(move.gaussian):
+    if not len(transition.gaussian):
         law = next(iter(trace.transition.values())).distribution
         return NotApplicable("no state has a Gaussian transition", law.location)
-    if not depends_on(total, move.gaussian.symbols):
+    if not depends_on(total, transition.gaussian.symbols):
         return NotApplicable("no state with a Gaussian transition is observed", where)
     try:
-        slope = array(gradient(total, move.gaussian.symbols))
-        curvature = hessian(total, move.gaussian.symbols)
+        slope = array(gradient(total, transition.gaussian.symbols))
+        curvature = hessian(total, transition.gaussian.symbols)
     except NotDifferentiable as error:
         return NotApplicable(f"the observation is not twice differentiable: {error.found}", where)
     if all(e.op == "const" and e.data == 0.0 for e in curvature.ravel()):
         return NotApplicable("the observation has no curvature in the state", where)
-    draw, fit, log_ratio, look_ahead = _newton(move, total, slope, curvature)
+    draw, fit, log_ratio, look_ahead = _newton(transition, total, slope, curvature)
     correction = Term(observed[0].site, -log_ratio, None)
     return Proposal(
         "guided",
@@ -347,7 +349,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         tuple(observed),
         draw,
         (*observed, correction),
-        None if move.random else look_ahead,
+        None if transition.random else look_ahead,
         fit=fit,
         explanation="Laplace: particles are drawn from a Gaussian fitted to "
         "f(x_t | x_{t-1}) g(y_t | x_t) by "
@@ -356,11 +358,11 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
 
 
 def _newton(
-    move: Split, total: Expr, slope: ExprArray, curvature: ExprArray
+    transition: Split, total: Expr, slope: ExprArray, curvature: ExprArray
 ) -> tuple[dict[Expr, Expr], tuple[Expr, ...], Expr, Expr]:
     """(draw, fit, log (q / f)(x_t | x_{t-1}, y_t), log of Laplace's approximation to
     p(y_t | x_{t-1})) of a few Newton steps from the mean of the transition."""
-    block, n = move.gaussian, len(move.gaussian)
+    block, n = transition.gaussian, len(transition.gaussian)
     precision = inverse(block.covariance)
     spread = array([apply("sqrt", block.covariance[i, i]) for i in range(n)])
     x, factor = gaussian_fit(block, slope, curvature, precision)
@@ -385,11 +387,11 @@ def _newton(
     (g_mode,) = substitute([total], at_mode)
     to_mode = array(x - block.mean)
     look_ahead = g_mode - 0.5 * (to_mode @ precision @ to_mode) - apply("log", narrower)
-    ahead = move.insert({look_ahead: look_ahead})[look_ahead]
+    ahead = transition.insert({look_ahead: look_ahead})[look_ahead]
     fit = (*x, *(factor[i, j] for i in range(n) for j in range(i + 1)))
-    if depends_on(look_ahead, list(move.others)):  # the fit is no function of x_{t-1} alone
+    if depends_on(look_ahead, list(transition.others)):  # the fit is no function of x_{t-1} alone
         fit = ()
-    return move.complete(chosen), fit, log_ratio, ahead
+    return transition.complete(chosen), fit, log_ratio, ahead
 
 
 def gaussian_fit(

@@ -239,16 +239,17 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         return Proposal("twisted", {}, (), {}, (), explanation=explanation, looped=looped)
     observed = tuple(terms(trace, "observation", missing))
     states = trace.state_symbols
-    start, move = _start(found.initial, states), _move(found.transition, states)
+    start = _initial_law(found.initial, states)
+    later = _transition_law(found.transition, states)
     site = observed[0].site
     return Proposal(
         "twisted",
         start.draw,
         (*observed, Term(site, -start.log_ratio, None)),
-        move.draw,
-        (*observed, Term(site, -move.log_ratio, None)),
-        move.ahead,
-        fit=move.fit,
+        later.draw,
+        (*observed, Term(site, -later.log_ratio, None)),
+        later.ahead,
+        fit=later.fit,
         explanation=explanation,
     )
 
@@ -263,14 +264,14 @@ class _Law:
     fit: tuple[Expr, ...]
 
 
-def _start(form: NoiseForm, states: list[Expr]) -> _Law:
+def _initial_law(form: NoiseForm, states: list[Expr]) -> _Law:
     """x_1 under the twisted law, which the kernel has worked out: it depends on no particle."""
     mean, factor = start_symbols(len(form.noise))
     root = lower_inverse(factor) if form.noise else factor
     return _twisted_law(form, states, mean, factor, root, constant(0.0))
 
 
-def _move(form: NoiseForm, states: list[Expr]) -> _Law:
+def _transition_law(form: NoiseForm, states: list[Expr]) -> _Law:
     """x_t under the twisted law, given x_{t-1}."""
     r = len(form.noise)
     precision, pull, centre = twisting_symbols(len(states))

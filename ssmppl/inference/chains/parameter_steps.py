@@ -148,7 +148,7 @@ def _totals(
 def log_joint(steps: ParameterSteps, theta: np.ndarray, paths: list[np.ndarray]) -> float:
     """log p(theta, x, y), deterministic components of x set on the way; -inf for nan.
 
-    +inf where a density is infinite, which is no point to go to: see `slices.comparable`.
+    +inf where a density is infinite, which is no point to go to (`inference/updates/slices.py`).
     """
     program = steps.problem.program
     value = program.entry("log_prior")(theta) if len(theta) else 0.0
