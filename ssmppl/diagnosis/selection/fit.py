@@ -399,12 +399,9 @@ class Fitter:
         return np.swapaxes(np.take_along_axis(system.particles, index[:, None], axis=2), 1, 2)
 
     def gradient(
-        self,
-        space: Space,
-        z: np.ndarray,
-        stream: np.ndarray,
+        self, space: Space, z: np.ndarray, stream: np.ndarray,
         transform: UnconstrainedTransform | None = None,
-    ) -> tuple[float, np.ndarray] | None:
+    ) -> tuple[float, np.ndarray] | None:  # fmt: skip
         """(log p(y) + log prior, its derivatives (F,) in z), estimated; None where none is."""
         point = (transform or UnconstrainedTransform(space)).at(z)
         if point.log_prior == -np.inf:

@@ -244,12 +244,9 @@ class Interweaving:
         return replace(tuning, where=where, factors=factors, chosen=chosen, seen=(), won=won)
 
     def step(
-        self,
-        tuning: InterweavingTuning,
-        theta: np.ndarray,
-        paths: Paths,
+        self, tuning: InterweavingTuning, theta: np.ndarray, paths: Paths,
         generator: np.random.Generator,
-    ) -> tuple[InterweavingTuning, float]:
+    ) -> tuple[InterweavingTuning, float]:  # fmt: skip
         """One sweep's steps; theta and paths in place. Returns the share that was accepted."""
         sweep = tuning.sweep
         if tuning.where is None:

@@ -28,6 +28,7 @@ from ssmppl.language.model.traced import Trace
 
 Result = TypeVar("Result")
 DrawnChains = Sequence[ChainDraws[Any]]
+Drawn = tuple[list[ChainDraws[Any]], dict[str, Any]]  # the chains, and what to report of them
 PlanRows = list[tuple[str, str]]
 
 # Titles of what `explain` says of the methods.
@@ -111,14 +112,6 @@ class Derived(Protocol):
     def eliminable(self) -> Eliminable: ...
 
 
-def _nothing_to_say(plan: Derived) -> Mapping[str, PlanRows]:
-    return {}
-
-
-def _no_attributes(problem: Problem, chains: DrawnChains) -> dict[str, Any]:
-    return {}
-
-
 @dataclass(frozen=True)
 class SamplingMethod:
     """What `sample` and `explain` know of a method, whose settings are of the class it is
@@ -136,19 +129,13 @@ class SamplingMethod:
     """
 
     prepare: Callable[[SamplingSetup, Any], PreparedChains] | None
-    independent: (
-        Callable[
-            [SamplingSetup, Any, int, Executor | None, bool],
-            tuple[list[ChainDraws[Any]], dict[str, Any]],
-        ]
-        | None
-    ) = None
+    independent: Callable[..., Drawn] | None = None
     state_classes: tuple[type, ...] = ()
     complete: Callable[[Any, int], Any] = lambda settings, draws: settings
     by_row: Callable[[Any], bool] = lambda settings: False
-    attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = _no_attributes
+    attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = lambda problem, chains: {}
     where_slow: str = ""
-    explain: Callable[[Derived], Mapping[str, PlanRows]] = _nothing_to_say
+    explain: Callable[[Derived], Mapping[str, PlanRows]] = lambda plan: {}
 
     @property
     def markov(self) -> bool:
@@ -158,7 +145,7 @@ class SamplingMethod:
     def draw(
         self, setup: SamplingSetup, settings: Any, draws: int, executor: Executor | None,
         progress: bool,
-    ) -> tuple[list[ChainDraws[Any]], dict[str, Any]]:  # fmt: skip
+    ) -> Drawn:  # fmt: skip
         """The chains, and what to report of them."""
         if self.prepare is None:
             assert self.independent is not None

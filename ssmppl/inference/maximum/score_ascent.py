@@ -122,13 +122,9 @@ def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
 
 
 def _newton(
-    setup: Maximization,
-    method: ScoreAscent,
-    start: np.ndarray,
-    runs: Runs,
-    most: int,
+    setup: Maximization, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int,
     bar: Progress,
-) -> Ascent:
+) -> Ascent:  # fmt: skip
     way = _Iterations()
     z, interrupted, share = np.array(start), False, np.inf
     try:
@@ -267,13 +263,9 @@ def _answer(
 
 
 def _paper(
-    setup: Maximization,
-    method: ScoreAscent,
-    start: np.ndarray,
-    runs: Runs,
-    most: int,
+    setup: Maximization, method: ScoreAscent, start: np.ndarray, runs: Runs, most: int,
     bar: Progress,
-) -> Ascent:
+) -> Ascent:  # fmt: skip
     metric = paper_metric(setup)
     way, z, interrupted = _Iterations([np.array(start)]), np.array(start), False
     try:

@@ -12,7 +12,7 @@ import ssmppl as ssm
 import ssmppl.language.distributions as D
 from ssmppl import datasets
 from ssmppl.analysis.structure import linear_gaussian
-from ssmppl.codegen.kernels.kalman.square_root import square_root as kernel
+from ssmppl.codegen.kernels.kalman import square_root as kernel
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.kalman import kalman_filter, kalman_log_likelihood, kalman_model
