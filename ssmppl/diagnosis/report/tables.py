@@ -112,7 +112,7 @@ def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
 def missing_table(
     screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
 ) -> pd.DataFrame:
-    """The estimated_strength missing curve of the mean over each variable of an equation.
+    """The estimated missing curve of the mean over each variable of an equation.
 
     others : candidates that are projected out.
     """
