@@ -4,8 +4,8 @@
 
 The reference C is the true model, refitted to the first 70% of the rows (its parameters and its
 effects' strengths). F of the report's model and its interval are made by the tool's own
-`ssmppl.diagnosis.heldout.gain_ratio.closed` on the confirm rows. F* is the same ratio at the same
-fitted parameters, over the confirm parts of 20 fresh runs of the true system with the same inputs.
+`ssmppl.diagnosis.heldout.gain_ratio` on the held-out rows. F* is the same ratio at the same fitted
+parameters, over the held-out rows of 20 fresh runs of the true system with the same inputs.
 Opens the answers:
 run it after the diagnosis, before `score.py`, which reads `cache/fresh.json`.
 """

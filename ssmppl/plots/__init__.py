@@ -32,22 +32,8 @@ from ssmppl.plots.predictions import plot_predictions
 from ssmppl.plots.states import plot_forecast, plot_states
 
 __all__ = [
-    "free_run",
-    "gap_closed",
-    "missing_term",
-    "page",
-    "panel_figures",
-    "pictures",
-    "plot",
-    "plot_ancestry",
-    "plot_filter",
-    "plot_forecast",
-    "plot_likelihood",
-    "plot_maximization",
-    "plot_predictions",
-    "plot_prior_posterior",
-    "plot_states",
-    "ranked_effects",
-    "residual_map",
+    "free_run", "gap_closed", "missing_term", "page", "panel_figures", "pictures", "plot",
+    "plot_ancestry", "plot_filter", "plot_forecast", "plot_likelihood", "plot_maximization",
+    "plot_predictions", "plot_prior_posterior", "plot_states", "ranked_effects", "residual_map",
     "save",
-]
+]  # fmt: skip

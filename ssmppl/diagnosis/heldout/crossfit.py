@@ -20,12 +20,7 @@ import numpy as np
 
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated
-from ssmppl.diagnosis.heldout.gain_ratio import (
-    FEWEST_BLOCKS,
-    NOT_GIVEN,
-    HeldOutGain,
-    gain_ratio,
-)
+from ssmppl.diagnosis.heldout.gain_ratio import FEWEST_BLOCKS, NOT_GIVEN, HeldOutGain, gain_ratio
 from ssmppl.diagnosis.heldout.parts import FOLDS, Fold, folds
 from ssmppl.diagnosis.heldout.predictions import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference

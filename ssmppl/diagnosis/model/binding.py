@@ -126,9 +126,7 @@ def _changes(candidate: Candidate, returned: Any, part: Part) -> dict[str, Expr]
             out[labels[argument]] = as_expr(value)
         except TypeError:
             raise _refuse(
-                effect,
-                f"it returned {value!r}",
-                "return one number, or an expression",
+                effect, f"it returned {value!r}", "return one number, or an expression"
             ) from None
     return out
 

@@ -84,8 +84,7 @@ def score_columns(
     later = [a + b for a, b in zip(parts["transition"], parts["observation"], strict=True)]
     further = len(superset.state_symbols) > len(base.state_symbols) or sums.columns
     given = replace(
-        superset,
-        parameters={n: s for n, s in superset.parameters.items() if n not in strengths},
+        superset, parameters={n: s for n, s in superset.parameters.items() if n not in strengths}
     )
     if not further:
         given = replace(base, parameters=given.parameters)  # its laws hold no strength

@@ -93,10 +93,7 @@ class Findings:
     failures: Failures = field(default_factory=Failures)
 
     def __post_init__(self) -> None:
-        for name, value, known in (
-            ("verdict", self.verdict, VERDICTS),
-            ("mode", self.mode, MODES),
-        ):
+        for name, value, known in (("verdict", self.verdict, VERDICTS), ("mode", self.mode, MODES)):
             if value not in known:
                 raise ArgumentError(
                     f"the {name} of a report cannot be {value!r}",

@@ -13,27 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ssmppl.diagnosis.report import words
 from ssmppl.diagnosis.report.findings import Findings
 from ssmppl.diagnosis.report.panels import TITLES, bars, curves, mapped, pictures, runs
-from ssmppl.diagnosis.report.words import (
-    GLOSSARY,
-    alternatives,
-    class_letters,
-    headline,
-    how_far,
-    how_sure,
-    leaders,
-    left_out,
-    listed,
-    next_steps,
-    place,
-    row_label,
-    rows,
-    sentence,
-    untold,
-    where,
-    which,
-)
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
 if TYPE_CHECKING:
@@ -170,10 +152,10 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
         f"<title>{_text(title)}</title>", f"<style>{CSS}</style>", "</head>", "<body>", "<main>",
         f"<header><h1>{_text(title)}</h1></header>",
         f'<section class="verdict {kind}" aria-label="The answer">',
-        f"<p>{_text(headline(report))}</p>", "</section>",
+        f"<p>{_text(words.headline(report))}</p>", "</section>",
         _answers(report),
-        _section("How sure", _list(how_sure(report)) + _unknown(report)),
-        _section("What to do next", _list(next_steps(report))),
+        _section("How sure", _list(words.how_sure(report)) + _unknown(report)),
+        _section("What to do next", _list(words.next_steps(report))),
         evidence,
         tables,
         _section("Words used here", _glossary()),
@@ -211,24 +193,24 @@ def _list(items: Iterable[str]) -> str:
 # -- the answers
 def _answers(report: Findings) -> str:
     """Three cards: a large word or number, and the sentences below it."""
-    found = leaders(report)
-    gap = rows(report.where)[:1] if report.verdict != "no measurable gap" else []
-    spot = place(gap[0]) if gap else "nowhere in particular"
-    names = [listed(alternatives(report, row), "or") for row in found]
+    found = words.leaders(report)
+    gap = words.rows(report.where)[:1] if report.verdict != "no measurable gap" else []
+    spot = words.place(gap[0]) if gap else "nowhere in particular"
+    names = [words.listed(words.alternatives(report, row), "or") for row in found]
     cause = {"none of these": "none of these", "no measurable gap": "nothing found"}
-    first = (rows(report.closed) or [{"F": None}])[0]
+    first = (words.rows(report.closed) or [{"F": None}])[0]
     far, ends = "not measured", ""
     if is_number(first["F"]):
         far, ends = percent(first["F"]), interval(first["F_low"], first["F_high"])
     cards = (
-        ("Where is the gap?", spot, "", where(report)),
+        ("Where is the gap?", spot, "", words.where(report)),
         (
             "Which effect is missing?",
             cause.get(report.verdict, "; and ".join(names)),
             "",
-            which(report),
+            words.which(report),
         ),
-        ("How far does the gap close?", far, ends, how_far(report)),
+        ("How far does the gap close?", far, ends, words.how_far(report)),
     )
     body = "\n".join(
         f'<section class="card"><h2>{_text(question)}</h2><p class="large">{_text(large)}'
@@ -245,9 +227,9 @@ def _unknown(report: Findings) -> str:
     """What could not be told, and what has to be known before the figures are used."""
     out = ""
     for title, items in (
-        ("What these data could not tell", untold(report)),
-        ("To be kept in mind", [sentence(n) for n in report.notes]),
-        ("Left out, as they failed", left_out(report)),
+        ("What these data could not tell", words.untold(report)),
+        ("To be kept in mind", [words.sentence(n) for n in report.notes]),
+        ("Left out, as they failed", words.left_out(report)),
     ):
         if items:
             out += f"\n<h3>{title}</h3>\n{_list(items)}"
@@ -272,24 +254,24 @@ def _alt(report: Findings, name: str) -> str:
     """What the picture shows, for those who cannot see it."""
     if name == "residual_map":
         table = report.residual_map.dropna(subset=["z"])
-        text = f"Map of z by time for the equations {listed(mapped(report))}."
+        text = f"Map of z by time for the equations {words.listed(mapped(report))}."
         if len(table):
             top = table.loc[table["z"].abs().idxmax()]
             text += f" Largest: {number(top['z'], 2)} for {top['equation']} at " \
                     f"{span(top['t_from'], top['t_to'], top['experiment'])}."  # fmt: skip
         return text
     if name == "ranked_effects":
-        items = [f"{row_label(r)} {number(_gain(r), 2)}" for r in bars(report)]
+        items = [f"{words.row_label(r)} {number(_gain(r), 2)}" for r in bars(report)]
         return f"Bars of the gain in nats: {'; '.join(items)}."
     if name == "gap_closed":
         items = [f"{r['effect']} {percent(r['F'])} ({interval(r['F_low'], r['F_high'])})"
-                 for r in rows(report.closed)]  # fmt: skip
+                 for r in words.rows(report.closed)]  # fmt: skip
         return f"Share of the gap closed with its 95% interval: {'; '.join(items)}."
     if name == "missing_term":
-        return "Curves with bands: " + listed([f"what is missing in {e} over {v}"
-                                               for e, v in curves(report)]) + "."  # fmt: skip
-    shown = listed(list(dict.fromkeys(str(c) for _, c in runs(report))))
-    first = (rows(report.closed) or [{}])[0]
+        items = [f"what is missing in {e} over {v}" for e, v in curves(report)]
+        return f"Curves with bands: {words.listed(items)}."
+    shown = words.listed(list(dict.fromkeys(str(c) for _, c in runs(report))))
+    first = (words.rows(report.closed) or [{}])[0]
     text = f"Data of {shown} with free runs of the model as it was and with what was found."
     if is_number(first.get("rmse_before")) and is_number(first.get("rmse_after")):
         text += f" The error goes from {number(first['rmse_before'])} to " \
@@ -309,7 +291,7 @@ def _png(picture: bytes) -> str:
 # -- the tables
 def _tables(report: Findings) -> str:
     out = []
-    letters = class_letters(report)
+    letters = words.class_letters(report)
     for name, title in TABLES.items():
         table = report.tables()[name]
         if name == "classes":
@@ -317,7 +299,7 @@ def _tables(report: Findings) -> str:
         if not len(table):
             continue
         body = [[_cell(column, row[column], letters) for column in table.columns]
-                for row in rows(table.head(LONGEST_TABLE))]  # fmt: skip
+                for row in words.rows(table.head(LONGEST_TABLE))]  # fmt: skip
         count = f" (first {LONGEST_TABLE} of {len(table)})" if len(table) > LONGEST_TABLE else ""
         heads = [HEADINGS.get(c, str(c).replace("_", " ")) for c in table.columns]
         out.append(_table(title + count, heads, body, _left(table)))
@@ -384,7 +366,7 @@ def _table(title: str, heads: list[str], body: list[list[str]], left: set[int]) 
 
 # -- the end
 def _glossary() -> str:
-    terms = "\n".join(f"<dt>{_text(t)}</dt><dd>{_text(m)}.</dd>" for t, m in GLOSSARY.items())
+    terms = "\n".join(f"<dt>{_text(t)}</dt><dd>{_text(m)}.</dd>" for t, m in words.GLOSSARY.items())
     return f"<dl>\n{terms}\n</dl>"
 
 

@@ -12,13 +12,7 @@ from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, 
 from ssmppl.diagnosis.heldout.predictions import FreeRun
 from ssmppl.diagnosis.heldout.reference import residual_groups
 from ssmppl.diagnosis.report.findings import tabulate
-from ssmppl.diagnosis.screening.location import (
-    Group,
-    curve,
-    localise,
-    regions,
-    when,
-)
+from ssmppl.diagnosis.screening.location import Group, curve, localise, regions, when
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.diagnosis.selection.refit import Refit
@@ -112,7 +106,7 @@ def _region(screen: Screen, key: tuple[str, str], places: list[int]) -> str:
 def missing_table(
     screen: Screen, key: tuple[str, str], others: Sequence[Candidate]
 ) -> pd.DataFrame:
-    """The estimated_strength missing curve of the mean over each variable of an equation.
+    """The estimated missing curve of the mean over each variable of an equation.
 
     others : candidates that are projected out.
     """

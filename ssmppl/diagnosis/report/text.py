@@ -7,19 +7,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from ssmppl import markup
-from ssmppl.diagnosis.report.words import (
-    GLOSSARY,
-    answers,
-    class_letters,
-    headline,
-    left_out,
-    marked,
-    next_steps,
-    row_label,
-    rows,
-    sentence,
-    untold,
-)
+from ssmppl.diagnosis.report import words
 from ssmppl.drawing.numerals import DASH, is_number, number, p_text, with_error
 
 if TYPE_CHECKING:
@@ -33,13 +21,13 @@ ALIKE = "Effects with the same letter cannot be told apart by these data."
 
 def cause_rows(report: Findings, shown: int = SHOWN_CAUSES) -> list[tuple[str, ...]]:
     """Header and the best causes: name, form, strength, gain, p, class letter."""
-    letters, chosen = class_letters(report), marked(report)
+    letters, chosen = words.class_letters(report), words.marked(report)
     out: list[tuple[str, ...]] = [("effect", "form", "strength", "gain (nats)", "p", "alike")]
-    for i, r in enumerate(rows(report.causes)[:shown]):
+    for i, r in enumerate(words.rows(report.causes)[:shown]):
         refit = is_number(r["gain_refit"])
         gain = number(r["gain_refit"] if refit else r["gain_screen"], 2)
         gain += "" if refit or gain == DASH else " *"
-        name = ("→ " if i in chosen else "  ") + row_label(r)
+        name = ("→ " if i in chosen else "  ") + words.row_label(r)
         form = r["form"] if isinstance(r["form"], str) else ""
         out.append((name, form, with_error(r["estimate"], r["se"]), gain,
                     p_text(r["p"]).removeprefix("p ").removeprefix("= "),
@@ -66,18 +54,18 @@ def _table(cells: list[tuple[str, ...]]) -> list[str]:
 
 def report_text(report: Findings) -> str:
     """The verdict, the three answers, one table, what could not be told and what would tell."""
-    lines = [*wrapped(headline(report)), ""]
-    for name, sentences in answers(report):
+    lines = [*wrapped(words.headline(report)), ""]
+    for name, sentences in words.answers(report):
         lines += wrapped(" ".join(sentences), f"{name:<10}", " " * 10)
     cells = cause_rows(report)
     if len(cells) > 1:
         lines += ["", *_table(cells)]
         if any("*" in row[3] for row in cells[1:]):
             lines.append(PREDICTED)
-        if class_letters(report):
+        if words.class_letters(report):
             lines.append(ALIKE)
         for term in ("gain", "closable gap", "p")[:: 1 if len(report.closed) else 2]:
-            lines += wrapped(f"{term}: {GLOSSARY[term]}.")
+            lines += wrapped(f"{term}: {words.GLOSSARY[term]}.")
     for name, found in _rest(report):
         lines += ["", name]
         for item in found:
@@ -87,10 +75,10 @@ def report_text(report: Findings) -> str:
 
 def report_html(report: Findings) -> str:
     """What `report_text` says, for a notebook."""
-    parts = [markup.heading(report.title or "Diagnosis"), markup.paragraph(headline(report))]
+    parts = [markup.heading(report.title or "Diagnosis"), markup.paragraph(words.headline(report))]
     rows_of_answers = [
         (markup.text(name), markup.text(" ".join(sentences)))
-        for name, sentences in answers(report)
+        for name, sentences in words.answers(report)
         if sentences
     ]
     parts.append(markup.table(rows_of_answers, left=(0, 1)))
@@ -102,7 +90,7 @@ def report_html(report: Findings) -> str:
         parts.append(markup.table(cells, [head[i] for i in keep], left))
         if any("*" in row[3] for row in causes):
             parts.append(markup.paragraph(PREDICTED))
-        if class_letters(report):
+        if words.class_letters(report):
             parts.append(markup.paragraph(ALIKE))
     for name, found in _rest(report):
         items = "".join(f"<li>{markup.text(item)}</li>" for item in found)
@@ -113,9 +101,9 @@ def report_html(report: Findings) -> str:
 def _rest(report: Findings) -> list[tuple[str, list[str]]]:
     """What could not be told, what would tell, and what has to be known."""
     found = [
-        ("Could not be told", untold(report)), ("What next", next_steps(report)),
-        ("Notes", [sentence(n) for n in report.notes]),
-        ("Left out", left_out(report)),
+        ("Could not be told", words.untold(report)), ("What next", words.next_steps(report)),
+        ("Notes", [words.sentence(n) for n in report.notes]),
+        ("Left out", words.left_out(report)),
     ]  # fmt: skip
     return [(name, items) for name, items in found if items]
 

@@ -24,10 +24,7 @@ MOMENTS = {
     "time dependence": "how the noise of one step depends on the last, of",
 }
 
-USE = {
-    "screen": "effects were looked for on",
-    "confirm": "the gap was measured on",
-}
+USE = {"screen": "effects were looked for on", "confirm": "the gap was measured on"}
 
 GLOSSARY = {
     "gain": "how much more probable the effect makes the data, on a log scale: 1 nat is 2.7 times "

@@ -25,7 +25,7 @@ def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     base = augmented.fitter(())
     train = list(screen.experiments)
     fit = base.fit(train, seed_sequence(1), start, FROM_START)
-    groups = reference.signal(screen, ())
+    groups = reference.significant_groups(screen, ())
     assert groups
 
     def made():

@@ -12,7 +12,7 @@ from ssmppl.diagnosis.model.basis import basis
 from ssmppl.diagnosis.model.binding import bind
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.equations import Augmented, Equations, as_it_was
-from ssmppl.diagnosis.model.initial_law import Start
+from ssmppl.diagnosis.model.initial_law import ProperInitialLaw
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.language.distributions import Normal
 from ssmppl.language.trace import trace
@@ -91,7 +91,9 @@ def test_a_start_that_was_given_stays_when_more_is_added():
         next(c for c in offers(t, scales(t))[0] if c.effect.name == n)
         for n in ("quadratic drag", "outliers")
     )
-    started = Start({"x": (np.array(0.5), np.array(3.0))}).given(augment(t, [friction]))
+    started = ProperInitialLaw({"x": (np.array(0.5), np.array(3.0))}).applied_to(
+        augment(t, [friction])
+    )
     assert isinstance(started, Augmented)
     for m in (started, augment(started, [noise])):
         law = m.initial["x"].distribution

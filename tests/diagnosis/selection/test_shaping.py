@@ -63,7 +63,7 @@ def test_a_period_moves_within_the_resolution_of_the_record():
 
 # -- fitted, the likelihoods exact
 def setting(extra):
-    """An oscillator's data with `extra` (T,) added to its force, its model's fit and augmented."""
+    """An oscillator with `extra` (T,) added to its force: its data, fit and augmented models."""
     inputs = models.inputs_of("oscillator", ROWS)
     force = {"u": inputs["u"] + extra}
     model, theta = models.build("oscillator"), models.THETA["oscillator"]
