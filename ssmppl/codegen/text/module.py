@@ -18,9 +18,6 @@ from typing import Any
 
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
 from ssmppl.codegen.text.render import (
-    CALLS,
-    DRAWS,
-    MATRIX_CALLS,
     Names,
     Writer,
     comment,
@@ -30,6 +27,7 @@ from ssmppl.codegen.text.render import (
 )
 from ssmppl.codegen.text.specialise import specialise
 from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.operations import KERNELS
 from ssmppl.language.model.traced import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
 
@@ -43,6 +41,9 @@ LEVELS = {
 
 # What every section has, and the arguments.
 OUTER = {"prepare": "theta, c", "step": "theta, c, y_data, seen_data, u_data, t, s"}
+# Where the functions stand that generated text calls, and its decorators.
+HOMES = {n: f"ssmppl.codegen.kernels.math.{file}" for n, file in KERNELS.items()}
+HOMES |= dict.fromkeys(("exact", "kernel"), "ssmppl.codegen.kernels.math.flags")
 
 
 def level_of(node: Expr) -> int:
@@ -305,19 +306,6 @@ def _summed(group: Sequence[Target]) -> Target:
     return Target(group[0].text, total, group[0].guard)
 
 
-# The modules of `kernels/math` and the functions that generated text calls there.
-MODULES = {
-    "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
-    "special": "lgamma digamma trigamma gammaln_rise digamma_rise betaln ndtr log_ndtr ndtri erf "
-    "erfc i0e i1e betabinomial_cdf betabinomial_quantile vonmises_cdf vonmises_quantile gammainc "
-    "gammaincc gammaincinv gammainccinv betainc betaincc betaincinv betainccinv",
-    "random": "normal uniform gamma gamma_by poisson binomial vonmises",
-    "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil "
-    "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile "
-    "poisson_survival_quantile negbinomial_survival_quantile cholesky inverse logdet det",
-    "flags": "exact kernel",
-}
-
 # Functions that some sections lack, and then are not called.
 OPTIONAL = ("fit", "look_ahead", "weigh_future")
 
@@ -383,10 +371,7 @@ class ModuleText:
         lines += ["import math", "from math import inf, nan", "", "import numba"]
         lines += ["import numpy as np", ""]
         words = set(re.findall(r"\w+", "\n".join(self.parts)))
-        imports = dict(self.imports)
-        for file, names in MODULES.items():
-            package = f"ssmppl.codegen.kernels.math.{file}"
-            imports |= {n: package for n in names.split() if n in words and n not in imports}
+        imports = {n: home for n, home in HOMES.items() if n in words} | self.imports
         for package in sorted(set(imports.values())):
             names = ", ".join(sorted(n for n, home in imports.items() if home == package))
             wrapped = textwrap.fill(names, 92, initial_indent="    ", subsequent_indent="    ")
@@ -403,8 +388,3 @@ def heading(title: str) -> str:
     """A comment line across the page, and the title under it."""
     wrapped = "\n".join(f"# {line}" for line in textwrap.wrap(title, 94))
     return f"# {'-' * 96}\n{wrapped}"
-
-
-def known_spellings() -> set[str]:
-    """Every function that generated text may call, for the test that all have an import."""
-    return {*CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values()} - {"abs"}
