@@ -28,8 +28,6 @@ from ssmppl.expressions import special
 from ssmppl.expressions.node import (
     BOOLEAN,
     INDEX_BY_SYMBOL,
-    MATRIX_OPS,
-    OPS,
     Expr,
     as_expr,
     attributed,
@@ -42,6 +40,7 @@ from ssmppl.expressions.node import (
     user_location,
 )
 from ssmppl.expressions.operations import (
+    MATRIX_OPS,
     OPERATIONS,
     WRITTEN,
     Level,
@@ -56,7 +55,6 @@ __all__ = [
     "BOOLEAN",
     "INDEX_BY_SYMBOL",
     "MATRIX_OPS",
-    "OPS",
     "Expr",
     "as_expr",
     "attributed",
@@ -249,10 +247,13 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
             return number, e
 
 
-def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) -> list[Expr]:
+def topological(
+    roots: Iterable[Expr], within: Container[Expr] | None = None, until: Container[Expr] = ()
+) -> list[Expr]:
     """Every node under `roots`, arguments before users, each once; without recursion.
 
     within : other nodes are left out, with whatever is reached only through them.
+    until : what is reached only through these nodes is left out, themselves not.
     """
     order: list[Expr] = []
     seen: set[Expr] = set()
@@ -264,6 +265,8 @@ def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) ->
         elif node not in seen:
             seen.add(node)
             stack.append((node, True))
+            if node in until:
+                continue
             stack.extend(
                 (a, False) for a in reversed(node.args)
                 if a not in seen and (within is None or a in within)

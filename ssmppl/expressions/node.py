@@ -25,9 +25,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import Location, UnsupportedOperation
-from ssmppl.expressions.operations import BOOLEAN, MATRIX_OPS, OPERATIONS
-
-OPS = frozenset([*OPERATIONS, *MATRIX_OPS, "const", "symbol", "item", "random", "call"])
+from ssmppl.expressions.operations import BOOLEAN, OPERATIONS
 
 INDEX_BY_SYMBOL = (
     "np.choose(k, table) is table[k] for a symbol k and an array of numbers: an element of a "

@@ -106,7 +106,7 @@ def betabinomial_quantile(n: Any, a: Any, b: Any, q: Any) -> np.ndarray:
     return np.where(sound & (q >= 0) & (q <= 1), k, np.nan)
 
 
-def negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
+def _negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
     """P(X <= k), "lower", or P(X > k), "upper", of counts of dispersion r."""
     r, mean = np.asarray(r, dtype=float), np.asarray(mean, dtype=float)
     of_k, of_r = (sp.betaincc, sp.betainc) if side == "lower" else (sp.betainc, sp.betaincc)
@@ -136,32 +136,25 @@ def _round_up(k: Any, cdf: Callable[[Any], Any], q: Any) -> Any:
 
 def negbinomial_quantile(r: Any, mean: Any, q: Any) -> Any:
     """The smallest k with P(X <= k) >= q, for counts of dispersion r."""
-    found = smallest_above(lambda k: negbinomial_tail(k, r, mean, "lower"), q)
+    found = _smallest(lambda k: _negbinomial_tail(k, r, mean, "lower"), q, np.greater_equal)
     return np.where(np.asarray(q) == 1.0, np.inf, found)
 
 
 def poisson_survival_quantile(rate: Any, q: Any) -> Any:
     """The smallest k with P(X > k) <= q."""
-    return smallest_below(lambda k: sp.gammainc(k + 1.0, rate), q)
+    return _smallest(lambda k: sp.gammainc(k + 1.0, rate), q, np.less_equal)
 
 
 def negbinomial_survival_quantile(r: Any, mean: Any, q: Any) -> Any:
     """Likewise, for counts of dispersion r."""
-    return smallest_below(lambda k: negbinomial_tail(k, r, mean, "upper"), q)
-
-
-def smallest_above(cdf: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
-    """The smallest whole k >= 0 with cdf(k) >= q, elementwise."""
-    return _smallest(cdf, q, np.greater_equal)
-
-
-def smallest_below(survival: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
-    """The smallest whole k >= 0 with survival(k) <= q, elementwise."""
-    return _smallest(survival, q, np.less_equal)
+    return _smallest(lambda k: _negbinomial_tail(k, r, mean, "upper"), q, np.less_equal)
 
 
 def _smallest(tail: Callable[[np.ndarray], Any], q: Any, reached: np.ufunc) -> np.ndarray:
-    """By a k that is doubled and an interval that is halved."""
+    """The smallest whole k >= 0 where tail(k) has reached q, elementwise.
+
+    By a k that is doubled and an interval that is halved.
+    """
     (q,) = _wide(q)
     high = np.zeros(np.broadcast_shapes(q.shape, np.shape(tail(np.zeros(())))))
     known = ~np.isnan(tail(high) + q)

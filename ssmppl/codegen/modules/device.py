@@ -25,7 +25,7 @@ from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.codegen.kernels.math.flags import Kernel, interpreted
 from ssmppl.codegen.kernels.particle import cuda_filter
 from ssmppl.codegen.store import folder
-from ssmppl.codegen.text.kernel_functions import filter_kit
+from ssmppl.codegen.text.kernel_functions import filter_functions
 from ssmppl.codegen.text.module import HOMES, Layout, ModuleText, Section
 from ssmppl.codegen.text.render import identifier
 from ssmppl.codegen.text.specialise import specialise
@@ -174,7 +174,7 @@ def compile_device(trace: Trace, proposal: Proposal, tile: int = TILE) -> Device
     """
     cuda_module()
     layout = Layout(trace)
-    section = filter_kit(layout, proposal)
+    section = filter_functions(layout, proposal)
     _check(section, proposal)
     host = ModuleText(layout)
     host.add(f"particle filter, {proposal.name}", section)

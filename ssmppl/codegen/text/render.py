@@ -75,7 +75,7 @@ class Writer:
         """Append the statements `target = expression` for all targets."""
         roots = [e for _, e in targets]
         uses, finals = _uses(roots, self.text), set(roots)
-        for node in topological_until(roots, self.text):
+        for node in topological(roots, until=self.text):
             if node in self.text or node.op == "const":
                 continue
             if node.op == "symbol":
@@ -149,7 +149,7 @@ def _uses(roots: list[Expr], named: Mapping[Expr, object]) -> dict[Expr, int]:
     uses: dict[Expr, int] = {}
     for r in roots:
         uses[r] = uses.get(r, 0) + 1
-    for node in topological_until(roots, named):
+    for node in topological(roots, until=named):
         if node in named:
             continue
         for a in node.args:
@@ -157,23 +157,6 @@ def _uses(roots: list[Expr], named: Mapping[Expr, object]) -> dict[Expr, int]:
         if node.op == "pow" and is_small_power(node):
             uses[node.args[0]] += 1
     return uses
-
-
-def topological_until(roots: Iterable[Expr], named: Mapping[Expr, object]) -> list[Expr]:
-    """Nodes under `roots`, arguments first, not looking below nodes that have a name already."""
-    order: list[Expr] = []
-    seen: set[Expr] = set()
-    stack = [(r, False) for r in reversed(list(roots))]
-    while stack:
-        node, expanded = stack.pop()
-        if expanded:
-            order.append(node)
-        elif node not in seen:
-            seen.add(node)
-            stack.append((node, True))
-            if node not in named:
-                stack.extend((a, False) for a in reversed(node.args) if a not in seen)
-    return order
 
 
 def number_text(value: float) -> str:
@@ -192,7 +175,7 @@ def comment(node: Expr, width: int = 60) -> str:
 
 
 def depends(nodes: Iterable[Expr], level_of: Callable[[Expr], int]) -> dict[Expr, int]:
-    """Binding time of every node: the latest among its symbols (see `program.LEVELS`)."""
+    """Binding time of every node: the latest among its symbols (see `module.LEVELS`)."""
     level: dict[Expr, int] = {}
     for node in topological(nodes):
         if node.args:
@@ -202,6 +185,3 @@ def depends(nodes: Iterable[Expr], level_of: Callable[[Expr], int]) -> dict[Expr
         if node.op in ("symbol", "random"):
             level[node] = max(level[node], level_of(node))
     return level
-
-
-__all__ = ["Names", "Writer", "comment", "depends", "identifier", "symbol_name"]

@@ -16,10 +16,10 @@ from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.codegen.kernels.particle.resampling import SYSTEMATIC
 from ssmppl.codegen.modules.marginal import MarginalFilter
 from ssmppl.codegen.text.module import PARTICLE, level_of
-from ssmppl.codegen.text.render import depends, is_small_power, topological_until
+from ssmppl.codegen.text.render import depends, is_small_power
 from ssmppl.counts import check_room
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.expr import Expr, topological
 from ssmppl.expressions.operations import CHEAP, OPERATIONS, SLOW
 from ssmppl.inference.particles.filtering import FilterSettings, filter_settings, repeated_estimates
 from ssmppl.inference.particles.on_device import check_device
@@ -67,7 +67,7 @@ def cost(proposal: Proposal) -> float:
 def _pass_cost(roots: list[Expr], known: dict[Expr, bool]) -> float:
     level = depends(roots, level_of)
     total = 0.0
-    for node in topological_until(roots, known):
+    for node in topological(roots, until=known):
         if level[node] != PARTICLE or node.op == "symbol" or node in known:
             continue
         if node.op == "random":
