@@ -8,7 +8,7 @@ others become matrix nodes (`MATRIX_OPS`), which generated code evaluates by one
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -61,55 +61,20 @@ class ExprArray(np.ndarray):
         place = {node: i for i, node in enumerate(unpack(table))}
         return _unpack_array, (table, [place[n] for n in nodes], self.shape)
 
-    # NumPy's methods, which would bypass the protocols, by the functions of the same name.
-    def sum(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.sum, self, args, kwargs)
 
-    def prod(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.prod, self, args, kwargs)
+def _by_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    def method(self: ExprArray, *args: Any, **kwargs: Any) -> Any:
+        return behaviour["function"](function, (self, *args), kwargs)
 
-    def mean(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.mean, self, args, kwargs)
-
-    def var(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.var, self, args, kwargs)
-
-    def std(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.std, self, args, kwargs)
-
-    def max(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.max, self, args, kwargs)
-
-    def min(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.min, self, args, kwargs)
-
-    def dot(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.dot, self, args, kwargs)
-
-    def clip(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.clip, self, args, kwargs)
-
-    def trace(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.trace, self, args, kwargs)
-
-    def cumsum(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.cumsum, self, args, kwargs)
-
-    def any(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.any, self, args, kwargs)
-
-    def all(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.all, self, args, kwargs)
-
-    def cumprod(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.cumprod, self, args, kwargs)
-
-    def round(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.round, self, args, kwargs)
+    return method
 
 
-def _by_function(function: Any, a: ExprArray, args: tuple, kwargs: dict) -> Any:
-    return behaviour["function"](function, (a, *args), kwargs)
+# NumPy's methods, which would bypass the protocols, by the functions of the same name.
+for _function in (
+    np.sum, np.prod, np.mean, np.var, np.std, np.max, np.min, np.dot, np.clip, np.trace, np.cumsum,
+    np.any, np.all, np.cumprod, np.round,
+):  # fmt: skip
+    setattr(ExprArray, _function.__name__, _by_function(_function))
 
 
 def _unpack_array(table: list, places: list[int], shape: tuple[int, ...]) -> ExprArray:

@@ -78,10 +78,11 @@ class Operation:
         neither has it.
     kernel : file and function of `codegen/kernels/math` that generated code calls; without a file a
         built-in function.
-    plain : for plain Python of floats, a function, or a phrase of its own.
+    plain : the function that plain Python calls on floats ("logaddexp" is one of `lambdify.py`), or
+        a phrase of its own; "" where `written` says it, or where the interpreter is asked.
     cost : nanoseconds per particle, from timings of single passes; what they weigh matters, not the
         unit.
-    written : in Python's signs and words, where these have it.
+    written : by Python's signs and words, where it has any.
     meaning : function of arrays, where it is neither `numpy` nor one of this name in `special.py`.
     """
 
@@ -96,7 +97,7 @@ class Operation:
 
     @property
     def called(self) -> Callable[..., Any] | None:
-        """The function that users call."""
+        """The function `numpy`."""
         home, _, own = self.numpy.partition(".")
         return getattr({"np": np, "special": sp}[home], own) if own else None
 
@@ -195,8 +196,8 @@ OPERATIONS = {o.name: o for o in _TABLE}
 WRITTEN = {o.name: o.written for o in _TABLE if o.written is not None}
 BOOLEAN = frozenset(("lt", "le", "eq", "ne", "and", "or", "not"))
 
-# Of a matrix, whose n * n entries, row by row, are the operands: how users write them, and what
-# they mean of a stack of matrices. Their kernels stand in `scalars.py` under their names.
+# Operations on a matrix, whose n * n entries, row by row, are the operands: how users write them,
+# and their meaning, a function of a stack of matrices. Kernels have the same names.
 MATRICES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "cholesky": ("np.linalg.cholesky({0})", np.linalg.cholesky),
     "inverse": ("np.linalg.inv({0})", np.linalg.inv),
@@ -204,11 +205,9 @@ MATRICES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "det": ("np.linalg.det({0})", np.linalg.det),
 }
 MATRIX_OPS = tuple(MATRICES)
-# Kinds of "random" nodes, which are functions of `random.py`; most normals and uniforms are drawn
-# in bulk.
+# Kinds of "random" nodes; most normals and uniforms are drawn in bulk.
 DRAWS = ("normal", "uniform", "gamma", "gamma_by", "poisson", "binomial", "vonmises")
 
-KERNELS: dict[str, str] = {
-    o.kernel.rpartition(".")[2]: o.kernel.rpartition(".")[0] for o in _TABLE if "." in o.kernel
-} | {**dict.fromkeys(MATRIX_OPS, "scalars"), **dict.fromkeys(DRAWS, "random")}
-"""Functions of `codegen/kernels/math` -> the file where they stand."""
+# Functions of `codegen/kernels/math` -> the file where they stand.
+KERNELS = dict(o.kernel.split(".")[::-1] for o in _TABLE if "." in o.kernel)
+KERNELS |= dict.fromkeys(MATRIX_OPS, "scalars") | dict.fromkeys(DRAWS, "random")

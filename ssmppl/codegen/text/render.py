@@ -17,7 +17,7 @@ from ssmppl.expressions.expr import MATRIX_OPS, Expr, symbol_text, to_text, topo
 from ssmppl.expressions.operations import KERNELS, OPERATIONS, WRITTEN, Level, Text, call, within
 
 PHRASES = WRITTEN | {
-    n: call(o.kernel.rpartition(".")[2], o.operands) for n, o in OPERATIONS.items() if o.kernel
+    n: call(o.kernel.split(".")[-1], o.operands) for n, o in OPERATIONS.items() if o.kernel
 }
 _OWN_NAMES = """theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng
     log_w out inf nan reference look trajectory total entry kernel np prev noise kept"""
@@ -32,6 +32,7 @@ class Names:
         self.taken = set(RESERVED) | set(taken)
 
     def fresh(self, wanted: str) -> str:
+        """A name that is not taken yet, as wanted but for underscores; taken from now on."""
         name = identifier(wanted)
         while name in self.taken:
             name += "_"
