@@ -27,6 +27,7 @@ from ssmppl.expressions.expr import (
     user_location,
 )
 from ssmppl.expressions.node import CHOICES, behaviour
+from ssmppl.expressions.operations import MATRICES
 
 _IDENTITY = {"add": 0.0, "mul": 1.0}  # what changes nothing
 
@@ -323,7 +324,7 @@ def _matrix(op: str, a: Any) -> ExprArray:
     n, numbers = len(a), _constants(a)
     if numbers is not None:
         try:
-            return array((np.linalg.inv if op == "inverse" else np.linalg.cholesky)(numbers))
+            return array(MATRICES[op][1](numbers))
         except np.linalg.LinAlgError as error:
             refuse(f"{op} of {numbers.tolist()}: {error}", "check the matrix's entries")
     node = matrix_op(op, a.flat, n)

@@ -247,11 +247,8 @@ class Expr:
 
 # np.exp(np.array([x, y])): on its plain arrays of objects NumPy calls the elements' methods.
 for _name, _operation in OPERATIONS.items():
-    if (
-        _operation.operands == 1
-        and _operation.numpy == f"np.{_name}"
-        and not hasattr(Expr, f"__{_name}__")
-    ):
+    _unary = _operation.operands == 1 and hasattr(np, _name)
+    if _unary and not hasattr(Expr, f"__{_name}__"):
         setattr(Expr, _name, _method(_name))
 
 
