@@ -123,6 +123,7 @@ CHOICES: dict[str, Callable[[Expr, Expr], Expr]] = {
 _VANISHING = {"exp", "ndtr", "erf", "erfc"}
 # Piecewise constant: derivative zero wherever there is one.
 FLAT = BOOLEAN | {"sign", "floor", "ceil"}
+JUMPING = FLAT | {"mod"}  # not continuous
 LONGEST = 80  # characters of an expression in an error
 
 

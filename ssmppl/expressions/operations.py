@@ -1,8 +1,8 @@
 """The operations of expressions: one table of what each means and how it is written.
 
-Whoever adds an operation enters it here, its derivative in `calculus.py` and its compiled function
-in `codegen/kernels/math`. Rules of simplification, signs and jumps are known of some operations
-only: they stand where they are used, and an operation that they do not name has none.
+Whoever adds an operation enters it here, its derivative, and whether it jumps, in `calculus.py` and
+its compiled function in `codegen/kernels/math`. What else is known of some operations, such as
+rules of simplification and signs, stands where it is used: nothing goes wrong without.
 
 Expressions are written in four dialects: for people (`expr.py`), in plain Python
 (`analysis/lambdify.py`), in generated code (`codegen/text/render.py`) and in model files
