@@ -13,7 +13,6 @@ table; parentheses are set by the levels of phrases, in the same way for all.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,8 +66,7 @@ def infix(sign: str, level: int, left: int = 0, right: int = 1) -> Phrase:
     return Phrase(f"{{0}}{sign}{{1}}", level, (level + left, level + right))
 
 
-@dataclass(frozen=True)
-class Operation:
+class Operation(NamedTuple):
     """An operation on numbers.
 
     Attributes
