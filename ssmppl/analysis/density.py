@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssmppl.errors import Location
-from ssmppl.expressions.arrays import ExprArray, array, elementwise
+from ssmppl.expressions.arrays import ExprArray, array, elementwise, inverse, log_determinant
 from ssmppl.expressions.expr import Expr, apply, attributed, constant
-from ssmppl.expressions.linear import inverse, log_determinant
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite

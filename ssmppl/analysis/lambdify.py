@@ -18,28 +18,31 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import MEANING, evaluate
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
+from ssmppl.expressions.operations import (
+    MATRICES,
+    OPERATIONS,
+    Level,
+    Operation,
+    Phrase,
+    call,
+    within,
+)
 
 DOMAIN = (ValueError, ZeroDivisionError, OverflowError)
 Function = Callable[[Sequence[float]], Any]
 
-_SAME_NAME = [
-    "exp", "log", "log1p", "expm1", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "erf",
-    "erfc",
-]  # fmt: skip
-_TEXT = {
-    "neg": "(-{0})", "not": "(not {0})", "add": "({0} + {1})", "sub": "({0} - {1})",
-    "mul": "({0} * {1})", "div": "({0} / {1})", "pow": "math.pow({0}, {1})", "mod": "({0} % {1})",
-    "lt": "({0} < {1})", "le": "({0} <= {1})", "eq": "({0} == {1})", "ne": "({0} != {1})",
-    "and": "({0} and {1})", "or": "({0} or {1})", "where": "({1} if {0} else {2})",
-    "abs": "abs({0})", "logaddexp": "logaddexp({0}, {1})",
-    # max(1.0, nan) is 1.0 in Python, and nan in NumPy
-    "maximum": "({0} if {0} >= {1} or {0} != {0} else {1})",
-    "minimum": "({0} if {0} <= {1} or {0} != {0} else {1})",
-    "gammaln": "math.lgamma({0})", "arcsin": "math.asin({0})", "arccos": "math.acos({0})",
-    "arctan": "math.atan({0})", "arcsinh": "math.asinh({0})", "arccosh": "math.acosh({0})",
-    "arctanh": "math.atanh({0})", "arctan2": "math.atan2({0}, {1})",
-    **{n: f"math.{n}({{0}})" for n in _SAME_NAME},
-}  # fmt: skip
+
+def _phrase(o: Operation) -> Phrase:
+    """By Python's signs and functions, else by the interpreter."""
+    if isinstance(o.plain, Phrase):
+        return o.plain
+    if o.plain:
+        return call(o.plain, o.operands)
+    asked = call(f"meaning[{o.name!r}]", o.operands)
+    return o.written or asked._replace(template=f"float({asked.template})")
+
+
+_PHRASES = {n: _phrase(o) for n, o in OPERATIONS.items()}
 _NEVER_RAISE = {"add", "sub", "mul", "neg", "not", "and", "or", "lt", "le", "eq", "ne", "where",
                 "abs", "maximum", "minimum", "logaddexp"}  # fmt: skip
 
@@ -77,7 +80,7 @@ def _function(
     for node in topological(expressions):
         if node in done:
             continue
-        text = _spelled(node, [done[a] for a in node.args])
+        text = _written(node, [done[a] for a in node.args])
         if node.op == "const":
             done[node] = text
             continue
@@ -132,7 +135,7 @@ def _once(function: Callable[[], Any]) -> Callable[[], Any]:
     return value
 
 
-def _spelled(node: Expr, parts: list[str]) -> str:
+def _written(node: Expr, parts: list[str]) -> str:
     """The text of one operation on the texts of its operands, which are short."""
     if node.op == "const":
         return f"({node.data!r})" if math.isfinite(node.data) else f"float('{node.data}')"
@@ -146,9 +149,7 @@ def _spelled(node: Expr, parts: list[str]) -> str:
         return f"calls[{id(node.data)}]({', '.join(parts)})"
     if node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
         return f"({parts[0]}*{parts[0]})"
-    if node.op in _TEXT:
-        return _TEXT[node.op].format(*parts)
-    return f"float(meaning[{node.op!r}]({', '.join(parts)}))"
+    return within(_PHRASES[node.op].of([(p, Level.ATOM) for p in parts]), Level.ATOM)
 
 
 def _logaddexp(a: float, b: float) -> float:
@@ -162,9 +163,10 @@ def _logaddexp(a: float, b: float) -> float:
 def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], Any]:
     def run(n: int, entries: tuple[float, ...]) -> Any:
         try:
-            return function(np.array(entries).reshape(n, n))
+            found = function(np.array(entries).reshape(n, n))
         except np.linalg.LinAlgError as error:
             raise ValueError(str(error)) from None
+        return found if found.ndim else float(found)
 
     return run
 
@@ -178,8 +180,5 @@ def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
         "DOMAIN": DOMAIN,
         "meaning": MEANING,
         "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
-        "matrix_cholesky": _matrix(np.linalg.cholesky),
-        "matrix_inverse": _matrix(np.linalg.inv),
-        "matrix_det": _matrix(lambda m: float(np.linalg.det(m))),
-        "matrix_logdet": _matrix(lambda m: float(np.linalg.slogdet(m)[1])),
+        **{f"matrix_{op}": _matrix(function) for op, (_, function) in MATRICES.items()},
     }

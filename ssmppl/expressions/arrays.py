@@ -1,17 +1,35 @@
-"""Arrays of symbols: a NumPy object array of `Expr`, element by element, reduced, multiplied."""
+"""Arrays of symbols: a NumPy object array of `Expr`, element by element, reduced, multiplied,
+factorised.
+
+Diagonal matrices are factorised and inverted entry by entry, matrices of numbers by NumPy; all
+others become matrix nodes (`MATRIX_OPS`), which generated code evaluates by one call each.
+"""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.lib.array_utils import normalize_axis_tuple
 
 from ssmppl.errors import UnsupportedOperation
-from ssmppl.expressions.expr import Expr, apply, as_expr, constant, pack, unpack, user_location
+from ssmppl.expressions.expr import (
+    Expr,
+    apply,
+    as_expr,
+    constant,
+    item,
+    matrix_op,
+    pack,
+    unpack,
+    user_location,
+)
 from ssmppl.expressions.node import CHOICES, behaviour
+from ssmppl.expressions.operations import MATRICES
+
+_IDENTITY = {"add": 0.0, "mul": 1.0}  # what changes nothing
 
 
 def _any_operator(self: Any, other: Any) -> Any: ...
@@ -44,55 +62,20 @@ class ExprArray(np.ndarray):
         place = {node: i for i, node in enumerate(unpack(table))}
         return _unpack_array, (table, [place[n] for n in nodes], self.shape)
 
-    # NumPy's methods, which would bypass the protocols, by the functions of the same name.
-    def sum(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.sum, self, args, kwargs)
 
-    def prod(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.prod, self, args, kwargs)
+def _by_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    def method(self: ExprArray, *args: Any, **kwargs: Any) -> Any:
+        return behaviour["function"](function, (self, *args), kwargs)
 
-    def mean(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.mean, self, args, kwargs)
-
-    def var(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.var, self, args, kwargs)
-
-    def std(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.std, self, args, kwargs)
-
-    def max(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.max, self, args, kwargs)
-
-    def min(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.min, self, args, kwargs)
-
-    def dot(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.dot, self, args, kwargs)
-
-    def clip(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.clip, self, args, kwargs)
-
-    def trace(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.trace, self, args, kwargs)
-
-    def cumsum(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.cumsum, self, args, kwargs)
-
-    def any(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.any, self, args, kwargs)
-
-    def all(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.all, self, args, kwargs)
-
-    def cumprod(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.cumprod, self, args, kwargs)
-
-    def round(self, *args, **kwargs):  # type: ignore[override]
-        return _by_function(np.round, self, args, kwargs)
+    return method
 
 
-def _by_function(function: Any, a: ExprArray, args: tuple, kwargs: dict) -> Any:
-    return behaviour["function"](function, (a, *args), kwargs)
+# NumPy's methods, which would bypass the protocols, by the functions of the same name.
+for _function in (
+    np.sum, np.prod, np.mean, np.var, np.std, np.max, np.min, np.dot, np.clip, np.trace, np.cumsum,
+    np.any, np.all, np.cumprod, np.round,
+):  # fmt: skip
+    setattr(ExprArray, _function.__name__, _by_function(_function))
 
 
 def _unpack_array(table: list, places: list[int], shape: tuple[int, ...]) -> ExprArray:
@@ -158,9 +141,6 @@ def choose(index: Any, choices: Sequence[Any] | np.ndarray) -> Any:
     return chosen
 
 
-_IDENTITY = {"add": 0.0, "mul": 1.0}
-
-
 def reduced(
     op: str, a: Any, axis: Any = None, keepdims: bool = False, initial: Any = None,
     where: Any = True,
@@ -168,7 +148,7 @@ def reduced(
     """`initial` (if any) and the elements along `axis` (all axes: None) joined by `op`, from the
     first to the last; of these only those where the mask `where` holds."""
     a = plain(a)
-    start = _IDENTITY.get(op, initial)  # what adds nothing
+    start = _IDENTITY.get(op, initial)
     if where is not True:
         if start is None:
             refuse(f"{op} of some elements, by where=, without initial=", "give initial= too")
@@ -320,3 +300,122 @@ def cumsum(a: Any, axis: Any = None) -> Any:
     for i in range(1, len(out)):
         out[i] = plain(elementwise("add", out[i - 1], out[i]))
     return array(np.moveaxis(out, 0, axis))
+
+
+# -- linear algebra on small matrices
+def square_matrix(a: Any, what: str) -> np.ndarray:
+    """`a` as a plain object array, refused unless it is a square matrix."""
+    a = plain(a)
+    if a.ndim != 2 or a.shape[0] != a.shape[1]:
+        refuse(f"{what} of shape {a.shape}", "pass one square matrix")
+    return a
+
+
+def _constants(a: np.ndarray) -> np.ndarray | None:
+    """The matrix as numbers where it holds no symbols."""
+    exprs = [as_expr(e) for e in a.flat]
+    if any(e.op != "const" for e in exprs):
+        return None
+    return np.array([e.data for e in exprs]).reshape(a.shape)
+
+
+def _matrix(op: str, a: Any) -> ExprArray:
+    a = square_matrix(a, f"linalg {op}")
+    n, numbers = len(a), _constants(a)
+    if numbers is not None:
+        try:
+            return array(MATRICES[op][1](numbers))
+        except np.linalg.LinAlgError as error:
+            refuse(f"{op} of {numbers.tolist()}: {error}", "check the matrix's entries")
+    node = matrix_op(op, a.flat, n)
+    zero = constant(0.0)
+    return array([[zero if op == "cholesky" and j > i else item(node, i, j) for j in range(n)]
+                  for i in range(n)])  # fmt: skip
+
+
+def _is_diagonal(a: Any) -> bool:
+    return all(
+        a[i] == 0 if not isinstance(a[i], Expr) else a[i].op == "const" and a[i].data == 0
+        for i in np.ndindex(a.shape)
+        if i[0] != i[1]
+    )
+
+
+def cholesky(a: Any, upper: bool = False) -> ExprArray:
+    """Lower Cholesky factor of a symmetric positive definite matrix (its lower half is read).
+
+    upper : the upper factor, of which the upper half is read.
+    """
+    if upper:
+        return array(plain(cholesky(square_matrix(a, "linalg.cholesky").T)).T)
+    a = square_matrix(a, "linalg.cholesky")
+    if _is_diagonal(a):
+        return array(np.diag(array([apply("sqrt", d) for d in np.diagonal(a)])))
+    return _matrix("cholesky", a)
+
+
+def squared(root: Any) -> ExprArray | None:
+    """The matrix whose Cholesky factor, made by `cholesky`, this is; None if it is no such."""
+    a = plain(root)
+    first = as_expr(a.flat[0]) if a.size else constant(0.0)
+    if first.op != "item" or first.args[0].op != "cholesky":
+        return None
+    node, n, zero = first.args[0], len(a), constant(0.0)
+    if node.data != n or any(
+        as_expr(a[i, j]) is not (item(node, i, j) if j <= i else zero) for i, j in np.ndindex(n, n)
+    ):
+        return None
+    return array(np.array(node.args, dtype=object).reshape(n, n))
+
+
+def inverse(a: Any) -> ExprArray:
+    """Inverse of a square matrix."""
+    a = square_matrix(a, "linalg inverse")
+    if _is_diagonal(a):
+        return array(np.diag(array([1.0 / as_expr(d) for d in np.diagonal(a)])))
+    return _matrix("inverse", a)
+
+
+def log_determinant(a: Any) -> Expr:
+    """log det a of a positive definite matrix."""
+    a = square_matrix(a, "linalg log determinant")
+    if _is_diagonal(a):
+        return reduced("add", [apply("log", d) for d in np.diagonal(a)])
+    numbers = _constants(a)
+    if numbers is not None:
+        return constant(np.linalg.slogdet(numbers)[1])
+    return matrix_op("logdet", a.flat, len(a))
+
+
+def det(a: Any) -> Expr:
+    """Determinant of a square matrix."""
+    a = square_matrix(a, "linalg.det")
+    if _is_diagonal(a):
+        return reduced("mul", list(np.diagonal(a)))
+    return matrix_op("det", a.flat, len(a))
+
+
+class Slogdet(NamedTuple):
+    """What np.linalg.slogdet gives."""
+
+    sign: Expr
+    logabsdet: Expr
+
+
+def slogdet(a: Any) -> Slogdet:
+    """Sign of det a and log |det a|."""
+    a = square_matrix(a, "linalg.slogdet")
+    if _is_diagonal(a):
+        size = reduced("add", [apply("log", apply("abs", d)) for d in np.diagonal(a)])
+    else:
+        size = log_determinant(a)
+    return Slogdet(apply("sign", det(a)), size)
+
+
+def norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
+    """Euclidean norm, of a vector, along an axis, or of all entries."""
+    along = axis is None or np.ndim(axis) == 0
+    euclidean = ord is None or (isinstance(ord, (int, float)) and ord == 2)
+    if not along or not euclidean or (ord == 2 and axis is None and plain(x).ndim != 1):
+        refuse("np.linalg.norm other than the Euclidean norm of vectors", "write it out")
+    return elementwise("sqrt", reduced("add", elementwise("mul", x, x), axis, keepdims))

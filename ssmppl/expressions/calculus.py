@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ssmppl.errors import SSMError
-from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import ExprArray, array, inverse
 from ssmppl.expressions.expr import (
     BOOLEAN,
     Expr,
@@ -31,7 +31,6 @@ from ssmppl.expressions.expr import (
     topological,
     without_exponentials,
 )
-from ssmppl.expressions.linear import inverse
 from ssmppl.expressions.properties import never_negative
 
 Partial = Callable[..., Sequence[Expr | float | None]]
@@ -124,6 +123,7 @@ CHOICES: dict[str, Callable[[Expr, Expr], Expr]] = {
 _VANISHING = {"exp", "ndtr", "erf", "erfc"}
 # Piecewise constant: derivative zero wherever there is one.
 FLAT = BOOLEAN | {"sign", "floor", "ceil"}
+JUMPING = FLAT | {"mod"}  # not continuous
 LONGEST = 80  # characters of an expression in an error
 
 

@@ -1,6 +1,6 @@
 """The NumPy interpreter: what an `Expr` means.
 
-Everything else that computes expressions (generated code above all) is tested against this table.
+Everything else that computes expressions (generated code above all) is tested against it.
 """
 
 from __future__ import annotations
@@ -10,69 +10,13 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import scipy.special as sp
 
-from ssmppl.expressions import special
-from ssmppl.expressions.expr import BINARY, MATRIX_OPS, TERNARY, UNARY, Expr, constant, topological
+from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
+from ssmppl.expressions.operations import MATRICES, OPERATIONS
 
 Draw = Callable[[str, tuple[np.ndarray, ...]], np.ndarray]
 
-_NUMPY = """exp log log1p expm1 sqrt sin cos tan sinh cosh tanh arcsin arccos arctan arcsinh arccosh
-    arctanh abs sign floor ceil maximum minimum arctan2 logaddexp"""
-_SCIPY = """gammaln digamma ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv gammainccinv
-    betainc betaincc betaincinv betainccinv i0e i1e"""
-_OWN = """gammaln_rise digamma_rise betaln betabinomial_cdf betabinomial_quantile vonmises_cdf
-    vonmises_quantile"""
-MEANING: dict[str, Callable[..., Any]] = {
-    **{n: getattr(np, n) for n in UNARY + BINARY if n in _NUMPY.split()},
-    **{n: getattr(sp, n) for n in UNARY + BINARY + TERNARY if n in _SCIPY.split()},
-    **{n: getattr(special, n) for n in _OWN.split()},
-    "trigamma": lambda a: sp.polygamma(1, a),
-    # smallest k with cdf(k) >= q; scipy's inverses are continuous in k
-    "poisson_quantile": lambda rate, q: _round_up(
-        sp.pdtrik(q, rate), lambda k: sp.pdtr(k, rate), q
-    ),
-    "binomial_quantile": lambda n, p, q: _round_up(
-        sp.bdtrik(q, n, p), lambda k: _binomial_cdf(k, n, p), q
-    ),
-    "negbinomial_quantile": lambda r, mean, q: np.where(
-        np.asarray(q) == 1.0,
-        np.inf,
-        special.smallest_above(lambda k: special.negbinomial_tail(k, r, mean, "lower"), q),
-    ),
-    # smallest k with P(X > k) <= q
-    "poisson_survival_quantile": lambda rate, q: special.smallest_below(
-        lambda k: sp.gammainc(k + 1.0, rate), q
-    ),
-    "negbinomial_survival_quantile": lambda r, mean, q: special.smallest_below(
-        lambda k: special.negbinomial_tail(k, r, mean, "upper"), q
-    ),
-    "neg": np.negative,
-    "not": np.logical_not,
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "pow": lambda a, b: np.power(np.asarray(a, dtype=float), b),
-    "mod": np.mod,
-    "lt": np.less,
-    "le": np.less_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "and": np.logical_and,
-    "or": np.logical_or,
-    "where": np.where,
-}
-
-
-def _binomial_cdf(k: Any, n: Any, p: Any) -> Any:
-    return np.where(k >= n, 1.0, sp.betainc(np.maximum(n - k, 0.5), k + 1.0, 1.0 - p))
-
-
-def _round_up(k: Any, cdf: Callable[[Any], Any], q: Any) -> Any:
-    k = np.maximum(np.ceil(k), 0.0)
-    below = np.maximum(k - 1.0, 0.0)
-    return np.where(np.asarray(q) == 1.0, np.inf, np.where(cdf(below) >= q, below, k))
+MEANING = {name: operation.function for name, operation in OPERATIONS.items()}
 
 
 def evaluate(
@@ -133,11 +77,7 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
 def _matrix(op: str, n: int, entries: list[Any]) -> np.ndarray:
     stacked = np.stack(np.broadcast_arrays(*entries), axis=-1).astype(float)
     matrices = stacked.reshape(stacked.shape[:-1] + (n, n))
-    if op == "det":
-        return np.linalg.det(matrices)
-    if op == "logdet":
-        return np.linalg.slogdet(matrices)[1]
-    function = np.linalg.inv if op == "inverse" else np.linalg.cholesky
+    _, function = MATRICES[op]
     with contextlib.suppress(np.linalg.LinAlgError):
         return function(matrices)
     result = np.full(matrices.shape, np.nan)  # nan where there is no such factor
@@ -175,14 +115,6 @@ def numpy_draws(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> Draw:
     return draw
 
 
-def is_number(node: Expr) -> bool:
-    """Whether the expression is a constant."""
-    return node.op == "const"
-
-
 def numbers(nodes: Iterable[Expr]) -> np.ndarray:
     """Values of expressions that hold no symbols."""
     return np.array([float(v) for v in _run(list(nodes), {}, None)])
-
-
-__all__ = ["MEANING", "constant", "evaluate", "is_number", "numbers", "numpy_draws"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import operator
 from collections.abc import Callable, Container, Iterable
 from typing import Any
 
@@ -17,14 +16,8 @@ import numpy as np
 
 from ssmppl.expressions import special
 from ssmppl.expressions.node import (
-    BINARY,
     BOOLEAN,
     INDEX_BY_SYMBOL,
-    MATRIX_OPS,
-    OPS,
-    QUATERNARY,
-    TERNARY,
-    UNARY,
     Expr,
     as_expr,
     attributed,
@@ -36,16 +29,22 @@ from ssmppl.expressions.node import (
     symbol,
     user_location,
 )
+from ssmppl.expressions.operations import (
+    MATRIX_OPS,
+    OPERATIONS,
+    WRITTEN,
+    Level,
+    Phrase,
+    Text,
+    call,
+    infix,
+    within,
+)
 
 __all__ = [
-    "BINARY",
     "BOOLEAN",
     "INDEX_BY_SYMBOL",
     "MATRIX_OPS",
-    "OPS",
-    "QUATERNARY",
-    "TERNARY",
-    "UNARY",
     "Expr",
     "as_expr",
     "attributed",
@@ -97,14 +96,8 @@ def _gammaln(x: float) -> float:
 
 # Constants are folded with NumPy's arithmetic, which is the meaning of these operations.
 FOLD: dict[str, Callable[..., Any]] = {
-    **{name: getattr(np, name) for name in UNARY if hasattr(np, name)},
-    "neg": operator.neg, "abs": abs, "add": operator.add, "sub": operator.sub,
-    "mul": operator.mul, "div": np.divide, "pow": np.power, "mod": np.mod,
-    "maximum": np.maximum, "minimum": np.minimum, "arctan2": np.arctan2,
-    "logaddexp": np.logaddexp, "gammaln": _gammaln, "where": np.where,
-    "gammaln_rise": special.gammaln_rise, "betaln": special.betaln,
-    "lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne,
-    "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
+    **{n: o.function for n, o in OPERATIONS.items() if o.numpy.startswith("np.")},
+    "gammaln": _gammaln, "gammaln_rise": special.gammaln_rise, "betaln": special.betaln,
 }  # fmt: skip
 
 
@@ -246,10 +239,13 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
 
 
 # -- walks over the graph
-def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) -> list[Expr]:
+def topological(
+    roots: Iterable[Expr], within: Container[Expr] | None = None, until: Container[Expr] = ()
+) -> list[Expr]:
     """Every node under `roots`, arguments before users, each once; without recursion.
 
     within : other nodes are left out, with whatever is reached only through them.
+    until : what is reached only through these nodes is left out, themselves not.
     """
     order: list[Expr] = []
     seen: set[Expr] = set()
@@ -261,6 +257,8 @@ def topological(roots: Iterable[Expr], within: Container[Expr] | None = None) ->
         elif node not in seen:
             seen.add(node)
             stack.append((node, True))
+            if node in until:
+                continue
             stack.extend(
                 (a, False) for a in reversed(node.args)
                 if a not in seen and (within is None or a in within)
@@ -378,8 +376,19 @@ def rebuilt(node: Expr, args: tuple[Expr, ...]) -> Expr:
 
 
 # -- text
-_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "pow": ("**", 4)}
-_INFIX |= {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "mod": ("%", 2)}
+# As in Python, but -a * b is -(a * b), and what only rounding tells apart has no parentheses.
+_PHRASES: dict[str, Phrase] = {
+    **{n: call(n, o.operands) for n, o in OPERATIONS.items()},
+    **{n: WRITTEN[n] for n in ("lt", "le", "eq", "ne", "sub")},
+    "neg": Phrase("-{0}", Level.SUM, (Level.PRODUCT,)),
+    "add": infix(" + ", Level.SUM, right=0),
+    "mul": infix("*", Level.PRODUCT, right=0),
+    "div": infix("/", Level.PRODUCT),
+    "mod": infix("%", Level.PRODUCT),
+    "pow": infix("**", Level.POWER, 1, 1),
+    "gammaln_rise": Phrase("gammaln({0} + {1}) - gammaln({0})", Level.SUM, (Level.CHOICE,) * 2),
+    "digamma_rise": Phrase("digamma({0} + {1}) - digamma({0})", Level.SUM, (Level.CHOICE,) * 2),
+}
 LONGEST = 10_000
 
 
@@ -429,43 +438,33 @@ def to_text(root: Expr, longest: int = LONGEST) -> str:
     """
     if root.op == "symbol":
         return symbol_text(root)
-    done: dict[Expr, tuple[str, int]] = {}
+    done: dict[Expr, Text] = {}
     for node in topological([root]):
-        parts = [done[a] for a in node.args]
-        if node.op == "const":
-            done[node] = (f"{node.data:.10g}", 9 if node.data >= 0 else 1)
-        elif node.op == "symbol":
-            done[node] = (symbol_text(node), 9)
-        elif node.op in _INFIX:
-            sign, level = _INFIX[node.op]
-            (a, la), (b, lb) = parts
-            chained = node.op == "pow" or level == 0  # in Python a < b == c is another thing
-            left = f"({a})" if la < level or (chained and la == level) else a
-            tight = sign not in "+*" or node.args[1].op == "mod"
-            right = f"({b})" if lb < level or (lb == level and tight) else b
-            done[node] = (f"{left}{sign}{right}" if level > 1 else f"{left} {sign} {right}", level)
-        elif node.op == "neg":
-            a, level = parts[0]
-            done[node] = (f"-({a})" if level < 2 else f"-{a}", 1)
-        elif node.op in MATRIX_OPS:
-            name = _matrix_name(node)
-            inside = ", ".join(p[0] for p in parts) if name is None else name
-            done[node] = (f"{node.op}({inside})", 9)
-        elif node.op == "item":
-            done[node] = (f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", 9)
-        elif node.op == "gammaln":
-            done[node] = (f"gammaln({done[_bare(node.args[0])][0]})", 9)
-        elif node.op in ("gammaln_rise", "digamma_rise"):
-            name, (a, b) = node.op.removesuffix("_rise"), (p[0] for p in parts)
-            done[node] = (f"{name}({a} + {b}) - {name}({a})", 1)
-        else:
-            name = node.data[0] if node.op == "random" else node.op
-            done[node] = (f"{name}({', '.join(p[0] for p in parts)})", 9)
-        text, level = done[node]
+        args = map(_bare, node.args) if node.op == "gammaln" else node.args
+        text, level = done[node] = _written(node, [done[a] for a in args])
         if len(text) > longest:
             mark = hashlib.sha256(text.encode()).hexdigest()[:8]
-            done[node] = (f"{text[:longest]}...{mark}", level)
+            done[node] = f"{text[:longest]}...{mark}", level
     return done[root][0]
+
+
+def _written(node: Expr, parts: list[Text]) -> Text:
+    """One node, from the texts of its arguments."""
+    op = node.op
+    if (phrase := _PHRASES.get(op)) is not None:
+        if op == "mul" and node.args[1].op == "mod":  # a * b % c is (a * b) % c
+            parts = [parts[0], (within(parts[1], Level.ATOM), Level.ATOM)]
+        return phrase.of(parts)
+    if op == "const":
+        return f"{node.data:.10g}", Level.ATOM if node.data >= 0 else Level.SUM
+    if op == "symbol":
+        return symbol_text(node), Level.ATOM
+    if op == "item":
+        return f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", Level.ATOM
+    inside = _matrix_name(node) if op in MATRIX_OPS else None
+    if inside is None:
+        inside = ", ".join(text for text, _ in parts)
+    return f"{node.data[0] if op == 'random' else op}({inside})", Level.ATOM
 
 
 behaviour["text"] = to_text

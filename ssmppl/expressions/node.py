@@ -6,8 +6,7 @@ nodes (`ssmppl.expressions.arrays.ExprArray`); there is no array-valued node. Th
 small matrices (`MATRIX_OPS`) are nodes over the matrix's entries, whose results are taken apart by
 "item" nodes.
 
-What an operation means is defined by `evaluate.py`, how it is spelled in generated code by
-`codegen/text/render.py`, its derivative by `calculus.py`: three tables over the names below.
+What there is to say of an operation stands in `operations.py`, its derivative in `calculus.py`.
 
 While a model is traced, `recording` and `choosing` keep where the user wrote each node, and which
 nodes are elements of an array that a symbol chose.
@@ -27,34 +26,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import Location, UnsupportedOperation
-
-_UNARY = """neg exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
-    arccosh arctanh abs sign floor ceil gammaln digamma trigamma ndtr log_ndtr ndtri erf erfc i0e
-    i1e not"""
-_BINARY = """add sub mul div pow mod maximum minimum arctan2 logaddexp lt le eq ne and or
-    gammaln_rise digamma_rise betaln gammainc gammaincc gammaincinv gammainccinv poisson_quantile
-    poisson_survival_quantile vonmises_cdf vonmises_quantile"""
-UNARY, BINARY = _UNARY.split(), _BINARY.split()
-_TERNARY = """where betainc betaincc betaincinv betainccinv binomial_quantile negbinomial_quantile
-    negbinomial_survival_quantile"""
-TERNARY = _TERNARY.split()
-QUATERNARY = ["betabinomial_cdf", "betabinomial_quantile"]
-MATRIX_OPS = ("cholesky", "inverse", "logdet", "det")  # args: the n*n entries, row by row
-OPS = frozenset(
-    [
-        *UNARY,
-        *BINARY,
-        *TERNARY,
-        *QUATERNARY,
-        *MATRIX_OPS,
-        "const",
-        "symbol",
-        "item",
-        "random",
-        "call",
-    ]
-)
-BOOLEAN = frozenset(("lt", "le", "eq", "ne", "and", "or", "not"))
+from ssmppl.expressions.operations import BOOLEAN, OPERATIONS
 
 INDEX_BY_SYMBOL = (
     "np.choose(k, table) is table[k] for a symbol k and an array of numbers: an element of a "
@@ -264,15 +236,6 @@ class Expr:
 
     __int__ = __index__
 
-    # np.exp(np.array([x, y])): on its plain arrays of objects NumPy calls the elements' methods.
-    exp, log, log1p, expm1, sqrt = map(_method, ("exp", "log", "log1p", "expm1", "sqrt"))
-    sin, cos, tan, arcsin, arccos, arctan = map(
-        _method, ("sin", "cos", "tan", "arcsin", "arccos", "arctan")
-    )
-    sinh, cosh, tanh, arcsinh, arccosh, arctanh = map(
-        _method, ("sinh", "cosh", "tanh", "arcsinh", "arccosh", "arctanh")
-    )
-
     def __array_ufunc__(self, ufunc, method, *inputs, **kwargs):
         return behaviour["ufunc"](ufunc, method, inputs, kwargs)
 
@@ -281,6 +244,13 @@ class Expr:
 
     def __repr__(self) -> str:
         return behaviour["text"](self)
+
+
+# np.exp(np.array([x, y])): on its plain arrays of objects NumPy calls the elements' methods.
+for _name, _operation in OPERATIONS.items():
+    _unary = _operation.operands == 1 and hasattr(np, _name)
+    if _unary and not hasattr(Expr, f"__{_name}__"):
+        setattr(Expr, _name, _method(_name))
 
 
 def _binary(op: str, a: Any, b: Any) -> Any:

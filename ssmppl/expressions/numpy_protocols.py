@@ -15,30 +15,34 @@ from inspect import signature
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from ssmppl.expressions.arrays import (
     ExprArray,
     array,
+    cholesky,
     choose,
     clip,
     cumsum,
+    det,
     dot,
     elementwise,
     inner,
+    inverse,
     matmul,
     mean,
+    norm,
     plain,
     reduced,
     refuse,
     scalar_or_array,
+    slogdet,
     trace,
     var,
     vdot,
 )
-from ssmppl.expressions.expr import TERNARY, UNARY, Expr, apply, as_expr
-from ssmppl.expressions.linear import cholesky, det, inverse, norm, slogdet
+from ssmppl.expressions.expr import Expr, apply, as_expr
 from ssmppl.expressions.node import behaviour, conditions
+from ssmppl.expressions.operations import OPERATIONS
 
 SHOWN = 3
 _ROUNDED = "np.floor(x + 0.5), which takes halves up, where NumPy takes them to even numbers"
@@ -96,12 +100,9 @@ def fix_for(name: str, known: Iterable[str]) -> str:
 
 
 # NumPy's and scipy.special's ufuncs by name: each an operation on the operands.
-_RENAMED = {
-    "negative": "neg", "absolute": "abs", "fabs": "abs", "subtract": "sub", "multiply": "mul",
-    "divide": "div", "true_divide": "div", "power": "pow", "float_power": "pow",
-    "remainder": "mod", "less": "lt", "less_equal": "le", "equal": "eq", "not_equal": "ne",
-    "logical_and": "and", "logical_or": "or", "logical_not": "not", "bitwise_and": "and",
-    "bitwise_or": "or", "invert": "not", "psi": "digamma",
+_UFUNCS = {f.__name__: n for n, o in OPERATIONS.items() if isinstance(f := o.called, np.ufunc)} | {
+    "fabs": "abs", "true_divide": "div", "float_power": "pow", "bitwise_and": "and",
+    "bitwise_or": "or", "invert": "not", "digamma": "digamma",
 }  # fmt: skip
 
 
@@ -155,13 +156,8 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "positive": lambda a: a,
     "conjugate": lambda a: a,
 }
-_DIRECT = {n for n in [*UNARY, *TERNARY] if n not in ("neg", "not", "abs", "where")} | {
-    "add", "maximum", "minimum", "arctan2", "logaddexp", "betaln", "gammainc", "gammaincc",
-    "gammaincinv", "gammainccinv",
-}  # fmt: skip
-
 # What a user can call, by a ufunc of NumPy's or of scipy.special's.
-_CALLABLE = {n for n in (*_RENAMED, *_COMPOSED, *_DIRECT) if hasattr(np, n) or hasattr(special, n)}
+_CALLABLE = {*_UFUNCS, *_COMPOSED}
 
 
 def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> Any:
@@ -173,7 +169,7 @@ def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> An
                 "write the new array as an expression, a + b instead of a += b")  # fmt: skip
     if method == "reduce" and name in ("add", "multiply", "maximum", "minimum"):
         given = _meant(called, {"axis": 0, **kwargs}, _REDUCING)
-        return reduced(_RENAMED.get(name, name), inputs[0], **given)
+        return reduced(_UFUNCS[name], inputs[0], **given)
     if method == "accumulate" and name == "add":
         return cumsum(inputs[0], **_meant(called, {"axis": 0, **kwargs}, ("axis",)))
     _meant(called, kwargs, ())
@@ -192,10 +188,9 @@ def apply_ufunc(ufunc: np.ufunc, method: str, inputs: tuple, kwargs: dict) -> An
         return scalar_or_array(out)
     if sign := {"bitwise_and": "&", "bitwise_or": "|", "invert": "~"}.get(name):
         conditions(sign, *(e for i in inputs for e in plain(i).ravel()))
-    op = _RENAMED.get(name, name if name in _DIRECT else None)
-    if op is None:
+    if name not in _UFUNCS:
         refuse(f"the function {name}", fix_for(name, _CALLABLE))
-    return elementwise(op, *inputs)
+    return elementwise(_UFUNCS[name], *inputs)
 
 
 behaviour["ufunc"] = apply_ufunc

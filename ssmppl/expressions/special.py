@@ -38,6 +38,11 @@ def _digamma_error(x: np.ndarray) -> np.ndarray:
     return error
 
 
+def trigamma(a: Any) -> Any:
+    """The second derivative of log Gamma."""
+    return sp.polygamma(1, a)
+
+
 def gammaln_rise(a: Any, b: Any) -> np.ndarray:
     """log Gamma(a + b) - log Gamma(a) for a, a + b >= 0, by Stirling's formula where they are
     large: the error is one of the result's size, not of the two functions'."""
@@ -101,7 +106,7 @@ def betabinomial_quantile(n: Any, a: Any, b: Any, q: Any) -> np.ndarray:
     return np.where(sound & (q >= 0) & (q <= 1), k, np.nan)
 
 
-def negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
+def _negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
     """P(X <= k), "lower", or P(X > k), "upper", of counts of dispersion r."""
     r, mean = np.asarray(r, dtype=float), np.asarray(mean, dtype=float)
     of_k, of_r = (sp.betaincc, sp.betainc) if side == "lower" else (sp.betainc, sp.betaincc)
@@ -109,18 +114,47 @@ def negbinomial_tail(k: Any, r: Any, mean: Any, side: str) -> Any:
     return np.where(mean < r, near, of_r(r, k + 1.0, r / (r + mean)))
 
 
-def smallest_above(cdf: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
-    """The smallest whole k >= 0 with cdf(k) >= q, elementwise."""
-    return _smallest(cdf, q, np.greater_equal)
+def poisson_quantile(rate: Any, q: Any) -> Any:
+    """The smallest k with P(X <= k) >= q; SciPy's inverse is continuous in k."""
+    return _round_up(sp.pdtrik(q, rate), lambda k: sp.pdtr(k, rate), q)
 
 
-def smallest_below(survival: Callable[[np.ndarray], Any], q: Any) -> np.ndarray:
-    """The smallest whole k >= 0 with survival(k) <= q, elementwise."""
-    return _smallest(survival, q, np.less_equal)
+def binomial_quantile(n: Any, p: Any, q: Any) -> Any:
+    """Likewise."""
+
+    def cdf(k: Any) -> Any:
+        return np.where(k >= n, 1.0, sp.betainc(np.maximum(n - k, 0.5), k + 1.0, 1.0 - p))
+
+    return _round_up(sp.bdtrik(q, n, p), cdf, q)
+
+
+def _round_up(k: Any, cdf: Callable[[Any], Any], q: Any) -> Any:
+    k = np.maximum(np.ceil(k), 0.0)
+    below = np.maximum(k - 1.0, 0.0)
+    return np.where(np.asarray(q) == 1.0, np.inf, np.where(cdf(below) >= q, below, k))
+
+
+def negbinomial_quantile(r: Any, mean: Any, q: Any) -> Any:
+    """The smallest k with P(X <= k) >= q, for counts of dispersion r."""
+    found = _smallest(lambda k: _negbinomial_tail(k, r, mean, "lower"), q, np.greater_equal)
+    return np.where(np.asarray(q) == 1.0, np.inf, found)
+
+
+def poisson_survival_quantile(rate: Any, q: Any) -> Any:
+    """The smallest k with P(X > k) <= q."""
+    return _smallest(lambda k: sp.gammainc(k + 1.0, rate), q, np.less_equal)
+
+
+def negbinomial_survival_quantile(r: Any, mean: Any, q: Any) -> Any:
+    """Likewise, for counts of dispersion r."""
+    return _smallest(lambda k: _negbinomial_tail(k, r, mean, "upper"), q, np.less_equal)
 
 
 def _smallest(tail: Callable[[np.ndarray], Any], q: Any, reached: np.ufunc) -> np.ndarray:
-    """By a k that is doubled and an interval that is halved."""
+    """The smallest whole k >= 0 where tail(k) has reached q, elementwise.
+
+    By a k that is doubled and an interval that is halved.
+    """
     (q,) = _wide(q)
     high = np.zeros(np.broadcast_shapes(q.shape, np.shape(tail(np.zeros(())))))
     known = ~np.isnan(tail(high) + q)

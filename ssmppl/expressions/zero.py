@@ -182,6 +182,3 @@ def _summands(parts: list[Expr]) -> list[Expr]:
             own = [a * b for a in under[0] for b in under[1]]
         found[node] = own if len(own) <= MANY else [node]
     return [p for part in parts for p in found[part]]
-
-
-__all__ = ["cancels", "wide_points"]

@@ -6,29 +6,28 @@ interpreter's table too, so that it is the text that is tested and not the accur
 stands.
 """
 
+from types import FunctionType
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ssmppl.language.distributions as D
-from ssmppl.codegen.kernels.math import elementary, scalars, special
-from ssmppl.codegen.kernels.math.flags import exact, kernel
+from ssmppl.codegen.kernels.math import elementary, random, scalars, special
+from ssmppl.codegen.kernels.math.flags import Kernel, exact, kernel
 from ssmppl.codegen.text.module import Layout, Section, Target
-from ssmppl.codegen.text.render import CALLS, INFIX, MATRIX_CALLS, is_small_power
+from ssmppl.codegen.text.render import PHRASES, is_small_power
 from ssmppl.codegen.text.sums import scalar_function
 from ssmppl.expressions import evaluate as interpreter
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
-    BINARY,
     MATRIX_OPS,
-    QUATERNARY,
-    TERNARY,
-    UNARY,
     apply,
     item,
     matrix_op,
 )
+from ssmppl.expressions.operations import KERNELS, OPERATIONS
 from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.codegen.harness import plain, run_plainly
@@ -62,16 +61,14 @@ NAMESPACE = {
     "np": np, "inf": np.inf, "nan": np.nan, "exact": exact, "kernel": kernel,
     "maximum": scalars.maximum, "abs": abs,
 }  # fmt: skip
-for _name in {*CALLS.values(), *MATRIX_CALLS.values()} - {"abs"}:
-    for _module in (elementary, special, special, special, scalars):
-        if hasattr(_module, _name):
-            NAMESPACE[_name] = getattr(_module, _name)
+MODULES = {m.__name__.rpartition(".")[2]: m for m in (elementary, scalars, special, random)}
+NAMESPACE |= {n: getattr(MODULES[f], n) for n, f in KERNELS.items() if f != "random"}
 
 
-def test_every_operation_has_a_spelling():
-    spelled = {*INFIX, *CALLS, *MATRIX_CALLS, "neg", "not", "where"}
-    assert set(UNARY + BINARY + TERNARY + QUATERNARY) | set(MATRIX_OPS) == spelled
-    assert {*CALLS.values(), *MATRIX_CALLS.values()} <= set(NAMESPACE)
+def test_every_operation_is_written():
+    assert set(PHRASES) == set(OPERATIONS)
+    for name, file in KERNELS.items():
+        assert isinstance(getattr(MODULES[file], name), Kernel | FunctionType), name
 
 
 def test_a_power_without_end_is_no_product():
@@ -128,8 +125,9 @@ def as_table(monkeypatch):
     def vectorised(function):
         return lambda *args: np.float64(function(*map(float, args)))
 
-    for op, name in CALLS.items():
-        if name != "abs":
+    for op, operation in OPERATIONS.items():
+        file, _, name = operation.kernel.rpartition(".")
+        if file:
             monkeypatch.setitem(interpreter.MEANING, op, vectorised(NAMESPACE[name]))
 
     def power(a, b):

@@ -14,10 +14,10 @@ from ssmppl.codegen.modules.filter_variants import numbered_filter, scored_filte
 from ssmppl.codegen.native import build as native_build
 from ssmppl.codegen.native import loading
 from ssmppl.codegen.native.build import addresses
-from ssmppl.codegen.native.library import HOMES
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.codegen.store import folder
+from ssmppl.expressions.operations import KERNELS
 from ssmppl.inference.run.problem import pose
 from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
@@ -76,7 +76,7 @@ def test_the_meaning_of_expressions(expression, decorator):
     values = {"t": 3, "states_prev": pairs, "states": np.zeros((1, pairs.shape[1]))}
     found = native_build.addresses("expression", text)
     called(found["run"], ["t", "states_prev", "states"], values)
-    space = {n: _compiled(n) for n in HOMES}
+    space = {n: _compiled(n) for n in KERNELS}
     space |= {"exact": lambda f: f, "kernel": lambda f: f, "inf": np.inf, "nan": np.nan}
     exec(text, space)
     expected = np.zeros((1, pairs.shape[1]))
@@ -87,7 +87,7 @@ def test_the_meaning_of_expressions(expression, decorator):
 
 
 def _compiled(name):
-    module = __import__(f"ssmppl.codegen.kernels.math.{HOMES[name]}", fromlist=[name])
+    module = __import__(f"ssmppl.codegen.kernels.math.{KERNELS[name]}", fromlist=[name])
     return getattr(module, name)
 
 

@@ -10,7 +10,7 @@ from ssmppl.errors import UnsupportedOperation
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.expressions.numpy_protocols import _COMPOSED, _DIRECT, _RENAMED, FUNCTIONS, STRUCTURAL
+from ssmppl.expressions.numpy_protocols import _COMPOSED, _UFUNCS, FUNCTIONS, STRUCTURAL
 
 RNG = np.random.default_rng(7)
 NUMBERS = {
@@ -256,7 +256,7 @@ def test_arguments_by_their_place(call):
     assert compare(lambda names: call(names["A"]), "by place")
 
 
-UFUNCS = sorted({*_RENAMED, *_COMPOSED, *_DIRECT, "matmul"})
+UFUNCS = sorted({*_UFUNCS, *_COMPOSED, "matmul"})
 
 
 @pytest.mark.parametrize("name", [n for n in UFUNCS if hasattr(np, n)])

@@ -15,7 +15,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.particle.cuda_filter import STREAM_BITS
-from ssmppl.codegen.text.kernel_functions import filter_kit
+from ssmppl.codegen.text.kernel_functions import filter_functions
 from ssmppl.codegen.text.module import Layout
 from ssmppl.data import unpack_observations
 from ssmppl.inference.particles.on_device import random_numbers, run_on_device
@@ -45,7 +45,7 @@ def example(name):
 def by_numpy(problem, theta, proposal, particles, rng):
     """(log increments, effective sizes) of the filter with the device's random numbers."""
     e, module = problem.experiments[0], problem.program.module
-    section = filter_kit(Layout(problem.trace), problem.program.proposals[proposal])
+    section = filter_functions(Layout(problem.trace), problem.program.proposals[proposal])
     role = {r: getattr(module, section.name(r), None) for r in ROLES}
     keys, points = random_numbers(rng, e.steps)
     states, fits = len(problem.trace.state_symbols), max(len(section.fits), 1)

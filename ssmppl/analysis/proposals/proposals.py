@@ -31,7 +31,14 @@ from ssmppl.analysis.structure import (
     without_density,
 )
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.arrays import ExprArray, array, elementwise
+from ssmppl.expressions.arrays import (
+    ExprArray,
+    array,
+    cholesky,
+    elementwise,
+    inverse,
+    log_determinant,
+)
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian, lower_inverse
 from ssmppl.expressions.expr import (
     Expr,
@@ -42,7 +49,6 @@ from ssmppl.expressions.expr import (
     substitute,
     topological,
 )
-from ssmppl.expressions.linear import cholesky, inverse, log_determinant
 from ssmppl.language.distributions import Draws
 from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite

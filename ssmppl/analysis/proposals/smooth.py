@@ -9,12 +9,11 @@ from __future__ import annotations
 from ssmppl.analysis.structure import deterministic
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.expr import BOOLEAN, dependent, topological
+from ssmppl.expressions.calculus import JUMPING
+from ssmppl.expressions.expr import dependent, topological
 from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
 from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.model.traced import Trace
-
-JUMPING = BOOLEAN | {"floor", "ceil", "sign", "mod"}
 
 
 def smooth_filter_applies(trace: Trace) -> NotApplicable | None:

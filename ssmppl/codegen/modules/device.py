@@ -25,12 +25,13 @@ from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.codegen.kernels.math.flags import Kernel, interpreted
 from ssmppl.codegen.kernels.particle import cuda_filter
 from ssmppl.codegen.store import folder
-from ssmppl.codegen.text.kernel_functions import filter_kit
-from ssmppl.codegen.text.module import MODULES, Layout, ModuleText, Section
-from ssmppl.codegen.text.render import MATRIX_CALLS, identifier
+from ssmppl.codegen.text.kernel_functions import filter_functions
+from ssmppl.codegen.text.module import HOMES, Layout, ModuleText, Section
+from ssmppl.codegen.text.render import identifier
 from ssmppl.codegen.text.specialise import specialise
 from ssmppl.compiling import once, one_at_a_time, parse
 from ssmppl.errors import ArgumentError
+from ssmppl.expressions.operations import KERNELS, MATRIX_OPS
 from ssmppl.language.model.traced import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
 
@@ -173,7 +174,7 @@ def compile_device(trace: Trace, proposal: Proposal, tile: int = TILE) -> Device
     """
     cuda_module()
     layout = Layout(trace)
-    section = filter_kit(layout, proposal)
+    section = filter_functions(layout, proposal)
     _check(section, proposal)
     host = ModuleText(layout)
     host.add(f"particle filter, {proposal.name}", section)
@@ -192,7 +193,7 @@ def _check(section: Section, proposal: Proposal) -> None:
     nodes = ast.walk(parse("\n".join(section.functions)))  # comments name what is computed once
     words = {n.func.id for n in nodes if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
     found = ""
-    if words & set(MATRIX_CALLS.values()):
+    if words & set(MATRIX_OPS):
         found = "factorises a matrix that depends on the state, one for each particle"
     elif primitives := sorted(words & set(REGISTRY)):
         found = f"calls the primitive {primitives[0]!r}, which is compiled for the processor"
@@ -225,10 +226,7 @@ def _text(name: str, section: Section, layout: Layout, tile: int) -> str:
     for helper in HELPERS:
         imports.pop(helper.__name__, None)
     words = set(re.findall(r"\w+", "\n".join(parts)))
-    for file, names in MODULES.items():
-        if file != "flags":
-            package = f"ssmppl.codegen.kernels.math.{file}"
-            imports |= {n: package for n in names.split() if n in words}
+    imports |= {n: HOMES[n] for n in KERNELS if n in words}
     lines = []
     for n, home in sorted(imports.items()):
         lines.append(f"from {home} import {n}")

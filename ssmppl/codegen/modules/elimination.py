@@ -13,7 +13,7 @@ from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
     WEIGH_CONNECTED,
     WEIGH_INITIAL,
-    filter_kit,
+    filter_functions,
     state_targets,
     weight_targets,
 )
@@ -39,14 +39,14 @@ def compile_elimination(
         return found
     layout = Layout(found.trace, found.columns)
     out = ModuleText(layout)
-    section = filter_kit(layout, found.proposal)
+    section = filter_functions(layout, found.proposal)
     joining_passes(section, found)
     out.add(f"conditional SMC: {found.proposal.explanation}", section)
     memory = deterministic_memory(trace)
     own = {"ahead": "NO_LOOK_AHEAD", "horizon": "-1" if memory is None else str(memory)}
     own["eliminated"] = "1"
     out.algorithm(conditional_smc, "conditional_smc_eliminated", section, "entry", own)
-    rows = row_kit(layout, found)
+    rows = row_functions(layout, found)
     out.add("statistics, row by row", rows)
     out.algorithm(statistics_by_row, "statistics_by_row", rows, "entry")
     names = ", ".join(map(repr, eliminable.components))
@@ -78,7 +78,7 @@ def joining_passes(section: Section, found: Elimination) -> None:
     )  # fmt: skip
 
 
-def row_kit(layout: Layout, found: Elimination) -> Section:
+def row_functions(layout: Layout, found: Elimination) -> Section:
     """What one row adds to each statistic."""
     section = Section(layout, "rows")
 

@@ -23,7 +23,7 @@ STEERED = ("linear_initial", "linear")
 def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     """Generate, write and import `noise_of` and `path_of`; where steered also `linearise`."""
     layout = Layout(trace)
-    section = noise_kit(layout, found)
+    section = noise_functions(layout, found)
     out = ModuleText(layout)
     counts = f"({len(found.initial.noise)}, {len(found.transition.noise)})"
     own = {"steered": str(steered), "noises": counts}
@@ -47,7 +47,7 @@ def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     return load(out, name, lines)
 
 
-def noise_kit(layout: Layout, found: Noises) -> Section:
+def noise_functions(layout: Layout, found: Noises) -> Section:
     """Functions of one particle: x by its noise, the noise by x with the Jacobian's log."""
     section = Section(layout, "noise")
 

@@ -20,7 +20,7 @@ from ssmppl.codegen.kernels.particle.conditional_smc import filtered_path
 from ssmppl.codegen.kernels.particle.particle_filter import particle_filter
 from ssmppl.codegen.kernels.particle.simulation import predict_step
 from ssmppl.codegen.native.loading import Loaded, load
-from ssmppl.codegen.text.kernel_functions import filter_kit, prediction_kit
+from ssmppl.codegen.text.kernel_functions import filter_functions, prediction_functions
 from ssmppl.codegen.text.module import Layout, ModuleText
 from ssmppl.codegen.text.render import identifier
 from ssmppl.compiling import one_at_a_time
@@ -66,13 +66,13 @@ def compile_marginal(
     }  # fmt: skip
     layout = Layout(found.trace)
     out = ModuleText(layout)
-    prediction = prediction_kit(found.trace, layout, bootstrap(found.trace, missing))
+    prediction = prediction_functions(found.trace, layout, bootstrap(found.trace, missing))
     out.add("one-step predictions", prediction)
     out.algorithm(predict_step, "predict", prediction, "exact")
     for proposal in proposals.values():
         if isinstance(proposal, NotApplicable):
             continue
-        section = filter_kit(layout, proposal)
+        section = filter_functions(layout, proposal)
         out.add(f"particle filter, {proposal.name}: {proposal.explanation}", section)
         ahead = "NO_LOOK_AHEAD"
         if proposal.look_ahead is not None:

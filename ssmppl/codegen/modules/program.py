@@ -43,13 +43,13 @@ from ssmppl.codegen.modules.tempered import TemperedFilter, compile_tempered
 from ssmppl.codegen.modules.twisted import TwistedFilter, compile_twisted
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
-    backward_kit,
+    backward_functions,
     conditional_passes,
-    filter_kit,
+    filter_functions,
     log_joint_function,
     parameter_functions,
-    prediction_kit,
-    simulation_kit,
+    prediction_functions,
+    simulation_functions,
 )
 from ssmppl.codegen.text.module import Layout, ModuleText
 from ssmppl.codegen.text.render import identifier
@@ -219,10 +219,10 @@ def _write(
     memory = deterministic_memory(trace)
     out = ModuleText(layout)
     if trace.observations:
-        prediction = prediction_kit(trace, layout, plain)
+        prediction = prediction_functions(trace, layout, plain)
         out.add("one-step predictions", prediction)
         out.algorithm(predict_step, "predict", prediction, "exact")
-    simulation = simulation_kit(trace, layout, plain)
+    simulation = simulation_functions(trace, layout, plain)
     out.add("simulation", simulation)
     out.algorithm(simulate, "simulate", simulation, "entry")
     out.algorithm(simulate_on, "simulate_on", simulation, "entry")
@@ -230,7 +230,7 @@ def _write(
     for name, proposal in proposals.items():
         if isinstance(proposal, NotApplicable) or not trace.observations or name == "twisted":
             continue
-        section = filter_kit(layout, proposal)
+        section = filter_functions(layout, proposal)
         conditional_passes(trace, layout, section, plain)
         out.add(f"particle filter, {name}: {proposal.explanation}", section)
         ahead = "NO_LOOK_AHEAD"
@@ -256,7 +256,7 @@ def _write(
 def _backward(out: ModuleText, trace: Trace, layout: Layout, plain: Proposal) -> None:
     """The entry points of backward simulation."""
     height, memory = transition_upper_bound(trace), deterministic_memory(trace)
-    section = backward_kit(trace, layout, plain, height)
+    section = backward_functions(trace, layout, plain, height)
     why = f"; no rejection: {height.reason}" if isinstance(height, NotApplicable) else ""
     out.add(f"backward simulation{why}", section)
     own = {"horizon": "-1" if memory is None else str(memory)}

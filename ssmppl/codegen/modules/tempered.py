@@ -26,7 +26,7 @@ from ssmppl.codegen.text import kernel_functions
 from ssmppl.codegen.text.kernel_functions import (
     WEIGH_CONNECTED,
     WEIGH_INITIAL,
-    prediction_kit,
+    prediction_functions,
     weight_targets,
 )
 from ssmppl.codegen.text.module import Layout, ModuleText, Section
@@ -120,7 +120,7 @@ def compile_tempered(trace: Trace, missing: Missing) -> TemperedFilter | NotAppl
         "density, and take Metropolis steps between them",
     )
     out = ModuleText(layout)
-    prediction = prediction_kit(trace, layout, plain)
+    prediction = prediction_functions(trace, layout, plain)
     out.add("one-step predictions", prediction)
     out.algorithm(predict_step, "predict", prediction, "exact")
     section = Section(layout, "tempered")

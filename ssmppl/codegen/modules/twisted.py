@@ -34,7 +34,11 @@ from ssmppl.codegen.kernels.particle.simulation import predict_step
 from ssmppl.codegen.kernels.twisted import lookahead, lookahead_backward, twisting
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.store import folder
-from ssmppl.codegen.text.kernel_functions import conditional_passes, filter_kit, prediction_kit
+from ssmppl.codegen.text.kernel_functions import (
+    conditional_passes,
+    filter_functions,
+    prediction_functions,
+)
 from ssmppl.codegen.text.module import (
     PARTICLE,
     Layout,
@@ -287,7 +291,7 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     assert isinstance(proposal, Proposal)
     layout = Layout(trace, twisting_order(len(trace.state_symbols), len(found.initial.noise)))
     out = ModuleText(layout)
-    section = guide_kit(layout, trace, found)
+    section = guide_functions(layout, trace, found)
     out.add("the guide", section)
     own = {"flat": str(found.flat)}
     out.algorithm(lookahead.look_at, "look_at", section, "exact", own)
@@ -296,13 +300,13 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     own["most_likely"] = "most_likely"
     for kernel in (lookahead.follow_filter, lookahead.follow_gains):
         out.algorithm(kernel, kernel.__name__, section, "entry", own)
-    prediction = prediction_kit(trace, layout, bootstrap(trace, missing))
+    prediction = prediction_functions(trace, layout, bootstrap(trace, missing))
     out.add("one-step predictions", prediction)
     out.algorithm(predict_step, "predict", prediction, "exact")
     plain = bootstrap(trace, missing)
     own = {}
     if found.written_out:
-        section = filter_kit(layout, proposal)
+        section = filter_functions(layout, proposal)
         conditional_passes(trace, layout, section, plain)
         out.add(f"particle filter, {proposal.explanation}", section)
     else:
@@ -322,7 +326,7 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     return TwistedFilter(trace, found, module)
 
 
-def guide_kit(layout: Layout, trace: Trace, found: LookaheadModel) -> Section:
+def guide_functions(layout: Layout, trace: Trace, found: LookaheadModel) -> Section:
     """The functions by which the guide's kernels know the model; all of one particle."""
     section = Section(layout, "guide")
     for role, form, arguments in (

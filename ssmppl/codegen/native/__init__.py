@@ -4,7 +4,8 @@
     arithmetic.py its expressions
     library.py    the scalar functions that such text calls, as Numba compiles them, once for all
     build.py      IR -> machine code, kept on disk -> addresses
-    calls.py      Numba kernels, compiled once for all models, that call functions by address
+    entries.py    Numba's kernels, compiled once for all models, that call functions by address
+    loading.py    a generated module with its algorithms, by either way
 
 The text stays the one definition: what cannot be translated is compiled by Numba as it stands.
 """

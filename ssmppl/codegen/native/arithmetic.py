@@ -44,6 +44,7 @@ class Arithmetic:
         self.in_loop = False
 
     def value(self, node: ast.expr) -> Value:
+        """The value of an expression, after the lines that compute it."""
         if isinstance(node, ast.Constant):
             if isinstance(node.value, int):
                 return Value(INTEGER, str(node.value))
@@ -93,6 +94,7 @@ class Arithmetic:
         return self.binary(ARITHMETIC[type(node.op)], a, b)
 
     def binary(self, how: str, a: Value | str, b: Value | str) -> Value:
+        """`how`, an instruction such as fadd, on two numbers."""
         left, right = (x if isinstance(x, str) else self.float(x) for x in (a, b))
         return Value(FLOAT, self.let(f"{how} {self.flags}double {left}, {right}"))
 
@@ -175,6 +177,7 @@ class Arithmetic:
 
     # -- small things
     def float(self, v: Value) -> str:
+        """A number, whole or a condition as a double."""
         if v.kind == FLOAT:
             return v.text
         if v.kind == INTEGER:
@@ -184,11 +187,13 @@ class Arithmetic:
         raise Untranslatable(f"{self.name}: an array where a number belongs", fix="")
 
     def truth(self, v: Value) -> str:
+        """A number as a condition: whether it is not 0."""
         if v.kind == BOOLEAN:
             return v.text
         return self.let(f"fcmp une double {self.float(v)}, 0.0")
 
     def word(self, k: int) -> str:
+        """The k-th word that the function is given."""
         at = self.let(f"getelementptr i64, ptr %words, i64 {k}")
         return self.let(f"load i64, ptr {at}")
 
@@ -203,6 +208,7 @@ class Arithmetic:
         return ", !llvm.access.group !GROUP" if self.in_loop else ""
 
     def let(self, text: str) -> str:
+        """A new name for what an instruction gives."""
         self.count += 1
         self.lines.append(f"%v{self.count} = {text}")
         return f"%v{self.count}"

@@ -14,12 +14,10 @@ from numba import float64, types
 
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.store import folder
-from ssmppl.codegen.text.module import MODULES
 from ssmppl.compiling import once
+from ssmppl.expressions.operations import KERNELS, MATRIX_OPS
 
-HOMES = {n: file for file, names in MODULES.items() for n in names.split() if file != "flags"}
 STREAM = types.Array(types.uint64, 1, "C")
-MATRICES = frozenset(["cholesky", "inverse", "logdet", "det"])  # take tuples, give arrays
 
 
 @once
@@ -32,7 +30,7 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
     ------
     Untranslatable : there is no such function of floats.
     """
-    if name not in HOMES or name in MATRICES:
+    if name not in KERNELS or name in MATRIX_OPS:  # these take tuples, and give arrays
         raise Untranslatable(f"{name} is not a function of numbers", fix="")
     file = f"lib_{name}_{arity}"
     text = folder.kept(file, ".ll")
@@ -43,7 +41,7 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
 
 
 def _made(name: str, arity: int, draws: bool) -> str:
-    module = importlib.import_module(f"ssmppl.codegen.kernels.math.{HOMES[name]}")
+    module = importlib.import_module(f"ssmppl.codegen.kernels.math.{KERNELS[name]}")
     dispatcher: Any = getattr(getattr(module, name), "bare", None)
     if dispatcher is None:  # Numba is switched off
         raise Untranslatable(f"{name} is not compiled", fix="")

@@ -5,10 +5,9 @@ same for all models: so a model's own functions are translated to LLVM directly,
 call them by address. What cannot be translated (matrices, the user's primitives) is compiled by
 Numba from the very same text.
 
-Who waits at a terminal for the compiler is told so, once in a process.
-
-Verbs that show no progress would otherwise be silent for half a minute, on the first model of its
-kind on a machine. Numba tells when it compiles (`numba.core.event`).
+Who waits at a terminal for the compiler is told so, once in a process, as Numba tells when it
+compiles (`numba.core.event`): verbs that show no progress would else be silent for half a minute
+on the first model of its kind on a machine.
 """
 
 from __future__ import annotations
@@ -36,6 +35,16 @@ from ssmppl.compiling import LOCK, one_at_a_time
 
 SILENT_SECONDS = 2.0  # of compiling, all together, before it is told
 TEXT = "ssmppl: compiling what this kind of model needs, once; it may take a minute"
+# Specialised functions that kernels call, some of them in place of a model's own.
+HELPERS: dict[str, Any] = {
+    name: vars(home)[name]
+    for home, names in (
+        (lookahead, ("look_at", "most_likely")),
+        (twisting, twisting.SPECIALISED),
+        (backward, ("backward_weights", "continuation")),
+    )
+    for name in names
+}
 
 
 class Notice(event.Listener):
@@ -77,21 +86,7 @@ class Notice(event.Listener):
 
 
 notice = Notice()
-
-
 event.register("numba:compile", notice)
-
-# Specialised functions that kernels call, some of them in place of a model's own.
-HELPERS: dict[str, Any] = {
-    name: vars(home)[name]
-    for home, names in (
-        (lookahead, ("look_at", "most_likely")),
-        (twisting, twisting.SPECIALISED),
-        (backward, ("backward_weights",)),
-        (backward, ("continuation",)),
-    )
-    for name in names
-}
 
 
 class Loaded:

@@ -1,16 +1,13 @@
-"""The folder of generated modules and of what is compiled of them.
+"""The folder of generated modules and of what is compiled of them: written, imported, found again.
 
 One module per model and settings, `<cache>/ssmppl/<model>_<digest>.py`. The digest covers the
 text, the kernels' text and the versions of everything that Numba compiles. All is written
 atomically, so that several processes may share the folder.
 
-Generated modules: written to the cache folder and imported, what Numba compiles of them kept.
-
-A module is registered in `sys.modules` before it is executed. What is compiled is not left to
-Numba's own files: they hold one index for all signatures of a function, which two processes that
-write at once can pair with each other's code, and a full disk or half a file ends the call. Here
-each signature has a file of its own with its digest behind it; what cannot be written is compiled
-again by the next process, and so is what cannot be read.
+What is compiled is not left to Numba's own files: they hold one index for all signatures of a
+function, which two processes that write at once can pair with each other's code, and a full disk or
+half a file ends the call. Here each signature has a file of its own with its digest behind it; what
+cannot be written is compiled again by the next process, and so is what cannot be read.
 """
 
 from __future__ import annotations
@@ -166,7 +163,7 @@ def load(name: str, text: str) -> ModuleType:
     if path is None:  # tracebacks and Numba's errors show lines all the same
         lines = text.splitlines(keepends=True)
         linecache.cache[module.__file__] = len(text), None, lines, module.__file__
-    sys.modules[module_name] = module
+    sys.modules[module_name] = module  # before it is executed, as Python's own imports are
     try:
         exec(compile(text, module.__file__, "exec"), module.__dict__)
     except BaseException:

@@ -57,7 +57,7 @@ def moves(
     )  # fmt: skip
 
 
-def filter_kit(layout: Layout, proposal: Proposal, begin: str = DRAW_INITIAL) -> Section:
+def filter_functions(layout: Layout, proposal: Proposal, begin: str = DRAW_INITIAL) -> Section:
     """The particle filter's functions under one proposal; `begin`: arguments of `draw_initial`."""
     section = Section(layout, proposal.name)
     level = depends(proposal.fit, level_of)
@@ -108,7 +108,7 @@ def conditional_passes(trace: Trace, layout: Layout, section: Section, plain: Pr
     )  # fmt: skip
 
 
-def backward_kit(
+def backward_functions(
     trace: Trace, layout: Layout, plain: Proposal, height: Expr | NotApplicable
 ) -> Section:
     """The functions of backward simulation; `bound` where the transition density has one."""
@@ -137,7 +137,7 @@ def backward_kit(
     return section
 
 
-def simulation_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
+def simulation_functions(trace: Trace, layout: Layout, plain: Proposal) -> Section:
     """Functions that simulate states and observations."""
     section = Section(layout, "simulate")
     moves(section, plain.initial_draw, plain.draw)
@@ -146,7 +146,9 @@ def simulation_kit(trace: Trace, layout: Layout, plain: Proposal) -> Section:
     return section
 
 
-def prediction_kit(trace: Trace, layout: Layout, plain: Proposal, drawn: bool = True) -> Section:
+def prediction_functions(
+    trace: Trace, layout: Layout, plain: Proposal, drawn: bool = True
+) -> Section:
     """Functions for one-step predictions of the observations.
 
     drawn : whether these are drawn, too; the normals and uniforms that one draw takes are further

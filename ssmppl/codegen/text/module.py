@@ -1,10 +1,9 @@
-"""A generated module while it is written: its parts, the names they import, the header.
-
-Generated functions, written as text.
+"""A generated module while it is written: each algorithm's functions, and the module of them all.
 
 Three binding times (`CONSTANT < THETA < STEP < PARTICLE`): what depends on theta alone is computed
 once per call and kept in the array `c`, on theta and time once per step, kept in `s`, the rest in
-the loop over particles. A `Section` is one algorithm's functions over one pair of such arrays.
+the loop over particles. A `Section` is one algorithm's functions over one pair of such arrays, a
+`ModuleText` the sections with the kernels that call them, what they import and the header.
 """
 
 from __future__ import annotations
@@ -12,24 +11,21 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
 from ssmppl.codegen.text.render import (
-    CALLS,
-    DRAWS,
-    MATRIX_CALLS,
     Names,
     Writer,
     comment,
     depends,
     symbol_name,
-    topological_until,
 )
 from ssmppl.codegen.text.specialise import specialise
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.operations import KERNELS
 from ssmppl.language.model.traced import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
 
@@ -39,10 +35,12 @@ LEVELS = {
     "observation": STEP, "observation_prev": STEP, "seen": STEP, "seen_prev": STEP,
     "guide": STEP, "state": PARTICLE, "state_prev": PARTICLE, "noise": PARTICLE,
 }  # fmt: skip
-
-
-# What every section has, and the arguments.
+# What every section has, and the arguments; and what some lack, and then do not call.
 OUTER = {"prepare": "theta, c", "step": "theta, c, y_data, seen_data, u_data, t, s"}
+OPTIONAL = ("fit", "look_ahead", "weigh_future")
+# Where the functions stand that generated text calls, and its decorators.
+HOMES = {n: f"ssmppl.codegen.kernels.math.{file}" for n, file in KERNELS.items()}
+HOMES |= dict.fromkeys(("exact", "kernel"), "ssmppl.codegen.kernels.math.flags")
 
 
 def level_of(node: Expr) -> int:
@@ -102,6 +100,22 @@ class Layout:
         at = f"max({row} - 1, 0)" if kind.endswith("_prev") else row
         return f"{array}[{at}, {column}]"
 
+    def read(
+        self, roots: Iterable[Expr], names: dict[Expr, str], reserved: Names, indent: str = "    ",
+        sources: Mapping[Expr, str] | None = None,
+    ) -> list[str]:  # fmt: skip
+        """Lines that name the symbols under `roots` that have no name in `names` yet.
+
+        sources : where these symbols stand, instead of in theta or in a row.
+        """
+        lines = []
+        for node in topological(roots, until=names):
+            if node.op == "symbol" and node not in names:
+                names[node] = reserved.fresh(symbol_name(node))
+                source = (sources or {}).get(node) or self.element(node)
+                lines.append(f"{indent}{names[node]} = {source}")
+        return lines
+
     def column(self, node: Expr) -> int:
         """Index of a state's component."""
         return self.index[("state", node.data[1:])]
@@ -153,7 +167,7 @@ class Section:
         head: list[str] = []
         fits = self.fits if "fits" in arguments and role != "fit" else {}
         names = self._load_outer(roots, level, fits, reserved, head)
-        for node in topological_until(roots, {**names, **fits}):
+        for node in topological(roots, until={**names, **fits}):
             if node in fits:
                 row = reserved.fresh(f"fit_{fits[node]}")
                 head.append(f"    {row} = fits[{fits[node]}]")
@@ -196,7 +210,7 @@ class Section:
     ) -> list[Expr]:
         """The largest subexpressions that are known before the loop over particles."""
         outer = {n: True for n, lv in level.items() if lv in (THETA, STEP) and not is_matrix(n)}
-        used = topological_until(roots, {**outer, **fits})
+        used = topological(roots, until={**outer, **fits})
         inside = [n for n in used if n not in outer and n not in fits]
         needed = {a for n in inside for a in n.args} | set(roots)
         return [n for n in used if n in outer and n in needed]
@@ -206,7 +220,7 @@ class Section:
         names: dict[Expr, str],
     ) -> None:  # fmt: skip
         """Name the rows of the particles' arrays that the loop reads."""
-        for node in topological_until(roots, names):
+        for node in topological(roots, until=names):
             if node.op != "symbol" or level_of(node) != PARTICLE or node in names:
                 continue
             if node in scalars:
@@ -223,7 +237,7 @@ class Section:
     ) -> None:
         """Name the buffers of normals and uniforms, one per draw of a particle."""
         counts = {"normal": 0, "uniform": 0}
-        for node in topological_until(roots, names):
+        for node in topological(roots, until=names):
             if node.op == "random" and node.data[0] in counts:
                 kind = node.data[0]
                 k = counts[kind]
@@ -268,17 +282,14 @@ class Section:
         level = depends(roots, level_of)
         if array == "s":
             outer = {n: True for n, lv in level.items() if lv == THETA and not is_matrix(n)}
-            used = topological_until(roots, outer)
+            used = topological(roots, until=outer)
             inside = {a for n in used if n not in outer for a in n.args}
             for node in used:
                 if node in outer and node in inside and node.op != "symbol":
                     k = self.c.setdefault(node, len(self.c))
                     names[node] = reserved.fresh(f"c{k}")
                     head.append(f"    {names[node]} = c[{k}]  # {comment(node)}")
-        for node in topological_until(roots, names):
-            if node.op == "symbol" and node not in names:
-                names[node] = reserved.fresh(symbol_name(node))
-                head.append(f"    {names[node]} = {self.layout.element(node)}")
+        head += self.layout.read(roots, names, reserved)
         writer = Writer(names, reserved, self.layout.trace.locations)
         writer.assign([(f"{array}[{k}]", node) for node, k in slots.items()])
         text = [f"@exact\ndef {self.name(role)}({arguments}):", f'    """{doc}"""']
@@ -286,6 +297,7 @@ class Section:
 
 
 def is_matrix(node: Expr) -> bool:
+    """Whether the node is a whole matrix, which is no entry of `c` or `s`."""
     return node.op in ("cholesky", "inverse")
 
 
@@ -303,23 +315,6 @@ def _summed(group: Sequence[Target]) -> Target:
     for t in group[1:]:
         total = total + t.expression
     return Target(group[0].text, total, group[0].guard)
-
-
-# The modules of `kernels/math` and the functions that generated text calls there.
-MODULES = {
-    "elementary": "exp log log1p expm1 sqrt sin cos arctan sinh cosh tanh",
-    "special": "lgamma digamma trigamma gammaln_rise digamma_rise betaln ndtr log_ndtr ndtri erf "
-    "erfc i0e i1e betabinomial_cdf betabinomial_quantile vonmises_cdf vonmises_quantile gammainc "
-    "gammaincc gammaincinv gammainccinv betainc betaincc betaincinv betainccinv",
-    "random": "normal uniform gamma gamma_by poisson binomial vonmises",
-    "scalars": "tan arcsin arccos arctan2 arcsinh arccosh arctanh logaddexp sign floor ceil "
-    "maximum minimum power poisson_quantile binomial_quantile negbinomial_quantile "
-    "poisson_survival_quantile negbinomial_survival_quantile cholesky inverse logdet det",
-    "flags": "exact kernel",
-}
-
-# Functions that some sections lack, and then are not called.
-OPTIONAL = ("fit", "look_ahead", "weigh_future")
 
 
 @dataclass(frozen=True)
@@ -383,10 +378,7 @@ class ModuleText:
         lines += ["import math", "from math import inf, nan", "", "import numba"]
         lines += ["import numpy as np", ""]
         words = set(re.findall(r"\w+", "\n".join(self.parts)))
-        imports = dict(self.imports)
-        for file, names in MODULES.items():
-            package = f"ssmppl.codegen.kernels.math.{file}"
-            imports |= {n: package for n in names.split() if n in words and n not in imports}
+        imports = {n: home for n, home in HOMES.items() if n in words} | self.imports
         for package in sorted(set(imports.values())):
             names = ", ".join(sorted(n for n, home in imports.items() if home == package))
             wrapped = textwrap.fill(names, 92, initial_indent="    ", subsequent_indent="    ")
@@ -403,8 +395,3 @@ def heading(title: str) -> str:
     """A comment line across the page, and the title under it."""
     wrapped = "\n".join(f"# {line}" for line in textwrap.wrap(title, 94))
     return f"# {'-' * 96}\n{wrapped}"
-
-
-def known_spellings() -> set[str]:
-    """Every function that generated text may call, for the test that all have an import."""
-    return {*CALLS.values(), *MATRIX_CALLS.values(), *DRAWS.values()} - {"abs"}

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ssmppl.codegen.text.module import THETA, Layout, is_matrix, level_of
-from ssmppl.codegen.text.render import Names, Writer, depends, symbol_name, topological_until
-from ssmppl.expressions.expr import Expr
+from ssmppl.codegen.text.render import Names, Writer, depends
+from ssmppl.expressions.expr import Expr, topological
 
 
 def scalar_function(
@@ -14,13 +14,8 @@ def scalar_function(
     sources: dict[Expr, str] | None = None, returns: str = "",
 ) -> str:  # fmt: skip
     """A function without a loop: statements `target = expression`."""
-    reserved, head = Names(), []
-    names: dict[Expr, str] = {}
-    for node in topological_until([e for _, e in outputs], names):
-        if node.op == "symbol":
-            names[node] = reserved.fresh(symbol_name(node))
-            source = (sources or {}).get(node) or layout.element(node)
-            head.append(f"    {names[node]} = {source}")
+    reserved, names = Names(), dict[Expr, str]()
+    head = layout.read([e for _, e in outputs], names, reserved, sources=sources)
     writer = Writer(names, reserved, layout.trace.locations)
     writer.assign(outputs)
     lines = [f"@exact\ndef {name}({arguments}):", f'    """{doc}"""', *head, *writer.lines]
@@ -42,20 +37,16 @@ def time_sum(
         f"@exact\ndef {name}(theta, y_data, seen_data, u_data, trajectory, total):",
         f'    """{doc}"""',
     ]
-    head: list[str] = []
     names: dict[Expr, str] = {}
     fixed = fixed or {}
     roots = [e for es in parts.values() for e in es]
     roots += [e for pairs in fixed.values() for _, e in pairs]
     level = depends(roots, level_of)
     outer = {n: True for n, lv in level.items() if lv == THETA}
-    used = topological_until(roots, outer)
+    used = topological(roots, until=outer)
     inside = {a for n in used if n not in outer for a in n.args} | set(roots)
     needed = [n for n in used if n in outer and n in inside]
-    for node in topological_until(needed, {}):
-        if node.op == "symbol":
-            names[node] = reserved.fresh(symbol_name(node))
-            head.append(f"    {names[node]} = {layout.element(node)}")
+    head = layout.read(needed, names, reserved)
     writer = Writer(names, reserved, layout.trace.locations)
     compound = [n for n in needed if n.op != "symbol" and not is_matrix(n)]
     targets = [(reserved.fresh(f"c{k}"), n) for k, n in enumerate(compound)]
@@ -63,41 +54,32 @@ def time_sum(
     head += writer.lines
     names |= {n: text for text, n in targets}
     zero = [f"    total[{k}] = 0.0" for k in range(size)]
-    prior = _sum_block(layout, parts.get("prior", ()), names, reserved, "    ")
+    prior = _block(layout, _added(parts.get("prior", ())), names, reserved, "    ", "+=")
     body: list[str] = []
     for role, condition in (("initial", "t == 0"), ("transition", "t > 0"), ("observation", "")):
         indent = "            " if condition else "        "
-        block = _fix_block(layout, fixed.get(role, []), names, reserved, indent)
-        block += _sum_block(layout, parts.get(role, ()), names, reserved, indent)
+        set_first = [(layout.element(s), e) for s, e in fixed.get(role, [])]
+        block = _block(layout, set_first, names, reserved, indent, "=")
+        block += _block(layout, _added(parts.get(role, ())), names, reserved, indent, "+=")
         if block:
             body += [*([f"        if {condition}:"] if condition else []), *block]
     loop = ["    for t in range(y_data.shape[0]):", *body] if body else []
     return "\n".join([*lines, *head, *zero, *prior, *loop]) + "\n"
 
 
-def _fix_block(
-    layout: Layout, pairs: list[tuple[Expr, Expr]], names: dict[Expr, str], reserved: Names,
-    indent: str,
+def _added(summands: Sequence[Expr]) -> list[tuple[str, Expr]]:
+    """What is added to each total, where that is anything."""
+    pairs = [(f"total[{k}]", e) for k, e in enumerate(summands)]
+    return [(t, e) for t, e in pairs if not (e.op == "const" and e.data == 0.0)]
+
+
+def _block(
+    layout: Layout, pairs: list[tuple[str, Expr]], names: dict[Expr, str], reserved: Names,
+    indent: str, operator: str,
 ) -> list[str]:  # fmt: skip
-    own, inner, head = dict(names), Names(reserved.taken), []
-    for node in topological_until([e for _, e in pairs], own):
-        if node.op == "symbol" and node not in own:
-            own[node] = inner.fresh(symbol_name(node))
-            head.append(f"{indent}{own[node]} = {layout.element(node)}")
+    """The statements `target operator expression` of a block, with the symbols that it reads."""
+    own, inner = dict(names), Names(reserved.taken)
+    head = layout.read([e for _, e in pairs], own, inner, indent)
     writer = Writer(own, inner, layout.trace.locations, indent)
-    writer.assign([(layout.element(s), e) for s, e in pairs])
-    return [*head, *writer.lines] if pairs else []
-
-
-def _sum_block(
-    layout: Layout, summands: Sequence[Expr], names: dict[Expr, str], reserved: Names, indent: str
-) -> list[str]:
-    pairs = [(k, e) for k, e in enumerate(summands) if not (e.op == "const" and e.data == 0.0)]
-    own, inner, head = dict(names), Names(reserved.taken), []
-    for node in topological_until([e for _, e in pairs], own):
-        if node.op == "symbol" and node not in own:
-            own[node] = inner.fresh(symbol_name(node))
-            head.append(f"{indent}{own[node]} = {layout.element(node)}")
-    writer = Writer(own, inner, layout.trace.locations, indent)
-    writer.assign([(f"total[{k}]", e) for k, e in pairs], "+=")
-    return [*head, *writer.lines] if pairs else []
+    writer.assign(pairs, operator)
+    return [*head, *writer.lines]

@@ -15,23 +15,29 @@ import numpy as np
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import BOOLEAN, MATRIX_OPS, Expr, topological
+from ssmppl.expressions.operations import (
+    MATRICES,
+    OPERATIONS,
+    WRITTEN,
+    Level,
+    Phrase,
+    Text,
+    call,
+    within,
+)
 
 WIDTH = 73  # of one expression, which may stand behind `concentration=` of a law in a law
 
-_NUMPY = """exp log log1p expm1 sqrt sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh
-    arccosh arctanh abs sign floor ceil maximum minimum arctan2 logaddexp where"""
-_SPECIAL = """gammaln betaln ndtr log_ndtr ndtri erf erfc gammainc gammaincc gammaincinv
-    gammainccinv betainc betaincc betaincinv betainccinv i0e i1e"""
-CALLS = {n: f"np.{n}" for n in _NUMPY.split()} | {n: f"special.{n}" for n in _SPECIAL.split()}
-CALLS |= {"digamma": "special.psi"}
-LINALG = {"cholesky": "np.linalg.cholesky({0})", "inverse": "np.linalg.inv({0})",
-          "det": "np.linalg.det({0})", "logdet": "np.linalg.slogdet({0})[1]"}  # fmt: skip
-# Sign and level of binding, from Python's table of precedence.
-_INFIX = {"lt": ("<", 0), "le": ("<=", 0), "eq": ("==", 0), "ne": ("!=", 0), "or": ("|", 1),
-          "and": ("&", 2), "add": ("+", 3), "sub": ("-", 3), "mul": ("*", 4), "div": ("/", 4),
-          "mod": ("%", 4), "pow": ("**", 6)}  # fmt: skip
-_NEG, _ATOM = 5, 9
-Text = tuple[str, int]  # and the level at which it binds
+_OF_SUMS = (Level.SUM, Level.SUM)  # and of what binds more tightly
+PHRASES: dict[str, Phrase] = {
+    **{n: call(o.numpy, o.operands) for n, o in OPERATIONS.items() if o.numpy},
+    **{n: WRITTEN[n] for n in ("add", "sub", "mul", "div", "mod", "pow")},
+    **{n: WRITTEN[n]._replace(operands=_OF_SUMS) for n in ("lt", "le", "eq", "ne")},
+    "and": Phrase("{0} & {1}", Level.BIT_AND, _OF_SUMS),
+    "or": Phrase("{0} | {1}", Level.BIT_OR, _OF_SUMS),
+    "not": call("~", 1),
+    "neg": Phrase("-{0}", Level.SIGN, (Level.POWER,)),
+}
 
 
 def number(value: float) -> str:
@@ -119,10 +125,10 @@ class Lines:
     def _write(self, node: Expr) -> Text:
         if node.op == "symbol":
             _, name, index = node.data
-            return f"{name}[{', '.join(map(str, index))}]" if index else name, _ATOM
+            return f"{name}[{', '.join(map(str, index))}]" if index else name, Level.ATOM
         if node.op == "const":
             negative = node.data < 0 or str(node.data)[0] == "-"
-            return number(node.data), _NEG if negative else _ATOM
+            return number(node.data), Level.SIGN if negative else Level.ATOM
         made = self._combined(node)
         while len(made[0]) > WIDTH and self._split(node):
             made = self._combined(node)
@@ -134,48 +140,30 @@ class Lines:
 
     def _combined(self, node: Expr) -> Text:
         parts = [self._texts[a] for a in node.args]
-        if node.op in _INFIX:
-            return self._infix(node, parts)
-        if node.op == "neg":
-            text, level = parts[0]
-            plain = level == 6 or level > _NEG or (level == 4 and _product(node.args[0], self))
-            return f"-{text}" if plain else f"-({text})", _NEG
-        if node.op == "not":
-            return f"~({parts[0][0]})", _ATOM
+        if node.op == "neg" and parts[0][1] == Level.PRODUCT and _product(node.args[0], self):
+            return f"-{parts[0][0]}", Level.SIGN
+        if node.op in PHRASES:
+            return self._phrase(node, parts)
         if node.op == "item":
-            i, j = node.data
-            return f"{parts[0][0]}[{i}, {j}]", _ATOM
+            return f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", Level.ATOM
         if node.op in MATRIX_OPS:
             matrix = np.array(node.args, dtype=object).reshape(node.data, node.data)
-            return LINALG[node.op].format(self.array(matrix)), _ATOM
-        inside = ", ".join(p[0] for p in parts)
+            return MATRICES[node.op][0].format(self.array(matrix)), Level.ATOM
         if node.op == "call" and self._primitive is not None:
-            return f"{self._primitive(node)}({inside})", _ATOM
-        if node.op not in CALLS:
-            raise ArgumentError(
-                f"the model holds {node!r}, whose operation {node.op!r} has no spelling in Python",
-                fix="use what NumPy and scipy.special offer in the model's laws",
-            )
-        self.special |= CALLS[node.op].startswith("special.")
-        return f"{CALLS[node.op]}({inside})", _ATOM
+            return f"{self._primitive(node)}({', '.join(text for text, _ in parts)})", Level.ATOM
+        raise ArgumentError(
+            f"the model holds {node!r}, whose operation {node.op!r} has no spelling in Python",
+            fix="use what NumPy and scipy.special offer in the model's laws",
+        )
 
-    def _infix(self, node: Expr, parts: list[Text]) -> Text:
-        sign, level = _INFIX[node.op]
-        (a, la), (b, lb) = parts
-        first = node.args[0]
+    def _phrase(self, node: Expr, parts: list[Text]) -> Text:
+        phrase, first = PHRASES[node.op], node.args[0]
         if node.op in ("eq", "ne") and first.op == "const":  # Python would turn it round
-            name = "equal" if node.op == "eq" else "not_equal"
-            return f"np.{name}({a}, {b})", _ATOM
-        if node.op in ("and", "or", "lt", "le", "eq", "ne"):
-            a, b = (f"({t})" if lev < 3 else t for t, lev in parts)
-            return f"{a} {sign} {b}", level
-        if node.op == "pow":
-            a = f"({a})" if la <= level else a
-            b = f"({b})" if lb < _NEG else b
-            return f"{a}**{b}", level
-        a = f"({a})" if la < level or (la == _NEG and first.op == "neg" and level == 4) else a
-        b = f"({b})" if lb <= level else b
-        return f"{a} {sign} {b}", level
+            phrase = call(OPERATIONS[node.op].numpy, 2)
+        if phrase.level == Level.PRODUCT and first.op == "neg":  # -a * b is traced as -(a * b)
+            phrase = phrase._replace(operands=(Level.POWER, phrase.operands[1]))
+        self.special |= phrase.template.startswith("special.")
+        return phrase.of(parts)
 
     # -- local variables
     def _split(self, node: Expr) -> bool:
@@ -193,7 +181,7 @@ class Lines:
         self.statements += [f"# {comment}"] if comment else []
         line = f"{name} = {text}"
         self.statements.append(line if len(line) <= WIDTH + 14 else f"{name} = (\n    {text}\n)")
-        return name, _ATOM
+        return name, Level.ATOM
 
     def name(self, wish: str) -> str:
         """A name for a local variable that nothing else has."""
@@ -247,16 +235,17 @@ class Lines:
         if any(n in self._apart for n in flat):
             return None
         if all(n is flat[0] for n in flat):
-            return self.text(flat[0]), self._texts[flat[0]][1]
+            self.text(flat[0])
+            return self._texts[flat[0]]
         whole = self._whole.get(_key(values.shape, flat))
         if whole is not None:
-            return whole, _ATOM
+            return whole, Level.ATOM
         product = self._product(values)
         if product is not None:
-            return product, 4
+            return product, Level.PRODUCT
         first = flat[0]
-        alike = first.op in _INFIX or first.op in CALLS or first.op == "neg"
-        if not alike or first.op in ("eq", "ne") or any(n.op != first.op for n in flat):
+        alike = all(n.op == first.op for n in flat) and first.op in PHRASES
+        if not alike or first.op in ("eq", "ne", "not"):
             return None
         parts = []
         for k in range(len(first.args)):
@@ -265,11 +254,8 @@ class Lines:
                 return None
             parts.append(part)
         if first.op == "neg":
-            return f"-({parts[0][0]})" if parts[0][1] < _ATOM else f"-{parts[0][0]}", _NEG
-        if first.op in _INFIX:
-            return self._infix(first, parts)
-        self.special |= CALLS[first.op].startswith("special.")
-        return f"{CALLS[first.op]}({', '.join(p[0] for p in parts)})", _ATOM
+            return f"-{within(parts[0], Level.ATOM)}", Level.SIGN
+        return self._phrase(first, parts)
 
     def _product(self, values: Any) -> str | None:
         """A @ x, for a matrix and a vector that are quantities of the model."""
@@ -319,9 +305,9 @@ def _listed(function: str, texts: Sequence[str]) -> str:
 
 def _product(node: Expr, lines: Lines) -> bool:
     """Whether -a * b, for this product a * b, is traced as -(a * b) again."""
-    while node.op == "mul" and lines._texts[node][1] == 4:
+    while node.op == "mul" and lines._texts[node][1] == Level.PRODUCT:
         node = node.args[0]
-    return node.op not in ("div", "mod", "const") or lines._texts[node][1] == _ATOM
+    return node.op not in ("div", "mod", "const") or lines._texts[node][1] == Level.ATOM
 
 
 def _worth(node: Expr) -> bool:

@@ -16,39 +16,18 @@ from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.codegen.kernels.particle.resampling import SYSTEMATIC
 from ssmppl.codegen.modules.marginal import MarginalFilter
 from ssmppl.codegen.text.module import PARTICLE, level_of
-from ssmppl.codegen.text.render import depends, is_small_power, topological_until
+from ssmppl.codegen.text.render import depends, is_small_power
 from ssmppl.counts import check_room
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.operations import CHEAP, OPERATIONS, SLOW
 from ssmppl.inference.particles.filtering import FilterSettings, filter_settings, repeated_estimates
 from ssmppl.inference.particles.on_device import check_device
 from ssmppl.inference.preparation.exact_models import NEEDED, exact_model, filter_of, form_of
 from ssmppl.inference.run.problem import EXACT, Problem
 
-# Nanoseconds per particle, from timings of single passes; what they weigh matters, not the unit.
-COST = {"exp": 1.0, "log": 1.0, "log1p": 1.5, "expm1": 1.5, "sin": 1.3, "cos": 1.3, "tanh": 2.0,
-        "div": 0.7, "sqrt": 1.0, "pow": 8.0, "logaddexp": 3.5, "where": 0.3}  # fmt: skip
-SLOW = 30.0  # what is no vectorised pass: special functions, factorisations, scalar draws
-CHEAP = 0.15
-CHEAP_OPERATIONS = frozenset(
-    [
-        "add",
-        "sub",
-        "mul",
-        "neg",
-        "lt",
-        "le",
-        "eq",
-        "ne",
-        "and",
-        "or",
-        "abs",
-        "maximum",
-        "minimum",
-        "floor",
-        "item",
-    ]
-)
+# Nanoseconds per particle, as those of `Operation.cost`.
+COST = {n: o.cost for n, o in OPERATIONS.items()} | {"item": CHEAP}  # others are `SLOW`
 STEP = 2.6  # normalise, resample, gather
 NORMAL, UNIFORM = 1.5, 0.6
 LOOPED = 0.4  # a multiplication in a loop over matrices
@@ -88,12 +67,12 @@ def cost(proposal: Proposal) -> float:
 def _pass_cost(roots: list[Expr], known: dict[Expr, bool]) -> float:
     level = depends(roots, level_of)
     total = 0.0
-    for node in topological_until(roots, known):
+    for node in topological(roots, until=known):
         if level[node] != PARTICLE or node.op == "symbol" or node in known:
             continue
         if node.op == "random":
             total += {"normal": NORMAL, "uniform": UNIFORM}.get(node.data[0], SLOW)
-        elif node.op in CHEAP_OPERATIONS or (node.op == "pow" and is_small_power(node)):
+        elif node.op == "pow" and is_small_power(node):
             total += CHEAP
         else:
             total += COST.get(node.op, SLOW)

@@ -15,12 +15,18 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ssmppl.errors import ModelError
-from ssmppl.expressions.arrays import ExprArray, array
+from ssmppl.expressions.arrays import (
+    ExprArray,
+    array,
+    cholesky,
+    inverse,
+    log_determinant,
+    squared,
+)
 from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.calculus import lower_inverse
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, as_expr, constant, topological
-from ssmppl.expressions.linear import cholesky, inverse, log_determinant, squared
 from ssmppl.expressions.test_points import moderate, with_cases
 from ssmppl.language.distributions.base import (
     LOG_2PI,
