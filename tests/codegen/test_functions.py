@@ -10,7 +10,7 @@ from ssmppl.analysis.proposals.channels import channel_draws, observation_draws
 from ssmppl.analysis.proposals.proposals import bootstrap
 from ssmppl.analysis.proposals.twisted import guided, jacobian
 from ssmppl.codegen.modules.program import compile_trace
-from ssmppl.codegen.text.kernel_functions import filter_kit
+from ssmppl.codegen.text.kernel_functions import filter_functions
 from ssmppl.codegen.text.module import Layout
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
@@ -138,7 +138,7 @@ def test_what_is_kept_of_a_fit_has_a_row_of_its_own(case):
             continue
         twice = replace(p, fit=(p.fit[0], p.fit[0], *p.fit))
         for proposal in (p, twice):
-            rows = filter_kit(Layout(numbers.traced), proposal).fits.values()
+            rows = filter_functions(Layout(numbers.traced), proposal).fits.values()
             assert sorted(rows) == list(range(len(rows)))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.particle.cuda_filter import STREAM_BITS
-from ssmppl.codegen.text.kernel_functions import filter_kit
+from ssmppl.codegen.text.kernel_functions import filter_functions
 from ssmppl.codegen.text.module import Layout
 from ssmppl.data import unpack_observations
 from ssmppl.inference.particles.on_device import random_numbers, run_on_device
@@ -25,7 +25,7 @@ from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
 from tests.codegen.models import build
 
-TILE = 4
+THREADS = 4
 ROLES = ("prepare", "step", "draw_initial", "weigh_initial", "fit", "draw", "weigh")
 
 
@@ -45,7 +45,7 @@ def example(name):
 def by_numpy(problem, theta, proposal, particles, rng):
     """(log increments, effective sizes) of the filter with the device's random numbers."""
     e, module = problem.experiments[0], problem.program.module
-    section = filter_kit(Layout(problem.trace), problem.program.proposals[proposal])
+    section = filter_functions(Layout(problem.trace), problem.program.proposals[proposal])
     role = {r: getattr(module, section.name(r), None) for r in ROLES}
     keys, points = random_numbers(rng, e.steps)
     states, fits = len(problem.trace.state_symbols), max(len(section.fits), 1)
@@ -96,7 +96,7 @@ def main(cases, particles=10):
         e = problem.experiments[0]
         out = np.empty((2, e.steps))
         status, t = run_on_device(
-            problem, theta, proposal, particles, e, random_state(root), *out, tile=TILE
+            problem, theta, proposal, particles, e, random_state(root), *out, threads=THREADS
         )
         expected = by_numpy(problem, theta, proposal, particles, random_state(root))
         found = {"case": case, "status": [status, t], "found": out.tolist(), "expected": expected}

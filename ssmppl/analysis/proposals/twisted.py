@@ -221,6 +221,9 @@ def guide_order(d: int, r: int) -> list[Expr]:
     return [*halves[0], *g, *m, *start, *halves[1]]
 
 
+UNSUITED = "these filters do not compute the guide of the twisted proposal"
+
+
 def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     """The proposal, in terms of the guide's symbols; its laws only where they are written out."""
     found = guided(trace, missing)
@@ -233,7 +236,9 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     if not found.written_out:
         d, r = len(trace.state_symbols), len(found.transition.noise)
         looped = d * d + 2 * r * r
-        return Proposal("twisted", {}, (), {}, (), explanation=explanation, looped=looped)
+        return Proposal(
+            "twisted", {}, (), {}, (), explanation=explanation, looped=looped, unsuited=UNSUITED
+        )
     observed = tuple(terms(trace, "observation", missing))
     states = trace.state_symbols
     start, move = _start(found.initial, states), _move(found.transition, states)
@@ -247,6 +252,7 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         move.ahead,
         fit=move.fit,
         explanation=explanation,
+        unsuited=UNSUITED,
     )
 
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.eliminable import Eliminable
 from ssmppl.analysis.elimination.elimination import Elimination, eliminate
-from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, statistics_by_row
+from ssmppl.codegen.kernels.particle.conditional_smc import statistics_by_row
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
     WEIGH_CONNECTED,
     WEIGH_INITIAL,
-    filter_kit,
+    add_conditional_smc,
+    filter_functions,
     state_targets,
     weight_targets,
 )
@@ -39,14 +39,11 @@ def compile_elimination(
         return found
     layout = Layout(found.trace, found.columns)
     out = ModuleText(layout)
-    section = filter_kit(layout, found.proposal)
+    section = filter_functions(layout, found.proposal)
     joining_passes(section, found)
     out.add(f"conditional SMC: {found.proposal.explanation}", section)
-    memory = deterministic_memory(trace)
-    own = {"ahead": "NO_LOOK_AHEAD", "horizon": "-1" if memory is None else str(memory)}
-    own["eliminated"] = "1"
-    out.algorithm(conditional_smc, "conditional_smc_eliminated", section, "entry", own)
-    rows = row_kit(layout, found)
+    add_conditional_smc(out, section, trace, {"ahead": "NO_LOOK_AHEAD"}, eliminated=True)
+    rows = row_functions(layout, found)
     out.add("statistics, row by row", rows)
     out.algorithm(statistics_by_row, "statistics_by_row", rows, "entry")
     names = ", ".join(map(repr, eliminable.components))
@@ -78,7 +75,7 @@ def joining_passes(section: Section, found: Elimination) -> None:
     )  # fmt: skip
 
 
-def row_kit(layout: Layout, found: Elimination) -> Section:
+def row_functions(layout: Layout, found: Elimination) -> Section:
     """What one row adds to each statistic."""
     section = Section(layout, "rows")
 

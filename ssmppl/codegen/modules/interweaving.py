@@ -16,22 +16,18 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.traced import Trace
 
-STEERED = ("linear_initial", "linear")
-
 
 @one_at_a_time
 def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     """Generate, write and import `noise_of` and `path_of`; where steered also `linearise`."""
     layout = Layout(trace)
-    section = noise_kit(layout, found)
+    section = noise_functions(layout, found)
     out = ModuleText(layout)
     counts = f"({len(found.initial.noise)}, {len(found.transition.noise)})"
     own = {"steered": str(steered), "noises": counts}
     if steered:
         assert not isinstance(found.guide, NotApplicable)
         linear_passes(section, trace, found.guide)
-    else:
-        own |= {name: name for name in STEERED}
     what = "of a Gaussian approximation to their posterior" if steered else "of their laws"
     out.add(f"the states by the noises {what}", section)
     if steered:
@@ -47,7 +43,7 @@ def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     return load(out, name, lines)
 
 
-def noise_kit(layout: Layout, found: Noises) -> Section:
+def noise_functions(layout: Layout, found: Noises) -> Section:
     """Functions of one particle: x by its noise, the noise by x with the Jacobian's log."""
     section = Section(layout, "noise")
 

@@ -318,8 +318,10 @@ MODULES = {
     "flags": "exact kernel",
 }
 
-# Functions that some sections lack, and then are not called.
-OPTIONAL = ("fit", "look_ahead", "weigh_future")
+# Functions that some sections lack; they are never called then.
+OPTIONAL = (
+    "fit", "look_ahead", "weigh_future", "linear_initial", "linear", "hessian_initial", "hessian",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -368,7 +370,8 @@ class ModuleText:
         self.algorithms[name] = Algorithm(function, section, decorator, counts, bound or {})
         parameters = inspect.signature(getattr(function, "py_func", function)).parameters
         roles = [p for p in parameters if f"def {section.name(p)}(" in "\n".join(section.functions)]
-        names = {role: section.name(role) for role in [*OPTIONAL, "prepare", "step", *roles]}
+        names = dict.fromkeys(OPTIONAL, "absent")
+        names |= {role: section.name(role) for role in ["prepare", "step", *roles]}
         names |= {"sizes": f"({', '.join(map(str, counts))})", **(bound or {})}
         made = specialise(function, name, {k: v for k, v in names.items() if k in parameters})
         self.parts.append(made.text.replace("@exact", f"@{decorator}", 1))

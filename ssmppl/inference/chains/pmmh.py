@@ -192,7 +192,7 @@ class ScoredLikelihood(_WithFilter):
         return made
 
     def run(self, theta: np.ndarray, before: Run | None, stream: np.ndarray) -> Run | None:
-        entry, p = self.filter.module.filter_with_score, len(self.wanted)
+        entry, p = self.filter.run, len(self.wanted)
         total, paths, increments = 0.0, [], []
         slope, curvature = np.zeros(p), np.zeros((p, p))
         for e in self.problem.experiments:
