@@ -224,7 +224,7 @@ def test_what_a_new_model_needs_no_numba_for():
     wanted = tuple(program.trace.parameter_symbols)
     numbered = numbered_filter(program, proposal)
     scored = [scored_filter(program, proposal, wanted, second) for second in (False, True)]
-    for made, name in ((numbered, "correlated_path"), *((s, "filter_with_score") for s in scored)):
+    for made, name in ((numbered, "correlated_path"), *((s, "path_score") for s in scored)):
         assert getattr(made.module, name) is not getattr(made.module.module, name)
         assert not made.module.why
 

@@ -25,7 +25,7 @@ from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
 from tests.codegen.models import build
 
-TILE = 4
+THREADS = 4
 ROLES = ("prepare", "step", "draw_initial", "weigh_initial", "fit", "draw", "weigh")
 
 
@@ -96,7 +96,7 @@ def main(cases, particles=10):
         e = problem.experiments[0]
         out = np.empty((2, e.steps))
         status, t = run_on_device(
-            problem, theta, proposal, particles, e, random_state(root), *out, tile=TILE
+            problem, theta, proposal, particles, e, random_state(root), *out, threads=THREADS
         )
         expected = by_numpy(problem, theta, proposal, particles, random_state(root))
         found = {"case": case, "status": [status, t], "found": out.tolist(), "expected": expected}

@@ -74,6 +74,14 @@ class Proposal:
     fit: tuple[Expr, ...] = ()
     explanation: str = ""
     looped: int = 0  # multiplications per particle, of a proposal that is not written out
+    unsuited: str = ""  # why filters other than its own cannot run it, if they cannot
+
+    @property
+    def look_ahead_kind(self) -> str:
+        """Name of the kernels' constant for what its look-ahead knows."""
+        if self.look_ahead is None:
+            return "NO_LOOK_AHEAD"
+        return "EXACT" if self.exact_look_ahead else "APPROXIMATE"
 
 
 def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable]:

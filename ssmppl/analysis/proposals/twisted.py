@@ -224,6 +224,9 @@ def twisting_order(d: int, r: int) -> list[Expr]:
     return [*halves[0], *g, *m, *start, *halves[1]]
 
 
+UNSUITED = "these filters do not compute the guide of the twisted proposal"
+
+
 def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     """The proposal in the twisting function's symbols; its laws where they are written out."""
     found = lookahead_model(trace, missing)
@@ -236,7 +239,9 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     if not found.written_out:
         d, r = len(trace.state_symbols), len(found.transition.noise)
         looped = d * d + 2 * r * r
-        return Proposal("twisted", {}, (), {}, (), explanation=explanation, looped=looped)
+        return Proposal(
+            "twisted", {}, (), {}, (), explanation=explanation, looped=looped, unsuited=UNSUITED
+        )
     observed = tuple(terms(trace, "observation", missing))
     states = trace.state_symbols
     start = _initial_law(found.initial, states)
@@ -251,6 +256,7 @@ def twisted(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
         later.ahead,
         fit=later.fit,
         explanation=explanation,
+        unsuited=UNSUITED,
     )
 
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.eliminable import Eliminable
 from ssmppl.analysis.elimination.elimination import Elimination, eliminate
-from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, statistics_by_row
+from ssmppl.codegen.kernels.particle.conditional_smc import statistics_by_row
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
     WEIGH_CONNECTED,
     WEIGH_INITIAL,
+    add_conditional_smc,
     filter_functions,
     state_targets,
     weight_targets,
@@ -42,10 +42,7 @@ def compile_elimination(
     section = filter_functions(layout, found.proposal)
     joining_passes(section, found)
     out.add(f"conditional SMC: {found.proposal.explanation}", section)
-    memory = deterministic_memory(trace)
-    own = {"ahead": "NO_LOOK_AHEAD", "horizon": "-1" if memory is None else str(memory)}
-    own["eliminated"] = "1"
-    out.algorithm(conditional_smc, "conditional_smc_eliminated", section, "entry", own)
+    add_conditional_smc(out, section, trace, {"ahead": "NO_LOOK_AHEAD"}, eliminated=True)
     rows = row_functions(layout, found)
     out.add("statistics, row by row", rows)
     out.algorithm(statistics_by_row, "statistics_by_row", rows, "entry")

@@ -1,15 +1,9 @@
-"""Generated modules for the variants of PMMH: filters with scores, filters on given numbers.
+"""Generated modules of the particle filters that only some methods need.
 
-Each holds the functions of one proposal's particle filter once more, so that the program that every
-model gets is free of what only these variants need.
-
-The generated module of smoothed scores row by row, and of one-step predictions.
-
-The generated module of iterated filtering: a model whose particles carry their parameters.
-
-The generated module of a particle filter that can stop at a row, and go on.
-
-The generated module of the particle filter that is continuous in the parameters.
+Each is a module of its own, so that the program that every model gets is free of it: filters with
+scores and filters on given numbers (PMMH), a filter that can stop at a row and go on (SMC^2), one
+whose particles carry their parameters (iterated filtering), one that is continuous in the
+parameters; and smoothed scores and one-step predictions row by row.
 """
 
 from __future__ import annotations
@@ -24,15 +18,17 @@ from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals.perturbed import Perturbed
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
 from ssmppl.analysis.structure import deterministic
+from ssmppl.codegen.kernels.particle.conditional_smc import filtered_path
 from ssmppl.codegen.kernels.particle.continuous_filters import correlated_path, smooth_filter
 from ssmppl.codegen.kernels.particle.iterated_filter import iterated_filter
 from ssmppl.codegen.kernels.particle.particle_filter import filter_rows
 from ssmppl.codegen.kernels.particle.scored_filters import (
     complete_rows,
-    filter_with_score,
+    path_score,
     row_predictions,
     row_scores,
 )
+from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.program import Program
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import filter_functions, prediction_functions
@@ -47,22 +43,35 @@ from ssmppl.language.model.traced import Trace
 
 XI_INITIAL = "theta, c, s, states, out"
 XI = "theta, c, s, states_prev, states, out"
-STEERED = {
-    "twisted": "these filters do not compute the guide of the twisted proposal",
-    "tempered": "these filters weigh a row once, without temperatures",
-}
+TOGETHER = 48  # derivatives in one loop
+BEGIN = "theta, c, s, states_prev, states, normals, uniforms, rng"
 
 
 @dataclass(frozen=True)
 class ScoredFilter:
     """A generated filter that estimates derivatives in `wanted`, a sequence of parameter symbols.
 
-    module.filter_with_score(theta, y, seen, u, particles, rng, trajectory, log_increment, lag,
-    score, information), see the kernel.
+    module : its kernels `filtered_path` and `path_score`.
     """
 
     module: Loaded
     wanted: tuple[Expr, ...]
+
+    def run(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, particles: int,
+        rng: np.ndarray, trajectory: np.ndarray, log_increment: np.ndarray, lag: int,
+        score: np.ndarray, information: np.ndarray,
+    ) -> tuple[int, int, float]:  # fmt: skip
+        """(status, t, log Z) of `filtered_path`; what is derived is written where that is OK."""
+        (steps, d), data = trajectory.shape, (theta, y, seen, u)
+        x, w = np.empty((steps, d, particles)), np.empty((steps, particles))
+        kept = x, w, np.zeros((steps, particles), dtype=np.int32)
+        status, t, log_z = self.module.filtered_path(
+            *data, particles, rng, trajectory, log_increment, kept
+        )
+        if status == OK:
+            self.module.path_score(*data, *kept, lag, score, information)
+        return status, t, log_z
 
 
 @one_at_a_time
@@ -75,8 +84,8 @@ def scored_filter(
     given the states there is then no density for Fisher's identity.
     """
     trace, missing = program.trace, program.missing
-    if proposal.name in STEERED:
-        return NotApplicable(STEERED[proposal.name])
+    if proposal.unsuited:
+        return NotApplicable(proposal.unsuited)
     for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
         for site in deterministic(list(sites.values())):
             if any(depends_on(e, wanted) for e in array(site.distribution.mean()).ravel()):
@@ -106,9 +115,10 @@ def scored_filter(
         if second:
             doc = f"Second derivatives of {what}, row by row of the lower half."
             _outputs(section, f"hessian{name}", doc, arguments, curvatures)
-    roles = {} if second else {"hessian_initial": "hessian_initial", "hessian": "hessian"}
-    roles["second"] = str(second)
-    module = _module(program, proposal, section, filter_with_score, "score", roles)
+    module = _module(
+        program, proposal, section, "score",
+        (filtered_path, {"ahead": proposal.look_ahead_kind}), (path_score, {"second": str(second)}),
+    )  # fmt: skip
     return ScoredFilter(module, tuple(wanted))
 
 
@@ -132,8 +142,8 @@ def numbered_filter(program: Program, proposal: Proposal) -> NumberedFilter | No
     NotApplicable where particles are drawn by rejection, which takes a random count of numbers.
     """
     trace = program.trace
-    if proposal.name in STEERED:
-        return NotApplicable(STEERED[proposal.name])
+    if proposal.unsuited:
+        return NotApplicable(proposal.unsuited)
     for draws, sites in ((proposal.initial_draw, trace.initial), (proposal.draw, trace.transition)):
         for symbol, e in draws.items():
             for node in topological([e]):
@@ -145,7 +155,8 @@ def numbered_filter(program: Program, proposal: Proposal) -> NumberedFilter | No
                         site.distribution.location,
                     )
     section = filter_functions(Layout(trace), proposal)
-    module = _module(program, proposal, section, correlated_path, "correlated", {})
+    own = {"ahead": proposal.look_ahead_kind}
+    module = _module(program, proposal, section, "correlated", (correlated_path, own))
     return NumberedFilter(module, section.normals, section.uniforms)
 
 
@@ -159,21 +170,17 @@ def _outputs(section: Section, role: str, doc: str, arguments: str, values: Sequ
 
 
 def _module(
-    program: Program, proposal: Proposal, section: Section, kernel: Callable[..., Any], name: str,
-    bound: dict[str, str],
+    program: Program, proposal: Proposal, section: Section, name: str,
+    *kernels: tuple[Callable[..., Any], dict[str, str]],
 ) -> Loaded:  # fmt: skip
     trace = program.trace
     out = ModuleText(section.layout)
     out.add(f"particle filter, {proposal.name}: {proposal.explanation}", section)
-    ahead = "NO_LOOK_AHEAD"
-    if proposal.look_ahead is not None:
-        ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
-    out.algorithm(kernel, kernel.__name__, section, "entry", {"ahead": ahead, **bound})
-    lines = [f"Generated by ssmppl from the model {trace.name!r}: {kernel.__name__}.", ""]
+    for kernel, bound in kernels:
+        out.algorithm(kernel, kernel.__name__, section, "entry", bound)
+    names = ", ".join(kernel.__name__ for kernel, _ in kernels)
+    lines = [f"Generated by ssmppl from the model {trace.name!r}: {names}.", ""]
     return load(out, f"{identifier(trace.name)}_{proposal.name}_{name}", lines)
-
-
-TOGETHER = 48  # derivatives in one loop
 
 
 @one_at_a_time
@@ -230,9 +237,6 @@ def _passes(section: Section, role: str, arguments: str, values: Sequence[Expr])
     calls = [f"    {section.name(f'{role}_{k}')}({arguments})" for k in range(len(parts))]
     head = [f"@kernel\ndef {section.name(role)}({arguments}):", f'    """{doc}"""']
     section.functions.append("\n".join([*head, *(calls or ["    pass"])]) + "\n")
-
-
-BEGIN = "theta, c, s, states_prev, states, normals, uniforms, rng"
 
 
 @one_at_a_time

@@ -16,8 +16,6 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.traced import Trace
 
-STEERED = ("linear_initial", "linear")
-
 
 @one_at_a_time
 def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
@@ -30,8 +28,6 @@ def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     if steered:
         assert not isinstance(found.lookahead, NotApplicable)
         linear_passes(section, trace, found.lookahead)
-    else:
-        own |= {name: name for name in STEERED}
     what = "of a Gaussian approximation to their posterior" if steered else "of their laws"
     out.add(f"the states by the noises {what}", section)
     if steered:

@@ -19,8 +19,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap, derive
 from ssmppl.analysis.proposals.twisted import twisted
 from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
-from ssmppl.analysis.structure import check_start, deterministic_memory
-from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
+from ssmppl.analysis.structure import check_start
 from ssmppl.codegen.kernels.particle.backward import (
     backward_exact,
     backward_mcmc,
@@ -28,11 +27,9 @@ from ssmppl.codegen.kernels.particle.backward import (
     backward_weights,
     continuation,
 )
-from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, filtered_path
-from ssmppl.codegen.kernels.particle.particle_filter import move_blocks, particle_filter
+from ssmppl.codegen.kernels.particle.particle_filter import move_blocks
 from ssmppl.codegen.kernels.particle.simulation import (
     observe_states,
-    predict_step,
     simulate,
     simulate_on,
 )
@@ -43,12 +40,15 @@ from ssmppl.codegen.modules.tempered import TemperedFilter, compile_tempered
 from ssmppl.codegen.modules.twisted import TwistedFilter, compile_twisted
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
+    add_conditional_smc,
+    add_filters,
+    add_predictions,
     backward_functions,
     conditional_passes,
     filter_functions,
+    horizon,
     log_joint_function,
     parameter_functions,
-    prediction_functions,
     simulation_functions,
 )
 from ssmppl.codegen.text.module import Layout, ModuleText
@@ -57,6 +57,9 @@ from ssmppl.compiling import LOCK, once_property
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.traced import Trace
+
+# Proposals whose filters stand in a module of their own -> what a `Program` calls that.
+OWN_MODULES = {"twisted": "twisted", **dict.fromkeys(MARGINAL, "marginal"), "tempered": "tempered"}
 
 
 @dataclass
@@ -100,32 +103,34 @@ class Program:
         blocks and on a device."""
         return f"move_blocks_{proposal}" in self.loaded
 
-    def on_device(self, proposal: str, tile: int) -> DeviceFilter:
+    def on_device(self, proposal: str, threads: int) -> DeviceFilter:
         """The filter of one proposal for a CUDA device, with blocks of so many threads."""
-        key = proposal, tile
+        key = proposal, threads
         if key not in self._on_device:
             found = self.proposals[proposal]
             assert isinstance(found, Proposal), found
             with LOCK:
                 if key not in self._on_device:
-                    self._on_device[key] = compile_device(self.trace, found, tile)
+                    self._on_device[key] = compile_device(self.trace, found, threads)
         return self._on_device[key]
 
     def proposal(self, name: str) -> Proposal | NotApplicable | None:
         """What was derived under this name, or why nothing was; None where no proposal has it."""
-        if name in MARGINAL:
-            found = self.marginal
-            return found if isinstance(found, NotApplicable) else found.proposals[name]
-        if name == "tempered":
-            own = self.tempered
-            return own if isinstance(own, NotApplicable) else own.proposal
-        return self.proposals.get(name)
+        if name in self.proposals:
+            return self.proposals[name]
+        own = self.own_module(name)
+        return own if isinstance(own, NotApplicable | None) else own.proposals[name]
+
+    def own_module(self, proposal: str) -> Any:
+        """The module of its own in which this proposal's filters stand, or why there is none; None
+        where they stand in the program's."""
+        return getattr(self, OWN_MODULES[proposal]) if proposal in OWN_MODULES else None
 
     def carried(self, proposal: str) -> list[Expr]:
         """The components that a particle has under this proposal."""
-        if proposal in MARGINAL and isinstance(self.marginal, MarginalFilter):
-            return self.marginal.found.trace.state_symbols
-        return self.trace.state_symbols
+        own = self.own_module(proposal)
+        trace = self.trace if isinstance(own, NotApplicable | None) else own.trace
+        return trace.state_symbols
 
     def source(self) -> str:
         """The generated Python module, commented with the user's lines.
@@ -161,13 +166,11 @@ class Program:
         return self._entries[name]
 
     def _entry(self, name: str) -> Callable[..., Any]:
-        if name.endswith("_twisted") and isinstance(self.twisted, TwistedFilter):
-            return self.twisted.entry(name.removesuffix("_twisted"))
-        if name.endswith("_tempered") and isinstance(self.tempered, TemperedFilter):
-            return self.tempered.entry(name.removesuffix("_tempered"))
-        if name.endswith(tuple(f"_{own}" for own in MARGINAL)):
-            if isinstance(self.marginal, MarginalFilter):
-                return self.marginal.entry(name)
+        for proposal in OWN_MODULES:
+            if name.endswith(f"_{proposal}"):
+                own = self.own_module(proposal)
+                if not isinstance(own, NotApplicable):
+                    return own.entry(name.removesuffix(f"_{proposal}"), proposal)
         if not hasattr(self.module, name):
             for proposal, found in self.proposals.items():
                 if isinstance(found, NotApplicable) and name.endswith("_" + proposal):
@@ -216,35 +219,25 @@ def _write(
 ) -> tuple[ModuleText, list[str]]:
     layout = Layout(trace)
     plain = bootstrap(trace, missing)
-    memory = deterministic_memory(trace)
     out = ModuleText(layout)
     if trace.observations:
-        prediction = prediction_functions(trace, layout, plain)
-        out.add("one-step predictions", prediction)
-        out.algorithm(predict_step, "predict", prediction, "exact")
+        add_predictions(out, trace, layout, missing)
     simulation = simulation_functions(trace, layout, plain)
     out.add("simulation", simulation)
     out.algorithm(simulate, "simulate", simulation, "entry")
     out.algorithm(simulate_on, "simulate_on", simulation, "entry")
     out.algorithm(observe_states, "observe_states", simulation, "entry")
     for name, proposal in proposals.items():
-        if isinstance(proposal, NotApplicable) or not trace.observations or name == "twisted":
+        if isinstance(proposal, NotApplicable) or not trace.observations or name in OWN_MODULES:
             continue
         section = filter_functions(layout, proposal)
         conditional_passes(trace, layout, section, plain)
         out.add(f"particle filter, {name}: {proposal.explanation}", section)
-        ahead = "NO_LOOK_AHEAD"
-        if proposal.look_ahead is not None:
-            ahead = "EXACT" if proposal.exact_look_ahead else "APPROXIMATE"
-        own = {"ahead": ahead, "predict": "predict"}
-        out.algorithm(particle_filter, section.name("filter"), section, "entry", own)
-        out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", own)
+        ahead = {"ahead": proposal.look_ahead_kind}
+        add_filters(out, section, ahead)
+        add_conditional_smc(out, section, trace, ahead)
         if proposal.look_ahead is None:
             out.algorithm(move_blocks, section.name("move_blocks"), section, "entry")
-        own = {"ahead": ahead, "horizon": "-1" if memory is None else str(memory)}
-        own["eliminated"] = "0"
-        out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", own)
-        out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
     if trace.observations:
         _backward(out, trace, layout, plain)
     out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
@@ -255,11 +248,11 @@ def _write(
 
 def _backward(out: ModuleText, trace: Trace, layout: Layout, plain: Proposal) -> None:
     """The entry points of backward simulation."""
-    height, memory = transition_upper_bound(trace), deterministic_memory(trace)
+    height = transition_upper_bound(trace)
     section = backward_functions(trace, layout, plain, height)
     why = f"; no rejection: {height.reason}" if isinstance(height, NotApplicable) else ""
     out.add(f"backward simulation{why}", section)
-    own = {"horizon": "-1" if memory is None else str(memory)}
+    own = {"horizon": horizon(trace)}
     for function in (backward_weights, continuation):
         out.algorithm(function, function.__name__, section, "exact", own)
         own[function.__name__] = function.__name__

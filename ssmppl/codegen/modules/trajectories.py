@@ -1,8 +1,7 @@
-"""The generated module of a model's complete-data score and its derivative.
+"""Generated modules of sums over trajectories.
 
-The generated module of an M-step's statistics, summed over rows and averaged over paths.
-
-The generated module of a model's Gibbs updates: one statistics function for each.
+The complete-data score and its derivative; an M-step's statistics, summed over rows and averaged
+over paths; the statistics of Gibbs updates, a function for each.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The generated module of the twisted particle filter, and the guide that it goes by.
 
 The guide is computed anew for every theta and data set and handed to the filter as further columns
-of the inputs, so that the filter's kernels are the same as for any other proposal.
-
-Functions of the twisted filter where the noises are many; see `kernels/twisted/twisting.py`.
+of the inputs, so that the filter's kernels are the same as for any other proposal. Where the noises
+are many, the moves are functions with loops instead; see `kernels/twisted/twisting.py`.
 """
 
 from __future__ import annotations
@@ -26,18 +25,15 @@ from ssmppl.analysis.proposals.twisted import (
     twisted,
     twisting_order,
 )
-from ssmppl.analysis.structure import deterministic_memory
-from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
-from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, filtered_path
-from ssmppl.codegen.kernels.particle.particle_filter import particle_filter
-from ssmppl.codegen.kernels.particle.simulation import predict_step
 from ssmppl.codegen.kernels.twisted import lookahead, lookahead_backward, twisting
+from ssmppl.codegen.modules.exact import load_kernels
 from ssmppl.codegen.native.loading import Loaded, load
-from ssmppl.codegen.store import folder
 from ssmppl.codegen.text.kernel_functions import (
+    add_conditional_smc,
+    add_filters,
+    add_predictions,
     conditional_passes,
     filter_functions,
-    prediction_functions,
 )
 from ssmppl.codegen.text.module import (
     PARTICLE,
@@ -49,14 +45,17 @@ from ssmppl.codegen.text.module import (
     listed,
 )
 from ssmppl.codegen.text.render import depends, identifier
-from ssmppl.codegen.text.specialise import specialise
 from ssmppl.compiling import once, one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbol
 from ssmppl.language.model.traced import Trace
 
+MOST_STEPS = 12  # forward passes that improve the reference
+CLOSE = 0.05  # nats of improvement with which they end
+SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
 
-def steered_section(
+
+def twisted_section(
     trace: Trace, layout: Layout, found: LookaheadModel, plain: Proposal
 ) -> Section:
     """What the moves need to know of the model: its laws by their noise, and back."""
@@ -99,18 +98,13 @@ def varies(found: LookaheadModel) -> bool:
     return any(level[e] == PARTICLE for e in spread)
 
 
-def steered_moves(out: ModuleText, section: Section, found: LookaheadModel) -> dict[str, str]:
+def twisted_moves(out: ModuleText, section: Section, found: LookaheadModel) -> dict[str, str]:
     """Write the moves; what the filters' parameters for them stand for."""
     own = {"varies": str(varies(found))}
     for name in twisting.SPECIALISED:
         out.algorithm(vars(twisting)[name], name, section, "exact", dict(own))
-        own[name.removeprefix("steered_")] = name
+        own[name.removeprefix("twisted_")] = name
     return own
-
-
-MOST_STEPS = 12  # forward passes that improve the reference
-CLOSE = 0.05  # nats of improvement with which they end
-SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
 
 
 @dataclass
@@ -122,10 +116,11 @@ class TwistedFilter:
 
     trace: Trace
     found: LookaheadModel
+    proposals: dict[str, Proposal]
     module: Loaded = field(repr=False)
     _room: threading.local = field(default_factory=threading.local, repr=False, compare=False)
 
-    def entry(self, name: str, horizon: int = 0) -> Callable[..., Any]:
+    def entry(self, name: str, proposal: str = "twisted", horizon: int = 0) -> Callable[..., Any]:
         """`filter`, `alive_filter`, `filtered_path` or `conditional_smc`, called like those of
         other proposals.
 
@@ -133,7 +128,7 @@ class TwistedFilter:
         never. Up to the last row of each stretch the particles are worth most as a sample of
         what is known by then.
         """
-        run = getattr(self.module, f"{name}_twisted")
+        run = getattr(self.module, f"{name}_{proposal}")
 
         def call(theta: Any, y: Any, seen: Any, u: Any, *rest: Any) -> Any:
             return run(theta, y, seen, self.guide(theta, y, seen, u, horizon), *rest)
@@ -291,7 +286,7 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     assert isinstance(proposal, Proposal)
     layout = Layout(trace, twisting_order(len(trace.state_symbols), len(found.initial.noise)))
     out = ModuleText(layout)
-    section = guide_functions(layout, trace, found)
+    section = lookahead_functions(layout, trace, found)
     out.add("the guide", section)
     own = {"flat": str(found.flat)}
     out.algorithm(lookahead.look_at, "look_at", section, "exact", own)
@@ -300,33 +295,25 @@ def compile_twisted(trace: Trace, missing: Missing) -> TwistedFilter | NotApplic
     own["most_likely"] = "most_likely"
     for kernel in (lookahead.follow_filter, lookahead.follow_gains):
         out.algorithm(kernel, kernel.__name__, section, "entry", own)
-    prediction = prediction_functions(trace, layout, bootstrap(trace, missing))
-    out.add("one-step predictions", prediction)
-    out.algorithm(predict_step, "predict", prediction, "exact")
+    add_predictions(out, trace, layout, missing)
     plain = bootstrap(trace, missing)
-    own = {}
+    own = {"ahead": "GUIDED"}
     if found.written_out:
         section = filter_functions(layout, proposal)
         conditional_passes(trace, layout, section, plain)
         out.add(f"particle filter, {proposal.explanation}", section)
     else:
-        section = steered_section(trace, layout, found, plain)
+        section = twisted_section(trace, layout, found, plain)
         out.add(f"particle filter, {proposal.explanation}", section)
-        own = steered_moves(out, section, found)
-    memory = deterministic_memory(trace)
-    own = own | {"ahead": "GUIDED", "predict": "predict"}
-    out.algorithm(particle_filter, "filter_twisted", section, "entry", own)
-    out.algorithm(alive_filter, "alive_filter_twisted", section, "entry", own)
-    own = own | {"ahead": "GUIDED", "horizon": "-1" if memory is None else str(memory)}
-    own["eliminated"] = "0"
-    out.algorithm(filtered_path, "filtered_path_twisted", section, "entry", own)
-    out.algorithm(conditional_smc, "conditional_smc_twisted", section, "entry", own)
+        own |= twisted_moves(out, section, found)
+    add_filters(out, section, own)
+    add_conditional_smc(out, section, trace, own)
     lines = [f"Generated by ssmppl: the twisted particle filter of the model {trace.name!r}."]
     module = load(out, identifier(trace.name) + "_twisted", lines)
-    return TwistedFilter(trace, found, module)
+    return TwistedFilter(trace, found, {proposal.name: proposal}, module)
 
 
-def guide_functions(layout: Layout, trace: Trace, found: LookaheadModel) -> Section:
+def lookahead_functions(layout: Layout, trace: Trace, found: LookaheadModel) -> Section:
     """The functions by which the guide's kernels know the model; all of one particle."""
     section = Section(layout, "guide")
     for role, form, arguments in (
@@ -361,27 +348,12 @@ def linear_passes(section: Section, trace: Trace, found: LookaheadModel) -> None
     )  # fmt: skip
 
 
-HEAD = '''"""Generated by ssmppl: backward passes of the guide, the same for all models."""
-
-import math
-
-import numba
-import numpy as np
-
-'''
-
-
 @once
 def backward_passes() -> ModuleType:
-    """The kernels that know no model, compiled once for all."""
+    """The guide's kernels that know no model, compiled once for all."""
     kernels = (
         lookahead_backward.look_back,
         lookahead_backward.look_back_scalar,
         lookahead_backward.write_guide,
     )
-    made = [specialise(k, k.__name__, {}) for k in kernels]
-    names = {n: home for m in made for n, home in m.imports.items() if n != "exact"}
-    lines = [f"from {home} import {n}" for n, home in sorted(names.items())]
-    lines += ["", 'entry = numba.njit(nogil=True, error_model="numpy")', "", ""]
-    texts = [m.text.replace("@exact", "@entry", 1) for m in made]
-    return folder.load("guide", HEAD + "\n".join(lines) + "\n\n".join(texts))
+    return load_kernels("guide", "backward passes of the guide", {k.__name__: k for k in kernels})

@@ -97,6 +97,7 @@ def _made(
     made += [_specialised(f, n, bound) for f, n in (*helpers, (function, name))]
     here = {"exact", "predict", *(helper for _, helper in helpers)}
     imports = {n: home for m in made for n, home in m.imports.items() if n not in here}
+    imports |= {t: particle_filter.__name__ for _, t in fixed if t in vars(particle_filter)}
     lines = [f"from {home} import {n}" for n, home in sorted(imports.items())]
     text = HEAD.format(name=name, imports="\n".join(lines))
     text += "\n\n".join(_caller(k, *pair) for k, pair in enumerate(called))

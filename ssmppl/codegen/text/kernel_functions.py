@@ -8,9 +8,13 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.proposals.channels import channel_draws, observation_draws, of_components
-from ssmppl.analysis.proposals.proposals import Proposal
-from ssmppl.analysis.structure import deterministic
-from ssmppl.codegen.text.module import PARTICLE, Layout, Section, Target, level_of
+from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
+from ssmppl.analysis.structure import deterministic, deterministic_memory
+from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
+from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, filtered_path
+from ssmppl.codegen.kernels.particle.particle_filter import particle_filter
+from ssmppl.codegen.kernels.particle.simulation import predict_step
+from ssmppl.codegen.text.module import PARTICLE, Layout, ModuleText, Section, Target, level_of
 from ssmppl.codegen.text.render import Names, Writer, depends
 from ssmppl.codegen.text.sums import scalar_function, time_sum
 from ssmppl.errors import NotApplicable
@@ -28,6 +32,40 @@ LOOK_AHEAD = "theta, c, s, states_prev, fits, log_w"
 FITTED_DRAW = "theta, c, s, states_prev, fits, states, normals, uniforms, rng"
 WEIGH = "theta, c, s, states_prev, fits, states, log_w"
 OBSERVE = "theta, c, s, states, out, normals, uniforms, rng"
+
+
+def add_predictions(out: ModuleText, trace: Trace, layout: Layout, missing: Missing) -> None:
+    """Write `predict`, by which the filters of a module predict the next row."""
+    section = prediction_functions(trace, layout, bootstrap(trace, missing))
+    out.add("one-step predictions", section)
+    out.algorithm(predict_step, "predict", section, "exact")
+
+
+def add_filters(out: ModuleText, section: Section, bound: dict[str, str]) -> None:
+    """Write the particle filters of a section that was added: `filter`, `alive_filter` and
+    `filtered_path`, each with the section's suffix.
+
+    bound : what their parameter `ahead` stands for, and functions that are not the section's own.
+    """
+    predicting = bound | {"predict": "predict"}
+    out.algorithm(particle_filter, section.name("filter"), section, "entry", predicting)
+    out.algorithm(alive_filter, section.name("alive_filter"), section, "entry", predicting)
+    out.algorithm(filtered_path, section.name("filtered_path"), section, "entry", bound)
+
+
+def add_conditional_smc(
+    out: ModuleText, section: Section, trace: Trace, bound: dict[str, str], eliminated: bool = False
+) -> None:
+    """Write `conditional_smc` of a section that has `conditional_passes`; bound : as of
+    `add_filters`."""
+    own = bound | {"horizon": horizon(trace), "eliminated": str(int(eliminated))}
+    out.algorithm(conditional_smc, section.name("conditional_smc"), section, "entry", own)
+
+
+def horizon(trace: Trace) -> str:
+    """The steps for which deterministic components remember an ancestor; -1: for ever."""
+    memory = deterministic_memory(trace)
+    return "-1" if memory is None else str(memory)
 
 
 def state_targets(layout: Layout, draws: dict[Expr, Expr]) -> list[Target]:
@@ -85,11 +123,18 @@ def filter_functions(layout: Layout, proposal: Proposal, begin: str = DRAW_INITI
     return section
 
 
+def _values(sites: Sequence[Site]) -> list[tuple[Expr, Expr]]:
+    """The components of deterministic sites, each with its value."""
+    return [
+        pair
+        for site in sites
+        for pair in zip(site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True)
+    ]
+
+
 def conditional_passes(trace: Trace, layout: Layout, section: Section, plain: Proposal) -> None:
     """What conditional SMC needs on top of a filter: densities of joining the reference."""
-    value = {s: e for site in deterministic(list(trace.transition.values()))
-             for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(),
-                             strict=True)}  # fmt: skip
+    value = dict(_values(deterministic(list(trace.transition.values()))))
     given = {s: f"reference[{layout.column(s)}]" for s in trace.state_symbols}
     joined = {s: value.get(s, s) for s in trace.state_symbols}
     section.particle_pass(
@@ -114,10 +159,7 @@ def backward_functions(
     """The functions of backward simulation; `bound` where the transition density has one."""
     section = Section(layout, "backward")
     conditional_passes(trace, layout, section, plain)
-    known = deterministic(list(trace.transition.values()))
-    value = {s: e for site in known
-             for s, e in zip(site.value.ravel(), array(site.distribution.mean()).ravel(),
-                             strict=True)}  # fmt: skip
+    value = dict(_values(deterministic(list(trace.transition.values()))))
     section.particle_pass(
         "complete", "The deterministic components of x_t, from x_{t-1}.",
         "theta, c, s, states_prev, states", state_targets(layout, value),
@@ -210,13 +252,7 @@ def log_joint_function(trace: Trace, layout: Layout, missing: Missing) -> str:
             if t.site.name not in skipped:
                 total = total + t.guarded()
         parts[role] = [total]
-        fixed[role] = [
-            pair
-            for site in known
-            for pair in zip(
-                site.value.ravel(), array(site.distribution.mean()).ravel(), strict=True
-            )
-        ]
+        fixed[role] = _values(known)
     doc = "log p(x, y | theta); deterministic components of x are set on the way."
     return time_sum(layout, "log_joint", doc, parts, 1, fixed)
 

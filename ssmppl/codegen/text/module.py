@@ -37,7 +37,9 @@ LEVELS = {
 }  # fmt: skip
 # What every section has, and the arguments; and what some lack, and then do not call.
 OUTER = {"prepare": "theta, c", "step": "theta, c, y_data, seen_data, u_data, t, s"}
-OPTIONAL = ("fit", "look_ahead", "weigh_future")
+OPTIONAL = (
+    "fit", "look_ahead", "weigh_future", "linear_initial", "linear", "hessian_initial", "hessian",
+)  # fmt: skip
 # Where the functions stand that generated text calls, and its decorators.
 HOMES = {n: f"ssmppl.codegen.kernels.math.{file}" for n, file in KERNELS.items()}
 HOMES |= dict.fromkeys(("exact", "kernel"), "ssmppl.codegen.kernels.math.flags")
@@ -363,7 +365,8 @@ class ModuleText:
         self.algorithms[name] = Algorithm(function, section, decorator, counts, bound or {})
         parameters = inspect.signature(getattr(function, "py_func", function)).parameters
         roles = [p for p in parameters if f"def {section.name(p)}(" in "\n".join(section.functions)]
-        names = {role: section.name(role) for role in [*OPTIONAL, "prepare", "step", *roles]}
+        names = dict.fromkeys(OPTIONAL, "absent")
+        names |= {role: section.name(role) for role in ["prepare", "step", *roles]}
         names |= {"sizes": f"({', '.join(map(str, counts))})", **(bound or {})}
         made = specialise(function, name, {k: v for k, v in names.items() if k in parameters})
         self.parts.append(made.text.replace("@exact", f"@{decorator}", 1))

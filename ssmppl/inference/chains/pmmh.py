@@ -197,7 +197,7 @@ class ScoredLikelihood(_KeepsPaths):
     def run(
         self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
     ) -> LikelihoodRun | None:
-        entry, p = self.filter.module.filter_with_score, len(self.wanted)
+        entry, p = self.filter.run, len(self.wanted)
         slope, curvature = np.zeros(p), np.zeros((p, p))
 
         def one(

@@ -361,7 +361,8 @@ def _proposal(setup: SamplingSetup, method: SMC2) -> str:
         theta = setup.space.theta
         name = setup.once("proposal", lambda: choose(setup.problem, theta, exact=False)).name
         name = {"auxiliary": "guided", "twisted": "bootstrap"}.get(name, name)
-    if setup.problem.proposal(name).look_ahead is not None or name in ("twisted", "tempered"):
+    found = setup.problem.proposal(name)
+    if found.look_ahead is not None or found.unsuited:
         raise ArgumentError(
             f"proposal={name!r} looks ahead, which the filters of SMC2 do not",
             fix='use "auto", "bootstrap" or "guided"',

@@ -7,7 +7,7 @@ from numba.core.errors import NumbaError
 
 from ssmppl.codegen.kernels.math.random import fill_uniform, new_state, uniform
 from ssmppl.codegen.kernels.particle.weights import OK
-from ssmppl.codegen.modules.device import TILE, cuda_module
+from ssmppl.codegen.modules.device import THREADS, cuda_module
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.problem import Problem
@@ -39,15 +39,15 @@ def check_device(problem: Problem, proposal: str, **others: tuple[object, object
 
 def run_on_device(
     problem: Problem, theta: np.ndarray, proposal: str, particles: int, experiment: Experiment,
-    rng: np.ndarray, log_increments: np.ndarray, ess: np.ndarray, tile: int = TILE,
+    rng: np.ndarray, log_increments: np.ndarray, ess: np.ndarray, threads: int = THREADS,
 ) -> tuple[int, int]:  # fmt: skip
     """Run the filter over one experiment, with systematic resampling at every row; (status, t).
 
     log_increments, ess : (T,), written.
     """
     cuda = cuda_module()
-    made = problem.program.on_device(proposal, tile)
-    steps, tiles = experiment.steps, -(-particles // tile)
+    made = problem.program.on_device(proposal, threads)
+    steps, blocks = experiment.steps, -(-particles // threads)
     c, s = np.empty(made.sizes[0]), np.empty((steps, made.sizes[1]))
     made.prepare(theta, c)
     for t in range(steps):
@@ -57,17 +57,17 @@ def run_on_device(
     draws = [cuda.to_device(a) for a in (keys, points)]
     x, old = (cuda.device_array((made.sizes[2], particles)) for _ in range(2))
     sums, old_sums = (cuda.device_array(particles, np.int64) for _ in range(2))
-    ends = cuda.device_array(tiles, np.int64)
-    tops, squares = (cuda.device_array(tiles) for _ in range(2))
-    flags, status = cuda.device_array(tiles, np.int64), cuda.device_array(steps, np.int64)
+    ends = cuda.device_array(blocks, np.int64)
+    tops, squares = (cuda.device_array(blocks) for _ in range(2))
+    flags, status = cuda.device_array(blocks, np.int64), cuda.device_array(steps, np.int64)
     out = [cuda.device_array(steps) for _ in range(2)]
     for t in range(steps):
         x, old, sums, old_sums = old, x, old_sums, sums
         move = *given, t, particles, *draws, old, old_sums, ends, x, sums, tops, squares, flags
         join = particles, t, sums, tops, squares, flags, ends, *out, status
         try:
-            made.move[tiles, tile](*move)
-            made.join[1, tile](*join)
+            made.move[blocks, threads](*move)
+            made.join[1, threads](*join)
         except NumbaError as error:  # at the first row, where the kernels are compiled
             told = next(line for line in str(error).splitlines() if line.strip())
             raise ArgumentError(

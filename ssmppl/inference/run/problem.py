@@ -12,7 +12,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
-from ssmppl.codegen.modules.program import Program, compile_trace
+from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model.model import Model
@@ -55,8 +55,8 @@ class Problem:
                     fix="leave method= out, or take a method whose likelihood is exact, as "
                     "MetropolisHastings, Gibbs, EM and DirectOptimization do where there is one",
                 )
-            known = [n for n in self.program.proposals if integrate or n != "twisted"]
-            known = ["auto", *known, *((*MARGINAL, "tempered") if integrate else ()), *others]
+            known = [n for n in self.program.proposals if n not in OWN_MODULES]
+            known = ["auto", *known, *(OWN_MODULES if integrate else ()), *others]
             raise ArgumentError(
                 f"proposal={name!r} is not known for this model",
                 fix=f"use one of: {listing(name, known)}",

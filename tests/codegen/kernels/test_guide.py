@@ -74,7 +74,7 @@ GAPS = {  # rows and components that are missing; last rows too, whose guide say
 def plainly(problem):
     """The twisted filter with its generated functions in plain Python."""
     made = problem.program.twisted
-    return TwistedFilter(made.trace, made.found, plain_module(made.module))
+    return TwistedFilter(made.trace, made.found, made.proposals, plain_module(made.module))
 
 
 @cache

@@ -55,7 +55,7 @@ class Setting:
         return plain("kept_factors")(self.spread_of, self.varies, theta, c, s, x, fits)
 
     def fit(self):
-        plain("steered_fit")(
+        plain("twisted_fit")(
             self.write_rest, self.spread_of, self.varies, None, None, self.s, self.x, self.fits
         )
         return self.fits
@@ -85,7 +85,7 @@ def test_mean_and_expectation(setting):
         expected = at_mode + 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
         assert fits[R, i] == pytest.approx(expected, rel=1e-12)
     log_w = np.empty(N)
-    plain("steered_look_ahead")(None, None, setting.s, setting.x, fits, log_w)
+    plain("twisted_look_ahead")(None, None, setting.s, setting.x, fits, log_w)
     np.testing.assert_array_equal(log_w, fits[R])
 
 
@@ -108,7 +108,7 @@ def test_draws_and_their_density(setting):
         draws["e"] = e.copy()
         states[:] = 1.0
 
-    plain("steered_draw")(
+    plain("twisted_draw")(
         setting.kept_factors, follow, None, None, setting.s, setting.x, fits, x, normals, uniforms,
         None,
     )  # fmt: skip
@@ -130,7 +130,7 @@ def test_draws_and_their_density(setting):
         log_w[:] = 0.25
 
     log_w = np.full(N, np.nan)
-    plain("steered_weigh")(
+    plain("twisted_weigh")(
         setting.kept_factors, recover, weigh_observed, None, None, setting.s, setting.x, fits, x,
         log_w,
     )  # fmt: skip
@@ -147,7 +147,7 @@ def test_the_first_state(setting):
     def begin(theta, c, s, e, states):
         draws["e"] = e.copy()
 
-    plain("steered_draw_initial")(begin, None, None, setting.s, x, normals, np.full(N, 0.5), None)
+    plain("twisted_draw_initial")(begin, None, None, setting.s, x, normals, np.full(N, 0.5), None)
     e, factor = draws["e"], setting.start_factor
     expected = setting.start[:, None] + np.linalg.solve(factor.T, normals.reshape(R, N))
     np.testing.assert_allclose(e, expected, rtol=1e-12)
@@ -159,7 +159,7 @@ def test_the_first_state(setting):
         log_w[:] = -1.0
 
     log_w = np.empty(N)
-    plain("steered_weigh_initial")(recover, weigh_observed, None, None, setting.s, x, log_w)
+    plain("twisted_weigh_initial")(recover, weigh_observed, None, None, setting.s, x, log_w)
     covariance = np.linalg.inv(factor @ factor.T)
     q = stats.multivariate_normal.pdf(e.T, setting.start, covariance)
     f = stats.norm.pdf(e).prod(axis=0)
@@ -174,7 +174,7 @@ def test_weights_of_noise_a_thousand_spreads_away(setting):
     log_w = np.zeros(N)
     root = np.zeros((R * (R + 1) // 2, 1))
     root[[0, 2, 5]] = 3.0  # a third of the transition's spread
-    twisting.steered_ratio(e, np.zeros((R, 1)), root, log_w)
+    twisting.twisted_ratio(e, np.zeros((R, 1)), root, log_w)
     far = -np.log(twisting.DEFENSIVE)
     near = -np.log(twisting.DEFENSIVE + (1 - twisting.DEFENSIVE) * 27)
     np.testing.assert_allclose(log_w, [far] * 4 + [near], rtol=1e-12)

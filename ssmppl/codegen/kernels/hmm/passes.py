@@ -9,10 +9,9 @@ where there are T), log_g (S, T, K) of y_t given x_t. What has one row where the
 same for all. From a value i that the data rule out the move need not be defined: its probability 0
 is no factor of it.
 
-The passes of `hidden_markov.py` by logarithms: exact however unlikely a value has become.
-
-Sources, notation and what is filled are as there, with the logarithms of `move`, `predicted` and
-`filtered` in their places.
+Each pass stands here twice: by probabilities, and (`..._logs`) by logarithms, exact however
+unlikely a value has become, with the logarithms of `move`, `predicted` and `filtered` in their
+places.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Kernel:
     def __init__(self, function: Callable, options: dict[str, Any]):
         update_wrapper(self, function)
         self.py_func = function
-        self.options = options
+        self.options = self.targetoptions = options
         without: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
         self.bare = numba.njit(**options, **without)(function)
 
@@ -98,3 +98,10 @@ Inlining is forced, because a loop with a call in it does not vectorise.
 
 exact = _decorator()
 """Decorator of functions in which the order of the operations is part of the method."""
+
+inlined = _decorator(inline="always")
+"""Decorator of the steps that algorithms share, as of `exact`; they take a model's functions too.
+
+Numba puts them where they are called before it looks at types: that costs its compiler less than a
+function each, and what an algorithm leaves out there is not compiled.
+"""

@@ -1,4 +1,4 @@
-"""Special functions of probability, scalar, for kernels.
+"""Special functions of probability, and laws' functions without a closed form: scalar, for kernels.
 
 Sources: M. Abramowitz and I. A. Stegun, *Handbook of Mathematical Functions* (A&S);
 M. J. Wichura's AS 241, *Applied Statistics* 37 (1988), for the normal quantile; C. Loader, *Fast
@@ -7,19 +7,16 @@ cancellation.  Relative errors are below 1e-12 (near a zero of the function: abs
 `tests/codegen/kernels/test_special.py` has the ranges.  Outside their domain the functions
 return NaN.
 
-Incomplete gamma and beta functions, regularised, and their inverses in x.
+Incomplete gamma and beta functions, regularised: series and continued fractions of A&S 6.5.29,
+6.5.31 and 26.5.8; the factors x^a e^-x / Gamma and x^a (1-x)^b / B by Loader's saddle-point form,
+which keeps its accuracy for large a.  The choice between them follows A. R. DiDonato and
+A. H. Morris, *ACM TOMS* 12 (1986).  Their inverses in x are Newton's method kept inside a
+shrinking bracket.
 
-Series and continued fractions of A&S 6.5.29, 6.5.31 and 26.5.8; the factors x^a e^-x / Gamma
-and x^a (1-x)^b / B by C. Loader's saddle-point form, which keeps its accuracy for large a.
-The choice between them follows A. R. DiDonato and A. H. Morris, *ACM TOMS* 12 (1986).  The
-inverses are Newton's method kept inside a shrinking bracket.  Outside their domain: NaN.
-
-Distribution functions that have no closed form, scalar, for kernels.
-
-The beta-binomial law's is a sum over its values, each from the last by their ratio (Johnson, Kemp
-and Kotz 2005, "Univariate discrete distributions", section 6.2.2), in logarithms, which neither
-over- nor underflow. Von Mises' is an integral, by the double exponential rule of Takahasi and Mori
-(1974), *Publ. RIMS* 9. Outside their domain the functions return NaN.
+The beta-binomial distribution function is a sum over the law's values, each from the last by their
+ratio (Johnson, Kemp and Kotz 2005, "Univariate discrete distributions", section 6.2.2), in
+logarithms, which neither over- nor underflow.  Von Mises' is an integral, by the double exponential
+rule of Takahasi and Mori (1974), *Publ. RIMS* 9.
 """
 
 from __future__ import annotations
@@ -34,6 +31,11 @@ from ssmppl.codegen.kernels.math.flags import exact
 _INF = np.inf
 _SQRT_HALF = 0.7071067811865476
 _LOG_SQRT_2PI = 0.9189385332046727
+_EPS = 2.220446049250313e-16
+_TINY = 1e-300
+_STEPS = 1_000_000  # of a series or fraction; some 8 sqrt(max(a, b)) of them are needed
+FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
+STEP, NODES = 0.0625, 52  # of the rule, on each side of its middle
 
 
 @exact
@@ -276,11 +278,6 @@ def deviance_part(x, mean):
 def poisson_density(x, mean):
     """mean^x e^-mean / Gamma(x + 1) for real x > 0, mean > 0 (Loader, equation 4)."""
     return exp(-stirling_error(x) - deviance_part(x, mean)) / math.sqrt(2.0 * np.pi * x)
-
-
-_EPS = 2.220446049250313e-16
-_TINY = 1e-300
-_STEPS = 1_000_000  # of a series or fraction; some 8 sqrt(max(a, b)) of them are needed
 
 
 @exact
@@ -562,10 +559,6 @@ def _beta_quantile(a, b, p, q):
             break
         t = following
     return 1.0 / (1.0 + exp(-t))
-
-
-FARTHEST = 42.0  # exp(-42) of the density at the end of the integral is below rounding
-STEP, NODES = 0.0625, 52  # of the rule, on each side of its middle
 
 
 @exact

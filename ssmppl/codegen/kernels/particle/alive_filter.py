@@ -35,8 +35,8 @@ from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform, unifor
 from ssmppl.codegen.kernels.particle.particle_filter import (
     NO_LOOK_AHEAD,
     copy,
-    gather,
-    look_ahead_weights,
+    descend,
+    resampling_weights,
 )
 from ssmppl.codegen.kernels.particle.weights import (
     ALL_ZERO,
@@ -114,14 +114,12 @@ def alive_filter(
         if moments is not None:
             predict(theta, y, seen, u, t, x, w, rng, moments[4])
         if t > 0:
-            copy(w, p)
+            status = resampling_weights(
+                fit, look_ahead, theta, c, s, x, fits_prev, w, ahead, log_v, part, p
+            )
+            if status != OK:
+                return status, t
             if ahead != NO_LOOK_AHEAD:
-                if sizes[5] > 0:
-                    fit(theta, c, s, x, fits_prev)
-                look_ahead(theta, c, s, x, fits_prev, log_v)
-                _, status = look_ahead_weights(log_v, w, part, ahead, p)
-                if status != OK:
-                    return status, t
                 log_ratio_of(w, p, log_ratio)
             x, x_prev = x_prev, x
         alive, tries, undefined = 0, 0, 0
@@ -139,12 +137,7 @@ def alive_filter(
             else:
                 tried_prev, fits = np.empty((d, m)), np.empty((sizes[5], m))
                 independent_ancestors(rng, p, part, chosen)
-                gather(x_prev, chosen, tried_prev)
-                if sizes[5] > 0:
-                    if ahead != NO_LOOK_AHEAD:
-                        gather(fits_prev, chosen, fits)
-                    else:
-                        fit(theta, c, s, tried_prev, fits)
+                descend(fit, theta, c, s, x_prev, fits_prev, chosen, ahead, tried_prev, fits)
                 draw(theta, c, s, tried_prev, fits, tried, normals, uniforms, rng)
                 weigh(theta, c, s, tried_prev, fits, tried, log_tried)
                 if ahead != NO_LOOK_AHEAD:

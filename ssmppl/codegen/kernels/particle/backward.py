@@ -1,21 +1,10 @@
-"""Backward simulation with the exact kernel, over a model's generated functions.
+"""Backward simulation: trajectories drawn through the particles of a filter.
 
-Godsill, Doucet and West (2004), algorithm 1; Schön et al. (2015), section 5. Given the particles
-and weights of a filter, each trajectory draws its x_T by the last weights and then, backwards in
-time, the index of x_t with probability proportional to w_t^i f(x'_{t+1} | x_t^i): O(N) for each
-trajectory and step.
-
-Deterministic (Dirac) components of a trajectory are those that follow from its noisy components,
-as in `conditional_smc`. Where x_{t+1}, ..., x_{t+h} change with the choice of x_t in this way, the
-law of the noisy components is not Markov, and the weights take in what the choice does to the
-densities of these steps: f and g of t + 1, ..., t + h and f of t + h + 1 (Lindsten and Schön 2013,
-"Backward simulation methods", section 4.5). `horizon` is h - 0 where there is nothing of the
-kind, and -1 where the choice changes all later steps (a position that integrates a velocity).
-
-Notation: N particles, M trajectories, T steps, D states; history : (T, D, N); weights : (T, N);
-paths : (T, D, M).
-
-Backward simulation that looks at single pairs (x_t^i, x'_{t+1}) instead of at all N weights.
+`backward_exact`: Godsill, Doucet and West (2004), algorithm 1; Schön et al. (2015), section 5.
+Given the particles and weights of a filter, each trajectory draws its x_T by the last weights and
+then, backwards in time, the index of x_t with probability proportional to
+w_t^i f(x'_{t+1} | x_t^i): O(N) for each trajectory and step. The others look at single pairs
+(x_t^i, x'_{t+1}), and their passes go over trajectories instead of over particles.
 
 `backward_rejection`: the index i is proposed by the filter's weights and accepted with probability
 f(x'_{t+1} | x_t^i) / sup_x f(x'_{t+1} | x) (Douc, Garivier, Moulines and Olsson 2011). All
@@ -28,7 +17,15 @@ law of their indices stays exact.
 independent Metropolis-Hastings steps, proposals again by the filter's weights (Bunch and Godsill
 2013): O(1) for each trajectory and step, and a path of the genealogy where no step is made.
 
-Notation as in `backward`; all passes go over trajectories instead of over particles.
+Deterministic (Dirac) components of a trajectory are those that follow from its noisy components,
+as in `conditional_smc`. Where x_{t+1}, ..., x_{t+h} change with the choice of x_t in this way, the
+law of the noisy components is not Markov, and the weights take in what the choice does to the
+densities of these steps: f and g of t + 1, ..., t + h and f of t + h + 1 (Lindsten and Schön 2013,
+"Backward simulation methods", section 4.5). `horizon` is h - 0 where there is nothing of the
+kind, and -1 where the choice changes all later steps (a position that integrates a velocity).
+
+Notation: N particles, M trajectories, T steps, D states; history : (T, D, N); weights : (T, N);
+paths : (T, D, M).
 """
 
 from __future__ import annotations
@@ -47,6 +44,15 @@ from ssmppl.codegen.kernels.particle.weights import (
     relative_weights,
     rule_out,
 )
+
+ABOVE_BOUND = 4
+"""A density above what was derived as its bound."""
+
+SLACK = 1e-6
+"""By how much rounding may lift the log of a density above its bound."""
+
+PRICE = 20.0
+"""Cost of a proposal, as a number of particles that the exact kernel could have weighed."""
 
 
 @exact
@@ -184,16 +190,6 @@ def backward_exact(
             step(theta, c, y, seen, u, t, s)
             complete(theta, c, s, paths[t - 1], paths[t])
     return OK, n_steps
-
-
-ABOVE_BOUND = 4
-"""A density above what was derived as its bound."""
-
-SLACK = 1e-6
-"""By how much rounding may lift the log of a density above its bound."""
-
-PRICE = 20.0
-"""Cost of a proposal, as a number of particles that the exact kernel could have weighed."""
 
 
 @exact

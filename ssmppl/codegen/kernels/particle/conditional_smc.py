@@ -1,14 +1,14 @@
-"""Conditional SMC with ancestor sampling: the kernel of PGAS, over a model's generated functions.
+"""Filters that keep paths: conditional SMC with ancestor sampling, and a filter with one path.
 
-Algorithm 3 of Lindsten, Jordan and Schön (2014), "Particle Gibbs with ancestor sampling" (in Schön
-et al. 2015, algorithm 7): particle N follows the reference trajectory; its ancestor is drawn anew
-at every step with probability proportional to w_{t-1} f(x'_t | x_{t-1}). The other ancestors are
-drawn given that one by conditional systematic resampling (Chopin and Singh 2015), which has the
-same marginals as independent draws, so the kernel leaves p(x_{1:T} | y_{1:T}, theta) invariant for
-every N >= 2. It draws the new trajectory among the N ancestral paths by their final weights; so
-under the invariant law the weighted mean of a function over all N paths has the expectation of the
-function of the one that was drawn, with less variance. Particle SAEM averages so (Lindsten 2013;
-Schön et al. 2015, equation for its approximation of Q).
+`conditional_smc`, the kernel of PGAS: algorithm 3 of Lindsten, Jordan and Schön (2014), "Particle
+Gibbs with ancestor sampling" (in Schön et al. 2015, algorithm 7): particle N follows the reference
+trajectory; its ancestor is drawn anew at every step with probability proportional to
+w_{t-1} f(x'_t | x_{t-1}). The other ancestors are drawn given that one by conditional systematic
+resampling (Chopin and Singh 2015), which has the same marginals as independent draws, so the kernel
+leaves p(x_{1:T} | y_{1:T}, theta) invariant for every N >= 2. It draws the new trajectory among the
+N ancestral paths by their final weights; so under the invariant law the weighted mean of a function
+over all N paths has the expectation of the function of the one that was drawn, with less variance.
+Particle SAEM averages so (Lindsten 2013; Schön et al. 2015, equation for its approximation of Q).
 
 Deterministic (Dirac) components of the reference are those that follow from its noisy components
 and the new ancestor. Where they forget the ancestor within `horizon` steps, the weights take the
@@ -16,21 +16,19 @@ densities of these steps in (section 7.1 there); where they never do, `horizon` 
 ancestor is sampled: particle Gibbs as in Andrieu, Doucet and Holenstein (2010).
 
 Where parameters are `eliminated` (`analysis/elimination/elimination.py`; Wigren, Risuleo, Murray
-and Lindsten 2019), particles carry their running statistics as further deterministic components.
-These never forget the ancestor, but add up: what all later rows of the reference are worth given an
-ancestor's statistics is one number, `weigh_future`.
+and Lindsten 2019), particles carry their running statistics as further deterministic components,
+which `statistics_by_row` tells of a trajectory. These never forget the ancestor, but add up: what
+all later rows of the reference are worth given an ancestor's statistics is one number,
+`weigh_future`.
 
-Notation: N particles, T steps; x : (D, N); reference, trajectory : (T, D); w : (N,).
-
-What each row of a trajectory adds to the statistics of parameters that are eliminated.
-
-What is kept of the particles of earlier steps, so that a path can be read off at the end.
-
-Either everything, (T, D, N) values with (T, N) ancestors; or the tree of those particles that have
-descendants: Jacob, Murray and Rubenthaler (2015), "Path storage in the particle filter",
+A genealogy is what is kept of the particles of earlier steps, so that a path can be read off at the
+end: either everything, (T, D, N) values with (T, N) ancestors; or the tree of those particles that
+have descendants: Jacob, Murray and Rubenthaler (2015), "Path storage in the particle filter",
 *Statistics and Computing* 25, algorithms 1 to 3. Paths coalesce: the tree has T + O(N log N) nodes
 on average, against T N. Writing a step down whole costs less than pruning the tree as long as all
 of it is small, so the tree is taken where it is not (`DENSE`). Both give the same paths.
+
+Notation: N particles, T steps; x : (D, N); reference, trajectory : (T, D); w : (N,).
 """
 
 from __future__ import annotations
@@ -44,22 +42,27 @@ from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform, unifor
 from ssmppl.codegen.kernels.particle.particle_filter import (
     NO_LOOK_AHEAD,
     add,
-    any_finite,
     copy,
+    descend,
     gather,
     look_ahead_weights,
+    move,
+    resampling_weights,
     second_stage,
+    weigh_row,
 )
 from ssmppl.codegen.kernels.particle.resampling import PADDING, conditional_systematic, systematic
-from ssmppl.codegen.kernels.particle.weights import (
-    ALL_ZERO,
-    NAN,
-    OK,
-    draw_relative,
-    normalise,
-    relative_weights,
-    rule_out,
-)
+from ssmppl.codegen.kernels.particle.weights import OK, draw_relative, relative_weights, rule_out
+
+# Numbers, of the particles of all steps, up to which everything is kept: 256 MiB, and half as much
+# again for ancestors where there is one state.
+DENSE = 1 << 25
+FIRST = 4  # times N: nodes that a tree has room for at the beginning
+UNUSED = -1  # a node's number of children where the node is free
+
+FREE, CURSOR, ROW = 0, 1, 2  # in `counters`
+JOINING = 8
+"""Added to a status of the weights by which the reference's ancestor into row t is drawn."""
 
 
 @exact
@@ -87,15 +90,6 @@ def statistics_by_row(
         moved[t] = told[:, 0]
         tell_observed(theta, c, s, x, told)
         measured[t] = told[:, 0]
-
-
-# Numbers, of the particles of all steps, up to which everything is kept: 256 MiB, and half as much
-# again for ancestors where there is one state.
-DENSE = 1 << 25
-FIRST = 4  # times N: nodes that a tree has room for at the beginning
-UNUSED = -1  # a node's number of children where the node is free
-
-FREE, CURSOR, ROW = 0, 1, 2  # in `counters`
 
 
 @exact
@@ -217,10 +211,6 @@ def _with_twice_the_room(tree):
     return more_nodes, more_parents, more_children, leaves, counters
 
 
-JOINING = 8
-"""Added to a status of the weights by which the reference's ancestor into row t is drawn."""
-
-
 @exact
 def draw_index(w, u):
     """Index j with probability w[j], from one uniform; never one of weight zero."""
@@ -331,9 +321,7 @@ def conditional_smc(
                 second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
         genealogy = remember(genealogy, t, x, ancestors)
-        _, ess, status = normalise(log_v, w)
-        if status == NAN and not any_finite(log_v):
-            status = ALL_ZERO
+        _, ess, status = weigh_row(log_v, w)
         if status != OK:
             return status, t
         ess_total += ess
@@ -356,16 +344,20 @@ def conditional_smc(
 @exact
 def filtered_path(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh, sizes, ahead,
-    theta, y, seen, u, particles, rng, trajectory, log_increment,
+    theta, y, seen, u, particles, rng, trajectory, log_increment, kept=None,
 ):  # fmt: skip
     """A particle filter that keeps one ancestral path; returns (status, t, log Z).
 
     What PMMH needs (Andrieu, Doucet and Holenstein 2010, section 2.4.2): the likelihood estimate
     and, drawn by the final weights, a path of the same run. Systematic resampling at every step.
+    kept : None, or the whole particle system, written, as of `particle_filter`.
     """
     n_steps, n, d = y.shape[0], particles, trajectory.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
-    genealogy = open_genealogy(n_steps, d, n, DENSE)
+    if kept is None:
+        genealogy = open_genealogy(n_steps, d, n, DENSE)
+    else:
+        genealogy = (kept[0], kept[2], open_genealogy(0, d, 0, 0)[2])
     x, x_before, x_prev = np.empty((d, n)), np.empty((d, n)), np.empty((d, n))
     fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
@@ -378,41 +370,28 @@ def filtered_path(
         step(theta, c, y, seen, u, t, s)
         x, x_before = x_before, x
         if t > 0:
-            copy(w, p)
-            if ahead != NO_LOOK_AHEAD:
-                if sizes[5] > 0:
-                    fit(theta, c, s, x_before, fits_prev)
-                look_ahead(theta, c, s, x_before, fits_prev, log_v)
-                _, status = look_ahead_weights(log_v, w, log_base, ahead, p)
-                if status != OK:
-                    return status, t, -np.inf
+            status = resampling_weights(
+                fit, look_ahead, theta, c, s, x_before, fits_prev, w, ahead, log_v, log_base, p
+            )
+            if status != OK:
+                return status, t, -np.inf
             systematic(rng, p, ancestors)
-            gather(x_before, ancestors, x_prev)
-            if sizes[5] > 0:
-                if ahead != NO_LOOK_AHEAD:
-                    gather(fits_prev, ancestors, fits)
-                else:
-                    fit(theta, c, s, x_prev, fits)
-        fill_normal(rng, normals)
-        if sizes[4] > 0:
-            fill_uniform(rng, uniforms)
-        if t == 0:
-            draw_initial(theta, c, s, x, normals, uniforms, rng)
-            weigh_initial(theta, c, s, x, log_v)
-        else:
-            draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
-            weigh(theta, c, s, x_prev, fits, x, log_v)
+            descend(fit, theta, c, s, x_before, fits_prev, ancestors, ahead, x_prev, fits)
+        move(
+            draw_initial, weigh_initial, draw, weigh, theta, c, s, t, x_prev, fits, x, log_v,
+            normals, uniforms, rng,
+        )  # fmt: skip
         if ahead != NO_LOOK_AHEAD:
             if t > 0:
                 second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
                 log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
         genealogy = remember(genealogy, t, x, ancestors)
-        log_sum, _, status = normalise(log_v, w)
-        if status == NAN and not any_finite(log_v):
-            status = ALL_ZERO
+        log_sum, _, status = weigh_row(log_v, w)
         if status != OK:
             return status, t, -np.inf
         log_increment[t] += log_sum - math.log(n)
+        if kept is not None:
+            copy(w, kept[1][t])
     recall(genealogy, draw_index(w, uniform(rng)), trajectory)
     return OK, n_steps, log_increment.sum()

@@ -1,23 +1,20 @@
-"""A particle filter whose likelihood is a continuous function of the parameters.
+"""Particle filters that are continuous, or nearly so, in the parameters and the random numbers.
 
-S. Malik and M. K. Pitt, "Particle filters for continuous likelihood evaluation and maximisation",
-*Journal of Econometrics* 165 (2011): for one scalar state, resampling inverts a piecewise linear
-distribution function through the sorted particles. With fixed normals and stratified uniforms every
-particle then moves continuously with the parameters. Where two particles change places they have
-one weight, as they are weighed by the observation alone, so that the function stays the same there.
+`smooth_filter`: S. Malik and M. K. Pitt, "Particle filters for continuous likelihood evaluation and
+maximisation", *Journal of Econometrics* 165 (2011): for one scalar state, resampling inverts a
+piecewise linear distribution function through the sorted particles. With fixed normals and
+stratified uniforms every particle then moves continuously with the parameters. Where two particles
+change places they have one weight, as they are weighed by the observation alone, so that the
+function stays the same there.
 
-Notation: N particles, T steps; x : (1, N); w : (N,) normalised weights.
+`correlated_path`, for the correlated pseudo-marginal method (Deligiannidis, Doucet and Pitt 2018,
+section 4.2): all randomness comes in as numbers, and before they are resampled the particles are
+put in order, so that a small change of the numbers or of theta moves the resampled particles a
+little only. One state component is ordered by its value, several along a Hilbert curve (Gerber and
+Chopin 2015), which keeps neighbours together where an order by one coordinate would not see the
+others. The points of the curve are computed by J. Skilling's method (*AIP Conf. Proc.* 707, 2004).
 
-A particle filter as a nearly continuous function of given random numbers and of theta.
-
-For the correlated pseudo-marginal method (Deligiannidis, Doucet and Pitt 2018, section 4.2): all
-randomness comes in as numbers, and before they are resampled the particles are put in order, so
-that a small change of the numbers or of theta moves the resampled particles a little only. One
-state component is ordered by its value, several along a Hilbert curve (Gerber and Chopin 2015),
-which keeps neighbours together where an order by one coordinate would not see the others. The
-points of the curve are computed by J. Skilling's method (*AIP Conf. Proc.* 707, 2004).
-
-Notation as in `conditional_smc.py`.
+Notation: N particles, T steps; x : (D, N); w : (N,) normalised weights.
 """
 
 from __future__ import annotations
@@ -29,21 +26,22 @@ import numpy as np
 from ssmppl.codegen.kernels.math.flags import exact
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.math.special import ndtr
-from ssmppl.codegen.kernels.particle.conditional_smc import draw_index
+from ssmppl.codegen.kernels.particle.conditional_smc import ancestral_path, draw_index
 from ssmppl.codegen.kernels.particle.particle_filter import (
     NO_LOOK_AHEAD,
     add,
-    any_finite,
     copy,
-    gather,
-    look_ahead_weights,
+    descend,
+    resampling_weights,
     second_stage,
+    weigh_row,
 )
 from ssmppl.codegen.kernels.particle.resampling import PADDING
-from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, NAN, OK, normalise
+from ssmppl.codegen.kernels.particle.weights import OK, normalise
 
 CROWDED = 24  # particles in one bucket, from which insertion alone would be slow
 GAPS = (29524, 9841, 3280, 1093, 364, 121, 40, 13, 4, 1)  # (3^k - 1) / 2, D. E. Knuth's
+_LOWEST, _HIGHEST = 1e-16, 1.0 - 1e-16  # of uniforms, which are never 0 or 1
 
 
 @exact
@@ -153,9 +151,6 @@ def smooth_filter(
             return status, t
         log_increment[t] = log_sum - math.log(n)
     return OK, n_steps
-
-
-_LOWEST, _HIGHEST = 1e-16, 1.0 - 1e-16  # of uniforms, which are never 0 or 1
 
 
 @exact
@@ -274,22 +269,25 @@ def correlated_path(
         step(theta, c, y, seen, u, t, s)
         x = history[t]
         if t > 0:
-            copy(w, p)
-            if ahead != NO_LOOK_AHEAD:
-                if sizes[5] > 0:
-                    fit(theta, c, s, history[t - 1], fits_prev)
-                look_ahead(theta, c, s, history[t - 1], fits_prev, log_v)
-                _, status = look_ahead_weights(log_v, w, log_base, ahead, p)
-                if status != OK:
-                    return status, t, -np.inf
+            status = resampling_weights(
+                fit,
+                look_ahead,
+                theta,
+                c,
+                s,
+                history[t - 1],
+                fits_prev,
+                w,
+                ahead,
+                log_v,
+                log_base,
+                p,
+            )
+            if status != OK:
+                return status, t, -np.inf
             order_of(history[t - 1], order)
             ordered_systematic(to_uniform(points[t]), p, order, ancestors)
-            gather(history[t - 1], ancestors, x_prev)
-            if sizes[5] > 0:
-                if ahead != NO_LOOK_AHEAD:
-                    gather(fits_prev, ancestors, fits)
-                else:
-                    fit(theta, c, s, x_prev, fits)
+            descend(fit, theta, c, s, history[t - 1], fits_prev, ancestors, ahead, x_prev, fits)
             copy(ancestors, ancestry[t])
         for i in range(own_uniforms.size):
             own_uniforms[i] = to_uniform(uniforms[t, i])
@@ -304,17 +302,9 @@ def correlated_path(
                 second_stage(w, p, ancestors, part, log_base)
                 add(log_v, log_base)
                 log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
-        log_sum, _, status = normalise(log_v, w)
-        if status == NAN and not any_finite(log_v):
-            status = ALL_ZERO
+        log_sum, _, status = weigh_row(log_v, w)
         if status != OK:
             return status, t, -np.inf
         log_increment[t] += log_sum - math.log(n)
-    k = draw_index(w, to_uniform(points[n_steps]))
-    for back in range(n_steps):
-        t = n_steps - 1 - back
-        for m in range(d):
-            trajectory[t, m] = history[t, m, k]
-        if t > 0:
-            k = ancestry[t, k]
+    ancestral_path(history, ancestry, draw_index(w, to_uniform(points[n_steps])), trajectory)
     return OK, n_steps, log_increment.sum()

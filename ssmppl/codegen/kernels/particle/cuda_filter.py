@@ -1,18 +1,18 @@
-"""The particle filter on a CUDA device: two kernels for each row, over tiles of particles.
+"""The particle filter on a CUDA device: two kernels for each row, over blocks of threads.
 
-`move_tiles` has one thread for each particle. It finds the particle's ancestor, moves and weighs it
+`move_blocks` has a thread for each particle. It finds the particle's ancestor, moves and weighs it
 by the model's functions, those that also run on the processor, over arrays of a single particle;
-then the threads of a tile add their weights up. `join_tiles`, on one block of threads, makes one
-filter of the tiles. Nothing is brought back to the host before the last row.
+then the threads of a block add their weights up. `join_blocks`, on one block of threads, makes one
+filter of the blocks. Nothing is brought back to the host before the last row.
 
-Weights are added up as whole numbers, in units of 2^-52 of the largest weight of a tile, and tiles
-in units that leave room for all of them. Sums of whole numbers do not depend on their order, so
-that every run gives the same numbers, and never fall, so that a search among them cannot find a
+Weights are added up as whole numbers, in units of 2^-52 of the largest weight of a block, and
+blocks in units that leave room for all of them. Sums of whole numbers do not depend on their order,
+so that every run gives the same numbers, and never fall, so that a search among them cannot find a
 particle of weight zero.
 
 These are texts: `codegen/modules/device.py` puts a model's functions and sizes in, and compiles.
 
-Notation: N particles, one to a thread, in tiles of TILE; D states; x : (D, N).
+Notation: N particles, one to a thread, in blocks of THREADS threads; D states; x : (D, N).
 """
 
 from __future__ import annotations
@@ -80,26 +80,26 @@ def running_sum(values, lane, own):
     return found
 
 
-def move_tiles(
+def move_blocks(
     draw_initial, weigh_initial, fit, draw, weigh,
-    tile_size, states, fits, has_fit, normals, uniforms,
+    block_size, states, fits, has_fit, normals, uniforms,
     theta, c, s, t, particles, keys, points, old, old_sums, old_ends, x, sums, tops, squares,
     flags,
 ):  # fmt: skip
-    """Resample, move and weigh one particle; the tile's sums.
+    """Resample, move and weigh one particle; the block's sums.
 
-    tile_size, states, fits, normals, uniforms : whole numbers in the text, of at least 1, as is
+    block_size, states, fits, normals, uniforms : whole numbers in the text, of at least 1, as is
         has_fit, 0 or 1.
     s : (T, S), the constants of each step. keys : (3,) uint64, the state that the particles'
         streams count from. points : (T,), where the systematic points of a row begin, in (0, 1).
-    old, old_sums, old_ends : the particles of row t - 1, their sums within each tile, and (tiles,)
-        the sums of all tiles up to each one.
-    x, sums, tops, squares, flags : written, of row t. tops : (tiles,) the largest log weights.
+    old, old_sums, old_ends : the particles of row t - 1, their sums within each block, and
+        (blocks,) the sums of all blocks up to each one.
+    x, sums, tops, squares, flags : written, of row t. tops : (blocks,) the largest log weights.
     """
     i = cuda.grid(1)
-    lane, tile = cuda.threadIdx.x, cuda.blockIdx.x
-    real = cuda.shared.array(tile_size, np.float64)
-    whole = cuda.shared.array(tile_size, np.int64)
+    lane, block = cuda.threadIdx.x, cuda.blockIdx.x
+    real = cuda.shared.array(block_size, np.float64)
+    whole = cuda.shared.array(block_size, np.int64)
     log_w = cuda.local.array(1, np.float64)
     log_w[0] = -np.inf
     if i < particles:
@@ -118,11 +118,11 @@ def move_tiles(
             draw_initial(theta, c, s[t], one, normal_draws, uniform_draws, stream)
             weigh_initial(theta, c, s[t], one, log_w)
         else:
-            tiles = old_ends.size
-            total = old_ends[tiles - 1]
+            blocks = old_ends.size
+            total = old_ends[blocks - 1]
             point = np.int64((i + points[t]) * (np.float64(total) / particles))
             point = max(min(point, total - 1), 0)
-            low, high = 0, tiles - 1  # the first tile whose end lies beyond the point
+            low, high = 0, blocks - 1  # the first block whose end lies beyond the point
             while low < high:
                 middle = (low + high) // 2
                 if old_ends[middle] > point:
@@ -130,8 +130,8 @@ def move_tiles(
                 else:
                     low = middle + 1
             begin = old_ends[low - 1] if low > 0 else 0
-            first = low * tile_size
-            last = min(first + tile_size, particles) - 1
+            first = low * block_size
+            last = min(first + block_size, particles) - 1
             share = np.float64(point - begin) / max(np.float64(old_ends[low] - begin), 1.0)
             rest = min(np.int64(share * np.float64(old_sums[last])), old_sums[last] - 1)
             low, high = first, last  # the first particle whose sum lies beyond the rest
@@ -164,29 +164,29 @@ def move_tiles(
     if i < particles:
         sums[i] = own
     if lane == 0:
-        tops[tile] = top
-        squares[tile] = np.float64(square) / UNIT
-        flags[tile] = (
+        tops[block] = top
+        squares[block] = np.float64(square) / UNIT
+        flags[block] = (
             (HAS_NAN if any_nan else 0)
             + (HAS_INFINITE if any_infinite else 0)
             + (HAS_FINITE if any_finite else 0)
         )
 
 
-def join_tiles(
-    tile_size, particles, t, sums, tops, squares, flags, ends, log_increment, ess, status
+def join_blocks(
+    block_size, particles, t, sums, tops, squares, flags, ends, log_increment, ess, status
 ):  # fmt: skip
-    """One filter of all tiles: their sums up to each one, and the row's likelihood.
+    """One filter of all blocks: their sums up to each one, and the row's likelihood.
 
-    tile_size : whole number in the text, here of the threads, too. ends : (tiles,), written.
+    block_size : whole number in the text, here of the threads, too. ends : (blocks,), written.
     log_increment, ess, status : (T,), written at t.
     """
     lane = cuda.threadIdx.x
-    real = cuda.shared.array(tile_size, np.float64)
-    whole = cuda.shared.array(tile_size, np.int64)
-    tiles = ends.size
-    each = (tiles + tile_size - 1) // tile_size
-    first, last = min(lane * each, tiles), min((lane + 1) * each, tiles)
+    real = cuda.shared.array(block_size, np.float64)
+    whole = cuda.shared.array(block_size, np.int64)
+    blocks = ends.size
+    each = (blocks + block_size - 1) // block_size
+    first, last = min(lane * each, blocks), min((lane + 1) * each, blocks)
     has = 0
     top = -np.inf
     for b in range(first, last):
@@ -196,15 +196,15 @@ def join_tiles(
     any_infinite = cuda.syncthreads_or(np.int32(has & HAS_INFINITE))
     any_finite = cuda.syncthreads_or(np.int32(has & HAS_FINITE))
     top = largest_of(real, lane, top)
-    room = 1.0  # the sum of all tiles is to stay below 2^62
-    while room < tiles * (tile_size / 512.0):
+    room = 1.0  # the sum of all blocks is to stay below 2^62
+    while room < blocks * (block_size / 512.0):
         room *= 2.0
     own, total, square = np.int64(0), 0.0, 0.0
     for b in range(first, last):
         scale = 0.0
         if tops[b] > -np.inf:
             scale = exp(tops[b] - top)
-        weight = np.float64(sums[min((b + 1) * tile_size, particles) - 1])
+        weight = np.float64(sums[min((b + 1) * block_size, particles) - 1])
         total += weight / UNIT * scale
         square += squares[b] * scale * scale
         own += np.int64(weight * scale / room)

@@ -1,4 +1,4 @@
-"""The particle filter, over the generated functions of a model.
+"""The particle filter, over the generated functions of a model; the steps that other filters share.
 
 Algorithm 2 of Schön et al. (2015) in the auxiliary form of Pitt and Shephard (1999): with weights
 w_{t-1} and look-ahead values v, resample by p ~ w v, move by q, weigh by (w / p) f g / q. With
@@ -11,23 +11,16 @@ every N (Del Moral 2004, proposition 7.4.1; Pitt et al. 2012 for the auxiliary f
 Notation: N particles, T steps; x, x_prev : (D, N), one contiguous row per state component; w : (N,)
 normalised weights; log_v : (N,) unnormalised log weights.
 
-The particle filter over some rows, to be gone on with: what SMC^2 attaches to each parameter.
-
-As `particle_filter.py`, for proposals without look-ahead: resample at every row, move by q, weigh
-by f g / q. The product of the mean weights is unbiased for the likelihood of the rows.
-
-Notation: N particles, D states; x : (D, N); w : (N,) normalised weights.
-
-One particle filter in blocks of particles, which threads share out.
-
-Resampling and normalising are what particles have to wait for each other in. Here each block moves,
-weighs and normalises its own particles, by random numbers of its own, and then only a few numbers
-of each block meet: the weight of particle i of block b is share[b] w[b, i]. From the shares a block
-knows in which blocks the ancestors of its particles lie, and finds them there. So a row is one pass
-that threads need not wait for each other in, and what is computed does not depend on who does it.
-
-Notation: N particles in B blocks of n = `BLOCK`, the last of them filled up with particles of
-weight zero; x : (B, D, n); w : (B, n), the weights within each block; shares : (B,).
+Two forms are for proposals without look-ahead. `filter_rows` runs over some rows, to be gone on
+with: what SMC^2 attaches to each parameter. `move_blocks` is one row of a filter in blocks of
+particles, which threads share out. Resampling and normalising are what particles have to wait for
+each other in; there each block moves, weighs and normalises its own particles, by random numbers of
+its own, and then only a few numbers of each block meet: the weight of particle i of block b is
+share[b] w[b, i]. From the shares a block knows in which blocks the ancestors of its particles lie,
+and finds them there. So a row is one pass that threads need not wait for each other in, and what is
+computed does not depend on who does it. Its arrays: B blocks of n = `BLOCK`, the last of them
+filled up with particles of weight zero; x : (B, D, n); w : (B, n), the weights within each block;
+shares : (B,).
 """
 
 from __future__ import annotations
@@ -37,7 +30,7 @@ import math
 import numpy as np
 
 from ssmppl.codegen.kernels.math.elementary import log
-from ssmppl.codegen.kernels.math.flags import exact, kernel
+from ssmppl.codegen.kernels.math.flags import exact, inlined, kernel
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.kernels.particle.resampling import (
     PADDING,
@@ -63,6 +56,12 @@ NO_LOOK_AHEAD, APPROXIMATE, EXACT, GUIDED = 0, 1, 2, 3
 # the plain weights mixed in, w / p <= 1 / share.
 PLAIN_SHARE = 0.1
 GUIDED_SHARE = 0.02  # where the look-ahead knows all that is to come, and steers the moves too
+BITS = 13
+BLOCK = 1 << BITS
+"""Particles of a block: few enough for their rows to stay in a core's cache."""
+
+_SHIFT = np.uint64(BITS)
+_MASK = np.uint64(BLOCK - 1)
 
 
 @kernel
@@ -171,6 +170,67 @@ def look_ahead_weights(log_v, w, log_base, ahead, p):
 
 
 @exact
+def absent(*arguments):
+    """Stands for a function that a model lacks; never called."""
+
+
+@inlined
+def resampling_weights(
+    fit, look_ahead, theta, c, s, x, fits, w, ahead, log_v, log_base, p
+):  # fmt: skip
+    """p <- what to resample the particles x by: w, or `look_ahead_weights` where there are any; the
+    status of these."""
+    copy(w, p)
+    status = OK
+    if ahead != NO_LOOK_AHEAD:
+        if fits.shape[0] > 0:
+            fit(theta, c, s, x, fits)
+        look_ahead(theta, c, s, x, fits, log_v)
+        _, status = look_ahead_weights(log_v, w, log_base, ahead, p)
+    return status
+
+
+@inlined
+def descend(fit, theta, c, s, x, fits, ancestors, ahead, x_prev, own_fits):
+    """x_prev <- the ancestors of the particles to come, own_fits <- what is fitted to these.
+
+    fits : of the particles x, known where they look ahead.
+    """
+    gather(x, ancestors, x_prev)
+    if own_fits.shape[0] > 0:
+        if ahead != NO_LOOK_AHEAD:
+            gather(fits, ancestors, own_fits)
+        else:
+            fit(theta, c, s, x_prev, own_fits)
+
+
+@inlined
+def move(
+    draw_initial, weigh_initial, draw, weigh, theta, c, s, t, x_prev, fits, x, log_v,
+    normals, uniforms, rng,
+):  # fmt: skip
+    """x (D, N) <- the particles of row t, log_v (N,) <- what they weigh."""
+    fill_normal(rng, normals)
+    if uniforms.size > 0:
+        fill_uniform(rng, uniforms)
+    if t == 0:
+        draw_initial(theta, c, s, x, normals, uniforms, rng)
+        weigh_initial(theta, c, s, x, log_v)
+    else:
+        draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
+        weigh(theta, c, s, x_prev, fits, x, log_v)
+
+
+@inlined
+def weigh_row(log_v, w):
+    """`normalise` the weights of a row, which is impossible where none of them is a number."""
+    log_sum, ess, status = normalise(log_v, w)
+    if status == NAN and not any_finite(log_v):
+        status = ALL_ZERO
+    return log_sum, ess, status
+
+
+@exact
 def particle_filter(
     prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh, predict,
     sizes, ahead, theta, y, seen, u, particles, scheme, ess_threshold, rng,
@@ -248,9 +308,7 @@ def particle_filter(
             weigh(theta, c, s, x_prev, fits, x, log_v)
         if not uniform_base:
             add(log_v, log_base)
-        log_sum, ess[t], status = normalise(log_v, w)
-        if status == NAN and not any_finite(log_v):
-            status = ALL_ZERO
+        log_sum, ess[t], status = weigh_row(log_v, w)
         if status != OK:
             return status, t
         if ess_threshold < 1.0:
@@ -291,30 +349,15 @@ def filter_rows(
             gather(x, ancestors, x_prev)
             if sizes[5] > 0:
                 fit(theta, c, s, x_prev, fits)
-        fill_normal(rng, normals)
-        if sizes[4] > 0:
-            fill_uniform(rng, uniforms)
-        if t == 0:
-            draw_initial(theta, c, s, x, normals, uniforms, rng)
-            weigh_initial(theta, c, s, x, log_v)
-        else:
-            draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
-            weigh(theta, c, s, x_prev, fits, x, log_v)
-        log_sum, _, status = normalise(log_v, w)
-        if status == NAN and not any_finite(log_v):
-            status = ALL_ZERO
+        move(
+            draw_initial, weigh_initial, draw, weigh, theta, c, s, t, x_prev, fits, x, log_v,
+            normals, uniforms, rng,
+        )  # fmt: skip
+        log_sum, _, status = weigh_row(log_v, w)
         if status != OK:
             return status, t
         log_increment[t] = log_sum - log_n
     return OK, stop
-
-
-BITS = 13
-BLOCK = 1 << BITS
-"""Particles of a block: few enough for their rows to stay in a core's cache."""
-
-_SHIFT = np.uint64(BITS)
-_MASK = np.uint64(BLOCK - 1)
 
 
 @kernel
@@ -406,15 +449,10 @@ def move_blocks(
             gather_blocks(old, ancestors, x_prev)
         if t > 0 and sizes[5] > 0:
             fit(theta, c, s, x_prev, fits)
-        fill_normal(streams[b], normals)
-        if sizes[4] > 0:
-            fill_uniform(streams[b], uniforms)
-        if t == 0:
-            draw_initial(theta, c, s, x[b], normals, uniforms, streams[b])
-            weigh_initial(theta, c, s, x[b], log_v)
-        else:
-            draw(theta, c, s, x_prev, fits, x[b], normals, uniforms, streams[b])
-            weigh(theta, c, s, x_prev, fits, x[b], log_v)
+        move(
+            draw_initial, weigh_initial, draw, weigh, theta, c, s, t, x_prev, fits, x[b], log_v,
+            normals, uniforms, streams[b],
+        )  # fmt: skip
         if keep:
             add(log_v, log_base)
         for i in range(max(particles - b * n, 0), n):

@@ -1,49 +1,33 @@
-"""A particle filter that estimates the score and the observed information as it runs.
+"""Score and observed information from the genealogy of a particle filter, by fixed-lag smoothing.
 
 Fisher's identity, grad log p(y) = E[sum_t xi_t | y] with xi_t = grad log { f(x_t | x_{t-1})
 g(y_t | x_t) }, and Louis' identity, - hess log p(y) = - E[sum_t h_t | y] - Var[sum_t xi_t | y]
-with h_t the second derivatives (Schön et al. 2015, section 6; Louis 1982). Expectations at step s
-are taken over the particles' ancestors at s, weighed at step min(s + lag, T): the fixed-lag
-smoother of Kitagawa and Sato (2001), as Dahlin, Lindsten and Schön (2015) use it. The variance of
-the sum takes pairs of steps in as far as they are `lag` apart. The weights at s + lag are carried
-back along the ancestors, which costs O(N lag) a step and no memory beyond 2 lag + 1 steps.
+with h_t the second derivatives (Schön et al. 2015, section 6; Louis 1982). Expectations at a step
+are taken over the ancestors there of the weighted particles at a later step: the fixed-lag smoother
+(Kitagawa 1996; Kitagawa and Sato 2001; Olsson, Cappé, Douc and Moulines 2008), which needs no
+transition density and so holds for deterministic components.
 
-Notation as in `conditional_smc.py`; xi : (P, N) at one step, h : (P (P + 1) / 2, N), row by row of
-the lower half.
+`path_score` weighs step s at step min(s + lag, T), as Dahlin, Lindsten and Schön (2015) do. The
+variance of the sum takes pairs of steps in as far as they are `lag` apart. The weights at s + lag
+are carried back along the ancestors, which costs O(N lag) a step and derivatives of 2 lag + 1 steps
+at a time.
 
-Smoothed complete-data scores, row by row, from the genealogy of a particle filter.
+`row_scores` keeps the rows apart. Rows are done in blocks, so that all rows of a block share one
+pass back along the ancestors: the lag is `lag` for the last row of a block and less than twice that
+for the first; only ancestors with a weight are evaluated.
 
-Fisher's identity: d log p(y_{1:T}) / d theta = sum_t E[xi_t | y_{1:T}], with xi_t the derivative of
-log { f(x_t | x_{t-1}) g(y_t | x_t) }. Expectations at row t are taken over the ancestors at t - 1
-and t of the weighted particles at a later row: the fixed-lag smoother (Kitagawa 1996; Olsson,
-Cappé, Douc and Moulines 2008), which needs no transition density and so holds for deterministic
-components. Rows are done in blocks, so that all rows of a block share one pass back along the
-ancestors: the lag is `lag` for the last row of a block and less than twice that for the first.
-
-Notation: F derivatives, N particles, T rows; only ancestors with a weight are evaluated.
+Notation: N particles, T rows, P or F derivatives; xi : (P, N) at one step, h : (P (P + 1) / 2, N),
+row by row of the lower half.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ssmppl.codegen.kernels.math.flags import exact
-from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform, uniform
-from ssmppl.codegen.kernels.particle.conditional_smc import draw_index
-from ssmppl.codegen.kernels.particle.particle_filter import (
-    NO_LOOK_AHEAD,
-    add,
-    any_finite,
-    copy,
-    gather,
-    look_ahead_weights,
-    second_stage,
-)
-from ssmppl.codegen.kernels.particle.resampling import PADDING, systematic
+from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
+from ssmppl.codegen.kernels.particle.particle_filter import copy, gather
 from ssmppl.codegen.kernels.particle.simulation import mix_channels
-from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, NAN, OK, normalise
 
 
 @exact
@@ -98,22 +82,18 @@ def add_information(w, s, lag, xis, hs, ancestry, mean, before, information):
 
 
 @exact
-def filter_with_score(
-    prepare, step, draw_initial, weigh_initial, fit, look_ahead, draw, weigh,
-    gradient_initial, gradient, hessian_initial, hessian, sizes, ahead, second,
-    theta, y, seen, u, particles, rng, trajectory, log_increment, lag, score, information,
+def path_score(
+    prepare, step, gradient_initial, gradient, hessian_initial, hessian, sizes, second,
+    theta, y, seen, u, history, weights, ancestry, lag, score, information,
 ):  # fmt: skip
-    """`filtered_path` with score (P,) and, if `second`, information (P, P); returns (status, t,
-    log Z)."""
-    n_steps, n, d, n_parameters = y.shape[0], particles, trajectory.shape[1], score.size
+    """Write the score (P,) and, if `second`, the information (P, P), from a particle system.
+
+    history (T, D, N), weights (T, N), ancestry (T, N) : as of `filtered_path`.
+    """
+    n_steps, d, n = history.shape
+    n_parameters = score.size
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
-    history, ancestry = np.empty((n_steps, d, n)), np.empty((n_steps, n), dtype=np.int32)
-    x_prev = np.empty((d, n))
-    fits, fits_prev = np.empty((sizes[5], n)), np.empty((sizes[5], n))
-    normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
-    log_v, log_base, part = np.empty(n), np.empty(n), np.empty(n)
-    w, p, back, further = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    ancestors = np.empty(n + PADDING, dtype=np.int32)
+    x_prev, back, further = np.empty((d, n)), np.empty(n), np.empty(n)
     ring = 2 * lag + 1
     xis = np.empty((ring, n_parameters, n))
     mean, before = np.empty(n_parameters), np.empty(n_parameters)
@@ -124,58 +104,22 @@ def filter_with_score(
             for j in range(n_parameters):
                 information[i, j] = 0.0
     score[:] = 0.0
-    log_increment[:] = 0.0
     prepare(theta, c)
     for t in range(n_steps):
         step(theta, c, y, seen, u, t, s)
-        x = history[t]
-        if t > 0:
-            copy(w, p)
-            if ahead != NO_LOOK_AHEAD:
-                if sizes[5] > 0:
-                    fit(theta, c, s, history[t - 1], fits_prev)
-                look_ahead(theta, c, s, history[t - 1], fits_prev, log_v)
-                _, status = look_ahead_weights(log_v, w, log_base, ahead, p)
-                if status != OK:
-                    return status, t, -np.inf
-            systematic(rng, p, ancestors)
-            gather(history[t - 1], ancestors, x_prev)
-            if sizes[5] > 0:
-                if ahead != NO_LOOK_AHEAD:
-                    gather(fits_prev, ancestors, fits)
-                else:
-                    fit(theta, c, s, x_prev, fits)
-            copy(ancestors, ancestry[t])
-        fill_normal(rng, normals)
-        if sizes[4] > 0:
-            fill_uniform(rng, uniforms)
         if t == 0:
-            draw_initial(theta, c, s, x, normals, uniforms, rng)
-            weigh_initial(theta, c, s, x, log_v)
-            gradient_initial(theta, c, s, x, xis[0])
+            gradient_initial(theta, c, s, history[t], xis[0])
             if second:
-                hessian_initial(theta, c, s, x, hs[0])
+                hessian_initial(theta, c, s, history[t], hs[0])
         else:
-            draw(theta, c, s, x_prev, fits, x, normals, uniforms, rng)
-            weigh(theta, c, s, x_prev, fits, x, log_v)
-            gradient(theta, c, s, x_prev, x, xis[t % ring])
+            gather(history[t - 1], ancestry[t], x_prev)
+            gradient(theta, c, s, x_prev, history[t], xis[t % ring])
             if second:
-                hessian(theta, c, s, x_prev, x, hs[t % later])
-        if ahead != NO_LOOK_AHEAD:
-            if t > 0:
-                second_stage(w, p, ancestors, part, log_base)
-                add(log_v, log_base)
-                log_increment[t] = math.log(n)  # the second-stage weights hold 1 / N already
-        log_sum, _, status = normalise(log_v, w)
-        if status == NAN and not any_finite(log_v):
-            status = ALL_ZERO
-        if status != OK:
-            return status, t, -np.inf
-        log_increment[t] += log_sum - math.log(n)
+                hessian(theta, c, s, x_prev, history[t], hs[t % later])
         # smooth what is `lag` steps old, at the end all that is left
         last = t == n_steps - 1
         if last or t >= lag:
-            copy(w, back)
+            copy(weights[t], back)
             for r in range(t, max(t - lag, 0) - 1, -1):
                 if last or r == t - lag:
                     add_score(back, xis[r % ring], mean, score)
@@ -188,14 +132,6 @@ def filter_with_score(
         for i in range(n_parameters):
             for j in range(i):
                 information[j, i] = information[i, j]
-    k = draw_index(w, uniform(rng))
-    for back_by in range(n_steps):
-        t = n_steps - 1 - back_by
-        for m in range(d):
-            trajectory[t, m] = history[t, m, k]
-        if t > 0:
-            k = ancestry[t, k]
-    return OK, n_steps, log_increment.sum()
 
 
 @exact

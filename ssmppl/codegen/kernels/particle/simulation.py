@@ -1,6 +1,6 @@
-"""Simulation of states and observations, many draws side by side.
+"""Simulation of states and observations, many draws side by side, and one-step predictions of y_t.
 
-One-step predictions of the observation, from weighted particles moved by the transition.
+A prediction moves the weighted particles of the row before by the transition.
 """
 
 from __future__ import annotations

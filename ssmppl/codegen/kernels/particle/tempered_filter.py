@@ -22,11 +22,9 @@ import numpy as np
 from ssmppl.codegen.kernels.math.elementary import exp, log
 from ssmppl.codegen.kernels.math.flags import exact, kernel
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform, uniform
-from ssmppl.codegen.kernels.particle.particle_filter import any_finite, copy, gather
+from ssmppl.codegen.kernels.particle.particle_filter import copy, gather, weigh_row
 from ssmppl.codegen.kernels.particle.resampling import PADDING, systematic
 from ssmppl.codegen.kernels.particle.weights import (
-    ALL_ZERO,
-    NAN,
     OK,
     normalise,
     summarise,
@@ -196,9 +194,7 @@ def tempered_filter(
                 temperatures[t, level] = up_to
             up_to = temperatures[t, level]
             power(log_g, up_to - at, log_v)
-            log_sum, ess[t], status = normalise(log_v, w)
-            if status == NAN and not any_finite(log_v):
-                status = ALL_ZERO
+            log_sum, ess[t], status = weigh_row(log_v, w)
             if status != OK:
                 return status, t
             total += log_sum - log_n

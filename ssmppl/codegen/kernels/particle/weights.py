@@ -1,6 +1,7 @@
-"""Normalised importance weights, their sum and their effective size; an index drawn by weights.
+"""Weights of particles and of trajectories: normalised, drawn by, and what is summed and ranked by
+them.
 
-The sum is taken after subtracting the maximum (log-sum-exp); the effective sample size is
+Sums of weights are taken after subtracting the maximum (log-sum-exp); the effective sample size is
 (sum W)^2 / sum W^2, A. Kong, J. S. Liu and W. H. Wong, *JASA* 89 (1994).  Passes that vectorise;
 nothing is allocated.
 
@@ -8,11 +9,8 @@ A loop that adds up stores nothing.  Before a loop that does both the compiler c
 addresses of its arrays, and takes the scalar one if they are close: the order of the sum, and with
 it the last digit, would depend on where short arrays happen to lie.
 
-Weighted means, covariances and quantiles of particles.
-
-A particle without weight counts for nothing, be its values infinite or undefined.
-
-Statistics of many trajectories: each one's own, and their weighted means.
+In means, covariances and quantiles a particle without weight counts for nothing, be its values
+infinite or undefined.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ DEFENSIVE = 0.02  # share of the transition in the proposal's mixture; as in the
 
 # In this order each one's text may name those before it.
 SPECIALISED = (
-    "spread_of", "kept_factors", "steered_fit", "steered_look_ahead", "steered_draw",
-    "steered_weigh", "steered_draw_initial", "steered_weigh_initial",
+    "spread_of", "kept_factors", "twisted_fit", "twisted_look_ahead", "twisted_draw",
+    "twisted_weigh", "twisted_draw_initial", "twisted_weigh_initial",
 )  # fmt: skip
 
 
@@ -124,26 +124,26 @@ def solve_upper(c, h):
 
 
 @exact
-def steered_fit(rest, spread_of, varies, theta, c, s, states_prev, fits):
+def twisted_fit(rest, spread_of, varies, theta, c, s, states_prev, fits):
     """fits (R + 1 ..., N) <- the noise's mean under the guide, the log of what psi_t can be
     expected to be, and C where it varies."""
     d, n, r = states_prev.shape[0], states_prev.shape[1], int(s[0])
     pull, centre = 1 + d * (d + 1) // 2, 1 + d * (d + 1) // 2 + d
-    away, steered = np.empty((d, n)), np.empty((d, n))
+    away, slope = np.empty((d, n)), np.empty((d, n))
     mean, ahead = fits[:r], fits[r]
     rest(theta, c, s, states_prev, away)
     for i in range(d):
         for k in range(n):
             away[i, k] -= s[centre + i]
     for i in range(d):
-        set_row(steered[i], s[pull + i])
+        set_row(slope[i], s[pull + i])
         for j in range(d):
             k = 1 + max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
             if s[k] != 0.0:
-                add_scaled(s[k : k + 1], away[j], -1.0, steered[i])
+                add_scaled(s[k : k + 1], away[j], -1.0, slope[i])
     set_row(ahead, 0.0)
     for i in range(d):  # g' v - v' A v / 2, with v the way from the centre
-        add_scaled(steered[i], away[i], 0.5, ahead)
+        add_scaled(slope[i], away[i], 0.5, ahead)
         add_scaled(s[pull + i : pull + i + 1], away[i], 0.5, ahead)
     ls = spread_of(theta, c, s, states_prev)
     root = factors(s, ls, d, r)
@@ -151,7 +151,7 @@ def steered_fit(rest, spread_of, varies, theta, c, s, states_prev, fits):
         set_row(mean[k], 0.0)
         for j in range(d):
             if ls.shape[1] > 1 or ls[j * r + k, 0] != 0.0:
-                add_scaled(ls[j * r + k], steered[j], 1.0, mean[k])
+                add_scaled(ls[j * r + k], slope[j], 1.0, mean[k])
     solve_lower(root, mean)
     for k in range(r):
         add_scaled(mean[k], mean[k], 0.5, ahead)
@@ -174,7 +174,7 @@ def steered_fit(rest, spread_of, varies, theta, c, s, states_prev, fits):
 
 
 @exact
-def steered_look_ahead(theta, c, s, states_prev, fits, log_w):
+def twisted_look_ahead(theta, c, s, states_prev, fits, log_w):
     """log_w <- log of what psi_t can be expected to be, given x_{t-1}."""
     for i in range(log_w.size):
         log_w[i] = fits[int(s[0]), i]
@@ -189,7 +189,7 @@ def kept_factors(spread_of, varies, theta, c, s, x, fits):
 
 
 @exact
-def steered_noise(mean, root, normals, uniforms, n):
+def twisted_noise(mean, root, normals, uniforms, n):
     """Noise (R, N) under the guide, or for a share of the particles under the transition."""
     r = mean.shape[0]
     out = np.empty((r, n))
@@ -205,7 +205,7 @@ def steered_noise(mean, root, normals, uniforms, n):
 
 
 @exact
-def steered_ratio(e, mean, root, log_w):
+def twisted_ratio(e, mean, root, log_w):
     """log_w -= log (q / f) of the noise e (R, N)."""
     r, n = e.shape
     distance, volume = np.zeros(n), np.zeros(n)
@@ -229,18 +229,18 @@ def steered_ratio(e, mean, root, log_w):
 
 
 @exact
-def steered_draw(
+def twisted_draw(
     kept_factors, follow,
     theta, c, s, states_prev, fits, states, normals, uniforms, rng,
 ):  # fmt: skip
     """Draw x_t given x_{t-1} under the guide."""
     root = kept_factors(theta, c, s, states_prev, fits)
-    e = steered_noise(fits[: int(s[0])], root, normals, uniforms, states.shape[1])
+    e = twisted_noise(fits[: int(s[0])], root, normals, uniforms, states.shape[1])
     follow(theta, c, s, states_prev, e, states)
 
 
 @exact
-def steered_weigh(
+def twisted_weigh(
     kept_factors, recover, weigh_observed,
     theta, c, s, states_prev, fits, states, log_w,
 ):  # fmt: skip
@@ -249,7 +249,7 @@ def steered_weigh(
     e = np.zeros((int(s[0]), states.shape[1]))
     recover(theta, c, s, states_prev, states, e)
     weigh_observed(theta, c, s, states, log_w)
-    steered_ratio(e, fits[: int(s[0])], root, log_w)
+    twisted_ratio(e, fits[: int(s[0])], root, log_w)
 
 
 @exact
@@ -265,14 +265,14 @@ def start_of(s, d):
 
 
 @exact
-def steered_draw_initial(begin, theta, c, s, states, normals, uniforms, rng):
+def twisted_draw_initial(begin, theta, c, s, states, normals, uniforms, rng):
     """Draw x_1 under the guide."""
     mean, root = start_of(s, states.shape[0])
-    begin(theta, c, s, steered_noise(mean, root, normals, uniforms, states.shape[1]), states)
+    begin(theta, c, s, twisted_noise(mean, root, normals, uniforms, states.shape[1]), states)
 
 
 @exact
-def steered_weigh_initial(
+def twisted_weigh_initial(
     recover_initial, weigh_observed, theta, c, s, states, log_w
 ):  # fmt: skip
     """Log weight of x_1."""
@@ -280,4 +280,4 @@ def steered_weigh_initial(
     e = np.zeros((int(s[0]), states.shape[1]))
     recover_initial(theta, c, s, states, e)
     weigh_observed(theta, c, s, states, log_w)
-    steered_ratio(e, mean, root, log_w)
+    twisted_ratio(e, mean, root, log_w)
