@@ -3,7 +3,7 @@
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from ssmppl.codegen.text.module import specialise as module
+from ssmppl.codegen.text import specialise as module
 from ssmppl.codegen.text.specialise import specialise
 
 NONE, SOME = 0, 1
