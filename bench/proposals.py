@@ -37,7 +37,9 @@ def derived(problem: Problem) -> dict[str, Proposal]:
     found |= {} if isinstance(marginal, NotApplicable) else marginal.proposals
     if isinstance(found["guided"], NotApplicable):  # else it is no match for the others
         tempered = problem.program.tempered
-        found["tempered"] = tempered if isinstance(tempered, NotApplicable) else tempered.proposal
+        found["tempered"] = (
+            tempered if isinstance(tempered, NotApplicable) else tempered.proposals["tempered"]
+        )
     return {k: p for k, p in found.items() if not isinstance(p, NotApplicable)}
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.kalman.square_root import OK, kalman_filter, square_root
+from ssmppl.codegen.kernels.kalman.square_root import OK, kalman_filter, rests, square_root
 
 STEPS = 400
 NAMES = (
@@ -87,13 +87,13 @@ def test_roots_at_rest():
     """But for rounding, whatever the signs of the columns."""
     root = np.array([[2.0, 0.0], [3.0, 4.0]])
     last = root.copy()
-    assert square_root.rests(root * np.array([-1.0, 1.0]), last)
+    assert rests(root * np.array([-1.0, 1.0]), last)
     np.testing.assert_array_equal(last, root)
     root[1, 0] += 4e-14
-    assert not square_root.rests(root, last)
-    assert square_root.rests(root, last)
+    assert not rests(root, last)
+    assert rests(root, last)
     root[1, 0] += 4e-15
-    assert square_root.rests(root, last)
+    assert rests(root, last)
 
 
 def test_what_is_learned_beside_what_no_data_tell():
