@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmppl.codegen.kernels.kalman.square_root import OK, kalman_filter, rests, square_root
+from ssmppl.codegen.kernels.kalman.square_root import OK, kalman_filter, rests
 
 STEPS = 400
 NAMES = (
