@@ -8,6 +8,7 @@ from pathlib import Path
 from ssmppl.diagnosis.report.findings import COLUMNS, Findings
 from ssmppl.diagnosis.report.page import GENERATOR, page
 from ssmppl.diagnosis.report.panels import TITLES, pictures
+from ssmppl.diagnosis.report.text import report_text
 from ssmppl.errors import ArgumentError
 
 PAGE_FILE = "index.html"
@@ -41,7 +42,7 @@ def save(report: Findings, folder: str | os.PathLike[str]) -> Path:
         if report.model_text:
             (target / MODEL_FILE).write_text(report.model_text, encoding="utf-8")
             written.add(MODEL_FILE)
-        (target / TEXT_FILE).write_text(f"{report}\n", encoding="utf-8")
+        (target / TEXT_FILE).write_text(f"{report_text(report)}\n", encoding="utf-8")
         (target / PAGE_FILE).write_text(text, encoding="utf-8")
         for name in before - written:
             (target / name).unlink(missing_ok=True)

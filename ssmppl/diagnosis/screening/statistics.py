@@ -40,7 +40,7 @@ def autoregressive(
         for i, r in enumerate(rho):
             moved = np.concatenate([np.zeros_like(rows[:1]), r * rows[:-1]])
             bands = np.stack([np.ones(len(rows)), np.full(len(rows), -r)])
-            past = solve_banded((1, 0), bands, moved.reshape(len(rows), -1))
+            past = solve_banded((1, 0), bands, moved.reshape(len(rows), -1), check_finite=False)
             # past_t = sum_{j >= 1} r^j S_{t-j}
             found[..., i] += own + np.sum(rows * past.reshape(rows.shape), axis=0)
     return found

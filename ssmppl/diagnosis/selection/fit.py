@@ -1,9 +1,10 @@
 """Fits of a model and of its augmentations: the mode of the posterior.
 
-Linear Gaussian models are climbed with their exact score. Others are climbed by the extended Kalman
-filter's log-likelihood where there is one, which is smooth and takes a millisecond, from several
-starts, and from there by the particle smoother's score. How far the top still is is told in nats:
-g' H^-1 g / 2 is what a quadratic would still gain.
+Models are climbed by the extended Kalman filter's log-likelihood where there is one, which is
+smooth and takes a millisecond. For linear Gaussian models it is exact; where that climb does not
+end at its top, and from starts that nothing is known of, they are climbed with their exact score.
+Others are climbed from several starts, and from there by the particle smoother's score. How far the
+top still is is told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
 
 The climb by noisy scores is a quasi-Newton ascent: z <- z + H^-1 g on the unconstrained scale, with
 H an estimate of the information, kept up by damped BFGS updates (Nocedal and Wright 2006, procedure
@@ -40,7 +41,7 @@ from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.newton import Top, climb, information_at, newton_step
+from ssmppl.inference.optimisation.newton import GOOD, Top, climb, information_at, newton_step
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
@@ -271,7 +272,8 @@ class Fitter:
     # -- by the extended Kalman filter
     def _extended_log_likelihood(self, problem: Problem) -> Callable[[np.ndarray], float] | None:
         """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no
-        number; None where the model has no such filter."""
+        number; None where the model has no such filter. Of a linear Gaussian model by the exact
+        filter where rounding leaves that one without a number, as next to a vague initial law."""
         twisted = problem.program.twisted if self.settings.proposal == "twisted" else None
         if not isinstance(twisted, TwistedFilter):
             return None
@@ -282,6 +284,9 @@ class Fitter:
                 total += (
                     twisted.extended_log_likelihood(theta, e.y, e.seen, e.u) + self.log_correction
                 )
+            if isinstance(self.kalman, KalmanModel) and not np.isfinite(total):
+                shift = len(problem.experiments) * self.log_correction
+                total = self.kalman.log_likelihood(problem.experiments, theta) + shift
             return total if np.isfinite(total) else -np.inf
 
         return value
@@ -363,15 +368,16 @@ class Fitter:
     ) -> Fit:  # fmt: skip
         problem = space.problem
         setup = Maximization(problem, space, "posterior", self.fixed, start, seed)
-        # The extended filter's is the same here, and needs no matrices to be put together.
+        # The extended filter's is the same here, and needs no matrices to be put together. Where
+        # errors are wanted it has to end at its top; else to within what a decision needs.
         smooth = self._extended_log_likelihood(problem) or partial(
             kalman.log_likelihood, problem.experiments
         )
         function = density_of(space, smooth)
         top = None
-        if not effort.pilot:  # from near the top, and to within what a decision needs
+        if not effort.pilot:
             top = climb(function, space.z[space.where])
-        if top is not None and top.distance < NEAR:
+        if top is not None and top.distance < (GOOD if effort.standard_errors else NEAR):
             theta, converged = space.parameters(top.z)[0].copy(), True
         elif len(space.where):
             ascent = climb_exactly(setup, DirectOptimization(restarts=int(effort.pilot)))

@@ -94,14 +94,21 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
 
 def information_at(function: Function, z: np.ndarray) -> np.ndarray:
     """(F, F) minus the second derivatives at z (F,), by differences over a small share of a width;
-    0 where there is a point without a value."""
+    NaN where there is a point without a value."""
     z = np.array(z, dtype=float)
-    if not len(z):
-        return np.zeros((0, 0))
+    nothing = np.full((len(z), len(z)), np.nan)
     value = function(z)
+    if not len(z) or not np.isfinite(value):
+        return nothing
     width = widths(function, z, value, np.full(len(z), FIRST))
-    _, _, curvature = _derivatives(function, z, value, width, half=FINE)
-    return curvature / np.outer(width, width)
+    seen: list[float] = []
+
+    def kept(z: np.ndarray) -> float:
+        seen.append(function(z))
+        return seen[-1]
+
+    _, _, curvature = _derivatives(kept, z, value, width, half=FINE)
+    return curvature / np.outer(width, width) if np.all(np.isfinite(seen)) else nothing
 
 
 def _further(

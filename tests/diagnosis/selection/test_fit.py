@@ -117,6 +117,28 @@ def test_the_information_of_an_exact_fit_is_the_curvature_at_its_mode(name):
     np.testing.assert_allclose(top.information, curvature, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("sd", [1.0, 1e7], ids=["known start", "vague start"])
+@pytest.mark.parametrize("moves", [True, False], ids=["moves", "at rest"])
+def test_the_fast_climb_of_a_linear_gaussian_model_is_the_exact_one(sd, moves):
+    """With a vague start rounding leaves the extended filter without a number where the exact one
+    has it; at rest the scale of the noise runs to its bound."""
+    e, w = np.random.default_rng(seed_of("fast climb")).standard_normal((2, 151))
+    y = np.cumsum(0.5 * w) + e if moves else e[1:] - 0.8 * e[:-1]
+    problem = pose(level(ssm.Normal(0.0, sd=sd)), {"y": y})
+    fast, exact = (
+        Fitter(problem, {}, Settings(100, proposal)).fit(
+            problem.experiments, seed_sequence(1), {"q": 0.3, "r": 0.8}, FROM_START
+        )
+        for proposal in ("twisted", "bootstrap")
+    )
+    np.testing.assert_array_equal(fast.at_bound, exact.at_bound)
+    assert fast.at_bound.tolist() == [not moves, False]
+    assert fast.log_likelihood == pytest.approx(exact.log_likelihood, abs=2e-3)
+    assert fast.z[~fast.at_bound] == pytest.approx(exact.z[~exact.at_bound], abs=2e-2)
+    inside = np.ix_(~fast.at_bound, ~fast.at_bound)
+    np.testing.assert_allclose(fast.information[inside], exact.information[inside], rtol=0.05)
+
+
 def test_a_fit_may_start_with_an_information_matrix():
     """That of the parameters, here the exact one: the mode is the same, and nothing is simulated
     until the errors are asked for."""

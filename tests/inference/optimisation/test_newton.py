@@ -37,6 +37,17 @@ def test_the_information_is_the_curvature_also_where_the_third_derivative_is_lar
     np.testing.assert_allclose(information_at(function, at), exact, rtol=3e-4)
 
 
+def test_there_is_no_information_beside_a_point_without_a_value():
+    """Not a matrix of zeros, which would read as a likelihood that does not move."""
+
+    def function(z):
+        return -0.5 * z @ z if z[0] <= 0.0 else -np.inf
+
+    assert np.all(np.isnan(information_at(function, np.zeros(2))))
+    assert np.all(np.isnan(information_at(function, np.ones(2))))
+    np.testing.assert_allclose(information_at(function, -np.ones(2)), np.eye(2), atol=1e-5)
+
+
 def test_a_curved_valley_is_followed_to_its_end():
     """Rosenbrock's, from where Newton's matrix is not definite."""
     found = climb(lambda z: -100.0 * (z[1] - z[0] ** 2) ** 2 - (1.0 - z[0]) ** 2,
