@@ -1,4 +1,4 @@
-"""The group of commands: how help is laid out, how errors are told, what the exit codes are.
+"""The group of commands: how help is laid out, how errors are shown, what the exit codes are.
 
 ====  ==============================================================================
 code  when
@@ -252,7 +252,7 @@ def _without_colour(ctx: click.Context, option: click.Parameter, value: bool) ->
     if not value:
         return
     one: click.Context | None = ctx
-    while one is not None:  # an error is told by the group
+    while one is not None:  # the group shows the error
         one.color = False
         one = one.parent
     before = os.environ.get("NO_COLOR")
@@ -273,8 +273,8 @@ def _plain() -> bool:
 
 
 def _message(error: SSMError, fix: str) -> str:
-    told = str(error).removesuffix(error.fix) + fix
-    return "\n".join([f"{type(error).__name__}\n{told}", *getattr(error, "__notes__", ())])
+    text = str(error).removesuffix(error.fix) + fix
+    return "\n".join([f"{type(error).__name__}\n{text}", *getattr(error, "__notes__", ())])
 
 
 def _show_warning(

@@ -128,12 +128,12 @@ def columns_of(dataset: xr.Dataset) -> dict[str, Any]:
             found.setdefault(part, {}).setdefault(name, {})[what] = table[column].to_numpy()
     for name in predicted:
         if f"{name}_quantile" in dataset:
-            told = dataset[f"{name}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
-            for *index, j in np.ndindex(*told.shape[1:]):
+            quantiles = dataset[f"{name}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
+            for *index, j in np.ndindex(*quantiles.shape[1:]):
                 plain = name.removesuffix("_predicted")
                 label = component_label(name, index, own).replace(name, plain, 1)
-                level = f"{100 * float(told['quantile'][j]):.6g}"
-                found["predicted"][label][f"q{level.zfill(2)}"] = told.values[:, *index, j]
+                level = f"{100 * float(quantiles['quantile'][j]):.6g}"
+                found["predicted"][label][f"q{level.zfill(2)}"] = quantiles.values[:, *index, j]
     return found
 
 

@@ -44,7 +44,7 @@ def titles(count: int) -> list[str]:
 
 @styled
 def plot_filter(result: Any, *, ax: Any = None) -> Any:
-    """Effective sample size of a filter with the times of resampling, and what each row told.
+    """Effective sample size of a filter with times of resampling, and the increment of each row.
 
     Above, the effective sample size after each row, between 0 and N; the marks at the bottom stand
     at the rows after which the particles were resampled, if that was not at all of them. Below,
@@ -88,8 +88,8 @@ def plot_filter(result: Any, *, ax: Any = None) -> Any:
         total = np.mean([total_of(row) for row in increments])
         what = "log-likelihood" if len(increments) == 1 else "mean log-likelihood"
         sign = "−" if total < 0 else ""
-        told = f"{what} {sign}{abs(total):.6g}"
-        column[-1].set_title(told if sizes else "\n".join([*notes, told]))
+        title = f"{what} {sign}{abs(total):.6g}"
+        column[-1].set_title(title if sizes else "\n".join([*notes, title]))
         bare(column[-1])
         if sizes:
             column[0].set_title("\n".join(notes))

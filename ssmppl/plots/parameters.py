@@ -52,7 +52,7 @@ def plot_prior_posterior(
     """The density of each parameter before and after the data: prior dashed, posterior filled.
 
     Thin lines are single chains; where they differ from the whole, the chains have not mixed. A
-    posterior like its prior was not told anything by the data. The prior is drawn over the range of
+    posterior like its prior has learned nothing from the data. The prior is drawn over the range of
     the posterior, so that a vague one is a low line.
 
     Parameters

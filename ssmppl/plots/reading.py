@@ -244,7 +244,7 @@ def quantiles_at_levels(dataset: Any, variable: str, name: str, verb: str) -> di
     ------
     ArgumentError : the result has others.
     """
-    told = dataset[f"{variable}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
+    quantiles = dataset[f"{variable}_quantile"].isel(draw=0).transpose("time", ..., "quantile")
     known = dataset["quantile"].values
     places = [np.flatnonzero(np.isclose(known, level)) for level in LEVELS]
     if not all(len(p) for p in places):
@@ -252,7 +252,7 @@ def quantiles_at_levels(dataset: Any, variable: str, name: str, verb: str) -> di
             f"{verb} draws the quantiles {_texts(LEVELS)}, and the result has {_texts(known)}",
             fix="leave quantiles= out of the call that made it",
         )
-    values = np.moveaxis(told.values[..., [p[0] for p in places]], -1, 0)  # (5, T, ...)
+    values = np.moveaxis(quantiles.values[..., [p[0] for p in places]], -1, 0)  # (5, T, ...)
     return dict(components(name, values, 2))
 
 

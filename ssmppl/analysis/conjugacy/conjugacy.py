@@ -103,8 +103,10 @@ def conjugate_update(search: Search, found: Found) -> Update:
     )
     hyperparameters = search.unread(found.components)
     if hyperparameters is not None and not found.correction and not form.left:
-        told = describe.prior_alone(found.components, hyperparameters, "from which it is drawn")
-        return replace(update, explanation=told)
+        explanation = describe.prior_alone(
+            found.components, hyperparameters, "from which it is drawn"
+        )
+        return replace(update, explanation=explanation)
     title = name = joined(found.components)
     lines = None
     if family.as_matrices:

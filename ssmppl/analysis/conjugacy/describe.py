@@ -1,8 +1,8 @@
 """Updates in words: what is drawn, from which law, with which statistics.
 
-A block of few numbers is told function by function. One of vectors or matrices is told by sums of
-outer products, read off the laws (Normal or MvNormal, mean affine in the block) that it enters; by
-its functions where these laws are of another kind.
+A block of few numbers is described function by function. One of vectors or matrices is described
+by sums of outer products, read off the laws (Normal or MvNormal, mean affine in the block) that it
+enters; by its functions where these laws are of another kind.
 """
 
 from __future__ import annotations
@@ -313,7 +313,7 @@ def named(components: Sequence[Expr], trace: Trace) -> str:
 
 
 class MatrixWording:
-    """The statistics of a block as sums of outer products; None where they cannot be told so."""
+    """The statistics of a block as sums of outer products; None where they are not of that form."""
 
     def __init__(self, form: BlockForm, trace: Trace):
         self.form, self.block = form, form.components

@@ -17,8 +17,8 @@ log det W, W_ij, W_ij theta_jk, W_ij theta_ik      matrix Normal-Wishart (W = P)
 theta_jl                                           matrix Normal-inverse-Wishart (W = C^-1)
 =================================================  =============================================
 
-(Bernardo and Smith (1994), "Bayesian theory", appendix A.) A law is told by the functions alone,
-never by a distribution's name. All that is known of one is in its class, by the protocol of
+(Bernardo and Smith (1994), "Bayesian theory", appendix A.) A law is determined by the functions
+alone, never by a distribution's name. All that is known of one is in its class, by the protocol of
 `family.py`; the last lines below are the list that is searched. Matrices: `matrix_families.py`.
 """
 
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 FLAT = 1e-12  # curvature relative to the largest, below which a direction counts as flat
 LEAST_SHARE = 1e-12  # of a Dirichlet's mode
-FEW = 3  # Normal numbers whose functions are told one by one
+FEW = 3  # Normal numbers whose functions are listed one by one
 
 
 @dataclass(frozen=True)

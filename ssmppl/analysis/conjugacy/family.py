@@ -136,11 +136,11 @@ class Family(ABC):
 
     @property
     def as_matrices(self) -> bool:
-        """Whether the functions are too many to be told one by one."""
+        """Whether the functions are too many to be listed one by one."""
         return self.matrix_size > 0
 
     def matrix_statistics(self, words: MatrixWording) -> tuple[str, ...] | None:
-        """One line for each matrix that the law is made of; None where that cannot be told."""
+        """One line for each matrix that the law is made of; None where there is none."""
         return None
 
 

@@ -1,8 +1,8 @@
 """The search for blocks of parameters with a closed-form conditional.
 
 Largest first: a Normal vector together with its precision, joint Normal vectors, then one unit at a
-time (a number, a simplex, a matrix). Which family holds a block is told by its functions alone
-(`families.py`); what a family does not hold becomes a correction, or a refusal.
+time (a number, a simplex, a matrix). Which family holds a block is determined by its functions
+alone (`families.py`); what a family does not hold becomes a correction, or a refusal.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ With everything but a block fixed, every factor is sum_i c_i(rest) s_i(block), s
 
 The functions s_i are common to all roles; the C_i are the statistics. Factors that do not hold
 the block are left out. Supports are kept apart: the densities here are unguarded, and what a
-support asks of the block is told by `CompleteData.restrictions`.
+support asks of the block is given by `CompleteData.restrictions`.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ same for all models: so a model's own functions are translated to LLVM directly,
 call them by address. What cannot be translated (matrices, the user's primitives) is compiled by
 Numba from the very same text.
 
-Who waits at a terminal for the compiler is told so, once in a process, as Numba tells when it
+Who waits at a terminal for the compiler gets a notice, once in a process, as Numba tells when it
 compiles (`numba.core.event`): verbs that show no progress would else be silent for half a minute
 on the first model of its kind on a machine.
 """
@@ -33,7 +33,7 @@ from ssmppl.codegen.store import folder
 from ssmppl.codegen.text.module import ModuleText, Section
 from ssmppl.compiling import LOCK, one_at_a_time
 
-SILENT_SECONDS = 2.0  # of compiling, all together, before it is told
+SILENT_SECONDS = 2.0  # of compiling, all together, before the notice
 TEXT = "ssmppl: compiling what this kind of model needs, once; it may take a minute"
 # Specialised functions that kernels call, some of them in place of a model's own.
 HELPERS: dict[str, Any] = {
@@ -50,11 +50,11 @@ HELPERS: dict[str, Any] = {
 class Notice(event.Listener):
     """Hears of every compilation, of any thread.
 
-    told : nothing is said any more.
+    given : the notice has been given, or is not wanted.
     """
 
     def __init__(self) -> None:
-        self.told = False
+        self.given = False
         self._lock = threading.Lock()
         self._running, self._spent, self._since = 0, 0.0, 0.0
         self._timer: threading.Timer | None = None
@@ -62,7 +62,7 @@ class Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
         with self._lock:
             self._running += 1
-            if self._running > 1 or self.told or not (sys.stderr and sys.stderr.isatty()):
+            if self._running > 1 or self.given or not (sys.stderr and sys.stderr.isatty()):
                 return
             self._since = time.monotonic()
             self._timer = threading.Timer(max(SILENT_SECONDS - self._spent, 0.0), self._tell)
@@ -79,9 +79,9 @@ class Notice(event.Listener):
 
     def _tell(self) -> None:
         with self._lock:
-            if self.told:
+            if self.given:
                 return
-            self.told = True
+            self.given = True
         tqdm.write(TEXT, file=sys.stderr)
 
 

@@ -224,10 +224,10 @@ def _answers(report: Findings) -> str:
 
 
 def _unknown(report: Findings) -> str:
-    """What could not be told, and what has to be known before the figures are used."""
+    """What could not be decided, and what has to be known before the figures are used."""
     out = ""
     for title, items in (
-        ("What these data could not tell", words.untold(report)),
+        ("What these data could not decide", words.undecided(report)),
         ("To be kept in mind", [words.sentence(n) for n in report.notes]),
         ("Left out, as they failed", words.left_out(report)),
     ):

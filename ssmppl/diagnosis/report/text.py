@@ -1,4 +1,4 @@
-"""`print(report)`: the verdict, the three answers, one table, and what could not be told."""
+"""`print(report)`: the verdict, the three answers, one table, and what could not be decided."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _table(cells: list[tuple[str, ...]]) -> list[str]:
 
 
 def report_text(report: Findings) -> str:
-    """The verdict, the three answers, one table, what could not be told and what would tell."""
+    """The verdict, the three answers, one table, what is undecided and what would decide it."""
     lines = [*wrapped(words.headline(report)), ""]
     for name, sentences in words.answers(report):
         lines += wrapped(" ".join(sentences), f"{name:<10}", " " * 10)
@@ -99,9 +99,9 @@ def report_html(report: Findings) -> str:
 
 
 def _rest(report: Findings) -> list[tuple[str, list[str]]]:
-    """What could not be told, what would tell, and what has to be known."""
+    """What could not be decided, what would decide it, and what has to be known."""
     found = [
-        ("Could not be told", words.untold(report)), ("What next", words.next_steps(report)),
+        ("Could not be decided", words.undecided(report)), ("What next", words.next_steps(report)),
         ("Notes", [words.sentence(n) for n in report.notes]),
         ("Left out", words.left_out(report)),
     ]  # fmt: skip

@@ -423,8 +423,8 @@ def how_sure(report: Findings) -> list[str]:
     return out
 
 
-def untold(report: Findings) -> list[str]:
-    """What these data could not tell, and the parts that do not apply, with their reasons."""
+def undecided(report: Findings) -> list[str]:
+    """What these data could not decide, and the parts that do not apply, with their reasons."""
     out = []
     for row in leaders(report):
         if rivals(report, row):

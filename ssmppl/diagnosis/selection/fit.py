@@ -4,7 +4,7 @@ Models are climbed by the extended Kalman filter's log-likelihood where there is
 smooth and takes a millisecond. For linear Gaussian models it is exact; where that climb does not
 end at its top, and from starts that nothing is known of, they are climbed with their exact score.
 Others are climbed from several starts, and from there by the particle smoother's score. How far the
-top still is is told in nats: g' H^-1 g / 2 is what a quadratic would still gain.
+top still is is measured in nats: g' H^-1 g / 2 is what a quadratic would still gain.
 
 The climb by noisy scores is a quasi-Newton ascent: z <- z + H^-1 g on the unconstrained scale, with
 H an estimate of the information, kept up by damped BFGS updates (Nocedal and Wright 2006, procedure
@@ -20,7 +20,7 @@ numbers' scores and curvatures of a moderate size (Self and Liang 1987 for their
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -75,7 +75,8 @@ LARGEST = 1e100  # of a score: what is beyond is an overflow
 OUTWARDS = (1.0, 3.0, 7.0, 12.0)  # on the unconstrained scale: a factor of 3 to 160,000
 FREE = 0.1  # nats that going outwards may cost where the bound is the place of the maximum
 COST = 0.05  # nats that the value which is held may cost
-GRID = np.linspace(0.5, 40.0, 80).tolist()  # inwards, where the value that is held is looked for
+# Inwards, where the value that is held is looked for: as far as the smallest number there is.
+GRID = [*np.linspace(0.5, 40.0, 80).tolist(), *np.linspace(45.0, 800.0, 152).tolist()]
 STEPS = 40  # of halving
 FALL = 0.5  # nats by which the function has to fall inside: else the number is not identified
 
@@ -505,20 +506,41 @@ class Fitter:
 
     def with_information(self, fit: Fit, seed: np.random.SeedSequence) -> Fit:
         """The fit with an information matrix worth its name: minus the second derivatives where
-        they are exact, else that of scores simulated at it; its own was built up on the way."""
+        they are exact, else that of scores simulated at it; its own was built up on the way. NaN
+        where nothing that is simulated can be filtered."""
+        free = np.ix_(~fit.at_bound, ~fit.at_bound)  # at a bound it says nothing
         if isinstance(self.kalman, KalmanModel):
-            if np.all(np.isfinite(fit.information)):  # known already, or nothing is free
+            if np.all(np.isfinite(fit.information[free])):  # known already, or nothing is free
                 return fit
-            smooth = self._extended_log_likelihood(fit.problem)
-            if smooth is not None:
-                found = information_at(density_of(fit.space, smooth), fit.z)
-            else:
-                setup = Maximization(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
-                found = observed_information(setup, self.kalman, fit.z)
-            inside = found[np.ix_(~fit.at_bound, ~fit.at_bound)]  # at a bound it says nothing
-            if np.all(np.isfinite(found)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
-                return replace(fit, information=found)
-        return replace(fit, information=self._simulated_information(fit.space, fit.theta, seed))
+            for found in self._second_derivatives(self.kalman, fit, seed):
+                inside = found[free]
+                if np.all(np.isfinite(inside)) and np.all(np.linalg.eigvalsh(inside) > 0.0):
+                    return replace(fit, information=found)
+        try:
+            found = self._simulated_information(fit.space, fit.theta, seed)
+        except SamplingError:  # then there are no standard errors
+            found = np.full_like(fit.information, np.nan)
+        return replace(fit, information=found)
+
+    def _second_derivatives(
+        self, kalman: KalmanModel, fit: Fit, seed: np.random.SeedSequence
+    ) -> Iterator[np.ndarray]:
+        """(F, F) minus those of the log posterior at the fit, NaN in what is at a bound: the
+        cheapest first."""
+        smooth, free = self._extended_log_likelihood(fit.problem), ~fit.at_bound
+        if smooth is not None:
+            function = density_of(fit.space, smooth)
+
+            def inside(free_z: np.ndarray) -> float:
+                z = fit.z.copy()
+                z[free] = free_z
+                return function(z)
+
+            found = np.full((len(free), len(free)), np.nan)
+            found[np.ix_(free, free)] = information_at(inside, fit.z[free])
+            yield found
+        setup = Maximization(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
+        yield observed_information(setup, kalman, fit.z)
 
     def _unconstrained(
         self, space: Space, theta: np.ndarray, information: np.ndarray,

@@ -183,7 +183,7 @@ class Ascent:
     """Where a climb came to (P components of theta, K iterates).
 
     theta : (P,). log_likelihood : there, where the method knows it exactly, else None.
-    iterates : (K, P), the last one not necessarily theta. report : what is to be told of the run,
+    iterates : (K, P), the last one not necessarily theta. report : notes on the run,
     `converged` above all. information : (P, P), minus the second derivatives of the log-likelihood
     in theta, where the method has them. error : (P, P), the Monte Carlo covariance of theta itself.
     Of several starts the iterates are (starts, K, P); figures : what else is known of each iterate,

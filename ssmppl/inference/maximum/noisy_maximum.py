@@ -36,7 +36,9 @@ FEWEST = 40
 FAR = 2.0  # standard deviations that a centre moves at most
 NEAR = 1.0  # and from where a centre has come near the top
 CENTRED = 0.5  # share of the reach by which the last centre may lie off the top
-HOPELESS = 4.0  # squared relative error at a point by MOST_RUNS filters of which no top is told
+HOPELESS = (
+    4.0  # squared relative error at a point by MOST_RUNS filters with which no top is located
+)
 PATIENCE = 3  # rounds with such an error
 ALIKE = 0.4  # share of the information by which the shape may still change
 LEAST, MOST = 1.0 / 9.0, 16.0  # change of the information in a round

@@ -17,7 +17,7 @@ With M fixed the iterates end in a stationary law round the limit, which they ne
 factors of EM. The estimate is the fixed point of the regression of the later iterates on those
 before them, on the unconstrained scale, over independent chains from dispersed starts: no more
 than their mean where they have come to rest, and where they have not, corrected for what is left
-of the way. Its error is told by the jackknife over chains.
+of the way. Its error is estimated by the jackknife over chains.
 """
 
 from __future__ import annotations

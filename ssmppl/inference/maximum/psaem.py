@@ -11,8 +11,8 @@ averaged by their final weights, enter
 gamma_k is 1 for the first k_0 iterations, which forget where they began, then (k / k_0)^-exponent
 (Delyon, Lavielle and Moulines 1999 ask for a divergent sum and a convergent sum of squares). It
 converges for every N >= 2. The estimate is the mean of the later iterates on the unconstrained
-scale (Polyak and Juditsky 1992) over independent chains from dispersed starts; its error is told
-from how they differ.
+scale (Polyak and Juditsky 1992) over independent chains from dispersed starts; its error is
+estimated from how they differ.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def flag(name: str, value: Any) -> None:
 
 
 def a_name(name: str, value: Any) -> None:
-    """Which names there are depends on the model, or is told where it is looked up."""
+    """Which names there are depends on the model, or is given where it is looked up."""
     if not isinstance(value, str):
         raise ArgumentError(f"{name}={value!r}", fix='give a name, as "auto"')
 

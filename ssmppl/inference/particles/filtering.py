@@ -222,8 +222,8 @@ def full_run(
         np.empty(steps), np.empty(steps), np.empty((steps, d)), np.empty((steps, d, d)),
         np.empty((steps, p, d)), np.empty((steps, 4, k)), np.empty((steps, p, k)), kept,
     )  # fmt: skip
-    told = out.prediction, probabilities, out.predicted_quantiles, stream
-    moments = probabilities, out.mean, out.covariance, out.quantiles, told
+    predicted = out.prediction, probabilities, out.predicted_quantiles, stream
+    moments = probabilities, out.mean, out.covariance, out.quantiles, predicted
     status, t = run_filter(
         problem, theta, settings, experiment, rng, out.log_increments, out.ess, moments, kept
     )

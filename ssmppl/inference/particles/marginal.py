@@ -109,11 +109,11 @@ def marginal_run(
     increments, ess = np.empty(steps), np.empty(steps)
     size, p = len(problem.trace.state_symbols), len(probabilities)
     predicted = np.empty((steps, 4, k)), np.empty((steps, p, k))
-    told = predicted[0], probabilities, predicted[1], stream
+    prediction = predicted[0], probabilities, predicted[1], stream
     moments = nothing, np.empty((steps, d)), np.empty((steps, d, d)), np.empty((steps, 0, d))
     kept = particles, weights, np.zeros((steps, n), dtype=np.int32)
     status, t = run_filter(
-        problem, theta, settings, experiment, rng, increments, ess, (*moments, told), kept
+        problem, theta, settings, experiment, rng, increments, ess, (*moments, prediction), kept
     )
     if status != OK:
         raise failure(problem, theta, status, t, experiment)

@@ -69,9 +69,9 @@ def run_on_device(
             made.move[blocks, threads](*move)
             made.join[1, threads](*join)
         except NumbaError as error:  # at the first row, where the kernels are compiled
-            told = next(line for line in str(error).splitlines() if line.strip())
+            first_line = next(line for line in str(error).splitlines() if line.strip())
             raise ArgumentError(
-                f"the model {problem.trace.name!r} is not compiled for device='cuda': {told}",
+                f"the model {problem.trace.name!r} is not compiled for device='cuda': {first_line}",
                 fix="leave device= out",
             ) from error
     found = status.copy_to_host()

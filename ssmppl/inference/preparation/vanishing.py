@@ -52,7 +52,7 @@ def without_maximum(
             if np.ptp(y) == 0.0:
                 how = f"are constant ({y[0]:.6g} in every row)"
             elif some and not exact.all():
-                how = f"are told exactly by a value of the states in {np.sum(exact)} rows"
+                how = f"determine the states exactly in {np.sum(exact)} rows"
             else:
                 how = "can be followed exactly by the model"
             return NotApplicable(

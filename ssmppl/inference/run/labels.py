@@ -33,7 +33,7 @@ def with_data(result: xr.Dataset, experiment: Experiment) -> xr.Dataset:
 
 
 def component_dims(name: str, values: np.ndarray, leading: int) -> list[str]:
-    """Dims of the components of a state, channel or input, whatever it is that is told of them:
+    """Dims of the components of a state, channel or input, whatever quantity it is:
     what has the same dims can be added, and is not spread out into a table."""
     return [f"{name}_dim_{k}" for k in range(values.ndim - leading)]
 

@@ -29,7 +29,7 @@ from ssmppl.language.model.traced import Site
 
 APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
 FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
-LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be told
+LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be estimated
 LOW = 0.02  # share of draws at which a row changes, below which there is a warning
 STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
 Paths = tuple[np.ndarray, ...]

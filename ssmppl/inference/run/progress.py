@@ -23,7 +23,7 @@ BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaini
 SPARSE_SHARE = 0.2
 SPARSE_SECONDS = 5.0
 
-# Work without a bar that takes longer is told of; that on a model compiled before seldom does.
+# Work without a bar that takes longer is announced; that on a model compiled before seldom does.
 SILENT_SECONDS = 2.0
 
 
@@ -111,7 +111,7 @@ def announced(title: str, what: str, shown: bool = True) -> Iterator[None]:
     timer = threading.Timer(SILENT_SECONDS, tell)
     timer.daemon = True
     if shown:
-        notice.told = True  # by this
+        notice.given = True  # by this
         timer.start()
     try:
         yield

@@ -64,7 +64,7 @@ class Plan:
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
     memory : for how many steps a deterministic state remembers; None where it never forgets.
-    noises : what drives the states, or why it cannot be told.
+    noises : what drives the states, or why it is not known.
     eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
     """

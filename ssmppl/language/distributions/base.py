@@ -82,7 +82,7 @@ class Distribution:
     closed = False  # whether the lower bound itself belongs to the support
     open_above = False  # whether the upper one does not
     drawable = True  # whether it has a sampler
-    guards_range = False  # whether its density has to be told where a parameter is out of range
+    guards_range = False  # whether its density has to know where a parameter is out of range
     symmetric = False  # whether values are symmetric matrices, whose two halves share symbols
     by_name = "spread"  # what the keyword-only arguments are called in messages
     trials = ""  # the parameter that is a number of trials

@@ -22,7 +22,7 @@ from ssmppl.diagnosis.report.words import (
     listed,
     next_steps,
     sentence,
-    untold,
+    undecided,
     where,
     which,
 )
@@ -230,7 +230,7 @@ def test_what_would_tell_rivals_apart_is_named():
 
 
 def test_what_does_not_apply_is_told_with_its_reason():
-    told = untold(several())
+    told = undecided(several())
     assert "Input delay for u2: u2 is constant in these data." in told
     assert any("@ssm.primitive" in line for line in told)
 
@@ -240,7 +240,7 @@ def test_what_does_not_apply_for_one_reason_is_told_once():
     why = "it is only the integral of v"
     found = [{"part": p, "equation": e, "reason": why} for p, e in cells]
     report = dataclasses.replace(several(), not_applicable=tabulate("not_applicable", found))
-    assert untold(report)[-3:] == [
+    assert undecided(report)[-3:] == [
         "Drag and stop for x: it is only the integral of v.",
         "Drag for w: it is only the integral of v.",
         "Outliers: it is only the integral of v.",

@@ -7,7 +7,13 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.selection.fit import COST, Fitter, bounds_note, hold_at_bounds
+from ssmppl.diagnosis.selection.fit import (
+    COST,
+    FROM_START,
+    Fitter,
+    bounds_note,
+    hold_at_bounds,
+)
 from ssmppl.diagnosis.selection.refit import standard_errors
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
@@ -15,13 +21,14 @@ from tests.diagnosis.small import level
 from tests.statistics.checks import seed_of
 
 
-def test_a_scale_that_counts_for_nothing_is_held_next_to_where_it_counts():
+@pytest.mark.parametrize("z", [-27.0, -349.0, -700.0])
+def test_a_scale_that_counts_for_nothing_is_held_next_to_where_it_counts(z):
     """log(1 + s^2) lost, s = exp(z): the most that costs 0.05 nats is s = sqrt(e^.05 - 1)."""
 
     def function(z):
         return -np.log1p(np.exp(2.0 * z[0])) - 0.5 * (z[1] - 3.0) ** 2
 
-    z, mask = hold_at_bounds(function, np.array([-27.0, 3.0]), np.array([True, False]))
+    z, mask = hold_at_bounds(function, np.array([z, 3.0]), np.array([True, False]))
     assert mask.tolist() == [True, False]
     assert np.exp(z[0]) == pytest.approx(np.sqrt(np.expm1(COST)), rel=1e-3)
     assert z[1] == 3.0
@@ -81,3 +88,53 @@ def test_the_note_names_and_gives_the_value():
     assert text.startswith("in the fit of 'EMPS' the best value of q is a bound: held")
     assert "q at 0.000125" in text
     assert bounds_note([], {}, "a fit") == ""
+
+
+def test_a_sensor_without_noise_leaves_the_errors_of_the_rest():
+    """A servo axis whose position is read exactly: whatever the scale of the sensor's noise begins
+    with, also one next to nothing, from which the likelihood is flat a long way."""
+    model = ssm.Model("axis", inputs=("u",))
+
+    @model.prior
+    def prior():
+        return {
+            "b": ssm.HalfNormal(sd=5), "d": ssm.HalfNormal(sd=5), "q": ssm.HalfNormal(sd=0.05),
+            "r": ssm.HalfNormal(sd=0.01),
+        }  # fmt: skip
+
+    @model.initial
+    def initial():
+        return {"p": ssm.Normal(0, sd=0.01), "v": ssm.Normal(0, sd=0.01)}
+
+    @model.transition
+    def transition(p, v, u, b, d, q):
+        a = b * u - d * v
+        return {"p": ssm.Dirac(p + 0.02 * v + 0.0002 * a), "v": ssm.Normal(v + 0.02 * a, sd=q)}
+
+    @model.observation
+    def observation(p, r):
+        return {"y": ssm.Normal(p, sd=r)}
+
+    rng = np.random.default_rng(seed_of("axis"))
+    u, e = rng.standard_normal((2, 301))
+    p, v = np.zeros(301), np.zeros(301)
+    for t in range(300):
+        a = 1.0 * u[t] - 4.0 * v[t]
+        p[t + 1], v[t + 1] = p[t] + 0.02 * v[t] + 0.0002 * a, v[t] + 0.02 * a + 2e-3 * e[t]
+    problem = pose(model, {"y": p, "u": u})
+    fitter = Fitter(problem, {}, Settings(100, "twisted"))
+    found = []
+    for r in (1e-3, 1e-12, 1e-150):
+        start = {"b": 0.5, "d": 2.0, "q": 1e-3, "r": r}
+        fit = fitter.fit(problem.experiments, seed_sequence(1), start, FROM_START)
+        assert fit.bounds == ["r"]
+        found.append(standard_errors(fit, {}))
+    # With w = dp / dt, c = 1 - .01 d and w - .01 b u = c v, the equations are the regression
+    # w' - .01 b u' = (1 - .02 d) (w - .01 b u) + .02 b c u + c q e: slopes of its residual.
+    v, c = v[:-1], 1.0 - 0.01 * 4.0
+    by_b = -0.01 * u[1:] + 0.01 * (1.0 - 0.02 * 4.0) * u[:-1] - 0.02 * c * u[:-1]
+    x = np.column_stack([by_b, 0.02 * c * v + 0.0002 * u[:-1]])
+    spread = np.sqrt(np.diag(np.linalg.inv(x.T @ x))) * c * 2e-3
+    for errors in found:
+        assert np.isnan(errors["r"])
+        assert [errors["b"], errors["d"]] == pytest.approx(spread, rel=0.1)

@@ -9,8 +9,8 @@ innovation is z_t + Z_t delta with Z_t the response of the filter to a unit of d
 with factor and right from the QR factorisation of the whitened rows [Z_t, -z_t], updated by Givens
 rotations (Golub and Van Loan 2013, "Matrix computations", section 6.5) as rows come in. A sum of
 squares is never subtracted from another, so a level far from zero costs no digits, and a model
-with no diffuse phase at all, with gaps in it, or with rows that tell one delta twice is no special
-case. What is flat at t without data on it has an infinite variance.
+with no diffuse phase at all, with gaps in it, or with rows that determine one delta twice is no
+special case. What is flat at t without data on it has an infinite variance.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ NOTHING = 1e-11
 def absorb(row, target, factor, right):
     """Add the equation row . delta = target to the factorisation; row is destroyed.
 
-    Returns (whether it tells a new direction, residual, change of log |det factor|), the last two
-    in the directions known before and now.
+    Returns (whether it determines a new direction, residual, change of log |det factor|), the last
+    two in the directions known before and now.
     """
     n = row.size
     sizes = np.abs(row)
@@ -77,11 +77,11 @@ def absorb(row, target, factor, right):
 
 
 @exact
-def told(rows, factor, right, mean, extra, known):
-    """What the equations so far tell of rows (p, F), value and slopes in delta.
+def known_rows(rows, factor, right, mean, extra, known):
+    """What the equations so far say of rows (p, F), value and slopes in delta.
 
     Written: mean (p,); extra (p, G), a root of the part of their covariance that stems from delta;
-    known (p,), 0 where they hold a direction of delta that nothing was told about.
+    known (p,), 0 where they hold a direction of delta that no row has determined.
     """
     for i in range(rows.shape[0]):
         mean[i], known[i] = rows[i, 0], 1.0
@@ -101,7 +101,7 @@ def told(rows, factor, right, mean, extra, known):
 @exact
 def report(rows, root, factor, right, extra, known, mean, covariance):
     """Moments of rows + root e + (rows' slopes) delta; NaN and infinite where delta is unknown."""
-    told(rows, factor, right, mean, extra, known)
+    known_rows(rows, factor, right, mean, extra, known)
     fill(covariance, 0.0)
     add_square(root, covariance)
     add_square(extra[: rows.shape[0]], covariance)
@@ -124,7 +124,7 @@ def diffuse_filter(
     """Run the filter; returns (status, t) as `kalman_filter` does.
 
     flat (G,): the components of x_1 that are unknown; their m and P are zero. Written: factor
-    (G, G) and right (G,), whose diagonal has a zero for each direction that the data do not tell;
+    (G, G) and right (G,), whose diagonal has a zero for each direction that the data leave open;
     log_increment (T,), whose sum is log p(y) where there is none; and unless they are None the
     moments of `kalman_filter`, NaN and infinite where they do not exist yet.
     """

@@ -3,7 +3,7 @@
 Given the future, the standard normal variables of a step (see `steps.py`) are e = mu + U n,
 n ~ N(0, I). Back from t + 1 to t, with the blocks of the two transformations,
 
-    prediction   e_filt = Theta_11 e_pred + Theta_12 rest       rest ~ N(0, I), told by nobody
+    prediction   e_filt = Theta_11 e_pred + Theta_12 rest       rest ~ N(0, I), free
     update       e_pred = Theta_z z + Theta_e e_filt + Theta_rest rest
 
 so mu and U follow by multiplications with blocks of orthogonal matrices, whose norm is at most 1,
@@ -85,20 +85,20 @@ def smooth(
             copy(both[n : 2 * n, n:], wide[:, n : 2 * n])
             reflect(wide[:, : 2 * n], n)
             copy(wide[:, :n], root)
-        told, untold = array[k + n :, k : k + n], array[k + n :, k + n :]
+        by_e, by_rest = array[k + n :, k : k + n], array[k + n :, k + n :]
         if state_noise is not None:
             known = np.zeros((k_all, columns))
             multiply_add(array[k + 2 * n : k + 2 * n + k_all, :k], z[:k], known)
             law_of_noise(
-                r_root, known, told[n : n + k_all], untold[n : n + k_all], mu, root,
+                r_root, known, by_e[n : n + k_all], by_rest[n : n + k_all], mu, root,
                 noise[t], noise_covariance[t],
             )  # fmt: skip
         fill(mu_pred, 0.0)
         multiply_add(array[k + n : k + 2 * n, :k], z[:k], mu_pred)
-        multiply_add(told[:n], mu, mu_pred)
-        multiply(told[:n], root, wide[:, :n])
+        multiply_add(by_e[:n], mu, mu_pred)
+        multiply(by_e[:n], root, wide[:, :n])
         if k < k_all:
-            copy(untold[:n], wide[:, n : n + k_all - k])
+            copy(by_rest[:n], wide[:, n : n + k_all - k])
             reflect(wide[:, : n + k_all - k], n)
         copy(wide[:, :n], root_pred)
         if state_noise is not None and t == 0:
@@ -121,15 +121,15 @@ def smooth(
 
 
 @exact
-def law_of_noise(noise_root, known, told, untold, mu, root, mean, covariance):
-    """Moments of noise_root (known + told e + untold rest); rest ~ N(0, I), e ~ (mu, U U')."""
-    n, d, more = told.shape[0], told.shape[1], untold.shape[1]
+def law_of_noise(noise_root, known, by_e, by_rest, mu, root, mean, covariance):
+    """Moments of noise_root (known + by_e e + by_rest rest); rest ~ N(0, I), e ~ (mu, U U')."""
+    n, d, more = by_e.shape[0], by_e.shape[1], by_rest.shape[1]
     inner, spread = np.empty((n, d + more)), np.zeros((n, d + more))
-    multiply(told, root, inner[:, :d])
-    copy(untold, inner[:, d:])
+    multiply(by_e, root, inner[:, :d])
+    copy(by_rest, inner[:, d:])
     multiply_add(noise_root, inner, spread)
     columns = np.zeros((n, mu.shape[1]))
-    multiply_add(told, mu, known)
+    multiply_add(by_e, mu, known)
     multiply_add(noise_root, known, columns)
     for i in range(n):
         mean[i] = columns[i, 0]
@@ -153,7 +153,7 @@ def draw(model, start, y, seen, stream, log_increment, out):
     q_root, r_root = np.empty((n, n)), np.empty((k_all, k_all))
     both, array = np.empty((2 * n, 2 * n)), np.empty((k_all + 2 * n, k_all + n))
     filtered, z = np.empty((n, columns)), np.empty((k_all, columns))
-    root, told = np.empty((n, n)), np.empty((n, columns))
+    root, by_e = np.empty((n, n)), np.empty((n, columns))
     weights, fresh = np.empty(columns * draws), np.empty(max(n, k_all) * draws)
     fill_normal(stream, weights[draws:])
     weight = weights.reshape(columns, draws)
@@ -177,8 +177,8 @@ def draw(model, start, y, seen, stream, log_increment, out):
         for m in range(draws):
             for i in range(n):
                 out[m, t, i] = state[i, m]
-        multiply(array[k + n : k + 2 * n, :k], z[:k], told)
-        multiply(told, weight, e_pred)
+        multiply(array[k + n : k + 2 * n, :k], z[:k], by_e)
+        multiply(by_e, weight, e_pred)
         multiply_add(array[k + n : k + 2 * n, k : k + n], e, e_pred)
         if k < k_all:
             size = (k_all - k) * draws

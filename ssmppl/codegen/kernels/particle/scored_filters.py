@@ -194,7 +194,7 @@ def row_predictions(
     """
     n_steps, d, n = particles.shape
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
-    x, told = np.empty((d, n)), np.empty((4 * y.shape[1], n))
+    x, given_each = np.empty((d, n)), np.empty((4 * y.shape[1], n))
     normals, uniforms = np.empty(sizes[3] * n), np.empty(sizes[4] * n)
     w = np.full(n, 1.0 / n)
     prepare(theta, c)
@@ -207,8 +207,8 @@ def row_predictions(
         else:
             draw(theta, c, s, particles[t - 1], x, normals, uniforms, rng)
             copy(weights[t - 1], w)
-        moments(theta, c, s, x, told)
-        mix_channels(told, w, out[t])
+        moments(theta, c, s, x, given_each)
+        mix_channels(given_each, w, out[t])
 
 
 @exact

@@ -100,33 +100,33 @@ def observe_states(prepare, step, observe, sizes, theta, y, seen, u, rng, states
 
 
 @exact
-def mix_channels(told, w, out):
+def mix_channels(given_each, w, out):
     """out (4, K) : mean, variance, P(Y <= y), P(Y < y) of each channel, over particles w : (N,).
 
-    told : (4 K, N), the same given each particle.
+    given_each : (4 K, N), the same given each particle.
     """
     for k in range(out.shape[1]):
-        middles = told[4 * k]
+        middles = given_each[4 * k]
         out[0, k] = weighted_mean(middles, w)
         between = weighted_product(middles, out[0, k], middles, out[0, k], w)
-        out[1, k] = weighted_mean(told[4 * k + 1], w) + between
+        out[1, k] = weighted_mean(given_each[4 * k + 1], w) + between
         for row in range(2, 4):
-            below = weighted_mean(told[4 * k + row], w)
+            below = weighted_mean(given_each[4 * k + row], w)
             out[row, k] = 1.0 if below > 1.0 else below  # weights sum to 1 + rounding
 
 
 @exact
 def predict_step(
     prepare, step, draw_initial, draw, moments, observe, sizes,
-    theta, y, seen, u, t, x_prev, w_prev, rng, told,
+    theta, y, seen, u, t, x_prev, w_prev, rng, predicted,
 ):  # fmt: skip
     """Write what is predicted of y_t, K channels, at P levels.
 
-    told : prediction (T, 4, K), of which row t gets mean, variance, P(Y <= y_t) and P(Y < y_t) of
-        each channel; levels (P,), increasing; quantiles (T, P, K), of one y drawn for each
+    predicted : prediction (T, 4, K), of which row t gets mean, variance, P(Y <= y_t) and
+        P(Y < y_t) of each channel; levels (P,), increasing; quantiles (T, P, K), of one y drawn for each
         particle; stream, of these draws alone: `rng` goes on as if there were none.
     """
-    prediction, levels, quantiles, stream = told
+    prediction, levels, quantiles, stream = predicted
     n, n_channels = w_prev.size, y.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     x, out = np.empty((sizes[2], n)), np.empty((4 * n_channels, n))

@@ -33,7 +33,7 @@ def linearise(
     n_steps, d = x.shape
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.zeros((d + d * d + d * spread.shape[2], 1))
+    values = np.zeros((d + d * d + d * spread.shape[2], 1))
     told_initial = np.zeros((d + d * spread_initial.shape[1], 1))
     seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     prepare(theta, c)
@@ -45,8 +45,8 @@ def linearise(
             linear_initial(theta, c, s, now, told_initial)
             spread_out(told_initial, rest[0], jacobian[0], spread_initial)
         else:
-            linear(theta, c, s, before, now, told)
-            spread_out(told, rest[t], jacobian[t], spread[t])
+            linear(theta, c, s, before, now, values)
+            spread_out(values, rest[t], jacobian[t], spread[t])
         if looking and not abs(look_at(theta, c, s, now, seen_so, g[t], h[t])) < np.inf:
             return False
         for i in range(d):
@@ -111,7 +111,7 @@ def noise_of(
     widest = e.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.empty((widest + 1, 1))
+    values = np.empty((widest + 1, 1))
     line, line_initial = np.zeros((d + d * d + d * noises[1], 1)), np.zeros((d + d * noises[0], 1))
     rest, jacobian = np.empty(d), np.empty((d, d))
     spread, spread_initial = np.empty((d, noises[1])), np.empty((d, noises[0]))
@@ -124,12 +124,12 @@ def noise_of(
             now[i, 0] = x[t, i]
         r = noises[0] if t == 0 else noises[1]
         if t == 0:
-            recover_initial(theta, c, s, now, told)
+            recover_initial(theta, c, s, now, values)
         else:
-            recover(theta, c, s, before, now, told)
-        total += told[r, 0]
+            recover(theta, c, s, before, now, values)
+        total += values[r, 0]
         for k in range(widest):
-            e[t, k] = told[k, 0] if k < r else 0.0
+            e[t, k] = values[k, 0] if k < r else 0.0
         if steered:
             if t == 0:
                 linear_initial(theta, c, s, now, line_initial)
@@ -162,7 +162,7 @@ def path_of(
     widest = e.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.empty((widest + 1, 1))
+    values = np.empty((widest + 1, 1))
     line, line_initial = np.zeros((d + d * d + d * noises[1], 1)), np.zeros((d + d * noises[0], 1))
     rest, jacobian = np.empty(d), np.empty((d, d))
     spread, spread_initial = np.empty((d, noises[1])), np.empty((d, noises[0]))
@@ -191,11 +191,11 @@ def path_of(
                 noise[k] += mean[k]
         if t == 0:
             begin(theta, c, s, noise, kept[t], now)
-            recover_initial(theta, c, s, now, told)
+            recover_initial(theta, c, s, now, values)
         else:
             follow(theta, c, s, before, noise, kept[t], now)
-            recover(theta, c, s, before, now, told)
-        total += told[r, 0]
+            recover(theta, c, s, before, now, values)
+        total += values[r, 0]
         if not abs(total) < np.inf:
             return np.nan
         for i in range(d):

@@ -134,37 +134,37 @@ def update(p, h, g, toward, z, step):
 
 
 @exact
-def look_at(look, flat, theta, c, s, x, told, g, h):
+def look_at(look, flat, theta, c, s, x, values, g, h):
     """log g(y_t | x), with its slope and minus its curvature, positive semidefinite."""
     d = g.size
-    look(theta, c, s, x, told)
+    look(theta, c, s, x, values)
     m = 1 + d
     for i in range(d):
-        g[i] = told[1 + i, 0]
+        g[i] = values[1 + i, 0]
         for j in range(i + 1):
-            h[i, j] = told[m, 0]
+            h[i, j] = values[m, 0]
             h[j, i] = h[i, j]
             m += 1
     if not flat:
         lift(h)
-    return told[0, 0]
+    return values[0, 0]
 
 
 @exact
-def spread_out(told, rest, jacobian, spread):
-    """Take f (D,), J (D, D) and L (D, R) out of what a pass told; J only where there is one."""
+def spread_out(values, rest, jacobian, spread):
+    """Take f (D,), J (D, D) and L (D, R) out of a pass's values; J only where there is one."""
     d, m = rest.size, 0
     for i in range(d):
-        rest[i] = told[m, 0]
+        rest[i] = values[m, 0]
         m += 1
-    if told.shape[0] > d + spread.size:
+    if values.shape[0] > d + spread.size:
         for i in range(d):
             for j in range(d):
-                jacobian[i, j] = told[m, 0]
+                jacobian[i, j] = values[m, 0]
                 m += 1
     for i in range(d):
         for j in range(spread.shape[1]):
-            spread[i, j] = told[m, 0]
+            spread[i, j] = values[m, 0]
             m += 1
 
 
@@ -233,7 +233,7 @@ def follow_filter(
 ):  # fmt: skip
     """The first reference: an extended Kalman filter; returns its log-likelihood, -inf where it
     comes to no number, +inf where its covariances do and rounding has eaten the log-likelihood: an
-    observation told a state better than `RESOLVED`.
+    observation determines a state better than `RESOLVED`.
 
     x (T, D) its means, covariance (T, D, D), rest (T, D), jacobian (T, D, D), spread (T, D, R),
     spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
@@ -242,7 +242,7 @@ def follow_filter(
     r, r_initial = spread.shape[2], spread_initial.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.zeros((d + d * d + d * r, 1))
+    values = np.zeros((d + d * d + d * r, 1))
     told_initial = np.zeros((d + d * r_initial, 1))
     seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     p, after, jp = np.zeros((d, d)), np.empty((d, d)), np.empty((d, d))
@@ -261,8 +261,8 @@ def follow_filter(
                         total += spread_initial[i, k] * spread_initial[j, k]
                     p[i, j] = total
         else:
-            linear(theta, c, s, before, now, told)
-            spread_out(told, rest[t], jacobian[t], spread[t])
+            linear(theta, c, s, before, now, values)
+            spread_out(values, rest[t], jacobian[t], spread[t])
             for i in range(d):
                 for j in range(d):
                     total = 0.0
@@ -309,7 +309,7 @@ def follow_gains(
     r, r_initial = spread.shape[2], spread_initial.shape[1]
     c, s = np.empty(sizes[0]), np.empty(sizes[1])
     before, now = np.empty((d, 1)), np.empty((d, 1))
-    told = np.zeros((d + d * d + d * r, 1))
+    values = np.zeros((d + d * d + d * r, 1))
     told_initial = np.zeros((d + d * r_initial, 1))
     seen_so = np.zeros((1 + d + d * (d + 1) // 2, 1))
     total = 0.0
@@ -327,8 +327,8 @@ def follow_gains(
             spread_out(told_initial, rest[0], jacobian[0], spread_initial)
             begin(theta, c, s, e[0], now)
         else:
-            linear(theta, c, s, before, now, told)
-            spread_out(told, rest[t], jacobian[t], spread[t])
+            linear(theta, c, s, before, now, values)
+            spread_out(values, rest[t], jacobian[t], spread[t])
             follow(theta, c, s, before, e[t], now)
         total += look_at(theta, c, s, now, seen_so, g[t], h[t])
         if not abs(total) < np.inf:
