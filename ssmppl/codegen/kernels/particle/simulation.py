@@ -123,8 +123,8 @@ def predict_step(
     """Write what is predicted of y_t, K channels, at P levels.
 
     predicted : prediction (T, 4, K), of which row t gets mean, variance, P(Y <= y_t) and
-        P(Y < y_t) of each channel; levels (P,), increasing; quantiles (T, P, K), of one y drawn for each
-        particle; stream, of these draws alone: `rng` goes on as if there were none.
+        P(Y < y_t) of each channel; levels (P,), increasing; quantiles (T, P, K), of one y drawn
+        for each particle; stream, of these draws alone: `rng` goes on as if there were none.
     """
     prediction, levels, quantiles, stream = predicted
     n, n_channels = w_prev.size, y.shape[1]
