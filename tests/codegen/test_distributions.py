@@ -24,9 +24,9 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.model.traced import Site, Trace, symbols
 from ssmppl.language.trace import trace
-from tests.codegen.models import declare
 from tests.language.distributions.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
 from tests.language.distributions.test_truncated import COUNTS, check_counts
+from tests.models.statements import declare
 
 N = 20_000
 LEVEL = 1e-6 / (len(CASES) + 6 * len(JOINT_CASES) + len(TRUNCATED_CASES))  # Bonferroni

@@ -27,7 +27,7 @@ from tests.codegen.harness import (
     plain,
     stand_in,
 )
-from tests.codegen.models import MODELS, build
+from tests.models.statements import MODELS, build
 
 CASES = [(name, gaps) for name in MODELS for gaps in (False, True)]
 

@@ -21,8 +21,8 @@ from ssmppl.expressions.operations import KERNELS
 from ssmppl.inference.run.problem import pose
 from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
-from tests.codegen.models import MODELS, build
 from tests.codegen.native_calls import MATRIX, both_ways, called, sections
+from tests.models.statements import MODELS, build
 
 pytestmark = pytest.mark.skipif(
     native_build.llvm.llvm_version_info[0] < native_build.OLDEST,

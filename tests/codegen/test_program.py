@@ -14,7 +14,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.store import folder
 from ssmppl.language.trace import trace
-from tests.codegen.models import MODELS, build
+from tests.models.statements import MODELS, build
 
 ROOT = Path(__file__).parents[2]
 
@@ -30,7 +30,7 @@ def test_text(name):
     same = text == program.path.read_text() == again
     assert same  # not compared in the assert itself: pytest would take minutes over the difference
     lines = {int(n) for n in re.findall(r"# models\.py:(\d+)$", text, re.MULTILINE)}
-    source = (ROOT / "tests/codegen/models.py").read_text().splitlines()
+    source = (ROOT / "tests/models/statements.py").read_text().splitlines()
     start = MODELS[name].__code__.co_firstlineno
     assert lines, "no line of the user's is named"
     assert all(start < n < start + 40 for n in lines)
@@ -92,7 +92,7 @@ import numpy as np, sys
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.language.trace import trace
-from tests.codegen.models import build
+from tests.models.statements import build
 program = compile_trace(trace(build("linear_scalar")))
 run = program.module.simulate  # the variant that Numba compiles and keeps
 y = np.zeros((3, 1))

@@ -19,8 +19,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl import compiling
 from ssmppl.compiling import LOCK, literal, once, once_property, one_at_a_time, parse
-
-from .models import build
+from tests.models.statements import build
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0  # seconds; what is asked for takes milliseconds

@@ -10,8 +10,8 @@ from ssmppl.expressions.arrays import array
 from ssmppl.language.distributions import Truncated
 from ssmppl.language.trace import trace
 from tests.analysis.conjugacy import corpus
-from tests.codegen import models as features
-from tests.diagnosis import models
+from tests.models import gaps as models
+from tests.models import statements as features
 from tests.statistics.checks import seed_of
 
 ROLES = ("parameters", "initial", "transition", "observations", "proposal")

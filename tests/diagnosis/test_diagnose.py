@@ -14,8 +14,8 @@ from ssmppl.diagnosis.run.expected_time import Timed, in_words, seconds
 from ssmppl.diagnosis.screening import screen
 from ssmppl.diagnosis.selection import attribution, refit
 from ssmppl.errors import ArgumentError, DataError
-from tests.diagnosis import models
 from tests.diagnosis.small import BREAK, DATE, level, levels
+from tests.models import gaps as models
 
 FEW = 60  # simulated sets, in place of 100 or 200
 EFFECTS = ["level break", "sensor drift"]

@@ -23,8 +23,8 @@ from ssmppl.errors import SSMError
 from ssmppl.language.distributions import Flat, HalfFlat
 from ssmppl.modelfile import load_model, read_csv
 from tests.analysis.conjugacy import corpus
-from tests.diagnosis import models
 from tests.diagnosis.every import FILES, MODELS, candidates, traced
+from tests.models import gaps as models
 
 ROWS, MORE_SETS, PARTICLES, BLOCKS = 60, 32, 30, 5
 SAMPLE = {"fast": 12, "full": 6}  # effects tried

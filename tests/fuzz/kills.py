@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.inference.checkpoints import checkpoint_models as models
+from tests.models import checkpoints as models
 
 NAMES = ("Gibbs", "MetropolisHastings", "PMMH", "PGAS", "PGAS, interweaved", "SMC2")
 EACH = 5  # stops of one call, before it is left to end

@@ -27,7 +27,7 @@ import arviz as az
 import numpy as np
 
 import ssmppl as ssm
-from tests.inference.checkpoints.checkpoint_models import CALLS, pair
+from tests.models.checkpoints import CALLS, pair
 
 COUNTS = ssm.Model("counts")
 SHORT: dict[str, Any] = {"draws": 6, "warmup": 4, "chains": 2, "progress": False}

@@ -23,7 +23,7 @@ from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.trace import trace
 from tests.codegen.harness import Numbers
-from tests.codegen.models import build
+from tests.models.statements import build
 
 THREADS = 4
 ROLES = ("prepare", "step", "draw_initial", "weigh_initial", "fit", "draw", "weigh")

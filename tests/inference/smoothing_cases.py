@@ -10,7 +10,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.inference.run.problem import pose
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import seed_of
 from tests.statistics.exact import DenseGaussian
 from tests.statistics.test_likelihood import with_gaps

@@ -46,9 +46,10 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.inference.run.prior import draw_prior
 from ssmppl.inference.verbs.simulate import feeds_back
+from tests.models import standard as models
+from tests.models import wider as wider_models
 
 from . import geweke_kernels as kernels
-from . import models, wider_models
 from .checks import seed_of
 
 STEPS = 5  # rows of data: few, so that each transition can move far

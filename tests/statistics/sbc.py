@@ -23,8 +23,9 @@ import numpy as np
 from scipy import stats
 
 import ssmppl as ssm
+from tests.models import standard as models
+from tests.models import wider as wider_models
 
-from . import models, wider_models
 from .checks import seed_of
 
 KEPT = 63  # L: ranks from 0 to 63

@@ -18,8 +18,8 @@ from ssmppl.inference.particles.backward import backward_draws, genealogy, parti
 from ssmppl.inference.particles.filtering import FilterSettings, full_run, log_likelihood_estimate
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
+from tests.models import standard as models
 
-from . import models
 from .checks import seed_of
 
 PARAMETERS = {"theta": 1.0, "c": 0.5}

@@ -21,8 +21,8 @@ from ssmppl.inference.chains.pmmh import ParticleLikelihood
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
+from tests.models import standard as models
 
-from . import models
 from .checks import LEVEL, mean_one_p, seed_of, some
 from .exact import DenseGaussian, varve_log_likelihood
 

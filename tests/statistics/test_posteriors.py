@@ -16,8 +16,8 @@ from numpy.polynomial import Chebyshev
 
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, lgss_appendix, lgss_main_text
+from tests.models import standard as models
 
-from . import models
 from .checks import (
     assert_within,
     deviations,

@@ -17,8 +17,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves
 from ssmppl.inference.run import chain_runner
-
-from . import models
+from tests.models import standard as models
 
 DATA = {"y": ice_varves()[:60]}
 THETA = {"phi": 0.9, "tau": 20.0}

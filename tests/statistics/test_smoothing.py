@@ -14,8 +14,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.datasets import lgss_appendix, lgss_main_text
+from tests.models import standard as models
 
-from . import models
 from .checks import assert_moments, assert_within, deviations, seed_of, some
 from .exact import DenseGaussian, GridPosterior
 from .test_likelihood import vector_cells, with_gaps

@@ -19,8 +19,8 @@ from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_filter
 from ssmppl.inference.run.problem import pose
 from tests.codegen.harness import plain_module
-from tests.inference import twisted_models
-from tests.statistics import models
+from tests.models import standard as models
+from tests.models import twisted as twisted_models
 from tests.statistics.exact import DenseGaussian
 
 # --- correlated noise, an input, two channels of which single components are missing -------------

@@ -20,7 +20,7 @@ from ssmppl.inference.chains.pmmh import CorrelatedLikelihood, ScoredLikelihood
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.problem import pose
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 
 THETA = np.array([0.8, 0.4, 4.0, 0.3])  # a, k, precision, r

@@ -22,8 +22,8 @@ from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbol, symbols_of
 from ssmppl.language.trace import trace
-from tests.diagnosis import models
 from tests.diagnosis.harness import EVERY, content, nodes, offered, scales, traced
+from tests.models import gaps as models
 
 LAWS = ("initial", "transition", "observations")
 

@@ -26,7 +26,7 @@ from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.trace import trace
-from tests.diagnosis.models import THETA, build, simulated
+from tests.models.gaps import THETA, build, simulated
 from tests.statistics.checks import LEVEL, seed_of, some
 
 LINEAR = ("noisy_oscillator", "oscillator")

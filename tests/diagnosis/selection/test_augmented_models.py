@@ -7,8 +7,8 @@ from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.inference.run.problem import missing_of, pose
-from tests.diagnosis import models
 from tests.diagnosis.harness import scales
+from tests.models import gaps as models
 
 ROWS, THREADS = 40, 4
 

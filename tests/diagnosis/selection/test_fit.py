@@ -12,8 +12,8 @@ from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from tests.diagnosis import models
 from tests.diagnosis.small import level, levels
+from tests.models import gaps as models
 from tests.statistics.checks import LEVEL, seed_of, some
 
 CASES = {

@@ -15,8 +15,8 @@ from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.selection.shapes import PRICE, shape_bounds, shaped_all
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
-from tests.diagnosis import models
 from tests.diagnosis.harness import scales, traced
+from tests.models import gaps as models
 
 ROWS = 200
 

@@ -28,8 +28,8 @@ from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.model.traced import previous, seen
-from tests.inference import elimination_models as models
-from tests.inference.elimination_models import GONE, MODELS, STEPS, joint_draws
+from tests.models import elimination as models
+from tests.models.elimination import GONE, MODELS, STEPS, joint_draws
 from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some
 from tests.statistics.checks import deviations as deviations_of
 

@@ -20,8 +20,8 @@ from ssmppl.inference.chains.interweaving import Interweaving, InterweavingTunin
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.language.model.transforms import constant_bounds
-from tests.inference import noise_models as models
-from tests.inference.noise_models import CASES, STEPS, joint_draws
+from tests.models import noise as models
+from tests.models.noise import CASES, STEPS, joint_draws
 from tests.statistics.checks import LEVEL, some
 
 

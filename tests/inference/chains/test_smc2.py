@@ -12,7 +12,7 @@ from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.chains.smc2 import Filters, begin, exchange, one_row
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 
 LGSS = {"y": datasets.load("lgss_main_text")["y"]}

@@ -16,8 +16,8 @@ from ssmppl.inference.checkpoints import archive, chains, origin
 from ssmppl.inference.checkpoints.chains import ChainFile
 from ssmppl.inference.run import chain_runner
 from ssmppl.inference.verbs.sample import METHODS
-from tests.inference.checkpoints import checkpoint_models as models
-from tests.inference.checkpoints.checkpoint_models import CALLS, bits, call
+from tests.models import checkpoints as models
+from tests.models.checkpoints import CALLS, bits, call
 
 ROOT = Path(__file__).parents[3]
 DEFAULT = ["PGAS", "SMC2"]  # what is fast to compile

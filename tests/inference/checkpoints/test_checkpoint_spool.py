@@ -16,7 +16,6 @@ from ssmppl.inference.checkpoints import chains, spool
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import stack
 from ssmppl.results import arviz, save
-from tests.inference.checkpoints.checkpoint_models import bits, call
 from tests.inference.checkpoints.test_checkpoint import (
     CHAINS,
     ROOT,
@@ -32,6 +31,7 @@ from tests.inference.checkpoints.test_checkpoint import (
     starts,
     walk,
 )
+from tests.models.checkpoints import bits, call
 
 ROW = 8 * CHAINS * 5  # bytes of a draw of all chains: four numbers and a statistic
 

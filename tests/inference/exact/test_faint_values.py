@@ -13,7 +13,7 @@ from ssmppl.inference.exact import hidden_markov as passes
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from tests.inference.finite_models import MODELS, data_of
+from tests.models.finite import MODELS, data_of
 from tests.statistics.checks import seed_of
 
 

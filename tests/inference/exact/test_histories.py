@@ -13,7 +13,7 @@ from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.trace import trace
-from tests.inference.finite_models import MODELS, data_of, enumerated, weather
+from tests.models.finite import MODELS, data_of, enumerated, weather
 from tests.statistics.checks import LEVEL, seed_of
 
 

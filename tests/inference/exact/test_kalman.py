@@ -18,7 +18,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.kalman import kalman_filter, kalman_log_likelihood, kalman_model
 from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
-from tests.inference.kalman_models import MODELS, posed
+from tests.models.kalman import MODELS, posed
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.3])

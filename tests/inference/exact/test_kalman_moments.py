@@ -6,7 +6,7 @@ import pytest
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.errors import SamplingError
 from ssmppl.inference.exact.kalman import kalman_model
-from tests.inference.kalman_models import MODELS, posed, scalar
+from tests.models.kalman import MODELS, posed, scalar
 from tests.statistics.checks import seed_of
 
 

@@ -14,7 +14,7 @@ from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.language.model.model import Model
 from ssmppl.language.trace import trace
 from tests.inference.exact.test_kalman import lgss
-from tests.inference.kalman_models import MODELS, posed, scalar, time_varying
+from tests.models.kalman import MODELS, posed, scalar, time_varying
 from tests.statistics.checks import seed_of
 
 

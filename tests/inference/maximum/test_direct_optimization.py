@@ -14,7 +14,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.trace import trace
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import mean_one_p, seed_of
 from tests.statistics.exact import varve_log_likelihood
 

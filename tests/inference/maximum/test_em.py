@@ -13,9 +13,9 @@ from ssmppl.inference.maximum.em import climb as climb_em
 from ssmppl.inference.maximum.m_step import maximiser
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
-from tests.inference import em_models
-from tests.inference.em_models import simulated
-from tests.statistics import models
+from tests.models import em as em_models
+from tests.models import standard as models
+from tests.models.em import simulated
 from tests.statistics.checks import LEVEL, seed_of, some
 from tests.statistics.exact import DenseGaussian
 

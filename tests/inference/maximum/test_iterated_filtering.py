@@ -26,7 +26,7 @@ from ssmppl.inference.maximum.noisy_maximum import LocalMaximum, local_maximum
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 
 LGSS = {"y": datasets.load("lgss_main_text")["y"]}

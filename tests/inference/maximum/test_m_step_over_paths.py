@@ -6,8 +6,8 @@ import pytest
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.inference.maximum.m_step import maximise_over_paths, maximiser
-from tests.inference import em_models
 from tests.inference.maximum.test_em import setup_of
+from tests.models import em as em_models
 from tests.statistics.checks import seed_of
 
 closed = ssm.Model("closed")

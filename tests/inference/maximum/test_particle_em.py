@@ -23,10 +23,10 @@ from ssmppl.inference.maximum.psaem import (
 )
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.seeds import random_state
-from tests.inference import em_models
-from tests.inference.em_models import simulated
 from tests.inference.maximum.test_em import setup_of
-from tests.statistics import models
+from tests.models import em as em_models
+from tests.models import standard as models
+from tests.models.em import simulated
 from tests.statistics.checks import LEVEL, mcse_mean, seed_of, some
 
 SWEEPS = {"chains": 4, "dropped": 100, "kept": 3000}

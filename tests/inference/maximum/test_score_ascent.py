@@ -14,7 +14,7 @@ from ssmppl.inference.particles.scores import SmootherRun
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.verbs.maximize import choose_method
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import seed_of
 from tests.statistics.exact import varve_log_likelihood
 

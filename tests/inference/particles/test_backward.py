@@ -21,7 +21,7 @@ from ssmppl.inference.particles.filtering import SCHEMES, FilterSettings, log_li
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 from tests.inference.smoothing_cases import assert_moments, moments_of, smoothing_case
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import seed_of, some
 
 LEVEL = 0.001

@@ -20,8 +20,8 @@ from ssmppl.inference.particles.scores import complete_scores
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.language.trace import trace
-from tests.codegen.models import build
-from tests.statistics import models
+from tests.models import standard as models
+from tests.models.statements import build
 from tests.statistics.checks import seed_of
 
 # A deterministic state that moves with parameters in itself and in its start, whose noisy

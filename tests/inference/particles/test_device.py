@@ -19,8 +19,8 @@ import ssmppl as ssm
 from ssmppl.codegen.modules import device
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.language.trace import trace
-from tests.codegen.models import MODELS, build
 from tests.inference.particles.test_blocks import AT, MODEL, data
+from tests.models.statements import MODELS, build
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of
 
 ROOT = Path(__file__).parents[3]

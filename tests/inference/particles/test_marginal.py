@@ -18,7 +18,7 @@ from ssmppl.inference.particles.marginal import _Step, backward_pass, draw_given
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.trace import trace
-from tests.inference.conditional_models import THETA, enumerated, four_states, regimes
+from tests.models.conditional import THETA, enumerated, four_states, regimes
 from tests.statistics.checks import LEVEL, MCSE, deviations, mean_one_p, seed_of
 
 NAMES = ("marginal", "marginal_guided", "marginal_auxiliary")

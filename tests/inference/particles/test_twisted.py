@@ -22,7 +22,8 @@ from ssmppl.inference.preparation import proposal_choice
 from ssmppl.inference.preparation.proposal_choice import ENOUGH, choose
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from tests.inference.twisted_models import (
+from tests.models import standard as models
+from tests.models.twisted import (
     crash,
     crash_log_likelihood,
     pendulum,
@@ -31,7 +32,6 @@ from tests.inference.twisted_models import (
     volatility,
     volatility_log_likelihood,
 )
-from tests.statistics import models
 from tests.statistics.checks import (
     LEVEL,
     assert_moments,

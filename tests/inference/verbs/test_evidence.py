@@ -9,7 +9,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.datasets import ice_varves, load
 from ssmppl.inference.chains.bridge import bridge, importance
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import LEVEL, seed_of
 
 ERRORS = 4.0  # standard errors that an estimate may lie off

@@ -10,7 +10,7 @@ from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.language.trace import trace
-from tests.inference.finite_models import MODELS, independent, second_order, weather
+from tests.models.finite import MODELS, independent, second_order, weather
 from tests.statistics.checks import LEVEL, seed_of
 
 NAMES = ("stay", "leave", "m")

@@ -16,7 +16,7 @@ from ssmppl.inference.preparation.exact_score import ExactScore
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.verbs import maximize as verb
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import seed_of
 
 LGSS = [("lgss_main_text", 0.5), ("lgss_appendix", 1.0)]

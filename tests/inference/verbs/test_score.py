@@ -9,7 +9,7 @@ import ssmppl as ssm
 from ssmppl import datasets
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.particles.scores import SmootherRun, combine, run_weights
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import seed_of, some
 from tests.statistics.exact import DenseGaussian
 

@@ -22,7 +22,7 @@ from tests.inference.smoothing_cases import (
     moments_of,
     smoothing_case,
 )
-from tests.statistics import models
+from tests.models import standard as models
 from tests.statistics.checks import assert_moments as assert_chain_moments
 from tests.statistics.checks import seed_of
 from tests.statistics.exact import DenseGaussian

@@ -1,5 +1,5 @@
 """Further models with proper, informative priors, for the tests of calibration: what the models of
-`models.py` do not have.
+`standard.py` do not have.
 
 leverage : stochastic volatility whose transition names the observation before.
 ricker : a population that overshoots, counted with negative binomial error.
