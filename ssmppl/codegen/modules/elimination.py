@@ -84,7 +84,12 @@ def row_functions(layout: Layout, found: Elimination) -> Section:
 
     for role, doc, arguments, values in (
         ("initial_statistics", "What x_1 adds.", "theta, c, s, states, out", found.initial),
-        ("transition_statistics", "What x_t adds.", "theta, c, s, states_prev, states, out", found.later),
+        (
+            "transition_statistics",
+            "What x_t adds.",
+            "theta, c, s, states_prev, states, out",
+            found.later,
+        ),
         ("observed_statistics", "What y_t adds.", "theta, c, s, states, out", found.measured),
     ):
         section.particle_pass(role, doc, arguments, listed(values))
