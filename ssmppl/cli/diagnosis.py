@@ -53,7 +53,7 @@ def _made(folder: Path) -> Path:
 @MODEL
 @NEEDED_DATA
 @option("--mode", type=click.Choice(["full", "fast"]), default="full",
-        help="fast stops after the screen: nothing is fitted again.")  # fmt: skip
+        help="fast stops after the score tests: no refits.")  # fmt: skip
 @option("--fast", is_flag=True, show_default=False, help="The same as --mode fast.")
 @FIXED
 @option(
