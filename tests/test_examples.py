@@ -26,7 +26,7 @@ def example(name):
 def test_model_and_data_belong_together(name):
     model, data = example(name)
     text = str(ssm.explain(model, data))
-    assert "Chosen, unless a method is named" in text
+    assert "Default methods" in text
     ast.parse((EXAMPLES / name / "run.py").read_text(encoding="utf-8"))
 
 

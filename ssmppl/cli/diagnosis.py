@@ -53,7 +53,7 @@ def _made(folder: Path) -> Path:
 @MODEL
 @NEEDED_DATA
 @option("--mode", type=click.Choice(["full", "fast"]), default="full",
-        help="fast stops after the screen: nothing is fitted again.")  # fmt: skip
+        help="fast stops after the score tests: no refits.")  # fmt: skip
 @option("--fast", is_flag=True, show_default=False, help="The same as --mode fast.")
 @FIXED
 @option(
@@ -84,7 +84,7 @@ def diagnose(
     """Where MODEL.py differs from DATA, which effect is missing, how far the gap closes.
 
     Prints the three answers in words, and writes a folder with the page index.html, tables
-    (CSV), plots (PNG) and the model with what was found added. The page is one file that any
+    (CSV), plots (PNG) and the augmented model. The page is one file that any
     browser shows, on a phone too. Inputs are columns of the data; several DATA are several
     experiments of one system. Ctrl-C ends early: the stages that are done are kept, and the same
     command goes on from there. Where a part fails, the answer is without it and says so, and the

@@ -325,8 +325,8 @@ class _Diagnosis:
         with announced("diagnose", stage, shown=self.checkpoint.progress):
             fit = base.restored(experiments, self.checkpoint.computed(stage, numbers))
         if not fit.converged:
-            left = f": about {fit.distance:.1f} nats may be left" if fit.distance > 0.0 else ""
-            self.notes.append(f"the fit of the model did not settle ({stage}){left}")
+            left = f"; estimated remaining gain {fit.distance:.1f} nats" * (fit.distance > 0.0)
+            self.notes.append(f"the optimiser did not converge ({stage}){left}")
         if fit.bounds:
             self.notes.append(
                 bounds_note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}")

@@ -155,7 +155,7 @@ def no_gap():
         residual_map=residual_map(["x", "v", "y"], 1000, 20, {}),
         free_run=found.free_run.assign(after=NAN, after_low=NAN, after_high=NAN),
         estimates={"before": found.estimates["before"]},
-        notes=["the lower bound of the closable gain is not above zero, so no share is given"],
+        notes=["the lower bound of the reference's gain is not above zero, so no share is given"],
     )  # fmt: skip
 
 

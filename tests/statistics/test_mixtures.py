@@ -195,8 +195,8 @@ def test_posterior(name, method):
 def test_what_is_explained():
     """Slices for what is inside of a mixture; nothing is linear and Gaussian."""
     sections = dict(ssm.explain(outliers).sections())
-    parameters = dict(sections["Parameters given the states"])
-    assert "slice step" in parameters["p"]
+    parameters = dict(sections["Gibbs updates (full conditionals given states and data)"])
+    assert "slice sampling" in parameters["p"]
     assert "does not separate in p" in parameters["p"]
     assert "Mixture" in str(sections["Structure"])
     filters = dict(sections["Particle filter"])

@@ -80,10 +80,13 @@ def conjugate_update(search: Search, found: Found) -> Update:
     where, reason = site.distribution.location, ""
     if found.correction:
         sources = [f for j in found.correction for f in form.origins[form.monomials[j]]]
-        laws = " and the ".join(sorted({f"{f.role} law of {f.site}" for f in sources}))
+        laws = sorted({f"{f.role} law of {f.site}" for f in sources})
         left = ", ".join(to_text(form.functions[j]) for j in found.correction)
         where = sources[0].where
-        reason = f"the {laws} leaves {left} outside the {family.name} family"
+        reason = (
+            f"the {' and the '.join(laws)} {'is' if len(laws) == 1 else 'are'} not conjugate "
+            f"(outside the {family.name} family: {left})"
+        )
     if form.left:
         where, reason = form.left[0][1].where or where, form.left[0][1].reason
     update = Update(
@@ -139,19 +142,23 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
     if update.left:
         laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
         notes.append(
-            f"corrected for the {laws} by a Metropolis step on the log joint density and a slice "
-            f"sweep: {update.reason}"
+            f"Metropolis-Hastings with the {update.family} law, which leaves out the {laws}, as "
+            f"independence proposal, followed by univariate slice sampling: {update.reason}"
         )
         if update.where is not None:
             notes.append(update.where.short)
     elif update.correction:
         text = describe.correction_text(form, update.correction)
         if _may_be_bounded(update):
-            notes.append(f"accepted with probability proportional to {text}: {update.reason}")
+            notes.append(
+                f"rejection sampling from the {update.family} law with acceptance probability "
+                f"proportional to {text}: {update.reason}"
+            )
         else:
             notes.append(
-                f"corrected for {text} by a Metropolis step, as it has no known upper bound, and "
-                f"a slice sweep: {update.reason}"
+                f"Metropolis-Hastings with the {update.family} law as independence proposal "
+                f"(density ratio {text} not known to be bounded), followed by univariate slice "
+                f"sampling: {update.reason}"
             )
         if update.where is not None:
             notes.append(update.where.short)
@@ -184,19 +191,19 @@ def _slice(
     separated = separate_block(search.data, unit) if use_statistics else why
     form = separated if isinstance(separated, BlockForm) else None
     how = {
-        "real": "a slice step on its exact conditional",
-        "simplex": "slice steps on its log ratios, on their exact conditional",
-        "matrix": "slice steps on its Cholesky factor (log diagonal), on the exact conditional",
+        "real": "slice sampling of the full conditional",
+        "simplex": "slice sampling of the full conditional of its log ratios",
+        "matrix": "slice sampling of the full conditional of its Cholesky factor (log diagonal)",
     }[kind]
-    cost = "through its statistics" if form else "each evaluation a pass over the data"
-    law = f"{how}, {cost}"
+    cost = "each density evaluation costs one pass over the data"
+    law = f"{how}, evaluated from sufficient statistics" if form else f"{how}; {cost}"
     if degenerate(search.data, unit) is not None:
-        law = f"{how}, given the noisy states alone, from which the deterministic ones follow anew"
+        law = f"{how}, given the noisy states only; deterministic states are recomputed"
     notes = (f"because {why.reason}", *([why.where.short] if why.where else []))
     explanation = Explanation(joined(unit), law, describe.statistics(form) if form else (), notes)
     hyperparameters = search.unread(unit)
     if hyperparameters is not None:
-        explanation = describe.prior_alone(unit, hyperparameters, f"moved by {how}")
+        explanation = describe.prior_alone(unit, hyperparameters, f"updated by {how}")
     return Update(
         block=(unit[0].data[1],),
         components=unit,

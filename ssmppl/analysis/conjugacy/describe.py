@@ -58,11 +58,10 @@ def prior_alone(
 ) -> Explanation:
     """The explanation of a block that no law of the model reads, moved as `how` says."""
     given = f", given {', '.join(hyperparameters)}," if hyperparameters else ""
-    pronoun, noun = ("it", "its") if len(components) == 1 else ("them", "their")
+    verb, noun = ("does", "its") if len(components) == 1 else ("do", "their")
     return Explanation(
         joined(components),
-        f"no law of the model reads {pronoun}, so that the data tell nothing of {pronoun}: {noun} "
-        f"posterior{given} is {noun} prior, {how}",
+        f"{verb} not enter the model: {noun} posterior{given} equals {noun} prior, {how}",
     )
 
 

@@ -151,7 +151,8 @@ class Gamma(Family):
     def when_improper(self, known: Callable[[int], float | None]) -> str:
         c = known(self.log)
         proper = c is None or (c + 1.0) / self.power > 0.0
-        return "" if proper else "slice steps where the shape or the rate is not positive"
+        improper = "the Gamma law is improper (shape or rate not positive)"
+        return "" if proper else f"slice sampling when {improper}"
 
 
 @dataclass(frozen=True)
@@ -294,7 +295,7 @@ class Normal(Family):
         return f"{words.name} ~ Normal(H^-1 h, precision = H), {len(words.names)} numbers"
 
     def when_improper(self, known: Callable[[int], float | None]) -> str:
-        return "slice steps where the precision H is not positive definite"
+        return "slice sampling when the Normal law is improper (H not positive definite)"
 
     @property
     def as_matrices(self) -> bool:
@@ -448,7 +449,7 @@ class NormalGamma(ScaledFamily):
         )
 
     def when_improper(self, known: Callable[[int], float | None]) -> str:
-        return "separate updates where the precision H or the rate is not positive"
+        return "one-at-a-time updates when the joint law is improper (H or the rate not positive)"
 
 
 @dataclass(frozen=True)

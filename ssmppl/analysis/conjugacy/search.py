@@ -139,8 +139,8 @@ class Search:
             {f"{f.role} of {f.site}" for i in positions for f in form.origins[form.monomials[i]]}
         )
         return NotApplicable(
-            f"{names} enters the {' and the '.join(laws)} through {text}{more}, outside the span "
-            "of every family",
+            f"{names} is not conjugate: its full conditional contains {text}{more}, from the "
+            f"{' and the '.join(laws)}",
             factor.where,
         )
 

@@ -109,8 +109,8 @@ class CrossFit:
         same = int(table["same"].sum()) if "same" in table else len(each)  # resumed from before
         if self.chosen is not None and same < len(each):
             out.notes.append(
-                f"without the block, the effects chosen are those named here in {same} of "
-                f"{len(each)} blocks: the share is of what was chosen each time"
+                f"the effects selected without a block are those named here in {same} of "
+                f"{len(each)} folds: the share is that of the selection in each fold"
             )
         return out
 
@@ -124,7 +124,7 @@ class CrossFit:
             found[name] = self._predict(model, events, fold, seed)
         out = {n: p.log_density.sum(axis=1) for n, p in found.items()}
         if not all(np.all(np.isfinite(v)) for v in out.values()):
-            raise ArgumentError("a model fitted without a block gives the block no probability")
+            raise ArgumentError("zero predictive density for a held-out block")
         out["gain_mean"] = np.asarray(gain_of_mean(found["base"], found["effect"]))
         measured = [(e.seen.any(axis=1) & c).sum()
                     for e, c in zip(self.experiments, counts, strict=True)]  # fmt: skip

@@ -32,7 +32,7 @@ REPLICATES = 2000  # of the bootstrap
 LEAST_CHOSEN = 10  # blocks that the choice of their length leaves
 FEWEST_BLOCKS = 5  # below which the bootstrap does not know a variance
 SAME = 1e-3  # relative difference of two gains up to which they are the same model's
-NOT_GIVEN = "the share of the gap that is closed is not given: {}"
+NOT_GIVEN = "the share of the reference model's gain is not given: {}"
 
 Kind = Literal["bounded", "complement", "unbounded"]
 
@@ -106,10 +106,12 @@ class GainRatio:
         if not self.own_reference:
             return []
         low, high = (self.gain.nats + s * 1.96 * self.gain.error for s in (-1.0, 1.0))
-        what = "nothing beyond the chosen effect was found" if chosen else "no effect was chosen"
+        what = "the reference model equals the chosen model"
+        if not chosen:
+            what = "no effect was chosen, and the reference model is compared with itself"
         return [
-            f"{what}, so that the share is of its own gain: {self.gain.nats:.1f} nats on held-out "
-            f"rows (95% interval {low:.1f} to {high:.1f})"
+            f"{what}, so that the share is 100% by construction; its held-out gain is "
+            f"{self.gain.nats:.1f} nats (95% interval {low:.1f} to {high:.1f})"
         ]
 
 
@@ -384,7 +386,7 @@ class HeldOutRows:
             )  # fmt: skip
             best = predict(*reference, experiments, counts, seed)
         except SSMError as error:
-            out.notes.append(f"no reference to measure the gap against: {error.found}")
+            out.notes.append(f"the reference model could not be fitted: {error.found}")
             return
         model = (chosen.fitter, chosen.fit) if chosen else reference
         same = reference[1] is model[1]  # nothing was found beyond the chosen effects

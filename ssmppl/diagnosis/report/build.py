@@ -145,7 +145,10 @@ def build_report(r: Results, seconds: float) -> GapReport:
         (x.fitter.initial_law for x in [*r.refits, r.chosen] if x and x.fitter.initial_law), None
     )
     if initial_law:
-        notes.append(f"only linear Gaussian models can start flat: others start with {initial_law}")
+        notes.append(
+            "a diffuse initial distribution needs a linear Gaussian model: augmented models that "
+            f"are not linear Gaussian start with {initial_law}"
+        )
     return GapReport(
         verdict=verdict, where=where, causes=causes, classes=classes, closed=share,
         detection=checks, residual_map=table("residual_map", lambda: tables.map_table(screen)),
@@ -322,7 +325,7 @@ def _parts(r: Results) -> dict[str, Any]:
     if measured and not blocks and len(rows):
         out["confirm"] = _span(e, int(rows[0]), int(rows[-1]) + 1)
     if r.attribution and r.attribution.left_out:
-        out["choice"] = "that fewer effects were kept than fitted best was decided on held-out rows"
+        out["choice"] = "the number of effects was reduced by their held-out gain"
     return out
 
 

@@ -27,32 +27,33 @@ LONGEST_TABLE = 60  # rows; the CSV files have all
 
 # What the page calls columns and tables, and says below the panels.
 HEADINGS = {
-    "F": "share closed", "F_low": "from", "F_high": "to", "t_from": "from t", "t_to": "to t",
-    "gain_screen": "gain, predicted", "gain_refit": "gain, refitted", "class_id": "alike",
-    "estimate": "strength", "se": "±", "rho": "correlation", "separating_input": "told apart by",
-    "nats_per_sample": "nats per sample", "gain_mean": "nats from the mean",
-    "gain_noise": "nats from the noise law", "rmse_before": "error before",
+    "F": "share of the gain", "F_low": "from", "F_high": "to", "t_from": "from t", "t_to": "to t",
+    "gain_screen": "gain, score test", "gain_refit": "gain, refitted", "class_id": "class",
+    "estimate": "strength", "se": "±", "rho": "correlation", "separating_input": "separating input",
+    "nats_per_sample": "nats per sample", "gain_mean": "nats, conditional mean",
+    "gain_noise": "nats, rest of the distribution", "rmse_before": "error before",
     "rmse_after": "error after", "p": "p",
 }  # fmt: skip
 TABLES = {
     "causes": "All effects tried, best first",
-    "classes": "Effects that cannot be told apart",
+    "classes": "Effects not distinguishable by these data",
     "where": "Where the gap is",
-    "closed": "How far the gap closes",
-    "detection": "Checks of the one-step predictions",
+    "closed": "Held-out gain",
+    "detection": "Tests of the one-step predictions",
 }
 CAPTIONS = {
-    "residual_map": "Each cell is what the data say against one equation in one stretch of time, "
-    "in standard deviations (z). + and − mark cells beyond 3; a few cells beyond 2 are chance.",
-    "ranked_effects": "Gain in nats once the effect is added. Filled: the model was fitted again "
-    "with it; hatched: predicted by the screen. Effects with the same letter cannot be told apart "
-    "by these data.",
-    "gap_closed": "0% is the model as it was, 100% the best reference at hand. Lines are 95% "
-    "intervals; an arrow where the data do not bound them.",
-    "missing_term": "What would have to be added to the equation in each step, estimated without "
-    "a formula, with its 95% band. Where the band holds zero, nothing may be missing.",
-    "free_run": "A model is started once and never shown the data again. Shaded: where it expects "
-    "95% of them.",
+    "residual_map": "Each cell is the standardised smoothed score (z) of one equation in one "
+    "window of time. + and − mark |z| > 3; |z| > 2 is expected in about 5% of cells by chance.",
+    "ranked_effects": "Log-likelihood gain (nats) when the effect is added. Filled: model "
+    "refitted; hatched: score-test approximation. Effects with the same letter are not "
+    "distinguishable by these data.",
+    "gap_closed": "Share of the reference model's gain in held-out log predictive density: 0% is "
+    "the original model, 100% the reference. Lines are 95% intervals; an arrow where they are "
+    "unbounded or leave the axis.",
+    "missing_term": "The term missing from the equation in each step, estimated by smooth "
+    "functions, with its pointwise 95% band. Where the band contains zero, nothing may be missing.",
+    "free_run": "Open-loop simulation: each model is started once and does not see the data again. "
+    "Shaded: 95% prediction interval.",
 }
 
 # One column of text, cards side by side where there is room.
@@ -227,9 +228,9 @@ def _unknown(report: Findings) -> str:
     """What could not be decided, and what has to be known before the figures are used."""
     out = ""
     for title, items in (
-        ("What these data could not decide", words.undecided(report)),
-        ("To be kept in mind", [words.sentence(n) for n in report.notes]),
-        ("Left out, as they failed", words.left_out(report)),
+        ("Not identified by these data", words.undecided(report)),
+        ("Notes", [words.sentence(n) for n in report.notes]),
+        ("Failed parts", words.left_out(report)),
     ):
         if items:
             out += f"\n<h3>{title}</h3>\n{_list(items)}"
@@ -262,17 +263,17 @@ def _alt(report: Findings, name: str) -> str:
         return text
     if name == "ranked_effects":
         items = [f"{words.row_label(r)} {number(_gain(r), 2)}" for r in bars(report)]
-        return f"Bars of the gain in nats: {'; '.join(items)}."
+        return f"Bars of the log-likelihood gain in nats: {'; '.join(items)}."
     if name == "gap_closed":
         items = [f"{r['effect']} {percent(r['F'])} ({interval(r['F_low'], r['F_high'])})"
                  for r in words.rows(report.closed)]  # fmt: skip
-        return f"Share of the gap closed with its 95% interval: {'; '.join(items)}."
+        return f"Share of the reference model's gain, with its 95% interval: {'; '.join(items)}."
     if name == "missing_term":
-        items = [f"what is missing in {e} over {v}" for e, v in curves(report)]
+        items = [f"missing term in {e} over {v}" for e, v in curves(report)]
         return f"Curves with bands: {words.listed(items)}."
     shown = words.listed(list(dict.fromkeys(str(c) for _, c in runs(report))))
     first = (words.rows(report.closed) or [{}])[0]
-    text = f"Data of {shown} with free runs of the model as it was and with what was found."
+    text = f"Data of {shown} with free runs of the original and the augmented model."
     if is_number(first.get("rmse_before")) and is_number(first.get("rmse_after")):
         text += f" The error goes from {number(first['rmse_before'])} to " \
                 f"{number(first['rmse_after'])}."  # fmt: skip
@@ -377,7 +378,7 @@ def _model(report: Findings) -> str:
     link = f'<p><a download="augmented_model.py" href="data:text/x-python;base64,{coded}">' \
            "Download augmented_model.py</a></p>"  # fmt: skip
     return _section(
-        "The model with what was found",
+        "The augmented model",
         f'{link}\n<div class="scroll" tabindex="0" role="region" aria-label="Model file">'
         f"<pre><code>{html.escape(report.model_text)}</code></pre></div>",
     )

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 TITLES = {
     "residual_map": "Where the model and the data disagree",
     "ranked_effects": "Effects that were tried, best first",
-    "gap_closed": "How much of the gap each closes",
-    "missing_term": "What is missing, as estimated",
-    "free_run": "Simulated without seeing the data",
+    "gap_closed": "Share of the reference model's held-out gain",
+    "missing_term": "Estimated missing term",
+    "free_run": "Open-loop (free-run) simulation",
 }
 
 MOST_EQUATIONS, MOST_EFFECTS, MOST_CURVES, MOST_RUNS = 12, 8, 4, 6  # that are drawn
@@ -159,13 +159,13 @@ def ranked_effects(report: Findings, ax: Any) -> Any:
     ax.set_ylim(len(shown) - 0.6, -0.9)
     ax.set_yticks([])
     ax.axvline(0, color=FAINT, linewidth=0.7)
-    ax.set_xlabel("gain (nats)")
+    ax.set_xlabel("log-likelihood gain (nats)")
     bare(ax, ["bottom"])
     return ax
 
 
 def gap_closed(report: Findings, ax: Any) -> Any:
-    """Share of the closable gap that each effect closes, with its 95% interval.
+    """Share of the reference model's held-out gain that each effect has, with its 95% interval.
 
     An arrow is where the data do not bound the interval, or where it leaves the axis.
     """
@@ -190,7 +190,7 @@ def gap_closed(report: Findings, ax: Any) -> Any:
     ax.set_ylim(len(shown) - 0.6, -0.9)
     ax.set_yticks([])
     ax.xaxis.set_major_formatter(lambda x, _: percent(x))
-    ax.set_xlabel("share of the closable gap that is closed, 95% interval")
+    ax.set_xlabel("share of the reference model's held-out gain, 95% interval")
     bare(ax, ["bottom"])
     return ax
 
@@ -277,8 +277,8 @@ def free_run(
     table = table[(table["experiment"] == experiment) & (table["channel"] == channel)]
     total, table = len(table), table.tail(last)
     x = times(ax, table["t"])
-    _curve(ax, x, table, "before", BEFORE, "--", "model as it was")
-    _curve(ax, x, table, "after", AFTER, "-", "with what was found")
+    _curve(ax, x, table, "before", BEFORE, "--", "original model")
+    _curve(ax, x, table, "after", AFTER, "-", "augmented model")
     ax.plot(x, table["observed"].to_numpy(float), ".", color=DATA, markersize=2.5, label="data")
     notes = [f"experiment {experiment}"] * (len({e for e, _ in known}) > 1)
     notes += [f"last {last:,} of {total:,} rows"] * (total > last)

@@ -31,7 +31,7 @@ class GapReport(Findings):
         Effects that these data cannot tell apart share a `class_id`.
     classes : the members of each class, their correlation `rho` with the best one, and in words
         the input that would separate them best ("" if none would).
-    closed : the chosen model first: share F of the closable gap that it closes on data that took
+    closed : the chosen model first: share F of the reference model's gain on data that took
         no part in choosing it, with a 95% interval (infinite ends where the data do not bound it;
         F NaN where there is no measurable gap); the gain in nats per sample, and its parts in all
         from the mean and from the noise law; the error of a free run before and after.

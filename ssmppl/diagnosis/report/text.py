@@ -15,14 +15,15 @@ if TYPE_CHECKING:
 
 PAGE = 100  # columns
 SHOWN_CAUSES = 8
-PREDICTED = "* predicted by the screen, not refitted"
-ALIKE = "Effects with the same letter cannot be told apart by these data."
+PREDICTED = "* score-test approximation, model not refitted"
+ALIKE = "Effects with the same letter are not distinguishable by these data."
 
 
 def cause_rows(report: Findings, shown: int = SHOWN_CAUSES) -> list[tuple[str, ...]]:
     """Header and the best causes: name, form, strength, gain, p, class letter."""
     letters, chosen = words.class_letters(report), words.marked(report)
-    out: list[tuple[str, ...]] = [("effect", "form", "strength", "gain (nats)", "p", "alike")]
+    out: list[tuple[str, ...]] = [("effect", "form", "strength", "log-lik. gain (nats)", "p",
+                                    "class")]  # fmt: skip
     for i, r in enumerate(words.rows(report.causes)[:shown]):
         refit = is_number(r["gain_refit"])
         gain = number(r["gain_refit"] if refit else r["gain_screen"], 2)
@@ -64,7 +65,9 @@ def report_text(report: Findings) -> str:
             lines.append(PREDICTED)
         if words.class_letters(report):
             lines.append(ALIKE)
-        for term in ("gain", "closable gap", "p")[:: 1 if len(report.closed) else 2]:
+        for term in ("log-likelihood gain", "reference model", "p")[
+            :: 1 if len(report.closed) else 2
+        ]:
             lines += wrapped(f"{term}: {words.GLOSSARY[term]}.")
     for name, found in _rest(report):
         lines += ["", name]

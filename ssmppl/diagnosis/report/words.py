@@ -19,21 +19,21 @@ NAMED_RIVALS = 3
 CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
 MOMENTS = {
     "mean": "the mean of",
-    "scale": "the noise level of",
+    "scale": "the noise variance of",
     "tails": "the tails of the noise of",
-    "time dependence": "how the noise of one step depends on the last, of",
+    "time dependence": "the serial correlation of the noise of",
 }
 
-USE = {"screen": "effects were looked for on", "confirm": "the gap was measured on"}
+USE = {"screen": "effects were selected on", "confirm": "the held-out gain was evaluated on"}
 
 GLOSSARY = {
-    "gain": "how much more probable the effect makes the data, on a log scale: 1 nat is 2.7 times "
-    "as probable, 3 nats 20 times, 10 nats 22,000 times",
-    "closable gap": "what the best reference at hand gains over the model as it was, on the same "
-    "data; 100% closed means as good as that reference",
-    "p": "how often the best of everything tried would stand out this much if the model were "
-    "right; everything tried is counted, so one p does not mislead because many were computed",
-    "z": "a distance from what the model expects, in standard deviations",
+    "log-likelihood gain": "the increase of the log-likelihood when the effect is added: 1 nat is "
+    "a likelihood ratio of 2.7, 3 nats one of 20, 10 nats one of 22,000",
+    "reference model": "the model with the effects and with smooth functions of states and inputs "
+    "where they help; its gain in held-out log predictive density over the original model is 100%",
+    "p": "the p-value corrected for multiple testing (family-wise): the probability, if the model "
+    "were right, that the largest of all statistics tested is at least this large",
+    "z": "a standardised deviation from what the model expects",
     "±": "one standard error; twice that, either way, is about a 95% interval",
 }
 
@@ -148,27 +148,27 @@ def alternatives(report: Findings, row: dict[str, Any]) -> list[str]:
 
 # -- parts of sentences
 def share(report: Findings) -> str:
-    """How much of the gap the chosen model closes, with its interval; "" if not measured."""
+    """The chosen model's share of the reference's gain, with its interval; "" if not measured."""
     closed = rows(report.closed)
     if not closed or not is_number(closed[0]["F"]):
         return ""
     first = closed[0]
-    return f"closes {percent(first['F'])} of the closable gap " \
-           f"({interval(first['F_low'], first['F_high'])})"  # fmt: skip
+    return f"gives {percent(first['F'])} of the reference model's gain in held-out log " \
+           f"predictive density ({interval(first['F_low'], first['F_high'])})"  # fmt: skip
 
 
 def kept_back(report: Findings) -> str:
     """Which data took no part in choosing."""
     if "cross-fitting" in report.parts:
         blocks = report.parts["cross-fitting"]
-        return f"on {blocks} blocks of the data, each left out in turn"
+        return f"in {blocks}-fold blocked cross-validation"
     part = report.parts.get("confirm")
     when = _when(report, part) if isinstance(part, tuple | list) else str(part or "")
     if when and _experiment(report):
         when += ", and likewise of the others"
-    own = "on data that took no part in the choice"
+    own = "on held-out data"
     if "choice" in report.parts:
-        own = "on data that took part in the choice only in that an effect was left out again"
+        own = "on data that took part in the selection only in that an effect was left out again"
     return own + (f" ({when})" if when else "")
 
 
@@ -208,22 +208,22 @@ def headline(report: Findings) -> str:
     sure = p_text(found[0].get("p"))
     unfitted = bool(found[0].get("unfitted"))
     if report.mode == "fast" or unfitted:
-        text = f"the screen says that {named(report)} lacks {listed(groups[0], 'or')} ({sure} " \
-               f"with {tried(report)})."  # fmt: skip
-        text += " These data cannot tell which." * (len(groups[0]) > 1)
+        text = f"the score tests indicate a missing effect in {named(report)}: " \
+               f"{listed(groups[0], 'or')} ({sure}, corrected for {tried(report)})."  # fmt: skip
+        text += " They are not distinguishable by these data." * (len(groups[0]) > 1)
         if unfitted:
             return sentence(f"{text} The model with {row_label(found[0])} could not be fitted (see "
-                            "the notes), so that how far the gap closes is not known")  # fmt: skip
-        return sentence(f"{text} How much of the gap that closes has not been measured yet")
+                            "the notes), so that its held-out gain is not known")  # fmt: skip
+        return sentence(f"{text} The held-out gain has not been measured yet")
     lacks, adding = _lacks(groups)
     text, measured = f"{named(report)} lacks {lacks}", share(report)
     if measured:
         return sentence(f"{text}. {adding} {measured}")
     if not rows(report.closed):
-        return sentence(f"{text} ({sure}). How far the gap closes has not been measured")
+        return sentence(f"{text} ({sure}). The held-out gain has not been measured")
     return sentence(
-        f"{text} ({sure}), but {kept_back(report)} its gain is too uncertain to say how far the "
-        "gap closes"
+        f"{text} ({sure}), but {kept_back(report)} the gain is too uncertain for a share of the "
+        "reference model's gain"
     )
 
 
@@ -234,9 +234,9 @@ def _lacks(groups: list[list[str]]) -> tuple[str, str]:
         return listed([g[0] for g in groups]), "Adding them" if many else "Adding it"
     if not many:
         names = listed(groups[0], "or")
-        return f"one of these, and these data cannot tell which: {names}", "Adding the first"
+        return f"one of these, not distinguishable by these data: {names}", "Adding the first"
     numbered = "; ".join(f"({i}) {listed(g, 'or')}" for i, g in enumerate(groups, start=1))
-    text = f"{len(groups)} effects: {numbered} (“or” joins those that these data cannot tell apart)"
+    text = f"{len(groups)} effects: {numbered} (“or”: not distinguishable by these data)"
     return text, "Adding the first of each"
 
 
@@ -248,10 +248,10 @@ def _none_of_these(report: Findings) -> str:
         when = span(found[0]["t_from"], found[0]["t_to"], found[0]["experiment"])
         spot = f" in {place(found[0])}{f', strongest at {when}' if when else ''}" \
                f" ({p_text(found[0]['p'])})"  # fmt: skip
-    text = f"{named(report)} lacks something{spot}, and none of the {tried(report)} explains it."
+    text = f"{named(report)} is misspecified{spot}; none of the {tried(report)} accounts for it."
     if failed and not found:
         check = f"{failed[0]['statistic']} of {failed[0]['channel']}, {p_text(failed[0]['p'])}"
-        text += f" What shows it is a check of the one-step predictions ({check})."
+        text += f" The evidence is a test of the one-step predictions ({check})."
     if measured and _best_tried(report):
         text += f" The best of them, {_best_tried(report)}, {measured}: curves estimated from " \
                 "the data do clearly better."  # fmt: skip
@@ -272,12 +272,12 @@ def _no_gap(report: Findings) -> str:
     if best is None:
         return where + "."
     if is_number(best["p"]) and best["p"] <= report.settings.get("alpha", 0.05):
-        text = f"{where}: {row_label(best)} stood out at first ({p_text(best['p'])}), but"
+        text = f"{where}: {row_label(best)} was significant ({p_text(best['p'])}), but"
         if not rows(report.closed):
-            return f"{text} what it gains has not been measured."
-        return f"{text} {kept_back(report)} nothing could be gained."
-    return f"{where}: none of the {tried(report)} stands out from chance (the best, " \
-           f"{row_label(best)}, has {p_text(best['p'])})."  # fmt: skip
+            return f"{text} its held-out gain has not been measured."
+        return f"{text} {kept_back(report)} log predictive density did not improve measurably."
+    return f"{where}: none of the {tried(report)} is significant after correction for multiple " \
+           f"testing (the best, {row_label(best)}, has {p_text(best['p'])})."  # fmt: skip
 
 
 def _by_p(row: dict[str, Any]) -> float:
@@ -285,7 +285,7 @@ def _by_p(row: dict[str, Any]) -> float:
 
 
 def place(row: dict[str, Any]) -> str:
-    """Equation and moment: "the noise level of y"."""
+    """Equation and moment: "the noise variance of y"."""
     moment = str(row["moment"])
     return f"{MOMENTS.get(moment, f'the {moment} of')} {row['equation']}"
 
@@ -294,7 +294,9 @@ def where(report: Findings) -> list[str]:
     """Which equation, which moment, when and in which region: the three strongest places."""
     found = outstanding(report, report.where)
     if not found:
-        return ["No equation stands out from chance."]
+        return [
+            "No equation shows misfit that is significant after correction for multiple testing."
+        ]
     out = []
     for i, r in enumerate(found[:3]):
         region = r["region"] if isinstance(r["region"], str) else ""
@@ -310,12 +312,12 @@ def where(report: Findings) -> list[str]:
 def which(report: Findings) -> list[str]:
     """The effects that explain it, with their strength, and what they cannot be told from."""
     if report.verdict == "none of these":
-        text = f"None of the {tried(report)}. What is left over is more than chance"
+        text = f"None of the {tried(report)}. The remaining misfit is significant"
         curve = _curve_peak(report)
         return [sentence(text), *([curve] if curve else [])]
     found = leaders(report)
     if not found:
-        return [f"None of the {tried(report)} stands out."]
+        return [f"None of the {tried(report)} is significant."]
     out = []
     for row in found:
         form = f", {row['form']}" if isinstance(row.get("form"), str) and row["form"] else ""
@@ -325,18 +327,19 @@ def which(report: Findings) -> list[str]:
         gains = [row.get("gain_refit"), row.get("gain_screen")]
         gain = next((g for g in gains if is_number(g)), None)
         if gain is not None:
-            by = "" if is_number(gains[0]) else "predicted "
+            by = "" if is_number(gains[0]) else " (score-test approximation)"
             alone = " by itself" * (len(found) > 1)
-            text += f"; {by}gain {number(gain, 2)} nats{alone}, {p_text(row.get('p'))}"
+            text += f"; log-likelihood gain {number(gain, 2)} nats{alone}{by}"
+            text += f", {p_text(row.get('p'))}"
         out.append(sentence(text))
         others = rivals(report, row)
         if others:
             names = listed([row_label(r) for r in others], "or")
             rhos = [abs(float(r["rho"])) for r in others if is_number(r["rho"])]
-            close = f" (they leave traces that correlate up to {max(rhos):.2f})" if rhos else ""
-            out.append(sentence(f"these data cannot tell it from {names}{close}"))
+            close = f" (efficient scores correlated up to |rho| = {max(rhos):.2f})" if rhos else ""
+            out.append(sentence(f"not distinguishable by these data from {names}{close}"))
         elif row.get("class_id") in [r["class_id"] for r in rows(report.classes)]:
-            out.append("These data tell it from every other effect tried.")
+            out.append("These data distinguish it from every other effect tried.")
     return out
 
 
@@ -346,15 +349,15 @@ def _curve_peak(report: Findings) -> str:
     if not sure:
         return ""
     top = max(sure, key=lambda r: abs(r["estimate"]))
-    text = f"The estimated curve of what is missing in {top['equation']} is largest at " \
+    text = f"The estimated missing term in {top['equation']} is largest in magnitude at " \
            f"{top['variable']} = {number(top['value'])}: {number(top['estimate'])}"  # fmt: skip
     return f"{text} (95% band {number(top['low'])} to {number(top['high'])})."
 
 
 def how_far(report: Findings) -> list[str]:
-    """Share of the gap closed, its gain per sample, and the error of a free run."""
+    """Share of the reference's gain, the gain per sample, and the error of a free run."""
     if report.mode == "fast":
-        return ["Not measured: fast mode stops after the screen."]
+        return ["Not measured: fast mode stops after the score tests."]
     closed = rows(report.closed)
     if not closed and any(r.get("unfitted") for r in leaders(report)):
         return ["Not measured: the effect could not be fitted."]
@@ -366,27 +369,30 @@ def how_far(report: Findings) -> list[str]:
         if first["F"] < 0:
             out.append("A share below zero means that it made the predictions worse.")
     elif report.verdict == "no measurable gap":
-        out.append(sentence(f"{kept_back(report)}, no gap could be measured"))
+        out.append(
+            sentence(f"{kept_back(report)}, log predictive density did not improve measurably")
+        )
     else:
         out.append(sentence(
-            f"{kept_back(report)} the gain is too uncertain for a share of the gap: its interval "
-            "reaches zero (see the notes)"
+            f"{kept_back(report)} the reference model's gain is too uncertain for a share of it: "
+            "its interval reaches zero (see the notes)"
         ))  # fmt: skip
     if report.verdict == "no measurable gap":  # what no effect gained is no finding
         return out
     if is_number(first["nats_per_sample"]):
         nats = float(first["nats_per_sample"])
-        text = f"each sample becomes {number(math.exp(nats))} times as probable on average " \
-               f"({number(nats, 2)} nats per sample"  # fmt: skip
+        text = f"mean gain in log predictive density {number(nats, 2)} nats per sample (a " \
+               f"density ratio of {number(math.exp(nats))})"  # fmt: skip
         if is_number(first["gain_mean"]) and is_number(first["gain_noise"]):
-            text += f"; in all {number(first['gain_mean'], 2)} from better predictions and " \
-                    f"{number(first['gain_noise'], 2)} from a better noise law"  # fmt: skip
-        out.append(sentence(text + ")"))
+            text += f"; in all {number(first['gain_mean'], 2)} nats from the conditional mean, " \
+                    f"{number(first['gain_noise'], 2)} from the rest of the predictive " \
+                    "distribution"  # fmt: skip
+        out.append(sentence(text))
     before, after = first["rmse_before"], first["rmse_after"]
     if is_number(before) and is_number(after):
         way = "falls" if after < before else "does not fall: it goes"
-        out.append(f"The error of a simulation left to itself {way} from {number(before)} to "
-                   f"{number(after)} (root mean square, units of the data).")  # fmt: skip
+        out.append(f"Open-loop (free-run) simulation error {way} from {number(before)} to "
+                   f"{number(after)} (RMS, units of the data).")  # fmt: skip
     return out
 
 
@@ -395,9 +401,9 @@ def how_sure(report: Findings) -> list[str]:
     """What the numbers rest on: the data used for what, the tests, what stands out at all."""
     out = []
     if "cross-fitting" in report.parts:
-        out.append(f"The data were used in turn: {report.parts['cross-fitting']} blocks, each "
-                   "predicted by models that were fitted, and whose effects were chosen among the "
-                   "leading ones, without it.")  # fmt: skip
+        out.append(f"{report.parts['cross-fitting']}-fold blocked cross-validation: each block is "
+                   "predicted by models that were fitted, and whose effects were selected among "
+                   "the leading ones, without it.")  # fmt: skip
     else:
         used = [(name, _when(report, report.parts[name])) for name in USE
                 if isinstance(report.parts.get(name), tuple | list)]  # fmt: skip
@@ -406,20 +412,20 @@ def how_sure(report: Findings) -> list[str]:
             text = sentence(text)
             text += " Likewise of the other experiments." * bool(_experiment(report))
             once = len(used) > 1 and "choice" not in report.parts
-            out.append(text + " No row served twice." * once)
+            out.append(text + " Selection and evaluation rows are disjoint." * once)
     out += [sentence(str(v)) for v in report.parts.values() if isinstance(v, str)]
     tests = [r for r in rows(report.detection) if is_number(r["p"])]
     bad = outstanding(report, report.detection)
     if bad:
         names = [f"{r['statistic']} of {r['channel']} ({p_text(r['p'])})" for r in bad[:4]]
-        out.append(f"Before any effect was tried, the one-step predictions failed {len(bad)} of "
-                   f"{len(tests)} checks: {listed(names)}.")  # fmt: skip
+        out.append(f"The one-step predictions of the original model failed {len(bad)} of "
+                   f"{len(tests)} tests: {listed(names)}.")  # fmt: skip
     elif tests:
-        out.append(f"The one-step predictions of the model as it was passed all {len(tests)} "
-                   "checks.")  # fmt: skip
+        out.append(f"The one-step predictions of the original model passed all {len(tests)} "
+                   "tests.")  # fmt: skip
     if report.verdict == "no measurable gap":
-        out.append("That does not prove the model right: an effect that these data hardly excite "
-                   "leaves no trace in them.")  # fmt: skip
+        out.append("That does not prove the model right: an effect that is hardly excited cannot "
+                   "be identified from these data.")  # fmt: skip
     return out
 
 
@@ -453,8 +459,8 @@ def next_steps(report: Findings) -> list[str]:
         out.append("Parts of this answer are missing (left out, below). Another run tries them "
                    "again; with debug=True (--debug) it stops at the first fault.")  # fmt: skip
     if report.mode == "fast" and report.verdict != "no measurable gap":
-        out.append("Run it again in full mode: it refits the leading effects and measures how far "
-                   "the gap closes.")  # fmt: skip
+        out.append("Run it again in full mode: it refits the leading effects and measures the "
+                   "held-out gain.")  # fmt: skip
     for row in leaders(report):
         others = rivals(report, row)
         if not others:
@@ -462,12 +468,12 @@ def next_steps(report: Findings) -> list[str]:
         inputs = [r["separating_input"] for r in others]
         inputs = list(dict.fromkeys(i for i in inputs if isinstance(i, str) and i))
         if inputs:
-            out.append(f"To tell {listed(alternatives(report, row), 'from')}, record data with "
-                       f"{listed(inputs, 'or')}.")  # fmt: skip
+            out.append(f"To distinguish {listed(alternatives(report, row), 'from')}, record data "
+                       f"with {listed(inputs, 'or')}.")  # fmt: skip
         else:
-            out.append(f"None of the simple inputs considered would tell "
-                       f"{listed(alternatives(report, row), 'from')}; measure another quantity, "
-                       "or look at the machine.")  # fmt: skip
+            out.append(f"None of the simple inputs considered would distinguish "
+                       f"{listed(alternatives(report, row), 'from')}; add a sensor, or inspect the "
+                       "system.")  # fmt: skip
     if report.verdict == "none of these" and report.missing is not None:
         out.append("Look at the estimated curve, think what could have its shape, write it as an "
                    "@ssm.effect and run again with it.")  # fmt: skip
@@ -477,6 +483,6 @@ def next_steps(report: Findings) -> list[str]:
     elif report.verdict == "no measurable gap":
         out.append("To look closer, record more data, or drive the system over more of its range.")
     if report.model_text:
-        out.append("The model with what was found is ready to use: augmented_model.py, an ordinary "
-                   "model file (report.model in Python).")  # fmt: skip
+        out.append("The augmented model is ready to use: augmented_model.py, an ordinary model "
+                   "file (report.model in Python).")  # fmt: skip
     return out

@@ -322,7 +322,8 @@ def run_screen(
     if not own or len(drawn) < min(FEWEST, sets):
         why = f": {faults[0][FAULT]}" if faults else ""
         raise ArgumentError(
-            f"{len(drawn)} of {sets} data sets simulated at the fit went through the smoother{why}",
+            f"the smoother succeeded on only {len(drawn)} of {sets} parametric-bootstrap data "
+            f"sets{why}",
             fix="use more particles, or check the fit: the model may leave its domain",
         )
     names = Statistics.__dataclass_fields__

@@ -34,7 +34,7 @@ from ssmppl.diagnosis.selection.refit_test import LAX, affordable, gain_p, refit
 from ssmppl.diagnosis.selection.shapes import shaped_all
 from ssmppl.errors import SSMError
 
-AFRESH = "fitting anew"
+AFRESH = "refitting from default start"
 MOST_EFFECTS = 3
 MOST_WORK = 1.5e6  # rows times particles of a data set, beyond which no second screen is run
 FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated sets of that
@@ -126,7 +126,9 @@ class Selection:
             "refitting": lambda: leading(screen)[: self.singles]
         }
         if self.singles is None:
-            stages["refitting what is like it"] = lambda: correlated_candidates(screen, refits)
+            stages["refitting correlated candidates"] = lambda: correlated_candidates(
+                screen, refits
+            )
             stages["refitting other delays"] = lambda: delays(screen, refits)
             stages[AFRESH] = lambda: one_signed_candidates(screen)
         for stage, which in stages.items():
@@ -191,9 +193,10 @@ class Selection:
         if better > 2.0 * np.hypot(found.error, out.base.error) + 0.1:
             out.base, out.rebased = found, True
             out.notes.append(
-                f"starting from the best refit the model itself fits better by {better:.1f} nats: "
-                "p of the effects are of their refits, what was not refitted has none, and `where` "
-                "and the checks of the predictions are of the fit before"
+                "restarting from the best refit found a better optimum of the base model "
+                f"(+{better:.1f} nats): p-values are those of likelihood ratios, effects not "
+                "refitted have none, and `where` and the tests of the one-step predictions refer "
+                "to the earlier optimum"
             )
             out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
 
@@ -242,13 +245,13 @@ class Selection:
                 return
             if not chosen.fitter.exact and work > MOST_WORK:
                 out.notes.append(
-                    "whether a further effect is missing was not asked: the record is too long"
+                    "no further effect was tested (computational limit: too many rows)"
                 )
                 return
             try:
                 again = self._screen_again(chosen, rest, child_seed(seed, number))
             except SSMError as error:
-                out.notes.append(f"whether a further effect is missing is not known: {error.found}")
+                out.notes.append(f"the test for a further effect failed: {error.found}")
                 return
             if float(np.min(again.family.p, initial=1.0)) > LAX * self.alpha:
                 return

@@ -583,8 +583,8 @@ class Fitter:
         scores = [s for s in scores if np.all(np.abs(s) < LARGEST)]
         if not scores:
             raise SamplingError(
-                f"no data set simulated from {problem.trace.name!r} at its fit went through the "
-                "filter",
+                f"the filter failed on every data set simulated from {problem.trace.name!r} at its "
+                "fit",
                 fix="give the parameters priors round plausible values, or fix known ones",
             )
         square = np.mean([np.outer(s, s) for s in scores], axis=0)
@@ -655,10 +655,13 @@ def bounds_note(names: Sequence[str], values: dict[str, float], what: str) -> st
     """A note on parameters at a bound."""
     if not names:
         return ""
-    values_at = ", ".join(f"{n} at {values[n]:.3g}" if n in values else n for n in names)
+    values_at = ", ".join(f"{n} = {values[n]:.3g}" if n in values else n for n in names)
+    one = len(names) == 1
     return (
-        f"in {what} the best value of {' and '.join(names)} is a bound: held where it begins to "
-        f"count ({values_at}, which costs {COST:g} nats), and left out of the information"
+        f"in {what} the {'estimate' if one else 'estimates'} of {' and '.join(names)} "
+        f"{'is on the boundary of its' if one else 'are on the boundary of their'} support; "
+        f"{'it is' if one else 'they are'} fixed just inside ({values_at}, at a cost of {COST:g} "
+        f"nats{'' if one else ' each'}), and standard errors of the others are conditional on that"
     )
 
 

@@ -154,8 +154,8 @@ def refit(
     gain = fit.log_likelihood - base.log_likelihood
     if open_ended(fit, base):  # what it happened to reach is no rank
         return NotApplicable(
-            f"{name}: its fit did not settle: it gains {gain:.0f} nats at least, and about "
-            f"{fit.distance:.0f} may be left"
+            f"{name}: the optimiser did not converge; gain so far {gain:.0f} nats, estimated "
+            f"remaining gain {fit.distance:.0f} nats"
         )
     return Refit(tuple(index), candidates, fitter, fit, gain)
 
@@ -350,7 +350,8 @@ def refit_all(
         gain = fit.log_likelihood - base.log_likelihood
         if gain < -LOST - 3.0 * np.hypot(fit.error, base.error):
             reasons.append(
-                f"{name}: its fit lost its way, and ended {-gain:.0f} nats below the model's own"
+                f"{name}: the optimiser failed: log-likelihood {-gain:.0f} nats below the nested "
+                "base model"
             )
             continue
         cost = sum(screen.family.cost(int(screen.groups[k])) for k in index)

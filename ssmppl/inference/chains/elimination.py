@@ -263,9 +263,12 @@ def describe_elimination(found: Eliminable | NotApplicable) -> str:
 def explain_elimination(found: Eliminable) -> PlanRows:
     """What `explain` says: what can be eliminated, and why others cannot."""
     rows = [
-        (joined(u.components), "integrated out while trajectories are drawn, each particle "
-         f"carrying its statistics: {u.family}")
+        (joined(u.components), "marginalised in the trajectory update, each particle carrying "
+         f"sufficient statistics: {u.family}")
         for u in found.updates
     ]  # fmt: skip
     refused = found.refused.items()
-    return [*rows, *((repr(c), f"stays: {reason_and_line(reason)}") for c, reason in refused)]
+    return [
+        *rows,
+        *((repr(c), f"not marginalised: {reason_and_line(reason)}") for c, reason in refused),
+    ]

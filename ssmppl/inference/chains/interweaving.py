@@ -424,7 +424,7 @@ def interweaving(
     bounds = constant_bounds(setup.problem.trace)
     steps = Interweaving(space, tuple(moves), movable, pilot.scale, adapting, looking, bounds)
     moved = ", ".join(dict.fromkeys(owner[space.where[k]] for k in movable))
-    who = f"those slow in the plain chain, of {moved}" if looking else moved
+    who = f"those with high autocorrelation in the plain chain, of {moved}" if looking else moved
     return steps, f"{who}: moved with {describe_interweaving(found, model)}"
 
 
@@ -438,7 +438,7 @@ def describe_interweaving(found: Noises, model: ExactModel | None) -> str:
     if found.parameters:
         held.append("the noises of the transition")
     text = " or ".join(held) + " held fixed"
-    return text + ", whichever goes farther" if len(held) > 1 else text
+    return text + ", whichever has the larger expected jump" if len(held) > 1 else text
 
 
 def with_states(found: Noises) -> str:
@@ -446,10 +446,10 @@ def with_states(found: Noises) -> str:
     steered = not isinstance(found.lookahead, NotApplicable)
     who = ", ".join(found.tied if steered else found.parameters)
     text = (
-        f"{who}: may mix slowly given the states, which carry what the data tell of them; if the "
+        f"{who}: if warmup autocorrelation is high, also updated jointly with the trajectory in a "
+        f"non-centred parametrisation, {describe_interweaving(found, None)}"
     )
-    text += f"warmup finds it so, moved with the trajectory, {describe_interweaving(found, None)}"
     if isinstance(found.lookahead, NotApplicable):
-        text += f" (no approximation: {found.lookahead.reason})"
+        text += f" (no Gaussian approximation: {found.lookahead.reason})"
     centred = dict.fromkeys((*found.initial.centred, *found.transition.centred))
-    return text + (f"; stays where it is: {', '.join(centred)}" if centred else "")
+    return text + (f"; centred as before: {', '.join(centred)}" if centred else "")

@@ -286,19 +286,21 @@ def _trajectories_of(plan: Derived) -> str:
         return f"does not apply: {reason_and_line(singular)}"
     flat = [s.name for s in plan.trace.initial.values() if not s.distribution.proper]
     if flat:
-        return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"
+        return (
+            f"does not apply: {', '.join(flat)} {'has' if len(flat) == 1 else 'have'} an improper "
+            "(flat) initial distribution, which cannot be sampled"
+        )
     if plan.memory is None:
         return (
-            "conditional SMC without ancestor sampling: a deterministic component never "
-            "forgets its past, so a path cannot be joined to another ancestor; take more "
-            "particles, or PMMH"
+            "conditional SMC without ancestor sampling, which is impossible: the model has a "
+            "deterministic state with infinite memory; take more particles, or PMMH"
         )
     if plan.memory == 0:
         return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
+    steps = "noisy state" if plan.memory == 1 else f"{plan.memory} noisy states"
     return (
-        "conditional SMC with ancestor sampling, over the noisy components: deterministic "
-        f"ones forget their past in {plan.memory} step{'s' * (plan.memory > 1)}, whose "
-        "densities enter the ancestor weights"
+        "conditional SMC with ancestor sampling over the noisy states: deterministic states depend "
+        f"on the last {steps} only, whose densities enter the ancestor weights"
     )
 
 

@@ -33,8 +33,8 @@ PlanRows = list[tuple[str, str]]
 
 # Titles of what `explain` says of the methods.
 TRAJECTORIES = "Trajectories"
-INTERWEAVED = "Interweaved with these, where parameters mix slowly"
-ELIMINATED = "Eliminated in PGAS, where asked for"
+INTERWEAVED = "Joint parameter-trajectory moves (ASIS interweaving)"
+ELIMINATED = "Parameters that PGAS can marginalise (`eliminate=`)"
 
 
 class Memory(Keep, Protocol):

@@ -88,9 +88,9 @@ def collapse(
     label = "" if experiment.time is None else f" (time {label_text(experiment.time[worst])})"
     count = int(found[worst])
     text = (
-        f"the smoother has collapsed: at t={worst + 1}{label} its {draws} draws share {count} "
-        f"value{'s' if count > 1 else ''} of the states, so that their spread is not that of the "
-        f"posterior, there and at {len(rows) - 1} other rows. {fix}"
+        f"particle degeneracy at t={worst + 1}{label}: only {count} distinct "
+        f"particle{'s' if count > 1 else ''} among {draws} draws, and too few at {len(rows) - 1} "
+        f"other rows; the spread of the draws is not that of the posterior there. {fix}"
     )
     warnings.warn(text, stacklevel=4)
     return {"smoothing_warning": text}

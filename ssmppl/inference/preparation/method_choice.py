@@ -50,7 +50,10 @@ def choose_sampler(
     """
     if singular is not None:
         if isinstance(kind, NotApplicable):
-            return PMMH(), f"{singular.reason}: a random walk on the particle filter's likelihood"
+            return (
+                PMMH(),
+                f"{singular.reason}: random-walk Metropolis on the particle filter's likelihood",
+            )
         return MetropolisHastings(), (
             f"{kind}, and {singular.reason}: a random walk on the exact likelihood, "
             "which needs none"
@@ -59,12 +62,12 @@ def choose_sampler(
         if not stuck:
             return PGAS(interweave="auto"), (
                 "the model is not linear Gaussian: trajectories by conditional SMC; parameters "
-                "that the warmup finds slow given the states are moved along with these"
+                "with high autocorrelation in the warmup are also updated jointly with them"
             )
         if numbers <= FEW:
-            return PMMH(), f"{stuck}: a random walk on the particle filter's likelihood"
+            return PMMH(), f"{stuck}: random-walk Metropolis on the particle filter's likelihood"
         return PGAS(), (
-            f"{stuck}, but {numbers} numbers are too many for a random walk: conditional SMC "
+            f"{stuck}, but {numbers} parameters are too many for a random walk: conditional SMC "
             "without ancestor sampling; see the attribute trajectory_update_rate, and take more "
             "particles where it is low"
         )
@@ -86,18 +89,18 @@ def choose_sampler(
         if kind != "linear Gaussian":
             return Gibbs(), reason
         return Gibbs(interweave="auto"), (
-            f"{reason}; parameters that the warmup finds slow given the states are moved with the "
-            "states integrated out too"
+            f"{reason}; parameters with high autocorrelation in the warmup are also updated with "
+            "the states integrated out"
         )
     named = ", ".join(dict.fromkeys(open_))
     if numbers <= FEW:
         return MetropolisHastings(), (
-            f"{kind}, but {named} has no closed-form conditional: a random walk on the "
+            f"{kind}, but {named} has no closed-form conditional: random-walk Metropolis on the "
             "exact likelihood"
         )
     return Gibbs(), (
-        f"{kind}, with {numbers} numbers to move, too many for a random walk: exact "
-        f"trajectories, and slices for {named}"
+        f"{kind}, with {numbers} parameters, too many for a random walk: exact trajectories, and "
+        f"slice sampling for {named}"
     )
 
 
@@ -116,20 +119,20 @@ def why_stuck(trace: Trace, rows: int | None) -> str:
         return ""
     if noisy_start(trace):
         return (
-            "every state follows from those before it, so that PGAS has no trajectory to move; "
+            "the transition is noise-free, so that PGAS cannot update the states; "
             + start_as_parameter(trace)
         )
     random = [
         s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
     ]
     reason = (
-        "a deterministic component never forgets its past, so that PGAS cannot join a trajectory "
-        "to other ancestors"
+        "the model has a deterministic state with infinite memory, so that ancestor sampling is "
+        "impossible"
     )
     if all(d.support().kind == "integers" for d in random):
-        return f"{reason}, and given a trajectory of counts parameters move slowly"
+        return f"{reason}, and given a trajectory of counts parameters mix slowly"
     if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
-        return f"{reason}, and over more than {ROWS_WITHOUT_ANCESTORS} rows hardly moves its start"
+        return f"{reason}; with more than {ROWS_WITHOUT_ANCESTORS} rows early states mix slowly"
     return ""
 
 
@@ -162,9 +165,9 @@ def choose_maximiser(
         return IF2(), f"{singular.reason}: iterated filtering, which needs none"
     if deterministic_memory(trace) is None and not noisy_start(trace):
         return IF2(), (
-            "components that follow without a noise of their own never forget the past, so that "
-            "particle smoothing takes time that grows with the square of the rows: iterated "
-            "filtering, which only simulates; of some hundred rows ScoreAscent is more precise"
+            "the model has a deterministic state with infinite memory, so that particle smoothing "
+            "takes time quadratic in the number of rows: iterated filtering, which only simulates; "
+            "for a few hundred rows ScoreAscent is more precise"
         )
     return ScoreAscent(), (
         "Fisher's identity gives the score by particle smoothing; direct optimisation does not "

@@ -193,9 +193,8 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
         for i, first, last, n in stuck
     )
     text = (
-        f"the trajectory hardly ever changed at {where} (fewer than {LOW:.0%} of the draws): these "
-        "states, and parameters that hang on them, were not sampled. Take more particles, or "
-        "ssm.PMMH()"
+        f"path degeneracy: {where} changed in fewer than {LOW:.0%} of the draws; those states, and "
+        "parameters that depend on them, have not converged. Take more particles, or ssm.PMMH()"
     )
     warnings.warn(text, stacklevel=3)
     return {"trajectory_update_rate": least, "trajectory_warning": text}

@@ -46,9 +46,10 @@ from ssmppl.language.trace import trace
 PAGE = 100  # columns
 LONGEST_LAW = 600  # characters of a law, some six lines
 MOST_NAMED = 8  # columns that are not read
+UPDATES = "Gibbs updates (full conditionals given states and data)"
 TEMPERED = (
-    "for rows that tell far more than the transition: particles are weighed by rising powers of "
-    "the observation's density, and take Metropolis steps between them"
+    "for observations far more informative than the transition: particles are weighted by "
+    "increasing powers of the observation density, with Metropolis moves in between"
 )
 
 
@@ -101,7 +102,7 @@ class Plan:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
         if self.data:
-            out.append(("Data", [("bound", self.data), *self.labels]))
+            out.append(("Data", [("data set", self.data), *self.labels]))
         out.append(("Structure", self._structure()))
         rows = [self._proposal(n, p) for n, p in self.proposals.items()]
         guided = self.proposals.get("guided")
@@ -111,12 +112,12 @@ class Plan:
         if noisy:
             out.append(("Particle filter", rows))
             out.append((TRAJECTORIES, of_methods.pop(TRAJECTORIES)))
-        out.append(("Chosen, unless a method is named", self._choices()))
+        out.append(("Default methods", self._choices()))
         singular = without_density(t)
         if singular is not None:
-            out.append(("Parameters given the states", [("none", reason_and_line(singular))]))
+            out.append((UPDATES, [("none", reason_and_line(singular))]))
         elif self.updates and noisy:
-            out.append(("Parameters given the states", [_update(u) for u in self.updates]))
+            out.append((UPDATES, [_update(u) for u in self.updates]))
             out += of_methods.items()
         return [(title, rows) for title, rows in out if rows]
 
@@ -131,7 +132,7 @@ class Plan:
         if isinstance(self.structure, NotApplicable):
             found = [("nonlinear", f"not linear Gaussian: {reason_and_line(self.structure)}")]
             if isinstance(self.conditional, ConditionallyLinear):
-                found.append(("given the others", _integrated(self.conditional)))
+                found.append(("conditionally linear Gaussian", _integrated(self.conditional)))
             return found
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
                  "used only where they are asked for")]  # fmt: skip
@@ -192,11 +193,11 @@ class Plan:
 
 def _integrated(split: ConditionallyLinear) -> str:
     names = ", ".join(map(repr, split.linear))
-    verb = "is" if len(split.linear) == 1 else "are"
+    pronoun = "it" if len(split.linear) == 1 else "them"
     return (
-        f"{names} {verb} linear and Gaussian: a Kalman filter for each particle integrates "
-        f"{'it' if verb == 'is' else 'them'} out, and only the other states are sampled "
-        '(Rao-Blackwellised; proposals "marginal", "marginal_guided", "marginal_auxiliary")'
+        f"{names}, given the other states: a Kalman filter for each particle marginalises "
+        f"{pronoun}, and only the other states are sampled (Rao-Blackwellised particle filter; "
+        'proposals "marginal", "marginal_guided", "marginal_auxiliary")'
     )
 
 

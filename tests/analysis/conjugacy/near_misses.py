@@ -264,7 +264,7 @@ def added_rate(m):
     laws(m, gamma_prior, walk, None, observation)
 
 
-@refused("a", "slice", "Normal(x, precision=a)", "outside the span")
+@refused("a", "slice", "Normal(x, precision=a)", "full conditional contains")
 def negative_precision(m):
     """A precision whose prior reaches below zero is no Gamma."""
 

@@ -53,7 +53,7 @@ def test_a_parameter_of_a_deterministic_law_moves_on_the_density_of_the_noisy_st
     model, *_ = build("deterministic")
     (update,) = derive_updates(trace(model))
     assert update.needs_log_joint
-    assert "noisy states alone" in update.explanation.conditional
+    assert "noisy states only" in update.explanation.conditional
     rng, value, draws = np.random.default_rng(1), np.ones(1), []
     for _ in range(4000):
         value, _ = draw(

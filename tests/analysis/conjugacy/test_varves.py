@@ -84,7 +84,7 @@ def test_explanation_reads_as_the_paper(update):
         "phi to (-1, 1)",
         "sqrt(1 - phi**2): the initial law of x",
         "corpus.py",
-        "separate updates where the precision H or the rate is not positive",
+        "one-at-a-time updates when the joint law is improper (H or the rate not positive)",
     ):
         assert piece in text, text
 

@@ -111,7 +111,7 @@ def test_a_held_out_row_that_cannot_be_leaves_the_rest_of_the_report(monkeypatch
     report = ssm.diagnose(bounded(), {"y": y}, ["constant load"], particles=200, progress=False)
     assert report.closed.empty
     assert len(report.free_run) == 320
-    (note,) = [n for n in report.notes if "share of the gap" in n]
+    (note,) = [n for n in report.notes if "share of the reference model's gain" in n]
     assert "not given: all weights are zero at t=301" in note
 
 

@@ -98,7 +98,7 @@ def test_the_answer_comes_first_then_how_sure_then_what_next_and_the_model_last(
     assert found == [
         "Where is the gap?", "Which effect is missing?", "How far does the gap close?",
         "How sure", "What to do next", "The evidence", "Tables", "Words used here",
-        "The model with what was found",
+        "The augmented model",
     ]  # fmt: skip
     paragraphs = [text for _, text in Reader(page("effect_found")).all("p")]
     assert paragraphs[0].startswith("The model “oscillator” lacks one of these")
@@ -150,8 +150,8 @@ def test_tables_scroll_in_their_boxes_and_hold_the_numbers():
             assert path[-2:] == ("details", "div")
     titles = [text for _, text in reader.all("summary")]
     assert titles == [
-        "All effects tried, best first", "Effects that cannot be told apart", "Where the gap is",
-        "How far the gap closes", "Checks of the one-step predictions",
+        "All effects tried, best first", "Effects not distinguishable by these data",
+        "Where the gap is", "Held-out gain", "Tests of the one-step predictions",
         "Parameters, with standard errors", "Settings",
     ]  # fmt: skip
     cells = [text for _, text in reader.all("td")]

@@ -161,14 +161,14 @@ def test_the_free_run_draws_the_last_rows_of_data_and_both_models(ax):
     plots.free_run(report, ax, last=120)
     tail = report.free_run.tail(120)
     found = lines(ax)
-    for label, column in (("data", "observed"), ("model as it was", "before"),
-                          ("with what was found", "after")):  # fmt: skip
+    for label, column in (("data", "observed"), ("original model", "before"),
+                          ("augmented model", "after")):  # fmt: skip
         np.testing.assert_array_equal(found[label].get_xdata(), tail["t"])
         np.testing.assert_array_equal(found[label].get_ydata(), tail[column])
     # told apart without colours, too
-    styles = {found[n].get_linestyle() for n in ("model as it was", "with what was found")}
+    styles = {found[n].get_linestyle() for n in ("original model", "augmented model")}
     assert len(styles) == 2
-    assert found["model as it was"].get_color() == BEFORE
+    assert found["original model"].get_color() == BEFORE
     assert "last 120 of 1,000 rows" in ax.get_title(loc="left") + ax.get_title()
 
 
@@ -183,7 +183,7 @@ def test_the_free_run_of_one_experiment_and_channel(ax):
 
 def test_without_a_model_after_there_is_no_line_for_it(ax):
     plots.free_run(no_gap(), ax)
-    assert "with what was found" not in lines(ax)
+    assert "augmented model" not in lines(ax)
 
 
 def test_a_model_that_runs_away_does_not_hide_the_data(ax):

@@ -216,7 +216,7 @@ def test_a_panel_that_fails_is_left_out(monkeypatch, tmp_path):
     assert report.left_out["part"].tolist() == ["the panel 'ranked_effects'"]
     assert not (tmp_path / "ranked_effects.png").exists()
     assert (tmp_path / "free_run.png").exists()
-    assert "Left out, as they failed" in page.read_text()
+    assert "Failed parts" in page.read_text()
     assert "ranked_effects" in (tmp_path / "left_out.csv").read_text()
 
 

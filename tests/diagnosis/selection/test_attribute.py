@@ -153,7 +153,7 @@ def test_a_fit_that_lost_its_way_is_no_refit(asked, monkeypatch):
     monkeypatch.setattr(refits_of, "refit", lost)
     done, reasons = refits_of.refit_all(*given, Checkpoint(None, {}), "refitting")
     assert done == []
-    assert "nats below the model's own" in reasons[0]
+    assert "nats below the nested base model" in reasons[0]
 
 
 @pytest.mark.slow

@@ -85,8 +85,8 @@ def test_what_is_not_positive_definite_gives_no_error():
 
 def test_the_note_names_and_gives_the_value():
     text = bounds_note(["q"], {"q": 1.25e-4, "r": 2.0}, "the fit of 'EMPS'")
-    assert text.startswith("in the fit of 'EMPS' the best value of q is a bound: held")
-    assert "q at 0.000125" in text
+    assert text.startswith("in the fit of 'EMPS' the estimate of q is on the boundary")
+    assert "q = 0.000125" in text
     assert bounds_note([], {}, "a fit") == ""
 
 

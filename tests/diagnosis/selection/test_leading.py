@@ -120,11 +120,11 @@ def test_what_stands_out_and_could_not_be_fitted_is_named(loaded):
     assert report.model is None
     assert [(r["effect"], r["equation"]) for r in leaders(report)] == [("constant load", "v1")]
     text = headline(report)
-    assert "the screen says that the model “pair” lacks constant load in v1 (p" in text.lower()
+    assert "indicate a missing effect in the model “pair”: constant load in v1 (p" in text
     assert "could not be fitted" in text
     assert how_far(report) == ["Not measured: the effect could not be fitted."]
     assert "confirm" not in report.parts
-    assert "predicted gain" in which(report)[0]
+    assert "(score-test approximation)" in which(report)[0]
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_the_p_of_a_screen_at_another_fit_is_not_told(loaded):
     assert report.causes["p"].iloc[0] == pytest.approx(0.6)  # the larger of two tests
     assert report.causes["p"].iloc[1:].isna().all()
     assert report.verdict == "no measurable gap"
-    assert "stands out from chance" in headline(report)
+    assert "is significant after correction for multiple testing" in headline(report)
     assert "p = 0.60" in headline(report)
 
 
@@ -151,8 +151,8 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     results = dataclasses.replace(loaded, experiments=two, parts=parts)
     report = build_report(results, 1.0)
     assert report.parts == {"screen": (1, 84)}
-    assert "How far the gap closes has not been measured." in headline(report)
-    assert "took no part" not in str(report)
+    assert "The held-out gain has not been measured." in headline(report)
+    assert "held-out data" not in str(report)
     run = SimpleNamespace(mean=e.y, low=e.y, high=e.y)
     short = SimpleNamespace(mean=e.y[:20], low=e.y[:20], high=e.y[:20])
     row = {"effect": "x", "F": 0.9, "F_low": 0.8, "F_high": 1.0, "nats_per_sample": 0.1}
@@ -163,13 +163,14 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     assert first == 84 + GAP + 1
     assert f"t = {first} to 120 of experiment 2, and likewise of the others" in how_far(report)[0]
     assert "t = 1 to 84 of experiment 2" in how_sure(report)[0]
-    assert "Likewise of the other experiments. No row served twice." in how_sure(report)[0]
+    disjoint = "Likewise of the other experiments. Selection and evaluation rows are disjoint."
+    assert disjoint in how_sure(report)[0]
     results.attribution.left_out = True
     report = build_report(dataclasses.replace(results, held_out=far), 1.0)
     results.attribution.left_out = False
-    assert "No row served twice" not in str(report)
-    assert "took no part" not in str(report)
-    assert "decided on held-out rows" in " ".join(how_sure(report))
+    assert "rows are disjoint" not in str(report)
+    assert "held-out data" not in str(report)
+    assert "reduced by their held-out gain" in " ".join(how_sure(report))
 
 
 @pytest.mark.slow

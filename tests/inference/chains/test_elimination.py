@@ -358,7 +358,7 @@ def test_what_is_eliminated():
         assert described(problem, setting, {}, "bootstrap") == "tau (Gamma)"
     assert described(problem, False, {}, "bootstrap") == "none: eliminate=False"
     held = described(problem, "auto", {"tau": np.array(2.0)}, "bootstrap")
-    assert held.startswith("none: the initial law of x leaves log(1 - phi**2)")
+    assert held.startswith("none: the initial law of x is not conjugate")
     better = described(problem, "auto", {}, "auxiliary")
     assert better == "none: particles move by the proposal 'auxiliary'"
 
@@ -369,7 +369,7 @@ def test_what_is_eliminated():
         ("tau", {}, "eliminate='tau'"),
         (None, {}, "eliminate=None"),
         (("nu",), {}, "no free parameter"),
-        (("phi",), {}, r"leaves log\(1 - phi\*\*2\) outside the Normal family"),
+        (("phi",), {}, r"not conjugate \(outside the Normal family: log\(1 - phi\*\*2\)\)"),
         (True, {"proposal": "guided"}, "moves particles by the transition"),
     ],
 )
@@ -422,6 +422,6 @@ def test_steps_are_pickled_without_their_module():
 
 def test_plan_says_what_can_be_eliminated_and_why_not():
     plan = str(ssm.explain(models.scale))
-    rows = plan[plan.index("Eliminated in PGAS") :]
-    assert "tau  integrated out" in rows
-    assert "phi  stays: the initial law of x" in rows
+    rows = plan[plan.index("Parameters that PGAS can marginalise") :]
+    assert "tau  marginalised in the trajectory update" in rows
+    assert "phi  not marginalised: the initial law of x" in rows

@@ -445,10 +445,10 @@ def test_finite_states_are_left_alone(method):
 
 def test_plan_says_who_moves_and_why():
     plan = str(ssm.explain(models.mixed))
-    assert "Interweaved with these" in plan
+    assert "Joint parameter-trajectory moves (ASIS interweaving)" in plan
     flat = " ".join(plan.split())
-    assert "a, s, c: may mix slowly given the states" in flat
-    assert "stays where it is: z, k" in flat
+    assert "a, s, c: if warmup autocorrelation is high" in flat
+    assert "centred as before: z, k" in flat
     exact = " ".join(str(ssm.explain(models.linear)).split())
     assert "phi, q, r: moved with the states integrated out" in exact
     assert "finitely many values" in str(ssm.explain(coin))

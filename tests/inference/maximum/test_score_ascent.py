@@ -136,7 +136,7 @@ def test_it_is_not_where_a_position_never_forgets():
         lambda x, v, a: {"x": ssm.Dirac(x + v), "v": ssm.Normal(v - a * np.sin(x), sd=1)}
     )
     assert isinstance(method, ssm.IF2)
-    assert "never forget" in reason
+    assert "infinite memory" in reason
     method, _ = chosen(lambda x, v, a: {"x": ssm.Dirac(np.sin(v)), "v": ssm.Normal(a * x, sd=1)})
     assert isinstance(method, ssm.ScoreAscent)  # x forgets all but the last v
 

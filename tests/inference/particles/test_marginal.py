@@ -403,7 +403,7 @@ def test_posterior_of_pmmh_is_that_of_a_grid(data):
 
 
 def test_explain_names_what_is_integrated_out():
-    assert "z[0], z[1] are linear and Gaussian" in str(ssm.explain(regimes()))
+    assert "z[0], z[1], given the other states" in str(ssm.explain(regimes()))
 
 
 @pytest.mark.slow

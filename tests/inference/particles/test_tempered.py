@@ -177,11 +177,11 @@ def test_it_is_explained_and_chosen_where_nothing_better_is_derived():
     model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
     model.transition(lambda x: {"x": ssm.Normal(x, sd=1)})
     model.observation(lambda x: {"y": ssm.Normal(opaque(x), sd=0.01)})
-    assert "rising powers" in str(ssm.explain(model))
+    assert "increasing powers" in str(ssm.explain(model))
     problem = pose(model, {"y": np.array([0.3, -1.2, 2.0, 4.0, 3.0])})
     assert choose(problem, np.empty(0), whole=True, temper=True).name == "tempered"
     assert choose(problem, np.empty(0), whole=True).name == "bootstrap"
-    assert "rising powers" not in str(ssm.explain(PAIR))
+    assert "increasing powers" not in str(ssm.explain(PAIR))
 
 
 def test_no_particle_moves_to_where_the_density_is_infinite():

@@ -193,7 +193,9 @@ def test_a_smoother_that_collapsed_says_so(method):
     call = {"particles": 400, "seed": 5}
     if method == "fixed_lag":
         method = ssm.FixedLag(lag=60)
-    with pytest.warns(UserWarning, match=r"collapsed: at t=.* share . values? of the states"):
+    with pytest.warns(
+        UserWarning, match=r"particle degeneracy at t=.*: only . distinct particles? among"
+    ):
         found = ssm.smooth(still(1e-7), {"y": y}, {}, method, **call)
     assert "Use more particles" in found.attrs["smoothing_warning"]
     with warnings.catch_warnings():
