@@ -27,7 +27,7 @@ from ssmppl.diagnosis.model.differentiable import check_differentiable
 from ssmppl.diagnosis.model.initial_law import proper_initial_law
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.report.build import Results, build_report
+from ssmppl.diagnosis.report.build import build_report
 from ssmppl.diagnosis.report.findings import MODES
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers, digests
@@ -45,6 +45,7 @@ from ssmppl.diagnosis.selection.attribution import (
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.selection.equivalence import best_separating_input
 from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
+from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import pose

@@ -11,11 +11,11 @@ from ssmppl.diagnosis import diagnose
 from ssmppl.diagnosis.heldout import crossfit
 from ssmppl.diagnosis.model import candidates
 from ssmppl.diagnosis.report import tables
-from ssmppl.diagnosis.report.findings import VERDICTS
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.failures import FAULT, Failures, Tolerant, reason_of
 from ssmppl.diagnosis.screening import screen
 from ssmppl.diagnosis.selection import attribution, refit
+from ssmppl.diagnosis.verdict.verdicts import VERDICTS
 from ssmppl.errors import ExecutorError, SSMError
 from tests.diagnosis.made_up import effect_found
 from tests.diagnosis.small import BREAK, level, levels

@@ -11,8 +11,7 @@ from ssmppl.diagnosis.heldout.gain_ratio import Gain, HeldOutGain
 from ssmppl.diagnosis.heldout.parts import GAP, head, three_parts
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.report import tables
-from ssmppl.diagnosis.report.build import Results, build_report, labels
+from ssmppl.diagnosis.report.build import build_report
 from ssmppl.diagnosis.report.panels import bars, ranked_effects
 from ssmppl.diagnosis.report.text import cause_rows
 from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, which
@@ -21,6 +20,8 @@ from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.attribution import Attribution
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.refit import refit, refit_all
+from ssmppl.diagnosis.verdict import decision
+from ssmppl.diagnosis.verdict.results import Results, labels
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.diagnosis.made_up import effect_found, fast
@@ -175,7 +176,7 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
 @pytest.mark.slow
 def test_an_effect_that_gained_is_not_denied_where_the_share_is_open(loaded, monkeypatch):
     """Curves predict better still, but it is not known how large the gap is in all."""
-    monkeypatch.setattr(tables, "residual_group", lambda *_: (1e-4, ("v1", "mean")))
+    monkeypatch.setattr(decision, "strongest_residual", lambda *_: (1e-4, ("v1", "mean")))
     e = loaded.experiments[0]
     run = SimpleNamespace(mean=e.y, low=e.y, high=e.y)
     row = {"effect": "x", "F_low": np.nan, "F_high": np.nan}
