@@ -190,7 +190,7 @@ class _Diagnosis:
     # -- stages
     def _screen(self) -> Results:
         """Fit, and screen."""
-        base = self.augmented.fitter(())
+        base = self.augmented.base_fitter
         training = self.parts.train if self.parts else self.experiments
         fit = self._fit(base, training)
         states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
@@ -294,7 +294,7 @@ class _Diagnosis:
                 self.trace, design.scales, missing, (*self.fixed, *r.fit.bounds),
                 self.settings, self.effects, failures=self.failures,
             )  # fmt: skip
-            fitter = augmented.fitter(())
+            fitter = augmented.base_fitter
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
         whole = None if self.parts or (r.attribution and r.attribution.rebased) else r.screen
         return CrossFit(
@@ -330,7 +330,7 @@ class _Diagnosis:
             self.notes.append(f"the fit of the model did not settle ({stage}){left}")
         if fit.bounds:
             self.notes.append(
-                bounds_note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}")
+                bounds_note(fit.bounds, fit.by_component, f"the fit of {self.trace.name!r}")
             )
         return fit
 

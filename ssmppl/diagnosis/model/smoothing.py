@@ -92,6 +92,12 @@ class Smoother:
         generated = ("program", "module", "problem")
         return {k: v for k, v in self.__dict__.items() if k not in generated}
 
+    def with_particles(self, particles: int) -> Smoother:
+        """The same with another number of particles; the two share their generated code."""
+        out = Smoother(self.columns, self.missing, replace(self.settings, particles=particles))
+        vars(out).update(program=self.program, module=self.module, problem=self.problem)
+        return out
+
     @once_property
     def program(self) -> Program:
         return compile_trace(self.columns.base, self.missing)

@@ -15,8 +15,8 @@ from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.screening.detection import Statistics, detection
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
-from ssmppl.diagnosis.selection.refit import Refit, standard_errors
+from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note, standard_errors
+from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.verdict.decision import Decision, decide
 from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP
@@ -92,7 +92,7 @@ def _bound(r: Results) -> str:
     if r.chosen is None:
         return ""
     names = " and ".join(r.names)
-    return bounds_note(r.chosen.fit.bounds, r.chosen.fit.values(), f"the fit with {names}")
+    return bounds_note(r.chosen.fit.bounds, r.chosen.fit.by_component, f"the fit with {names}")
 
 
 def _leading(r: Results, order: Sequence[int]) -> list[dict[str, Any]]:
@@ -136,7 +136,7 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
         added = augment(r.trace, list(chosen.candidates))
         if chosen.fitter.initial_law:
             added = chosen.fitter.initial_law.applied_to(added)
-        values = {n: v for n, v in chosen.fit.values().items() if n.split("[")[0] in
+        values = {n: v for n, v in chosen.fit.by_component.items() if n.split("[")[0] in
                   added.parameters}  # fmt: skip
         text = model_text(
             added, title=f"{r.trace.name} with {names}",
@@ -152,7 +152,7 @@ def _written(r: Results, chosen: Refit, notes: list[str]) -> tuple[Model | None,
 
 def _estimates(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
     errors = standard_errors(fit, fitter.fixed)
-    return {n: (v, errors[n]) for n, v in fit.values().items()}
+    return {n: (v, errors[n]) for n, v in fit.by_component.items()}
 
 
 def _not_applicable(screen: Screen) -> Any:

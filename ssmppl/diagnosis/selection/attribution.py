@@ -180,8 +180,8 @@ class Selection:
         worth = critical_gain(self.screen, self.alpha)
         if not out.refits or out.refits[0].penalised_gain < worth:
             return
-        fitter, best = self.augmented.fitter(()), out.refits[0].fit
-        start = {n: v for n, v in best.start.items() if n in self.augmented.trace.parameters}
+        fitter, best = self.augmented.base_fitter, out.refits[0].fit
+        start = {n: v for n, v in best.by_parameter.items() if n in self.augmented.trace.parameters}
         numbers = self.checkpoint.computed(
             "fitting from the best refit",
             lambda: fitter.fit(self.train, child_seed(self.seed, 6), start, FROM_START).numbers,

@@ -41,6 +41,11 @@ class AugmentedModels:
     def __getstate__(self) -> dict:  # another process makes what it needs
         return {**self.__dict__, "_made": {}}
 
+    @property
+    def base_fitter(self) -> Fitter:
+        """The fitter of the model itself."""
+        return self.fitter(())
+
     def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         """The fitter of the model with these effects; shapes are fixed parameters, so that the
         generated code is the same for all data."""

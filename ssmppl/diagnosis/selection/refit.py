@@ -7,7 +7,7 @@ expects its top.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -27,9 +27,9 @@ from ssmppl.diagnosis.selection.fit import (
     Effort,
     Fit,
     Fitter,
+    standard_errors,
 )
 from ssmppl.errors import NotApplicable, SSMError
-from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
@@ -49,7 +49,6 @@ SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from whic
 OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
 AGAIN = 2  # times that a fit which left more is taken up where it ended
 LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
-LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Refit:
     @property
     def strengths(self) -> list[float]:
         """Estimated strengths of the effects."""
-        values = self.fit.values()
+        values = self.fit.by_component
         return [values[c.strength] for c in self.candidates]
 
     @property
@@ -87,34 +86,6 @@ class Refit:
     def errors(self) -> dict[str, float]:
         """Standard errors of all free parameters, from the information at the fit."""
         return standard_errors(self.fit, self.fitter.fixed)
-
-
-def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Standard errors by the text of each component; 0 for what is fixed.
-
-    NaN where there is no information: for what ran to a bound of its support, and for all where the
-    information about the others is not positive definite.
-    """
-    symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
-    nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
-    information = fit.information[np.ix_(free, free)]
-    if not np.all(np.isfinite(information)):
-        return nothing
-    scale = np.sqrt(np.abs(np.diagonal(information)))
-    if not np.all(scale > 0.0):
-        return nothing
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    if len(values) and values[0] <= LEAST_INFORMATION:
-        return nothing
-    setup = Maximization(
-        fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0)
-    )
-    jacobian = setup.transform.at(fit.z).jacobian
-    root = (jacobian[:, free] / scale) @ (vectors / np.sqrt(values))
-    spread = np.sqrt(np.sum(root**2, axis=1))
-    held = np.any(jacobian[:, fit.at_bound] != 0.0, axis=1)
-    spread = np.where(held, np.nan, spread)
-    return {repr(s): float(v) for s, v in zip(symbols, spread, strict=True)}
 
 
 def refit(
@@ -144,7 +115,7 @@ def refit(
         for _ in range(AGAIN):
             if not open_ended(fit, base):
                 break
-            more = fitter.fit(train, seed, fit.start, effort)
+            more = fitter.fit(train, seed, fit.by_parameter, effort)
             fit = max(fit, more, key=lambda f: f.log_likelihood)
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
@@ -221,7 +192,7 @@ def start_at(
     at = list(index)
     v = found.covariance[np.ix_(at, at)]
     strengths = np.linalg.lstsq(v, found.score[at], rcond=1e-6)[0]
-    out = base.start
+    out = base.by_parameter
     for k, value in zip(at, strengths, strict=True):
         c = design.candidates[k]
         if design.quadratic[k]:

@@ -113,7 +113,7 @@ def asked():
     problem = pose(level(), levels(120, 0.0, "right"))
     missing = missing_of(problem.experiments)
     augmented = AugmentedModels(problem.trace, missing, {}, Settings())
-    fitter = augmented.fitter(())
+    fitter = augmented.base_fitter
     fit = fitter.fit(problem.experiments, seed_sequence(1), {})
     e = problem.experiments[0]
     states = fitter.states(e, fit.theta, np.ones(4, np.uint64))
@@ -127,7 +127,7 @@ def asked():
 
 def lower(augmented, fit):
     """The same fit, stopped at another place, some nats below."""
-    fitter, theta = augmented.fitter(()), fit.theta * np.array([6.0, 0.7])
+    fitter, theta = augmented.base_fitter, fit.theta * np.array([6.0, 0.7])
     experiments = fit.problem.experiments
     value = fitter.kalman.log_likelihood(experiments, theta)
     assert value < fit.log_likelihood - 5.0

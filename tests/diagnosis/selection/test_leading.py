@@ -63,7 +63,7 @@ def loaded():
     problem = pose(pair(), {"y1": y[:, 0], "y2": y[:, 1]})
     train, missing = problem.experiments, missing_of(problem.experiments)
     augmented = AugmentedModels(problem.trace, missing, {}, Settings())
-    base, kept = augmented.fitter(()), Checkpoint(None, {})
+    base, kept = augmented.base_fitter, Checkpoint(None, {})
     fit = base.fit(train, seed_sequence(1), {})
     states = base.states(train[0], fit.theta, random_state(seed_sequence(2)))
     scales = Scales.of(problem.trace, states, train[0].y, train[0].u, 120)
