@@ -17,7 +17,7 @@ from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.heldout.parts import Parts
 from ssmppl.diagnosis.heldout.predictions import predict
 from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import Term, symbolic_shapes
+from ssmppl.diagnosis.model.basis import BasisTerm, symbolic_shapes
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
 from ssmppl.diagnosis.screening.familywise import familywise
@@ -38,7 +38,7 @@ Values = dict[str, np.ndarray]
 
 def significant_groups(
     screen: Screen, chosen: Sequence[Candidate]
-) -> list[tuple[list[Term], float]]:
+) -> list[tuple[list[BasisTerm], float]]:
     """(terms of one equation, moment and variable, tau) where the basis has signal beyond what was
     chosen, best first; none where chance explains it."""
     design = screen.design
@@ -103,7 +103,7 @@ def fit_reference(
 
 def _gained(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
-    groups: Sequence[tuple[list[Term], float]], parts: Parts, seed: np.random.SeedSequence,
+    groups: Sequence[tuple[list[BasisTerm], float]], parts: Parts, seed: np.random.SeedSequence,
 ) -> np.ndarray:  # fmt: skip
     """() nats by which the superset predicts the second part better; -inf where it has no fit."""
     gains = []
@@ -120,7 +120,7 @@ def _gained(
 
 def superset(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
-    groups: Sequence[tuple[list[Term], float]],
+    groups: Sequence[tuple[list[BasisTerm], float]],
 ) -> tuple[Fitter, Values]:  # fmt: skip
     """The fitter of the superset, and where it starts."""
     candidates = [t.candidate for terms, _ in groups for t in terms]

@@ -13,7 +13,7 @@ from ssmppl.diagnosis.report import tables
 from ssmppl.diagnosis.report.findings import tabulate
 from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.diagnosis.report.report import GapReport
-from ssmppl.diagnosis.screening.detection import Statistics, detection
+from ssmppl.diagnosis.screening.detection import PredictionChecks, detection
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note, standard_errors
 from ssmppl.diagnosis.selection.refit import Refit
@@ -123,7 +123,7 @@ def _curve(r: Results, decision: Decision) -> Any:
 def _detection(screen: Screen) -> Any:
     names = screen.design.detection_names(screen.experiments)
     found = detection(
-        Statistics(names.names, screen.observed.detection, names.quadratic),
+        PredictionChecks(names.names, screen.observed.detection, names.quadratic),
         screen.simulated.detection, screen.observed.nuisance, screen.simulated.nuisance,
     )  # fmt: skip
     found["p"] = tables.bonferroni(found["p"])

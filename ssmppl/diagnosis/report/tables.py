@@ -11,7 +11,7 @@ from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, starts_of
 from ssmppl.diagnosis.heldout.predictions import FreeRun
 from ssmppl.diagnosis.report.findings import tabulate
-from ssmppl.diagnosis.screening.location import Group, curve, localise, regions, when
+from ssmppl.diagnosis.screening.location import BasisGroupScore, curve, localise, regions, when
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.diagnosis.selection.refit import Refit
@@ -33,7 +33,7 @@ def bonferroni(p: Any) -> Any:
     return np.minimum(1.0, np.asarray(p, dtype=float) / SHARED)
 
 
-def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, Group]]:
+def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, BasisGroupScore]]:
     """Equation, moment, stretch of time and region of each group of the basis; by p
     (`bonferroni`)."""
     observed, nuisance = screen.observed, screen.simulated.nuisance

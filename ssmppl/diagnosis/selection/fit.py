@@ -31,7 +31,7 @@ import numpy as np
 from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
-from ssmppl.diagnosis.model.score_columns import Columns, score_columns
+from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
@@ -200,7 +200,9 @@ class Fitter:
         self.initial_law = initial_law
         self.kalman = kalman_model(problem.trace)
         trace = problem.trace
-        self.columns: Columns = score_columns(trace, trace, (), self.fixed, problem.program.missing)
+        self.columns: ScoreExpressions = score_columns(
+            trace, trace, (), self.fixed, problem.program.missing
+        )
         self.smoother = Smoother(self.columns, problem.program.missing, settings)
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)

@@ -174,7 +174,9 @@ def _information(
         return None
     names = [repr(s) for s in design.columns.nuisance]
     names += [design.candidates[k].strength for k in at]
-    scores = np.concatenate([screen.simulated.nuisance, screen.simulated.columns[:, at]], axis=1)
+    scores = np.concatenate(
+        [screen.simulated.nuisance, screen.simulated.candidate_scores[:, at]], axis=1
+    )
     rows = [sum(e.steps for e in es) for es in (train, screen.experiments)]
     found = scores.T @ scores / len(scores) * rows[0] / rows[1]
     place = {repr(s): i for i, s in enumerate(fitter.problem.trace.parameter_symbols)}

@@ -9,7 +9,7 @@ import pytest
 from ssmppl.diagnosis import diagnose as diagnosis
 from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.model.scales import Scale, Scales
+from ssmppl.diagnosis.model.scales import Scales, VariableScale
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.familywise import familywise, tail_p
@@ -78,7 +78,11 @@ def test_what_the_fit_cannot_show_is_fitted_anew():
              Candidate(ssm_effects.sensor_bias, "y", role="channel"),
              Candidate(replace(fold), "gain", role="parameter")]  # fmt: skip
     values = np.linspace(0.1, 3.0, 50)
-    scale = {"y": Scale.of(values), "z": Scale.of(values - 1.0), "noisy": Scale.of(values - 0.3)}
+    scale = {
+        "y": VariableScale.of(values),
+        "z": VariableScale.of(values - 1.0),
+        "noisy": VariableScale.of(values - 0.3),
+    }
     screen = SimpleNamespace(
         family=SimpleNamespace(leaders=[3, 1, 4, 2, 0]),
         design=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
@@ -193,14 +197,14 @@ def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
     columns, seen = screen.columns_of([load])
     assert columns.shape == (screen.sets, 1)
     k = screen.design.candidates.index(load)
-    np.testing.assert_array_equal(columns[:, 0], screen.simulated.columns[:, k])
-    assert seen[0] == screen.observed.columns[k]
+    np.testing.assert_array_equal(columns[:, 0], screen.simulated.candidate_scores[:, k])
+    assert seen[0] == screen.observed.candidate_scores[k]
     jump = next(c for c in screen.design.candidates if c.effect.name == "level break")
     other = replace(jump, shape=(("date", 17.3),))
     found, _ = screen.columns_of([other])
     best = next(int(j) for j in screen.family.best
                 if screen.design.candidates[j].group == jump.group)  # fmt: skip
-    np.testing.assert_array_equal(found[:, 0], screen.simulated.columns[:, best])
+    np.testing.assert_array_equal(found[:, 0], screen.simulated.candidate_scores[:, best])
 
 
 # -- shapes that are whole numbers, and effects that fail
