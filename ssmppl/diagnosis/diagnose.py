@@ -17,10 +17,10 @@ import numpy as np
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
-from ssmppl.diagnosis.heldout.crossfit import CrossFit
+from ssmppl.diagnosis.heldout.cross_validation import CrossValidation
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
-from ssmppl.diagnosis.heldout.parts import FOLDS, Parts, long_enough, three_parts
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
+from ssmppl.diagnosis.heldout.row_split import FOLDS, RowSplit, long_enough, three_parts
 from ssmppl.diagnosis.model.candidates import Chosen
 from ssmppl.diagnosis.model.candidates import chosen as chosen_effects
 from ssmppl.diagnosis.model.differentiable import check_differentiable
@@ -36,13 +36,13 @@ from ssmppl.diagnosis.run.expected_time import seconds as expected
 from ssmppl.diagnosis.run.failures import Failures, reason_of
 from ssmppl.diagnosis.run.seeds import child_seed
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.attribution import (
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
+from ssmppl.diagnosis.selection.effect_selection import (
     MOST_WORK,
-    Attribution,
-    Selection,
+    EffectSelection,
+    SelectionResult,
     add_standard_errors,
 )
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.selection.equivalence import best_separating_input
 from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
 from ssmppl.diagnosis.verdict.results import Results
@@ -141,11 +141,11 @@ class _Diagnosis:
         check_differentiable(self.trace, self.fixed)
         self.effects, self.mode, self.alpha = effects, mode, alpha
         self.root = seed_sequence(seed)
-        self.parts: Parts | None = None
+        self.split: RowSplit | None = None
         if mode == "full" and long_enough(self.experiments):
-            self.parts = three_parts(self.experiments)
+            self.split = three_parts(self.experiments)
         missing = self.problem.program.missing
-        if mode == "full" and self.parts is None:  # blocks of rows will be set missing
+        if mode == "full" and self.split is None:  # blocks of rows will be set missing
             missing = replace(missing, none=False)
         proposal = proposal_of(self.problem.program)
         number = particles or (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)[mode]
@@ -170,7 +170,7 @@ class _Diagnosis:
             results = self._screen()
             if self.mode == "full":
                 try:
-                    self._attribute(results)
+                    self._select(results)
                 except KeyboardInterrupt:
                     results.interrupted = True
                     self.checkpoint.say("interrupted: the report is of the stages that are done")
@@ -191,7 +191,7 @@ class _Diagnosis:
     def _screen(self) -> Results:
         """Fit, and screen."""
         base = self.augmented.base_fitter
-        training = self.parts.train if self.parts else self.experiments
+        training = self.split.train if self.split else self.experiments
         fit = self._fit(base, training)
         states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
         self.augmented.initial_law = proper_initial_law(
@@ -207,7 +207,7 @@ class _Diagnosis:
                 + "; ".join(map(str, design.refused[:3])),
                 fix="name others in effects=; ssm.effects.names() lists them",
             )
-        with self.failures.part("the time that is expected"):
+        with self.failures.guard("the time that is expected"):
             self._tell_time(base, fit, design, training)
         screen = run_screen(
             design, training, fit.theta, SETS[self.mode], self._seed(2), self.checkpoint
@@ -217,34 +217,34 @@ class _Diagnosis:
             "particles": 0 if base.exact else self.settings.particles,
         }  # fmt: skip
         return Results(
-            self.trace, self.experiments, self.parts, self.mode, self.alpha, base, fit, screen,
+            self.trace, self.experiments, self.split, self.mode, self.alpha, base, fit, screen,
             settings, self.notes, failures=self.failures,
         )  # fmt: skip
 
-    def _attribute(self, r: Results) -> None:
+    def _select(self, r: Results) -> None:
         """Refit and choose, find the equivalence class, measure the held-out gain; into `r`."""
-        found = Attribution(r.fit)
-        with self.failures.part("the choice of an effect"):
-            Selection(
+        found = SelectionResult(r.fit)
+        with self.failures.guard("the choice of an effect"):
+            EffectSelection(
                 self.augmented, r.screen, r.screen.experiments, self._seed(4), self.alpha,
                 self.checkpoint,
             ).run(found)  # fmt: skip
-        r.attribution, r.fit = found, found.base
+        r.selection, r.fit = found, found.base
         if found.unfitted is not None:  # nothing to measure, then
             return
-        with self.failures.part("whether several effects predict better than fewer"):
+        with self.failures.guard("whether several effects predict better than fewer"):
             self._validate_on_held_out_rows(r)
-        with self.failures.part("the input that would separate the class best"):
+        with self.failures.guard("the input that would separate the class best"):
             self._separating_input(r)
-        with self.failures.part("how far the gap closes"):
+        with self.failures.guard("how far the gap closes"):
             r.held_out = self._held_out_gain(r)
 
     def _validate_on_held_out_rows(self, r: Results) -> None:
         """Drop effects of several chosen together while all of them predict the held-out
         rows no better than the model itself: what they fitted was chance. It is a choice made on
         these rows, and the report says so."""
-        found = r.attribution
-        if not self.parts or found is None or found.chosen is None or not found.fewer:
+        found = r.selection
+        if not self.split or found is None or found.chosen is None or not found.fewer:
             return
         try:
             plain = self._held_out_predictions(r.base, r.fit)
@@ -273,19 +273,19 @@ class _Diagnosis:
 
     def _held_out_predictions(self, fitter: Fitter, fit: Fit) -> Predictions:
         """One-step predictions of the held-out rows."""
-        assert self.parts is not None
-        return predict(fitter, fit, self.experiments, self.parts.held_out, self._seed(8))
+        assert self.split is not None
+        return predict(fitter, fit, self.experiments, self.split.held_out, self._seed(8))
 
     def _held_out_gain(self, r: Results) -> HeldOutGain:
         once = r.chosen is not None and any(is_pulse(c) for c in r.chosen.candidates)
-        if self.parts and not once:
+        if self.split and not once:
             best = r.refits[0] if r.refits else None
             return HeldOutRows(
-                self.augmented, self.parts, (r.base, r.fit), r.screen, r.chosen, best
+                self.augmented, self.split, (r.base, r.fit), r.screen, r.chosen, best
             ).gain(r.label, self._seed(8), self.checkpoint)
         r.blocks = FOLDS
         augmented, design, base = self.augmented, r.screen.design, (r.base, r.fit)
-        if self.parts:  # the code so far knows no missing rows
+        if self.split:  # the code so far knows no missing rows
             missing = replace(self.augmented.missing, none=False)
             augmented = AugmentedModels(
                 self.trace, missing, self.fixed, self.settings, self.augmented.initial_law
@@ -296,8 +296,8 @@ class _Diagnosis:
             )  # fmt: skip
             fitter = augmented.base_fitter
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
-        whole = None if self.parts or (r.attribution and r.attribution.rebased) else r.screen
-        return CrossFit(
+        whole = None if self.split or (r.selection and r.selection.rebased) else r.screen
+        return CrossValidation(
             augmented, design, base, self.experiments, self.alpha, r.chosen, whole
         ).gain(r.label, self._seed(8), self.checkpoint)
 
@@ -350,7 +350,7 @@ class _Diagnosis:
             lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
         )
         of_climbs, _ = timed(lambda: base.value(experiments, fit.theta))
-        blocks = 0 if self.parts else FOLDS
+        blocks = 0 if self.split else FOLDS
         rest = expected(
             Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
             self.checkpoint.executor,

@@ -29,7 +29,7 @@ def build_report(r: Results, seconds: float) -> GapReport:
     screen, notes = r.screen, list(r.notes)
 
     def table(name: str, make: Callable[[], Any], nothing: Any = None) -> Any:
-        with r.failures.part(f"the table {name!r}"):
+        with r.failures.guard(f"the table {name!r}"):
             return make()
         return tabulate(name) if nothing is None else nothing
 
@@ -41,8 +41,8 @@ def build_report(r: Results, seconds: float) -> GapReport:
     if decision.verdict == NO_GAP and not r.screened:  # they are of a fit that was not the best one
         where["p"], checks["p"] = np.nan, np.nan
     share, runs = tabulate("closed"), None
-    if r.attribution:
-        notes += r.attribution.notes
+    if r.selection:
+        notes += r.selection.notes
         notes += filter(None, [_bound(r)])
     if r.held_out is not None:
         notes += r.held_out.notes
@@ -115,7 +115,7 @@ def _curve(r: Results, decision: Decision) -> Any:
     """The estimated curve that goes with the verdict; None where there is none, or an error ended
     it."""
     if decision.curve is not None:
-        with r.failures.part("the table 'missing'"):
+        with r.failures.guard("the table 'missing'"):
             return tables.missing_table(r.screen, decision.curve, decision.others)
     return None
 
@@ -168,13 +168,13 @@ def _parts(r: Results) -> dict[str, Any]:
     i = _longest(r.experiments)
     e, measured = r.experiments[i], r.held_out is not None and bool(r.held_out.rows)
     blocks = {"cross-fitting": r.blocks} if r.blocks and measured else {}
-    if r.parts is None:
+    if r.split is None:
         return blocks or {"screen": _span(e, 0, None)}
-    out: dict[str, Any] = {"screen": _span(e, 0, r.parts.second[i]), **blocks}
-    rows = np.flatnonzero(r.parts.held_out[i])
+    out: dict[str, Any] = {"screen": _span(e, 0, r.split.second[i]), **blocks}
+    rows = np.flatnonzero(r.split.held_out[i])
     if measured and not blocks and len(rows):
         out["confirm"] = _span(e, int(rows[0]), int(rows[-1]) + 1)
-    if r.attribution and r.attribution.left_out:
+    if r.selection and r.selection.left_out:
         out["choice"] = "that fewer effects were kept than fitted best was decided on held-out rows"
     return out
 

@@ -169,7 +169,7 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
 
 def _part(report: Findings, name: str, make: Callable[[], str]) -> str:
     """A part of the page; nothing where an error ended it, which the report then says."""
-    with report.failures.part(name):
+    with report.failures.guard(name):
         return make()
     return ""
 

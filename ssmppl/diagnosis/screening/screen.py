@@ -7,7 +7,7 @@ every statistic of the report that is not a refit takes its null law from them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -16,7 +16,7 @@ import numpy as np
 from ssmppl.analysis.density import Missing
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, Profiles, starts_of, with_all_dates
-from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.augment import augment, with_given_parameters
 from ssmppl.diagnosis.model.basis import BasisTerm, basis, symbolic_shapes
 from ssmppl.diagnosis.model.candidates import Chosen, Refused, offers
 from ssmppl.diagnosis.model.scales import Scales
@@ -38,8 +38,7 @@ from ssmppl.diagnosis.screening.location import BasisGroupScore, bin_edges, binn
 from ssmppl.diagnosis.screening.statistics import information_scale, typical_squares
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.distributions import Distribution, Flat
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.traced import Trace
 
 OWN_RUNS = 6  # passes over the data themselves, which show the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through
@@ -81,7 +80,7 @@ class ScreenDesign:
         if candidates is None:
             offered, self.refused = offers(trace, scales, effects, failures)
             offered = with_all_dates(offered, scales.rows)
-            with failures.part("the basis of smooth functions"):
+            with failures.guard("the basis of smooth functions"):
                 self.terms = basis(trace, scales)
         else:
             offered = list(candidates)
@@ -276,7 +275,7 @@ def _columns(
 ) -> tuple[ScoreExpressions, dict[str, float]]:
     """The score columns of the model with all candidates, and the values of their shapes."""
     made, shapes = symbolic_shapes(candidates)
-    superset = with_parameters(augment(trace, made), shapes)
+    superset = with_given_parameters(augment(trace, made), shapes)
     names = [c.strength for c in made]
     return score_columns(trace, superset, names, held, missing), dict(shapes)
 
@@ -288,7 +287,7 @@ def _compilable(
     """The candidates that have columns by themselves; the others are recorded as failures."""
     out = []
     for c in candidates:
-        with failures.part(f"the candidate {c}"):
+        with failures.guard(f"the candidate {c}"):
             _columns(trace, [c], held, missing)
             out.append(c)
     return out
@@ -413,17 +412,3 @@ def compare_with_null(null: Null, typical: np.ndarray, seen: ScreenStatistics) -
         found, score=found.score * by, variance=found.variance * by**2,
         strength=found.strength / by,
     )  # fmt: skip
-
-
-def with_parameters(
-    trace: Trace, names: Iterable[str], prior: Callable[[], Distribution] = Flat
-) -> Trace:
-    """The trace with further parameters: by default such as are given."""
-    location = next(iter(trace.transition.values())).distribution.location
-    parameters = dict(trace.parameters)
-    for name in names:
-        law = prior()
-        law.location = location
-        own = symbols("parameter", name, ())
-        parameters[name] = Site(name, "parameter", law, own, location)
-    return replace(trace, parameters=parameters)

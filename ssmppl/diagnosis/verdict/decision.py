@@ -64,7 +64,7 @@ def decide(r: Results, where: pd.DataFrame, checks: pd.DataFrame) -> Decision:
 def _by_effects(r: Results, where: pd.DataFrame) -> Decision:
     """The decision but for whether a gap can be measured at all."""
     least = float(np.min(r.screen.family.p, initial=1.0))
-    refitted = r.attribution is not None and r.mode == "full" and r.unfitted is None
+    refitted = r.selection is not None and r.mode == "full" and r.unfitted is None
     if r.held_out is not None and curves_beat(r.held_out, r.chosen is not None):
         best = r.chosen or (r.refits[0] if r.refits else None)
         tried = list(best.candidates) if best else []

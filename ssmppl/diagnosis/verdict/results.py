@@ -9,10 +9,10 @@ from typing import Any
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
-from ssmppl.diagnosis.heldout.parts import Parts
+from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.run.failures import Failures
 from ssmppl.diagnosis.screening.screen import Screen
-from ssmppl.diagnosis.selection.attribution import Attribution
+from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.diagnosis.selection.equivalence import Classes, equivalence_classes, group_leaders
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
@@ -22,7 +22,7 @@ from ssmppl.language.model.traced import Trace
 
 @dataclass
 class Results:
-    """The results of the stages so far. attribution, held_out : None where not done.
+    """The results of the stages so far. selection, held_out : None where not done.
 
     blocks : left out in turn, 0 for three parts. separating : by class, the input that would
     separate it.
@@ -30,7 +30,7 @@ class Results:
 
     trace: Trace
     experiments: Sequence[Experiment]
-    parts: Parts | None
+    split: RowSplit | None
     mode: str
     alpha: float
     base: Fitter
@@ -38,7 +38,7 @@ class Results:
     screen: Screen
     settings: dict[str, Any]
     notes: list[str]
-    attribution: Attribution | None = None
+    selection: SelectionResult | None = None
     held_out: HeldOutGain | None = None
     blocks: int = 0
     separating: dict[int, str] = field(default_factory=dict)
@@ -47,11 +47,11 @@ class Results:
 
     @property
     def refits(self) -> list[Refit]:
-        return self.attribution.refits if self.attribution else []
+        return self.selection.refits if self.selection else []
 
     @property
     def chosen(self) -> Refit | None:
-        return self.attribution.chosen if self.attribution else None
+        return self.selection.chosen if self.selection else None
 
     @property
     def names(self) -> list[str]:
@@ -67,17 +67,17 @@ class Results:
     @property
     def unfitted(self) -> int | None:
         """Column of the effect that the verdict rests on, though it was not refitted."""
-        return self.attribution.unfitted if self.attribution else None
+        return self.selection.unfitted if self.selection else None
 
     @property
     def screened(self) -> bool:
         """Whether the screen was run at the model's fit as it is known now."""
-        return not (self.attribution and self.attribution.rebased)
+        return not (self.selection and self.selection.rebased)
 
     @property
     def tested(self) -> dict[int, float] | None:
         """p of the refits that were tested themselves, by column; None if none was to be."""
-        return self.attribution.p if self.attribution else None
+        return self.selection.p if self.selection else None
 
     def classes(self) -> tuple[list[int], Classes]:
         """The leading shapes of all groups, best first, and their classes."""

@@ -8,7 +8,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.heldout.gain_ratio import Gain, HeldOutGain
-from ssmppl.diagnosis.heldout.parts import GAP, head, three_parts
+from ssmppl.diagnosis.heldout.row_split import GAP, head, three_parts
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report.build import build_report
@@ -17,8 +17,8 @@ from ssmppl.diagnosis.report.text import cause_rows
 from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, which
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.attribution import Attribution
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.diagnosis.selection.refit import refit, refit_all
 from ssmppl.diagnosis.verdict import decision
 from ssmppl.diagnosis.verdict.results import Results, labels
@@ -80,10 +80,10 @@ def loaded():
     found = dataclasses.replace(
         found, fit=found.fitter.with_information(found.fit, seed_sequence(6))
     )
-    attribution = Attribution(fit, singles, [], found)
+    selection = SelectionResult(fit, singles, [], found)
     return Results(
         problem.trace, train, None, "full", 0.05, base, fit, screen, {"model": "pair"}, [],
-        attribution,
+        selection,
     )  # fmt: skip
 
 
@@ -115,8 +115,8 @@ def test_what_stands_out_and_could_not_be_fitted_is_named(loaded):
     (load,) = [k for k, c in enumerate(loaded.screen.design.candidates)
                if (c.effect.name, c.equation) == ("constant load", "v1")]  # fmt: skip
     rest = [r for r in loaded.refits if r.index != (load,)]
-    found = Attribution(loaded.fit, rest, unfitted=load, notes=["not refitted: it failed"])
-    report = build_report(dataclasses.replace(loaded, attribution=found), 1.0)
+    found = SelectionResult(loaded.fit, rest, unfitted=load, notes=["not refitted: it failed"])
+    report = build_report(dataclasses.replace(loaded, selection=found), 1.0)
     assert report.verdict == "effect"
     assert report.model is None
     assert [(r["effect"], r["equation"]) for r in leaders(report)] == [("constant load", "v1")]
@@ -133,8 +133,8 @@ def test_the_p_of_a_screen_at_another_fit_is_not_told(loaded):
     """Of a model that a refit led to a better fit of: only what refits were tested for is known."""
     base = build_report(loaded, 1.0).causes
     tested = {loaded.refits[0].index[0]: 0.3}
-    found = Attribution(loaded.fit, loaded.refits, p=tested, rebased=True)
-    report = build_report(dataclasses.replace(loaded, attribution=found), 1.0)
+    found = SelectionResult(loaded.fit, loaded.refits, p=tested, rebased=True)
+    report = build_report(dataclasses.replace(loaded, selection=found), 1.0)
     assert base["p"].min() < 0.001
     assert report.causes["p"].iloc[0] == pytest.approx(0.6)  # the larger of two tests
     assert report.causes["p"].iloc[1:].isna().all()
@@ -149,7 +149,7 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     e = loaded.experiments[0]
     two = (head(e, 20), e)
     parts = three_parts(two)
-    results = dataclasses.replace(loaded, experiments=two, parts=parts)
+    results = dataclasses.replace(loaded, experiments=two, split=parts)
     report = build_report(results, 1.0)
     assert report.parts == {"screen": (1, 84)}
     assert "How far the gap closes has not been measured." in headline(report)
@@ -165,9 +165,9 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     assert f"t = {first} to 120 of experiment 2, and likewise of the others" in how_far(report)[0]
     assert "t = 1 to 84 of experiment 2" in how_sure(report)[0]
     assert "Likewise of the other experiments. No row served twice." in how_sure(report)[0]
-    results.attribution.left_out = True
+    results.selection.left_out = True
     report = build_report(dataclasses.replace(results, held_out=far), 1.0)
-    results.attribution.left_out = False
+    results.selection.left_out = False
     assert "No row served twice" not in str(report)
     assert "took no part" not in str(report)
     assert "decided on held-out rows" in " ".join(how_sure(report))

@@ -14,10 +14,10 @@ from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.familywise import familywise, tail_p
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection import attribution as module
+from ssmppl.diagnosis.selection import effect_selection as module
 from ssmppl.diagnosis.selection import refit as refits_of
-from ssmppl.diagnosis.selection.attribution import Attribution, Selection
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
 from ssmppl.diagnosis.selection.refit import (
     Refit,
     best_of_groups,
@@ -170,9 +170,11 @@ def test_a_better_place_for_the_parameters_is_no_effect(asked):
         augmented, bad, screen, [[k] for k in leading(screen)], screen.experiments,
         seed_sequence(3), kept, "refitting",
     )  # fmt: skip
-    out = Attribution(bad, list(done))
+    out = SelectionResult(bad, list(done))
     assert out.refits[0].gain > 5.0
-    Selection(augmented, screen, screen.experiments, seed_sequence(4), 0.05, kept)._refit_base(out)
+    EffectSelection(
+        augmented, screen, screen.experiments, seed_sequence(4), 0.05, kept
+    )._refit_base(out)
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
     shift = fit.log_likelihood - bad.log_likelihood
     for before, after in zip(done, out.refits, strict=True):
@@ -182,9 +184,9 @@ def test_a_better_place_for_the_parameters_is_no_effect(asked):
 @pytest.mark.slow
 def test_a_right_model_is_not_accused_by_a_bad_start(asked):
     augmented, fit, screen = asked
-    out = Attribution(lower(augmented, fit))
+    out = SelectionResult(lower(augmented, fit))
     kept = Checkpoint(None, {})
-    Selection(augmented, screen, screen.experiments, seed_sequence(5), 0.05, kept).run(out)
+    EffectSelection(augmented, screen, screen.experiments, seed_sequence(5), 0.05, kept).run(out)
     assert out.chosen is None
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
 
@@ -244,8 +246,8 @@ def test_of_refits_that_differ_in_their_shape_the_best_stands():
 def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left):
     """The number of effects left, by what each number of them gains on the held-out rows."""
     chain = [Refit(tuple(range(n)), ("effect",) * n, n, None, 10.0 * n) for n in (1, 2, 3)]
-    out = Attribution(None, chosen=chain[2], fewer=chain[:2])
-    results = SimpleNamespace(attribution=out, base=0, fit=None)
+    out = SelectionResult(None, chosen=chain[2], fewer=chain[:2])
+    results = SimpleNamespace(selection=out, base=0, fit=None)
 
     def predict(fitter, *_):
         return SimpleNamespace(log_density=np.full((8, 4), ({0: 0.0} | gains)[fitter] / 4.0))
@@ -253,7 +255,7 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
     monkeypatch.setattr(diagnosis, "predict", predict)
     monkeypatch.setattr(diagnosis, "add_standard_errors", lambda out, *_: None)
     running = object.__new__(diagnosis._Diagnosis)
-    running.parts, running.experiments = SimpleNamespace(held_out=[]), ()
+    running.split, running.experiments = SimpleNamespace(held_out=[]), ()
     running.root, running.checkpoint = seed_sequence(1), Checkpoint(None, {})
     running._validate_on_held_out_rows(results)
     assert len(out.chosen.candidates) == left
@@ -292,13 +294,13 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
 
     one = Refit((0,), ("first",), None, None, 9.0)
     monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
-    monkeypatch.setattr(Selection, "_best_pair", lambda *_: None)
-    monkeypatch.setattr(Selection, "_forward", forward)
+    monkeypatch.setattr(EffectSelection, "_best_pair", lambda *_: None)
+    monkeypatch.setattr(EffectSelection, "_forward", forward)
     screen = screen_of([6.0, 3.0], np.eye(2))
     screen.design = SimpleNamespace(scales=None)
-    out = Attribution(None)
+    out = SelectionResult(None)
     kept = Checkpoint(None, {})
-    Selection(
+    EffectSelection(
         None, screen, (), seed_sequence(1), 0.05, kept, always=True, singles=2, most=wanted,
         approximate=True,
     ).run(out)  # fmt: skip
