@@ -34,7 +34,7 @@ from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers, digests
 from ssmppl.diagnosis.run.expected_time import Timed, in_words, timed
 from ssmppl.diagnosis.run.expected_time import seconds as expected
 from ssmppl.diagnosis.run.failures import Failures, reason_of
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Stage, child_seed
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.selection.effect_selection import (
@@ -193,7 +193,9 @@ class _Diagnosis:
         base = self.augmented.base_fitter
         training = self.split.train if self.split else self.experiments
         fit = self._fit(base, training)
-        states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
+        states = [
+            base.states(e, fit.theta, random_state(self._seed(Stage.STATES))) for e in training
+        ]
         self.augmented.initial_law = proper_initial_law(
             self.trace, [x[0].mean(axis=0) for x in states], states
         )
@@ -210,7 +212,7 @@ class _Diagnosis:
         with self.failures.guard("the time that is expected"):
             self._tell_time(base, fit, design, training)
         screen = run_screen(
-            design, training, fit.theta, SETS[self.mode], self._seed(2), self.checkpoint
+            design, training, fit.theta, SETS[self.mode], self._seed(Stage.SCREEN), self.checkpoint
         )
         settings = {
             "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
@@ -226,8 +228,8 @@ class _Diagnosis:
         found = SelectionResult(r.fit)
         with self.failures.guard("the choice of an effect"):
             EffectSelection(
-                self.augmented, r.screen, r.screen.experiments, self._seed(4), self.alpha,
-                self.checkpoint,
+                self.augmented, r.screen, r.screen.experiments, self._seed(Stage.SELECTION),
+                self.alpha, self.checkpoint,
             ).run(found)  # fmt: skip
         r.selection, r.fit = found, found.base
         if found.unfitted is not None:  # nothing to measure, then
@@ -264,7 +266,7 @@ class _Diagnosis:
             if gain > 0.0:
                 return
             found.chosen, found.left_out = found.fewer.pop(), True
-            add_standard_errors(found, self._seed(4), self.checkpoint)
+            add_standard_errors(found, self._seed(Stage.SELECTION), self.checkpoint)
             found.notes.append(
                 f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
                 f"held-out rows worse than the model itself ({gain:.1f} nats); kept instead: "
@@ -274,7 +276,9 @@ class _Diagnosis:
     def _held_out_predictions(self, fitter: Fitter, fit: Fit) -> Predictions:
         """One-step predictions of the held-out rows."""
         assert self.split is not None
-        return predict(fitter, fit, self.experiments, self.split.held_out, self._seed(8))
+        return predict(
+            fitter, fit, self.experiments, self.split.held_out, self._seed(Stage.HELD_OUT)
+        )
 
     def _held_out_gain(self, r: Results) -> HeldOutGain:
         once = r.chosen is not None and any(is_pulse(c) for c in r.chosen.candidates)
@@ -282,7 +286,7 @@ class _Diagnosis:
             best = r.refits[0] if r.refits else None
             return HeldOutRows(
                 self.augmented, self.split, (r.base, r.fit), r.screen, r.chosen, best
-            ).gain(r.label, self._seed(8), self.checkpoint)
+            ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
         r.blocks = FOLDS
         augmented, design, base = self.augmented, r.screen.design, (r.base, r.fit)
         if self.split:  # the code so far knows no missing rows
@@ -299,7 +303,7 @@ class _Diagnosis:
         whole = None if self.split or (r.selection and r.selection.rebased) else r.screen
         return CrossValidation(
             augmented, design, base, self.experiments, self.alpha, r.chosen, whole
-        ).gain(r.label, self._seed(8), self.checkpoint)
+        ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
 
     def _separating_input(self, r: Results) -> None:
         """The input that would separate the class of the best, where there is a class."""
@@ -310,7 +314,7 @@ class _Diagnosis:
             return
         if r.base.exact or work <= MOST_WORK:
             r.separating[1] = best_separating_input(
-                r.screen, members, self._seed(7), self.checkpoint
+                r.screen, members, self._seed(Stage.SEPARATING_INPUT), self.checkpoint
             )
 
     # -- small parts
@@ -321,7 +325,7 @@ class _Diagnosis:
             self.checkpoint.say(f"{stage} {self.trace.name!r}")
 
         def numbers() -> Numbers:
-            return base.fit(experiments, self._seed(1), {}).numbers
+            return base.fit(experiments, self._seed(Stage.FIT), {}).numbers
 
         with announced("diagnose", stage, shown=self.checkpoint.progress):
             fit = base.restored(experiments, self.checkpoint.computed(stage, numbers))
@@ -344,10 +348,12 @@ class _Diagnosis:
         whole = design.theta(fit.theta)
         # A refit's code is about as much to compile as the screen's.
         for_screen, generating = timed(
-            lambda: design.smoother.run(experiments, whole, random_state(self._seed(12)))
+            lambda: design.smoother.run(experiments, whole, random_state(self._seed(Stage.TIMING)))
         )
         for_fit, _ = timed(
-            lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
+            lambda: base.smoother.run(
+                experiments, fit.theta, random_state(self._seed(Stage.TIMING))
+            )
         )
         of_climbs, _ = timed(lambda: base.value(experiments, fit.theta))
         blocks = 0 if self.split else FOLDS
@@ -364,5 +370,5 @@ class _Diagnosis:
         longest = max(e.steps for e in experiments)
         return Scales.of(self.trace, np.concatenate(states), y, u, longest)
 
-    def _seed(self, stage: int) -> np.random.SeedSequence:
+    def _seed(self, stage: Stage) -> np.random.SeedSequence:
         return child_seed(self.root, stage)

@@ -25,7 +25,7 @@ from ssmppl.diagnosis.heldout.predictions import Predictions, free_run, gain_of_
 from ssmppl.diagnosis.heldout.reference import fit_reference
 from ssmppl.diagnosis.heldout.row_split import FOLDS, Fold, folds
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen, screen_part
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
@@ -76,7 +76,7 @@ class CrossValidation:
 
         def one(k: int) -> Numbers:
             name = f"block {k + 1} of {len(blocks)}"
-            own, kept = child_seed(seed, 20, k), checkpoint.within(name)
+            own, kept = child_seed(seed, Task.BLOCK, k), checkpoint.within(name)
             try:
                 return kept.computed("held out", partial(self._one, blocks[k], own, kept))
             except SSMError:  # a block that a model cannot predict is no block to leave out

@@ -15,7 +15,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -94,7 +94,7 @@ class EffectSelection:
             return
         if not self.approximate:
             with guard("estimating shapes"):
-                out.refits = self._shaped(out, out.refits, 7, "estimating shapes")
+                out.refits = self._shaped(out, out.refits, Choice.SHAPES, "estimating shapes")
         out.chosen = out.refits[0]
         single, pair = out.chosen, None
         if self.most > 1:
@@ -116,8 +116,8 @@ class EffectSelection:
         if len(out.chosen.candidates) > 1:
             with guard("the shapes of all that was chosen"):
                 stage = "estimating the shapes of all that was chosen"
-                (out.chosen,) = self._shaped(out, [out.chosen], 8, stage)
-        add_standard_errors(out, child_seed(self.seed, 5), self.checkpoint)
+                (out.chosen,) = self._shaped(out, [out.chosen], Choice.CHOSEN_SHAPES, stage)
+        add_standard_errors(out, self._seed(Choice.STANDARD_ERRORS), self.checkpoint)
 
     # -- single effects
     def _refit_singles(self, out: SelectionResult) -> None:
@@ -132,7 +132,7 @@ class EffectSelection:
         for stage, which in stages.items():
             with self.checkpoint.failures.guard(stage):
                 more, failed = self._refit(
-                    out.base, screen, [[k] for k in which()], child_seed(self.seed, 1), stage,
+                    out.base, screen, [[k] for k in which()], self._seed(Choice.SINGLES), stage,
                     afresh=stage == AFRESH,
                 )  # fmt: skip
                 refits = best_of_groups(screen, refits + more)
@@ -150,11 +150,11 @@ class EffectSelection:
         )  # fmt: skip
 
     def _shaped(
-        self, out: SelectionResult, refits: Sequence[Refit], place: int, stage: str
+        self, out: SelectionResult, refits: Sequence[Refit], place: Choice, stage: str
     ) -> list[Refit]:
         return shaped_all(
             self.augmented, out.base, self.screen.design.scales, refits, self.train,
-            child_seed(self.seed, place), self.checkpoint, stage,
+            self._seed(place), self.checkpoint, stage,
         )  # fmt: skip
 
     # -- tests
@@ -184,7 +184,7 @@ class EffectSelection:
         start = {n: v for n, v in best.by_parameter.items() if n in self.augmented.trace.parameters}
         numbers = self.checkpoint.computed(
             "fitting from the best refit",
-            lambda: fitter.fit(self.train, child_seed(self.seed, 6), start, FROM_START).numbers,
+            lambda: fitter.fit(self.train, self._seed(Choice.BASE), start, FROM_START).numbers,
         )
         found = fitter.restored(self.train, numbers)
         better = found.log_likelihood - out.base.log_likelihood
@@ -210,8 +210,8 @@ class EffectSelection:
             if min(rest.values(), default=1.0) <= LAX * alpha:
                 best = min(rest, key=lambda k: rest[k])
                 found[best] = refit_p(
-                    self.augmented, out.base, self.screen, alpha, child_seed(self.seed, 4),
-                    self.checkpoint,
+                    self.augmented, out.base, self.screen, alpha,
+                    self._seed(Choice.REFIT_TEST), self.checkpoint,
                 )  # fmt: skip
         if not found:
             return False
@@ -223,7 +223,7 @@ class EffectSelection:
         """The best of the pairs of which the screen promises most, where it is clearly better than
         the best single one."""
         out.doubles, failed = self._refit(
-            out.base, self.screen, pairs(self.screen, out.refits), child_seed(self.seed, 2),
+            out.base, self.screen, pairs(self.screen, out.refits), self._seed(Choice.PAIRS),
             "refitting pairs",
         )  # fmt: skip
         out.notes += [f"not refitted: {reason}" for reason in failed]
@@ -234,7 +234,7 @@ class EffectSelection:
 
     def _forward(self, out: SelectionResult, most: int) -> None:
         """Screen again around the chosen model, and add what stands out, up to `most` effects."""
-        chosen, seed = out.chosen, child_seed(self.seed, 3)
+        chosen, seed = out.chosen, self._seed(Choice.FURTHER)
         while chosen is not None and len(chosen.candidates) < most:
             number, rest = len(chosen.candidates), _others(self.screen, chosen)
             work = sum(e.steps for e in self.train) * self.augmented.settings.particles
@@ -254,7 +254,7 @@ class EffectSelection:
                 return
             more, _ = self._refit(
                 chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
-                child_seed(seed, 10 + number), "refitting", chosen.candidates,
+                child_seed(seed, Task.FURTHER_REFITS + number), "refitting", chosen.candidates,
                 checkpoint=self.checkpoint.within(f"with {number + 1} effects"),
             )  # fmt: skip
             if not more or more[0].penalised_gain < critical_gain(again, self.alpha):
@@ -266,6 +266,9 @@ class EffectSelection:
                 index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain,
                 chosen.cost + best.cost,
             )  # fmt: skip
+
+    def _seed(self, step: Choice) -> np.random.SeedSequence:
+        return child_seed(self.seed, step)
 
     def _screen_again(
         self, chosen: Refit, rest: Sequence[Candidate], seed: np.random.SeedSequence

@@ -33,6 +33,7 @@ from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
+from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
@@ -348,7 +349,7 @@ class Fitter:
 
         def estimate(s: Space) -> float:
             n = self.settings.particles
-            return self._estimate(s.problem, s.theta, n, random_state(seed, 8))
+            return self._estimate(s.problem, s.theta, n, random_state(seed, Stream.TOP))
 
         was = estimate(space)
         for top in sorted(tops, key=lambda top: -top.value):
@@ -474,7 +475,7 @@ class Fitter:
     def _fit_by_particles(
         self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
     ) -> Fit:
-        stream = random_state(seed, 1)
+        stream = random_state(seed, Stream.ASCENT)
         z = space.z[space.where]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
@@ -509,7 +510,9 @@ class Fitter:
             n = self.settings.particles * 2**doubling
 
             def one(r: int, n: int = n, doubling: int = doubling) -> float:
-                return self._estimate(problem, theta, n, random_state(seed, 2, r, doubling))
+                return self._estimate(
+                    problem, theta, n, random_state(seed, Stream.LIKELIHOOD, r, doubling)
+                )
 
             log_z = np.array(run_tasks(one, range(repeats)))
             if not np.any(log_z > -np.inf):
@@ -604,7 +607,7 @@ class Fitter:
         simulator = self.simulator
 
         def one(r: int) -> np.ndarray | None:
-            stream = random_state(seed, 3, r)
+            stream = random_state(seed, Stream.INFORMATION, r)
             sets = simulator.sets(problem.experiments, theta, stream)
             try:
                 passes = smoother.run(sets, theta, stream, predicted=False)

@@ -16,7 +16,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
 from ssmppl.diagnosis.screening.efficient_score import Efficient
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -153,7 +153,7 @@ def _backtracked(
     quadratic may promise a top beyond the data's cliff."""
     if fitter.exact:
         return start
-    problem, stream = fitter.problem, random_state(seed, 4)
+    problem, stream = fitter.problem, random_state(seed, Stream.START)
     best, out = -np.inf, start
     for share in SHARES:
         tried = start | {n: share * start[n] for n in strengths}
@@ -338,7 +338,7 @@ def _one(
     added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
-    own = child_seed(seed, 5, k)
+    own = child_seed(seed, Task.REFIT, k)
     found = refit(augmented, base, screen, sets[k], train, own, added[k], afresh, approximate)
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
@@ -358,7 +358,7 @@ def _shaped(
         return out
     try:
         passes = design.smoother.run(
-            train, design.theta(base.theta), random_state(seed, 9), predicted=False
+            train, design.theta(base.theta), random_state(seed, Stream.WAVES), predicted=False
         )
     except SSMError:
         return out

@@ -18,7 +18,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.familywise import tail_p
 from ssmppl.diagnosis.screening.screen import Screen, compare_with_null
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -100,8 +100,8 @@ def _gain(
 ) -> float:  # fmt: skip
     """The largest gain in one data set; NaN where a fit failed."""
     design, plain = screen.design, augmented.base_fitter
-    stream = random_state(seed, 200, k)
-    own = child_seed(seed, 100, k)
+    stream = random_state(seed, Task.TEST_SCORES, k)
+    own = child_seed(seed, Task.TEST_FIT, k)
     try:
         fit = plain.fit(data, own, base.by_parameter, APPROXIMATELY)
         at = design.theta(fit.theta)
