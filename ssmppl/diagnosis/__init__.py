@@ -5,6 +5,7 @@ model/      the equations of a model, effects added to them, score columns, one 
 screening/  score tests of all candidates and checks of predictions, with family-wise p-values
 selection/  fits and refits, the choice among candidates, equivalence classes
 heldout/    the gain ratio on held-out rows or cross-validation blocks, the reference for it
+verdict/    the results of all stages, and the decision between the verdicts
 report/     tables, words, plots, page, and the model file
 run/        checkpoints, failures, seeds, expected time
 """

@@ -17,34 +17,35 @@ import numpy as np
 from ssmppl.counts import check_count, check_number
 from ssmppl.data import Experiment, check_values
 from ssmppl.diagnosis.effects.candidate import is_pulse
-from ssmppl.diagnosis.heldout.crossfit import CrossFit
+from ssmppl.diagnosis.heldout.cross_validation import CrossValidation
 from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain, HeldOutRows
-from ssmppl.diagnosis.heldout.parts import FOLDS, Parts, long_enough, three_parts
 from ssmppl.diagnosis.heldout.predictions import Predictions, predict
+from ssmppl.diagnosis.heldout.row_split import FOLDS, RowSplit, long_enough, three_parts
 from ssmppl.diagnosis.model.candidates import Chosen
 from ssmppl.diagnosis.model.candidates import chosen as chosen_effects
 from ssmppl.diagnosis.model.differentiable import check_differentiable
 from ssmppl.diagnosis.model.initial_law import proper_initial_law
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.report.build import Results, build_report
+from ssmppl.diagnosis.report.build import build_report
 from ssmppl.diagnosis.report.findings import MODES
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers, digests
 from ssmppl.diagnosis.run.expected_time import Timed, in_words, timed
 from ssmppl.diagnosis.run.expected_time import seconds as expected
 from ssmppl.diagnosis.run.failures import Failures, reason_of
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Stage, child_seed
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.attribution import (
+from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
+from ssmppl.diagnosis.selection.effect_selection import (
     MOST_WORK,
-    Attribution,
-    Selection,
+    EffectSelection,
+    SelectionResult,
     add_standard_errors,
 )
-from ssmppl.diagnosis.selection.augmented_models import AugmentedModels, proposal_of
 from ssmppl.diagnosis.selection.equivalence import best_separating_input
 from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
+from ssmppl.diagnosis.verdict.results import Results
 from ssmppl.errors import ArgumentError, SSMError, listing
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import pose
@@ -140,11 +141,11 @@ class _Diagnosis:
         check_differentiable(self.trace, self.fixed)
         self.effects, self.mode, self.alpha = effects, mode, alpha
         self.root = seed_sequence(seed)
-        self.parts: Parts | None = None
+        self.split: RowSplit | None = None
         if mode == "full" and long_enough(self.experiments):
-            self.parts = three_parts(self.experiments)
+            self.split = three_parts(self.experiments)
         missing = self.problem.program.missing
-        if mode == "full" and self.parts is None:  # blocks of rows will be set missing
+        if mode == "full" and self.split is None:  # blocks of rows will be set missing
             missing = replace(missing, none=False)
         proposal = proposal_of(self.problem.program)
         number = particles or (TWISTED_PARTICLES if proposal == "twisted" else PARTICLES)[mode]
@@ -169,7 +170,7 @@ class _Diagnosis:
             results = self._screen()
             if self.mode == "full":
                 try:
-                    self._attribute(results)
+                    self._select(results)
                 except KeyboardInterrupt:
                     results.interrupted = True
                     self.checkpoint.say("interrupted: the report is of the stages that are done")
@@ -189,10 +190,12 @@ class _Diagnosis:
     # -- stages
     def _screen(self) -> Results:
         """Fit, and screen."""
-        base = self.augmented.fitter(())
-        training = self.parts.train if self.parts else self.experiments
+        base = self.augmented.base_fitter
+        training = self.split.train if self.split else self.experiments
         fit = self._fit(base, training)
-        states = [base.states(e, fit.theta, random_state(self._seed(11))) for e in training]
+        states = [
+            base.states(e, fit.theta, random_state(self._seed(Stage.STATES))) for e in training
+        ]
         self.augmented.initial_law = proper_initial_law(
             self.trace, [x[0].mean(axis=0) for x in states], states
         )
@@ -206,44 +209,44 @@ class _Diagnosis:
                 + "; ".join(map(str, design.refused[:3])),
                 fix="name others in effects=; ssm.effects.names() lists them",
             )
-        with self.failures.part("the time that is expected"):
+        with self.failures.guard("the time that is expected"):
             self._tell_time(base, fit, design, training)
         screen = run_screen(
-            design, training, fit.theta, SETS[self.mode], self._seed(2), self.checkpoint
+            design, training, fit.theta, SETS[self.mode], self._seed(Stage.SCREEN), self.checkpoint
         )
         settings = {
             "model": self.trace.name, "alpha": self.alpha, "seed": str(self.root.entropy),
             "particles": 0 if base.exact else self.settings.particles,
         }  # fmt: skip
         return Results(
-            self.trace, self.experiments, self.parts, self.mode, self.alpha, base, fit, screen,
+            self.trace, self.experiments, self.split, self.mode, self.alpha, base, fit, screen,
             settings, self.notes, failures=self.failures,
         )  # fmt: skip
 
-    def _attribute(self, r: Results) -> None:
+    def _select(self, r: Results) -> None:
         """Refit and choose, find the equivalence class, measure the held-out gain; into `r`."""
-        found = Attribution(r.fit)
-        with self.failures.part("the choice of an effect"):
-            Selection(
-                self.augmented, r.screen, r.screen.experiments, self._seed(4), self.alpha,
-                self.checkpoint,
+        found = SelectionResult(r.fit)
+        with self.failures.guard("the choice of an effect"):
+            EffectSelection(
+                self.augmented, r.screen, r.screen.experiments, self._seed(Stage.SELECTION),
+                self.alpha, self.checkpoint,
             ).run(found)  # fmt: skip
-        r.attribution, r.fit = found, found.base
+        r.selection, r.fit = found, found.base
         if found.unfitted is not None:  # nothing to measure, then
             return
-        with self.failures.part("whether several effects predict better than fewer"):
+        with self.failures.guard("whether several effects predict better than fewer"):
             self._validate_on_held_out_rows(r)
-        with self.failures.part("the input that would separate the class best"):
+        with self.failures.guard("the input that would separate the class best"):
             self._separating_input(r)
-        with self.failures.part("how far the gap closes"):
+        with self.failures.guard("how far the gap closes"):
             r.held_out = self._held_out_gain(r)
 
     def _validate_on_held_out_rows(self, r: Results) -> None:
         """Drop effects of several chosen together while all of them predict the held-out
         rows no better than the model itself: what they fitted was chance. It is a choice made on
         these rows, and the report says so."""
-        found = r.attribution
-        if not self.parts or found is None or found.chosen is None or not found.fewer:
+        found = r.selection
+        if not self.split or found is None or found.chosen is None or not found.fewer:
             return
         try:
             plain = self._held_out_predictions(r.base, r.fit)
@@ -263,7 +266,7 @@ class _Diagnosis:
             if gain > 0.0:
                 return
             found.chosen, found.left_out = found.fewer.pop(), True
-            add_standard_errors(found, self._seed(4), self.checkpoint)
+            add_standard_errors(found, self._seed(Stage.SELECTION), self.checkpoint)
             found.notes.append(
                 f"{' and '.join(map(str, last.candidates))} fit better together, and predict "
                 f"held-out rows worse than the model itself ({gain:.1f} nats); kept instead: "
@@ -272,19 +275,21 @@ class _Diagnosis:
 
     def _held_out_predictions(self, fitter: Fitter, fit: Fit) -> Predictions:
         """One-step predictions of the held-out rows."""
-        assert self.parts is not None
-        return predict(fitter, fit, self.experiments, self.parts.held_out, self._seed(8))
+        assert self.split is not None
+        return predict(
+            fitter, fit, self.experiments, self.split.held_out, self._seed(Stage.HELD_OUT)
+        )
 
     def _held_out_gain(self, r: Results) -> HeldOutGain:
         once = r.chosen is not None and any(is_pulse(c) for c in r.chosen.candidates)
-        if self.parts and not once:
+        if self.split and not once:
             best = r.refits[0] if r.refits else None
             return HeldOutRows(
-                self.augmented, self.parts, (r.base, r.fit), r.screen, r.chosen, best
-            ).gain(r.label, self._seed(8), self.checkpoint)
+                self.augmented, self.split, (r.base, r.fit), r.screen, r.chosen, best
+            ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
         r.blocks = FOLDS
         augmented, design, base = self.augmented, r.screen.design, (r.base, r.fit)
-        if self.parts:  # the code so far knows no missing rows
+        if self.split:  # the code so far knows no missing rows
             missing = replace(self.augmented.missing, none=False)
             augmented = AugmentedModels(
                 self.trace, missing, self.fixed, self.settings, self.augmented.initial_law
@@ -293,12 +298,12 @@ class _Diagnosis:
                 self.trace, design.scales, missing, (*self.fixed, *r.fit.bounds),
                 self.settings, self.effects, failures=self.failures,
             )  # fmt: skip
-            fitter = augmented.fitter(())
+            fitter = augmented.base_fitter
             base = fitter, fitter.restored(self.experiments, r.fit.numbers)
-        whole = None if self.parts or (r.attribution and r.attribution.rebased) else r.screen
-        return CrossFit(
+        whole = None if self.split or (r.selection and r.selection.rebased) else r.screen
+        return CrossValidation(
             augmented, design, base, self.experiments, self.alpha, r.chosen, whole
-        ).gain(r.label, self._seed(8), self.checkpoint)
+        ).gain(r.label, self._seed(Stage.HELD_OUT), self.checkpoint)
 
     def _separating_input(self, r: Results) -> None:
         """The input that would separate the class of the best, where there is a class."""
@@ -309,7 +314,7 @@ class _Diagnosis:
             return
         if r.base.exact or work <= MOST_WORK:
             r.separating[1] = best_separating_input(
-                r.screen, members, self._seed(7), self.checkpoint
+                r.screen, members, self._seed(Stage.SEPARATING_INPUT), self.checkpoint
             )
 
     # -- small parts
@@ -320,7 +325,7 @@ class _Diagnosis:
             self.checkpoint.say(f"{stage} {self.trace.name!r}")
 
         def numbers() -> Numbers:
-            return base.fit(experiments, self._seed(1), {}).numbers
+            return base.fit(experiments, self._seed(Stage.FIT), {}).numbers
 
         with announced("diagnose", stage, shown=self.checkpoint.progress):
             fit = base.restored(experiments, self.checkpoint.computed(stage, numbers))
@@ -329,7 +334,7 @@ class _Diagnosis:
             self.notes.append(f"the optimiser did not converge ({stage}){left}")
         if fit.bounds:
             self.notes.append(
-                bounds_note(fit.bounds, fit.values(), f"the fit of {self.trace.name!r}")
+                bounds_note(fit.bounds, fit.by_component, f"the fit of {self.trace.name!r}")
             )
         return fit
 
@@ -343,13 +348,15 @@ class _Diagnosis:
         whole = design.theta(fit.theta)
         # A refit's code is about as much to compile as the screen's.
         for_screen, generating = timed(
-            lambda: design.smoother.run(experiments, whole, random_state(self._seed(12)))
+            lambda: design.smoother.run(experiments, whole, random_state(self._seed(Stage.TIMING)))
         )
         for_fit, _ = timed(
-            lambda: base.smoother.run(experiments, fit.theta, random_state(self._seed(12)))
+            lambda: base.smoother.run(
+                experiments, fit.theta, random_state(self._seed(Stage.TIMING))
+            )
         )
         of_climbs, _ = timed(lambda: base.value(experiments, fit.theta))
-        blocks = 0 if self.parts else FOLDS
+        blocks = 0 if self.split else FOLDS
         rest = expected(
             Timed(for_screen, for_fit, generating, of_climbs), SETS[self.mode], self.mode, blocks,
             self.checkpoint.executor,
@@ -363,5 +370,5 @@ class _Diagnosis:
         longest = max(e.steps for e in experiments)
         return Scales.of(self.trace, np.concatenate(states), y, u, longest)
 
-    def _seed(self, stage: int) -> np.random.SeedSequence:
+    def _seed(self, stage: Stage) -> np.random.SeedSequence:
         return child_seed(self.root, stage)

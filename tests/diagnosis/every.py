@@ -15,12 +15,11 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import linear_gaussian
-from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.augment import augment, with_given_parameters
 from ssmppl.diagnosis.model.basis import symbolic_shapes
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.initial_law import needs_proper_initial_law
 from ssmppl.diagnosis.model.score_columns import score_columns
-from ssmppl.diagnosis.screening.screen import with_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
@@ -132,7 +131,7 @@ def scored(t, added):
     """The columns that a screen asks of a model, for these effects; why some have none."""
     unique = {c.increment.key: c.increment for c in added}
     made, shapes = symbolic_shapes(list(unique.values()))
-    superset = with_parameters(augment(t, made), shapes)
+    superset = with_given_parameters(augment(t, made), shapes)
     names = [c.strength for c in made]
     found = score_columns(t, superset, names, (), Missing())
     own = {repr(s) for s in t.parameter_symbols}

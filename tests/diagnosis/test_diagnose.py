@@ -9,10 +9,10 @@ import pytest
 import ssmppl as ssm
 import ssmppl.datasets
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout import crossfit
+from ssmppl.diagnosis.heldout import cross_validation
 from ssmppl.diagnosis.run.expected_time import Timed, in_words, seconds
 from ssmppl.diagnosis.screening import screen
-from ssmppl.diagnosis.selection import attribution, refit
+from ssmppl.diagnosis.selection import effect_selection, refit
 from ssmppl.errors import ArgumentError, DataError
 from tests.diagnosis.small import BREAK, DATE, level, levels
 from tests.models import gaps as models
@@ -31,9 +31,9 @@ def few_sets(monkeypatch):
 
 def _few(patch):
     patch.setattr(diagnose, "SETS", {"fast": FEW, "full": FEW})
-    patch.setattr(crossfit, "SETS", FEW)
-    patch.setattr(crossfit, "SINGLES", 1)
-    for module in (diagnose, crossfit):
+    patch.setattr(cross_validation, "SETS", FEW)
+    patch.setattr(cross_validation, "SINGLES", 1)
+    for module in (diagnose, cross_validation):
         patch.setattr(module, "FOLDS", BLOCKS)
 
 
@@ -106,7 +106,7 @@ def test_an_interrupt_keeps_the_stages_that_are_done(jump, tmp_path, monkeypatch
         raise KeyboardInterrupt
 
     kept = tmp_path / "stages"
-    where = {"refit": (refit, "refit"), "share": (crossfit.CrossFit, "_one")}[stage]
+    where = {"refit": (refit, "refit"), "share": (cross_validation.CrossValidation, "_one")}[stage]
     with monkeypatch.context() as patch:
         patch.setattr(*where, interrupted)
         first = run(level(), levels(80, BREAK), checkpoint=kept)
@@ -122,7 +122,11 @@ def test_an_interrupt_keeps_the_stages_that_are_done(jump, tmp_path, monkeypatch
 
 def _only_later(patch):
     """`ScreenDesign.statistics`, forbidden until the refits have begun."""
-    begun, original, selected = [], screen.ScreenDesign.statistics, attribution.Selection.run
+    begun, original, selected = (
+        [],
+        screen.ScreenDesign.statistics,
+        effect_selection.EffectSelection.run,
+    )
 
     def statistics(self, *args, **kwargs):
         assert begun, "a simulated set of the first screen was drawn again"
@@ -132,7 +136,7 @@ def _only_later(patch):
         begun.append(True)
         return selected(*args, **kwargs)
 
-    patch.setattr(attribution.Selection, "run", later)
+    patch.setattr(effect_selection.EffectSelection, "run", later)
     return statistics
 
 

@@ -15,10 +15,10 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout import crossfit, predictions
+from ssmppl.diagnosis.heldout import cross_validation, predictions
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.screening import screen
-from ssmppl.diagnosis.selection import attribution, fit, refit_test
+from ssmppl.diagnosis.selection import effect_selection, fit, refit_test
 from ssmppl.errors import SSMError
 from ssmppl.language.distributions import Flat, HalfFlat
 from ssmppl.modelfile import load_model, read_csv
@@ -46,14 +46,14 @@ def few(patch, where, name):
     patch.setattr(diagnose, "SETS", {"fast": sets, "full": sets})
     patch.setattr(screen, "OWN_RUNS", 2)
     patch.setattr(screen, "FEWEST", sets // 2)
-    patch.setattr(attribution, "AGAIN", sets)
+    patch.setattr(effect_selection, "AGAIN", sets)
     patch.setattr(refit_test, "SETS", 3)
     patch.setattr(fit, "INFORMATION_SETS", 6)
     patch.setattr(fit, "PILOT_PARTICLES", PARTICLES)
-    patch.setattr(crossfit, "SETS", sets)
-    patch.setattr(crossfit, "SINGLES", 1)
+    patch.setattr(cross_validation, "SETS", sets)
+    patch.setattr(cross_validation, "SINGLES", 1)
     patch.setattr(predictions, "FREE_RUNS", 10)
-    for module in (diagnose, crossfit):
+    for module in (diagnose, cross_validation):
         patch.setattr(module, "FOLDS", BLOCKS)
 
 

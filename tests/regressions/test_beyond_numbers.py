@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.diagnosis.model.scales import Scale
+from ssmppl.diagnosis.model.scales import VariableScale
 from ssmppl.inference.chains.bridge import Student
 from ssmppl.inference.chains.parameter_steps import log_joint
 from ssmppl.inference.maximum.ascent import Maximization
@@ -167,10 +167,10 @@ def test_a_surface_that_no_axis_holds():
 
 
 def test_the_scale_of_numbers_that_have_no_squares():
-    found = Scale.of([1e200, -1e200, 3e200, np.nan])
+    found = VariableScale.of([1e200, -1e200, 3e200, np.nan])
     assert found.mean == pytest.approx(1e200)
     assert found.sd == pytest.approx(1e200 * np.std([1, -1, 3]))
-    assert Scale.of([0.0, 0.0]).sd == 0.0
+    assert VariableScale.of([0.0, 0.0]).sd == 0.0
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,9 @@ from scipy.special import stdtrit
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import WHOLE, segments
-from ssmppl.diagnosis.heldout.parts import Parts
 from ssmppl.diagnosis.heldout.predictions import FreeRun, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
+from ssmppl.diagnosis.heldout.row_split import RowSplit
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -133,7 +133,7 @@ def gain_ratio(
     ----------
     base, effect, reference : (T,), or (R, T) from R independent runs of the particle filter, run r
         of each with the same seed. Missing rows are 0 in all three. Rows may also be whole blocks
-        (the folds of a cross-fit): then give `block=1`.
+        (the folds of a cross-validation): then give `block=1`.
     block : rows per block; None: chosen by `block_length`.
     starts : first row of each experiment; no block reaches across.
     noise : Monte Carlo sd of the three totals, where there is one run only. With R >= 2 runs it
@@ -351,7 +351,7 @@ class HeldOutRows:
     """
 
     augmented: AugmentedModels
-    parts: Parts
+    split: RowSplit
     base: tuple[Fitter, Fit]
     screen: Screen
     chosen: Refit | None
@@ -360,7 +360,7 @@ class HeldOutRows:
     def gain(self, label: str, seed: np.random.SeedSequence, checkpoint: Checkpoint) -> HeldOutGain:
         """The chosen model, or else the reference itself, against the base model."""
         out = HeldOutGain()
-        out.simulate(self.base, self.parts.experiments, self.chosen, seed)
+        out.simulate(self.base, self.split.experiments, self.chosen, seed)
         try:
             self._measure(out, label, seed, checkpoint)
         except SSMError as error:  # a held-out row may be impossible under what others were fit to
@@ -376,13 +376,13 @@ class HeldOutRows:
         ------
         SSMError : a model cannot predict the held-out rows, or there are too few.
         """
-        chosen, experiments, counts = self.chosen, self.parts.experiments, self.parts.held_out
+        chosen, experiments, counts = self.chosen, self.split.experiments, self.split.held_out
         plain = predict(*self.base, experiments, counts, seed)
         try:
             reference = fit_reference(
                 self.augmented, chosen.candidates if chosen else (),
-                chosen.fit if chosen else self.base[1], self.screen, self.parts.train, seed,
-                checkpoint, self.parts,
+                chosen.fit if chosen else self.base[1], self.screen, self.split.train, seed,
+                checkpoint, self.split,
             )  # fmt: skip
             best = predict(*reference, experiments, counts, seed)
         except SSMError as error:

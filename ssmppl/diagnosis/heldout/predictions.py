@@ -10,6 +10,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.model.smoothing import Pass
+from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
@@ -48,7 +49,7 @@ def predict(
     experiments, counts = [experiments[i] for i in held], [counts[i] for i in held]
 
     def one(r: int) -> list[Pass]:
-        stream = random_state(seed, 6, r)
+        stream = random_state(seed, Stream.PREDICTIONS, r)
         passes = fitter.smoother.run(experiments, fit.theta, stream)
         for p in passes:
             p.log_increments[:1] += fitter.log_correction
@@ -140,7 +141,9 @@ class FreeRun:
 
 def free_run(fitter: Fitter, fit: Fit, e: Experiment, seed: np.random.SeedSequence) -> FreeRun:
     """Mean and central 95% of simulated observations with the experiment's inputs."""
-    draws = fitter.simulator.observations(e, fit.theta, random_state(seed, 7), FREE_RUNS)
+    draws = fitter.simulator.observations(
+        e, fit.theta, random_state(seed, Stream.FREE_RUN), FREE_RUNS
+    )
     with np.errstate(all="ignore"):
         known = not np.any(np.isnan(draws))  # nanquantile goes row by row
         quantile = np.quantile if known else np.nanquantile

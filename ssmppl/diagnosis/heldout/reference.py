@@ -14,14 +14,14 @@ import numpy as np
 
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.heldout.parts import Parts
 from ssmppl.diagnosis.heldout.predictions import predict
-from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import Term, symbolic_shapes
+from ssmppl.diagnosis.heldout.row_split import RowSplit
+from ssmppl.diagnosis.model.augment import augment, with_given_parameters
+from ssmppl.diagnosis.model.basis import BasisTerm, symbolic_shapes
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient
 from ssmppl.diagnosis.screening.familywise import familywise
-from ssmppl.diagnosis.screening.screen import Screen, with_parameters
+from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
 from ssmppl.diagnosis.selection.fit import APPROXIMATELY, WITHOUT_ERRORS, Fit, Fitter
 from ssmppl.errors import SSMError
@@ -38,7 +38,7 @@ Values = dict[str, np.ndarray]
 
 def significant_groups(
     screen: Screen, chosen: Sequence[Candidate]
-) -> list[tuple[list[Term], float]]:
+) -> list[tuple[list[BasisTerm], float]]:
     """(terms of one equation, moment and variable, tau) where the basis has signal beyond what was
     chosen, best first; none where chance explains it."""
     design = screen.design
@@ -66,13 +66,13 @@ def significant_groups(
 def fit_reference(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit, screen: Screen,
     train: Sequence[Experiment], seed: np.random.SeedSequence, checkpoint: Checkpoint,
-    parts: Parts | None = None,
+    split: RowSplit | None = None,
 ) -> tuple[Fitter, Fit]:  # fmt: skip
     """The superset, fitted from the fit of the model with the chosen effects.
 
     A fit that comes out below where it started has gone astray (a feedback of what is past that
     makes the model unstable): then with the best group alone, and at last with none. Where there
-    are `parts`, the curves, fitted to the first rows, have to predict the rows of the second part
+    is a `split`, the curves, fitted to the first rows, have to predict the rows of the second part
     better than the model without them does: what only bends through the noise is left out.
 
     Raises
@@ -80,17 +80,17 @@ def fit_reference(
     SSMError : it cannot be fitted.
     """
     groups = significant_groups(screen, chosen)
-    if groups and parts is not None:
+    if groups and split is not None:
         gained = checkpoint.computed(
             "reference on other rows",
-            lambda: {"nats": _gained(augmented, chosen, start, groups, parts, seed)},
+            lambda: {"nats": _gained(augmented, chosen, start, groups, split, seed)},
         )
         groups = groups if float(gained["nats"]) > 0.0 else []
     for count in dict.fromkeys((len(groups), min(1, len(groups)))):
         fitter, begin = superset(augmented, chosen, start, groups[:count])
 
         def numbers(fitter: Fitter = fitter, begin: Values = begin) -> Numbers:
-            effort = APPROXIMATELY if parts is None else WITHOUT_ERRORS
+            effort = APPROXIMATELY if split is None else WITHOUT_ERRORS
             return fitter.fit(train, seed, begin, effort).numbers
 
         stage = "reference" if count == len(groups) else "reference with one group"
@@ -103,15 +103,15 @@ def fit_reference(
 
 def _gained(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
-    groups: Sequence[tuple[list[Term], float]], parts: Parts, seed: np.random.SeedSequence,
+    groups: Sequence[tuple[list[BasisTerm], float]], split: RowSplit, seed: np.random.SeedSequence,
 ) -> np.ndarray:  # fmt: skip
     """() nats by which the superset predicts the second part better; -inf where it has no fit."""
     gains = []
     for wanted in ([], groups):
         fitter, begin = superset(augmented, chosen, start, wanted)
         try:
-            fit = fitter.fit(parts.reference_train, seed, begin, WITHOUT_ERRORS)
-            found = predict(fitter, fit, parts.train, parts.reference_validation, seed)
+            fit = fitter.fit(split.reference_train, seed, begin, WITHOUT_ERRORS)
+            found = predict(fitter, fit, split.train, split.reference_validation, seed)
         except SSMError:
             return np.asarray(-np.inf)
         gains.append(found.log_density.sum(axis=1).mean())
@@ -120,13 +120,13 @@ def _gained(
 
 def superset(
     augmented: AugmentedModels, chosen: Sequence[Candidate], start: Fit,
-    groups: Sequence[tuple[list[Term], float]],
+    groups: Sequence[tuple[list[BasisTerm], float]],
 ) -> tuple[Fitter, Values]:  # fmt: skip
     """The fitter of the superset, and where it starts."""
     candidates = [t.candidate for terms, _ in groups for t in terms]
     made, shapes = symbolic_shapes([*chosen, *candidates], of_time=True)
     widths = {f"tau_{i}": tau for i, (_, tau) in enumerate(groups)}
-    trace = with_parameters(augment(augmented.trace, made), {**shapes, **widths})
+    trace = with_given_parameters(augment(augmented.trace, made), {**shapes, **widths})
     parameters = dict(trace.parameters)
     # A prior may depend on parameters declared before: the widths come first.
     ordered = {n: parameters.pop(n) for n in widths}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -91,6 +91,20 @@ def augment(trace: Trace, candidates: Sequence[Candidate], *, prior: bool = True
         added=tuple(every),
         names=names,
     )
+
+
+def with_given_parameters(
+    trace: Trace, names: Iterable[str], prior: Callable[[], Distribution] = Flat
+) -> Trace:
+    """The trace with further parameters: by default such as are given."""
+    location = next(iter(trace.transition.values())).distribution.location
+    parameters = dict(trace.parameters)
+    for name in names:
+        law = prior()
+        law.location = location
+        own = symbols("parameter", name, ())
+        parameters[name] = Site(name, "parameter", law, own, location)
+    return replace(trace, parameters=parameters)
 
 
 def _in_order(before: Mapping[str, Site], new: dict[str, Site]) -> dict[str, Site]:

@@ -105,7 +105,7 @@ CURVES = bases((0.0, 1.0), MEAN + 1)[1:]  # of a standardised variable, without 
 
 
 @dataclass(frozen=True)
-class Term:
+class BasisTerm:
     """One basis function in one equation.
 
     moment : "mean" or "scale". variable : what it is a function of, in words. function : of a
@@ -131,13 +131,13 @@ class Term:
         return self.function((values - self.centre) / self.width)
 
 
-def basis(trace: Trace, scales: Scales) -> list[Term]:
+def basis(trace: Trace, scales: Scales) -> list[BasisTerm]:
     """The terms of all equations that have noise."""
     equations = Equations(as_it_was(trace))
     states, inputs = equations.of_role("state"), equations.of_role("input")
     varying = [p for p in [*states, *inputs] if scales.scale[p.label].sd > 0.0]
     noisy = [p for p in states if not equations.deterministic(p)]
-    out: list[Term] = []
+    out: list[BasisTerm] = []
     for part in [*noisy, *equations.of_role("channel")]:
         state = part.role == "state"
         own = [v for v in varying if state or v.role != "input"]
@@ -159,7 +159,7 @@ def basis(trace: Trace, scales: Scales) -> list[Term]:
     return [_with_it(t, moved) if t.candidate.change == "transition" else t for t in out]
 
 
-def _with_it(term: Term, moved: Mapping[str, Reaction]) -> Term:
+def _with_it(term: BasisTerm, moved: Mapping[str, Reaction]) -> BasisTerm:
     """The term with what moves within the step."""
     along = moved.get(term.equation, ())
     return replace(term, candidate=replace(term.candidate, carried=along)) if along else term
@@ -175,7 +175,7 @@ def _term(
     part: Part, moment: str, variable: str, name: str, kind: str, function: Callable[..., Any],
     shape: Mapping[str, float], bound: Mapping[str, Part], strength: str, *,
     states: Sequence[str] = (), shares: str = "",
-) -> Term:  # fmt: skip
+) -> BasisTerm:  # fmt: skip
     """A basis function as an effect that is bound: argument -> the state or input it stands for."""
     effect = Effect(
         name=name, kind=kind, function=function, on=part.label,
@@ -186,10 +186,10 @@ def _term(
         effect, part.label, tuple(shape.items()), tuple((a, v.label) for a, v in bound.items()),
         part.role, slug(strength), shares=slug(shares) if shares else "",
     )  # fmt: skip
-    return Term(candidate, part.label, moment, variable)
+    return BasisTerm(candidate, part.label, moment, variable)
 
 
-def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales) -> Term:
+def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: Scales) -> BasisTerm:
     curve = CURVES[k]
 
     def term(own, z, strength, centre, width):
@@ -204,7 +204,7 @@ def _curve(part: Part, moment: str, kind: str, variable: Part, k: int, scales: S
     return replace(found, function=curve, centre=scale.mean, width=scale.sd)
 
 
-def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[Term]:
+def _products(part: Part, variables: Sequence[Part], scales: Scales) -> list[BasisTerm]:
     """Terms that are products of functions of two variables."""
     degrees = DEGREES if len(variables) <= FEW else DEGREES[:FIRST]
     out = []
@@ -230,7 +230,7 @@ def _product(first: Smooth, second: Smooth) -> Callable[..., Any]:
     return term
 
 
-def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
+def _past(part: Part, variable: Part, k: int, scales: Scales) -> BasisTerm:
     """The variable through k + 1 low-passes in a row: B. de Vries and J. Principe, *Neural
     Networks* 5, 1992. All k of a variable share these states."""
 
@@ -248,7 +248,7 @@ def _past(part: Part, variable: Part, k: int, scales: Scales) -> Term:
     )  # fmt: skip
 
 
-def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> Term:
+def _ring(part: Part, variable: Part, turn: float, k: int, scales: Scales) -> BasisTerm:
     """What a resonator with `turn` rows to a turn makes of the variable: both phases share its
     states. It dies away by a factor e within a turn."""
     keep, angle = np.exp(-1.0 / turn), 2.0 * np.pi / turn

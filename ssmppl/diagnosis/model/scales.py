@@ -20,7 +20,7 @@ DIGITS = 4  # of the numbers that shapes are given in, at least, and of the spre
 
 
 @dataclass(frozen=True)
-class Scale:
+class VariableScale:
     """The scale of one variable: quantiles of its values and of their sizes at `LEVELS`."""
 
     mean: float
@@ -29,7 +29,7 @@ class Scale:
     sizes: tuple[float, ...]
 
     @classmethod
-    def of(cls, values: Any) -> Scale:
+    def of(cls, values: Any) -> VariableScale:
         """The scale of an array of any shape; NaN is missing."""
         v = np.asarray(values, dtype=float).ravel()
         v = v[np.isfinite(v)]
@@ -51,7 +51,7 @@ class Scale:
 class Scales:
     """The scale of each state component, channel and input, by label, and the number of rows."""
 
-    scale: Mapping[str, Scale]
+    scale: Mapping[str, VariableScale]
     rows: int
 
     @classmethod
@@ -65,11 +65,11 @@ class Scales:
                   (trace.input_symbols, inputs))  # fmt: skip
         for group, values in groups:
             for i, s in enumerate(group):
-                out[label_of(*s.data[1:])] = Scale.of(np.asarray(values)[..., i])
+                out[label_of(*s.data[1:])] = VariableScale.of(np.asarray(values)[..., i])
         return cls(out, rows)
 
 
-def value_of(grid: Grid, v: float, scale: Scale | None, n: int) -> float:
+def value_of(grid: Grid, v: float, scale: VariableScale | None, n: int) -> float:
     """One value of a shape parameter's grid as a number; n the number of rows."""
     if grid.unit == "rows":
         return float(max(1, round(v * n)))

@@ -26,8 +26,9 @@ from ssmppl.language.model.traced import Site, Trace, previous
 
 
 @dataclass(frozen=True)
-class Columns:
-    """F derivatives: those in the P nuisance parameters first, then those in the strengths.
+class ScoreExpressions:
+    """The score columns as expressions: F derivatives, those in the P nuisance parameters first,
+    then those in the strengths.
 
     base : the model. carried : the model over whose states the expressions are; the base itself
     where nothing has to be carried. follows : role -> (component, value) of what is carried.
@@ -50,7 +51,7 @@ class Columns:
 def score_columns(
     base: Trace, superset: Trace, strengths: Collection[str], held: Collection[str],
     missing: Missing,
-) -> Columns:  # fmt: skip
+) -> ScoreExpressions:  # fmt: skip
     """The columns of a model with candidates; `held` parameters, or components of them by their
     text, have none.
 
@@ -103,7 +104,7 @@ def score_columns(
                 )
                 if s not in known
             ]
-    return Columns(
+    return ScoreExpressions(
         base, carried, given, tuple(initial), tuple(later),
         tuple(s for s in derived.parameters if s in own),
         tuple(s.data[1] for s in derived.parameters if s not in own), follows, refused,

@@ -33,7 +33,7 @@ from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
-from ssmppl.diagnosis.model.score_columns import Columns
+from ssmppl.diagnosis.model.score_columns import ScoreExpressions
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.kalman import KalmanModel, KalmanMoments, kalman_model
@@ -85,12 +85,18 @@ class Pass:
 class Smoother:
     """Runs passes for a set of columns; the generated code is made when first asked for."""
 
-    def __init__(self, columns: Columns, missing: Missing, settings: Settings):
+    def __init__(self, columns: ScoreExpressions, missing: Missing, settings: Settings):
         self.columns, self.missing, self.settings = columns, missing, settings
 
     def __getstate__(self) -> dict:  # another process finds the generated modules in its cache
         generated = ("program", "module", "problem")
         return {k: v for k, v in self.__dict__.items() if k not in generated}
+
+    def with_particles(self, particles: int) -> Smoother:
+        """The same with another number of particles; the two share their generated code."""
+        out = Smoother(self.columns, self.missing, replace(self.settings, particles=particles))
+        vars(out).update(program=self.program, module=self.module, problem=self.problem)
+        return out
 
     @once_property
     def program(self) -> Program:

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from ssmppl.diagnosis.run.failures import Failures
+from ssmppl.diagnosis.verdict.verdicts import VERDICTS
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.language.model.model import Model
 
 if TYPE_CHECKING:
     import pandas as pd
 
-VERDICTS = ("effect", "none of these", "no measurable gap")
 MODES = ("full", "fast")
 
 # The columns of each table. Times are the labels of the data's rows.

@@ -16,6 +16,7 @@ import numpy as np
 from ssmppl.diagnosis.report import words
 from ssmppl.diagnosis.report.findings import Findings
 from ssmppl.diagnosis.report.panels import TITLES, bars, curves, mapped, pictures, runs
+from ssmppl.diagnosis.verdict.verdicts import NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
 if TYPE_CHECKING:
@@ -169,7 +170,7 @@ def page(report: Findings, wide: dict[str, bytes] | None = None) -> str:
 
 def _part(report: Findings, name: str, make: Callable[[], str]) -> str:
     """A part of the page; nothing where an error ended it, which the report then says."""
-    with report.failures.part(name):
+    with report.failures.guard(name):
         return make()
     return ""
 
@@ -195,10 +196,10 @@ def _list(items: Iterable[str]) -> str:
 def _answers(report: Findings) -> str:
     """Three cards: a large word or number, and the sentences below it."""
     found = words.leaders(report)
-    gap = words.rows(report.where)[:1] if report.verdict != "no measurable gap" else []
+    gap = words.rows(report.where)[:1] if report.verdict != NO_GAP else []
     spot = words.place(gap[0]) if gap else "nowhere in particular"
     names = [words.listed(words.alternatives(report, row), "or") for row in found]
-    cause = {"none of these": "none of these", "no measurable gap": "nothing found"}
+    cause = {NONE_OF_THESE: "none of these", NO_GAP: "nothing found"}
     first = (words.rows(report.closed) or [{"F": None}])[0]
     far, ends = "not measured", ""
     if is_number(first["F"]):

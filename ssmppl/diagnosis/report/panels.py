@@ -319,7 +319,7 @@ def panel_figures(report: Findings, width: float) -> dict[str, Any]:
     found: dict[str, Any] = {}
     with look():
         for name in TITLES:
-            with report.failures.part(f"the panel {name!r}"):
+            with report.failures.guard(f"the panel {name!r}"):
                 height = _height(report, name, width)
                 if height:
                     figure = Figure(figsize=(width, height), layout="constrained")
@@ -332,7 +332,7 @@ def pictures(report: Findings, width: float = DESK) -> dict[str, bytes]:
     """`panel_figures` as PNG files."""
     found = {}
     for name, figure in panel_figures(report, width).items():
-        with report.failures.part(f"the panel {name!r}"):
+        with report.failures.guard(f"the panel {name!r}"):
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=DPI)
             found[name] = buffer.getvalue()

@@ -10,9 +10,8 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated, shape_text, starts_of
 from ssmppl.diagnosis.heldout.predictions import FreeRun
-from ssmppl.diagnosis.heldout.reference import residual_groups
 from ssmppl.diagnosis.report.findings import tabulate
-from ssmppl.diagnosis.screening.location import Group, curve, localise, regions, when
+from ssmppl.diagnosis.screening.location import BasisGroupScore, curve, localise, regions, when
 from ssmppl.diagnosis.screening.screen import Screen
 from ssmppl.diagnosis.selection.equivalence import Classes
 from ssmppl.diagnosis.selection.refit import Refit
@@ -34,8 +33,9 @@ def bonferroni(p: Any) -> Any:
     return np.minimum(1.0, np.asarray(p, dtype=float) / SHARED)
 
 
-def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, Group]]:
-    """Equation, moment, stretch of time and region of each group of the basis; by p (`shared`)."""
+def where_table(screen: Screen, alpha: float) -> tuple[pd.DataFrame, dict[Any, BasisGroupScore]]:
+    """Equation, moment, stretch of time and region of each group of the basis; by p
+    (`bonferroni`)."""
     observed, nuisance = screen.observed, screen.simulated.nuisance
     columns, terms = screen.simulated.basis, screen.design.terms
     keys = list(dict.fromkeys((t.equation, t.moment) for t in terms))
@@ -126,24 +126,6 @@ def missing_table(
     return tabulate("missing", rows)
 
 
-def testable_candidates(screen: Screen) -> list[Candidate]:
-    """The candidates with a score that the parameters do not absorb."""
-    candidates = screen.design.candidates
-    return [c for c, s in zip(candidates, screen.efficient.status, strict=True) if not s]
-
-
-def residual_group(
-    screen: Screen, others: Sequence[Candidate]
-) -> tuple[float, tuple[str, str] | None]:
-    """(family-wise p, equation and moment) of what of the basis stands out most with `others`
-    projected out."""
-    groups = residual_groups(screen, others)
-    if not groups:
-        return 1.0, None
-    best = max(groups, key=lambda key: groups[key].z)
-    return groups[best].p, best[:2]
-
-
 def causes_table(
     screen: Screen, refits: Sequence[Refit], found: Classes, order: Sequence[int],
     tested: Mapping[int, float] | None, screened: bool = True,
@@ -219,7 +201,7 @@ def _when(c: Candidate, shape: str, value: float, times: Sequence[Any]) -> str:
 def classes_table(
     screen: Screen, found: Classes, order: Sequence[int], separating: dict[int, str]
 ) -> pd.DataFrame:
-    """The members of each class of two or more."""
+    """The members of each class, the leader first; an effect that is a class by itself, too."""
     rows = []
     for number in dict.fromkeys(found.class_id.tolist()):
         members = found.members(number)

@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ssmppl.diagnosis.verdict.verdicts import CURVES, EFFECT, NO_GAP, NONE_OF_THESE
 from ssmppl.drawing.numerals import interval, is_number, number, p_text, percent, span, with_error
 
 if TYPE_CHECKING:
     from ssmppl.diagnosis.report.findings import Findings
 
 NAMED_RIVALS = 3
-CURVES = "smooth functions of states and inputs"  # what closes the gap where no effect was chosen
 MOMENTS = {
     "mean": "the mean of",
     "scale": "the noise variance of",
@@ -113,7 +113,7 @@ def _places(report: Findings) -> list[int | None]:
             wanted = [r["effect"] == name for r in found]
         fresh = [i for i, same in enumerate(wanted) if same and i not in out]
         out.append(fresh[0] if fresh else None)
-    if report.chosen or report.verdict != "effect":
+    if report.chosen or report.verdict != EFFECT:
         return out
     return [0] if found else []
 
@@ -199,9 +199,9 @@ def answers(report: Findings) -> list[tuple[str, list[str]]]:
 
 def headline(report: Findings) -> str:
     """The verdict in a sentence or two, with its number and its uncertainty."""
-    if report.verdict == "no measurable gap":
+    if report.verdict == NO_GAP:
         return _no_gap(report)
-    if report.verdict == "none of these":
+    if report.verdict == NONE_OF_THESE:
         return _none_of_these(report)
     found = leaders(report) or [{"effect": "something", "equation": "", "p": None}]
     groups = [alternatives(report, row) for row in found]
@@ -311,7 +311,7 @@ def where(report: Findings) -> list[str]:
 
 def which(report: Findings) -> list[str]:
     """The effects that explain it, with their strength, and what they cannot be told from."""
-    if report.verdict == "none of these":
+    if report.verdict == NONE_OF_THESE:
         text = f"None of the {tried(report)}. The remaining misfit is significant"
         curve = _curve_peak(report)
         return [sentence(text), *([curve] if curve else [])]
@@ -368,7 +368,7 @@ def how_far(report: Findings) -> list[str]:
         out.append(sentence(f"{kept_back(report)}, {first['effect']} {share(report)}"))
         if first["F"] < 0:
             out.append("A share below zero means that it made the predictions worse.")
-    elif report.verdict == "no measurable gap":
+    elif report.verdict == NO_GAP:
         out.append(
             sentence(f"{kept_back(report)}, log predictive density did not improve measurably")
         )
@@ -377,7 +377,7 @@ def how_far(report: Findings) -> list[str]:
             f"{kept_back(report)} the reference model's gain is too uncertain for a share of it: "
             "its interval reaches zero (see the notes)"
         ))  # fmt: skip
-    if report.verdict == "no measurable gap":  # what no effect gained is no finding
+    if report.verdict == NO_GAP:  # what no effect gained is no finding
         return out
     if is_number(first["nats_per_sample"]):
         nats = float(first["nats_per_sample"])
@@ -423,7 +423,7 @@ def how_sure(report: Findings) -> list[str]:
     elif tests:
         out.append(f"The one-step predictions of the original model passed all {len(tests)} "
                    "tests.")  # fmt: skip
-    if report.verdict == "no measurable gap":
+    if report.verdict == NO_GAP:
         out.append("That does not prove the model right: an effect that is hardly excited cannot "
                    "be identified from these data.")  # fmt: skip
     return out
@@ -458,7 +458,7 @@ def next_steps(report: Findings) -> list[str]:
     elif len(report.left_out):
         out.append("Parts of this answer are missing (left out, below). Another run tries them "
                    "again; with debug=True (--debug) it stops at the first fault.")  # fmt: skip
-    if report.mode == "fast" and report.verdict != "no measurable gap":
+    if report.mode == "fast" and report.verdict != NO_GAP:
         out.append("Run it again in full mode: it refits the leading effects and measures the "
                    "held-out gain.")  # fmt: skip
     for row in leaders(report):
@@ -474,13 +474,13 @@ def next_steps(report: Findings) -> list[str]:
             out.append(f"None of the simple inputs considered would distinguish "
                        f"{listed(alternatives(report, row), 'from')}; add a sensor, or inspect the "
                        "system.")  # fmt: skip
-    if report.verdict == "none of these" and report.missing is not None:
+    if report.verdict == NONE_OF_THESE and report.missing is not None:
         out.append("Look at the estimated curve, think what could have its shape, write it as an "
                    "@ssm.effect and run again with it.")  # fmt: skip
-    elif report.verdict == "none of these":
+    elif report.verdict == NONE_OF_THESE:
         out.append("Think what could change the noise so, or what acts in that stretch only; write "
                    "it as an @ssm.effect and run again with it.")  # fmt: skip
-    elif report.verdict == "no measurable gap":
+    elif report.verdict == NO_GAP:
         out.append("To look closer, record more data, or drive the system over more of its range.")
     if report.model_text:
         out.append("The augmented model is ready to use: augmented_model.py, an ordinary model "

@@ -75,7 +75,7 @@ class Checkpoint:
 
     def within(self, stage: str) -> Checkpoint:
         """The same checkpoint, its names and titles under that of a stage."""
-        return _Part(self, stage)
+        return ScopedCheckpoint(self, stage)
 
     def __contains__(self, name: str) -> bool:
         return name in self._done
@@ -178,7 +178,7 @@ class Checkpoint:
         return out
 
 
-class _Part(Checkpoint):
+class ScopedCheckpoint(Checkpoint):
     """A checkpoint seen from within a stage."""
 
     def __init__(self, whole: Checkpoint, stage: str):

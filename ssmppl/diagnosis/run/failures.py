@@ -60,7 +60,7 @@ class Failures:
         return True
 
     @contextmanager
-    def part(self, name: str) -> Iterator[None]:
+    def guard(self, name: str) -> Iterator[None]:
         """An error inside ends this part only. One of an executor is raised, as all that follows
         would meet it too."""
         try:

@@ -30,8 +30,8 @@ FEWEST = 8  # pairs of values without which a statistic is left out (0 in every 
 
 
 @dataclass(frozen=True)
-class Statistics:
-    """Named statistics of one data set.
+class PredictionChecks:
+    """Named statistics of the predictions of one data set.
 
     names : (channel, statistic) of each. values : (K,), of order one where the model is right.
     quadratic : (K,) which are sums of squares, large being the only way to be wrong.
@@ -41,10 +41,10 @@ class Statistics:
     values: np.ndarray
     quadratic: np.ndarray
 
-    def with_values(self, channel: str, values: Mapping[str, float]) -> Statistics:
+    def with_values(self, channel: str, values: Mapping[str, float]) -> PredictionChecks:
         """These and more statistics of a channel, its CRPS at each horizon."""
         names = tuple((channel, name) for name in values)
-        return Statistics(
+        return PredictionChecks(
             self.names + names, np.append(self.values, list(values.values())),
             np.append(self.quadratic, np.zeros(len(names), bool)),
         )  # fmt: skip
@@ -64,7 +64,7 @@ def statistics(
     starts: Sequence[int] = WHOLE,
     lags: int = LAGS,
     delays: int = DELAYS,
-) -> Statistics:
+) -> PredictionChecks:
     """Statistics of the one-step predictions, channel by channel.
 
     mean, variance, tails : sqrt(n) times the mean of the Hermite polynomials of degree 1, 2 and 4
@@ -113,12 +113,12 @@ def statistics(
             before = [_sum(_lagged(e, u, k, parts)) for k in range(LONG + 1)]
             found[channel, f"mean with {name}, {LONG} lags"] = float(np.sum(np.square(before)))
     quadratic = np.array([name.endswith(f"{LONG} lags") for _, name in found], bool)
-    return Statistics(tuple(found), np.array(list(found.values())), quadratic)
+    return PredictionChecks(tuple(found), np.array(list(found.values())), quadratic)
 
 
 def detection(
-    observed: Statistics,
-    null: Sequence[Statistics] | np.ndarray,
+    observed: PredictionChecks,
+    null: Sequence[PredictionChecks] | np.ndarray,
     nuisance: np.ndarray,
     null_nuisance: np.ndarray,
 ) -> pd.DataFrame:

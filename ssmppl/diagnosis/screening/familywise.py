@@ -7,7 +7,7 @@ delays, dead-zone widths) counts as one hypothesis whose statistic is its larges
 The largest of hundreds of shapes lies higher by chance than a single statistic. Left as they are,
 such families alone would make the law of the largest of all, and whatever has one shape would have
 to stand as high as they do. So hypotheses are put on one scale before they are compared, as the
-smallest p in place of the largest statistic does (section 2.5 there), but by a `Scale` of two
+smallest p in place of the largest statistic does (section 2.5 there), but by a `NullScale` of two
 numbers for each: the p values themselves would have to be counted far beyond the simulated range.
 """
 
@@ -29,7 +29,7 @@ BOTH = 2.409420839653209  # normals whose largest has the median of |normal|: lo
 
 
 @dataclass(frozen=True)
-class Scale:
+class NullScale:
     """The common scale of groups: what is as rare for one |normal| as a height is for its group.
 
     number : (G,) of independent normals whose largest has the group's median. stretch : (G,) at
@@ -40,7 +40,7 @@ class Scale:
     stretch: np.ndarray
 
     @classmethod
-    def of(cls, null: np.ndarray) -> Scale:
+    def of(cls, null: np.ndarray) -> NullScale:
         """From simulated heights (B, G)."""
         middle = np.quantile(null, MEDIAN, axis=0)
         number = np.log(MEDIAN) / np.minimum(log_ndtr(middle), -1e-300)
@@ -80,7 +80,7 @@ class FamilyWise:
     best: np.ndarray
     height: np.ndarray
     maxima: np.ndarray
-    scale: Scale
+    scale: NullScale
     sided: np.ndarray
 
     @property
@@ -91,7 +91,7 @@ class FamilyWise:
     def put(self, label: int, height: float) -> float:
         """The height of a statistic of one group on the common scale."""
         at = int(np.searchsorted(self.labels, label))
-        return float(Scale(self.scale.number[at], self.scale.stretch[at]).put(np.array(height)))
+        return float(NullScale(self.scale.number[at], self.scale.stretch[at]).put(np.array(height)))
 
     def cost(self, label: int) -> float:
         """Nats that the choice among a group's shapes is worth: log of their effective number,
@@ -132,7 +132,7 @@ def familywise(
     best = np.array([np.flatnonzero(member == g)[np.argmax(high[member == g])]
                      for g in range(len(labels))])  # fmt: skip
     raw_null = np.stack([high_null[:, member == g].max(axis=1) for g in range(len(labels))], 1)
-    scale = Scale.of(raw_null)
+    scale = NullScale.of(raw_null)
     top, top_null = scale.put(high[best]), scale.put(raw_null)
     order = np.argsort(-top, kind="stable")
     # Column j: the largest among the groups that stand no higher than the j-th in the data.

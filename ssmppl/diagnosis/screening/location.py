@@ -46,7 +46,7 @@ LEAST_VARIANCE = 1e-3  # of a window's contrast, in shares of the whole: less is
 
 
 @dataclass(frozen=True)
-class Group:
+class BasisGroupScore:
     """Efficient scores of D basis functions in one data set, beside their null law.
 
     score : (D,) S~. covariance : (D, D) V. inverse : (D, D) M^-1, in the directions kept.
@@ -83,7 +83,7 @@ def group_score(
     observed_nuisance: np.ndarray,
     others: np.ndarray | None = None,
     observed_others: np.ndarray | None = None,
-) -> Group:
+) -> BasisGroupScore:
     """A group's statistic with the nuisance scores and `others` projected out.
 
     Parameters
@@ -129,7 +129,7 @@ def group_score(
     full = inverse_size[:, None] * (vectors[:, kept] @ inverse @ vectors[:, kept].T) * inverse_size
     info = float(np.trace(columns.T @ columns * np.outer(inverse_size, inverse_size))) / sets
     kappa = float(np.sqrt(min(np.trace(v) / info, 1.0))) if info > 0.0 else 0.0
-    return Group(
+    return BasisGroupScore(
         score, v * np.outer(size, size), full, q_seen, z, null, kappa, rank, w,
     )  # fmt: skip
 
@@ -138,7 +138,7 @@ def localise(
     groups: Mapping[Hashable, tuple[np.ndarray, np.ndarray]],
     nuisance: np.ndarray,
     observed_nuisance: np.ndarray,
-) -> tuple[pd.DataFrame, dict[Hashable, Group]]:
+) -> tuple[pd.DataFrame, dict[Hashable, BasisGroupScore]]:
     """Each group with all others projected out; p family-wise over the groups.
 
     groups : by key, for instance (equation, moment): columns (B, D) and observed (D,).
@@ -164,7 +164,7 @@ def localise(
             group_score(columns, observed, nuisance, observed_nuisance, others, seen)
         )
 
-    def together(found: list[Group]) -> np.ndarray:
+    def together(found: list[BasisGroupScore]) -> np.ndarray:
         z, null = np.array([g.z for g in found]), np.stack([g.null for g in found], axis=1)
         return familywise(z, null, sided=1, groups=np.arange(len(found)) % len(keys)).p
 
@@ -200,7 +200,7 @@ class Curve:
                          where=self.error > 0.0)  # fmt: skip
 
 
-def curve(group: Group, design: np.ndarray, level: float = 0.95) -> Curve:
+def curve(group: BasisGroupScore, design: np.ndarray, level: float = 0.95) -> Curve:
     """sum_d coef_d b_d at points whose basis values are design (G, D), coef = V^- S~."""
     from scipy.special import ndtri
 
@@ -212,7 +212,7 @@ def curve(group: Group, design: np.ndarray, level: float = 0.95) -> Curve:
 
 
 def regions(
-    group: Group, functions: Any, values: np.ndarray, name: str = "x", count: int = 5
+    group: BasisGroupScore, functions: Any, values: np.ndarray, name: str = "x", count: int = 5
 ) -> pd.DataFrame:
     """Table region, low, high, estimate, se, z: the missing term's mean over parts of a variable.
 
@@ -312,7 +312,7 @@ def binned(scores: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def when(
-    group: Group,
+    group: BasisGroupScore,
     columns: np.ndarray,
     observed: np.ndarray,
     nuisance: np.ndarray,

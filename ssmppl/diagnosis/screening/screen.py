@@ -7,7 +7,7 @@ every statistic of the report that is not a refit takes its null law from them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -16,11 +16,11 @@ import numpy as np
 from ssmppl.analysis.density import Missing
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, Profiles, starts_of, with_all_dates
-from ssmppl.diagnosis.model.augment import augment
-from ssmppl.diagnosis.model.basis import Term, basis, symbolic_shapes
+from ssmppl.diagnosis.model.augment import augment, with_given_parameters
+from ssmppl.diagnosis.model.basis import BasisTerm, basis, symbolic_shapes
 from ssmppl.diagnosis.model.candidates import Chosen, Refused, offers
 from ssmppl.diagnosis.model.scales import Scales
-from ssmppl.diagnosis.model.score_columns import Columns, score_columns
+from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import (
     Pass,
     Settings,
@@ -34,27 +34,26 @@ from ssmppl.diagnosis.run.failures import FAULT, Failures
 from ssmppl.diagnosis.screening import detection, statistics
 from ssmppl.diagnosis.screening.efficient_score import Efficient, Null, efficient
 from ssmppl.diagnosis.screening.familywise import FamilyWise, familywise
-from ssmppl.diagnosis.screening.location import Group, bin_edges, binned, group_score
+from ssmppl.diagnosis.screening.location import BasisGroupScore, bin_edges, binned, group_score
 from ssmppl.diagnosis.screening.statistics import information_scale, typical_squares
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.distributions import Distribution, Flat
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.traced import Trace
 
 OWN_RUNS = 6  # passes over the data themselves, which show the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through
 
 
 @dataclass(frozen=True)
-class Statistics:
-    """Statistics of one data set: nuisance (P,), columns (K,), basis (D,), detection (S,).
+class ScreenStatistics:
+    """Statistics of one data set: nuisance (P,), candidate_scores (K,), basis (D,), detection (S,).
 
-    squares (K,) : of the columns' rows, summed; NaN where a column is no sum of scores.
+    squares (K,) : of the rows of each score, summed; NaN where it is no plain sum of rows.
     nuisance_bins (J, P), basis_bins (J, D) : sums over J bins of time.
     """
 
     nuisance: np.ndarray
-    columns: np.ndarray
+    candidate_scores: np.ndarray
     squares: np.ndarray
     basis: np.ndarray
     detection: np.ndarray
@@ -77,11 +76,11 @@ class ScreenDesign:
         self._simulator = simulator
         self.trace, self.settings, self.scales = trace, settings, scales
         self.refused: list[Refused] = []
-        self.terms: list[Term] = []
+        self.terms: list[BasisTerm] = []
         if candidates is None:
             offered, self.refused = offers(trace, scales, effects, failures)
             offered = with_all_dates(offered, scales.rows)
-            with failures.part("the basis of smooth functions"):
+            with failures.guard("the basis of smooth functions"):
                 self.terms = basis(trace, scales)
         else:
             offered = list(candidates)
@@ -156,7 +155,7 @@ class ScreenDesign:
     def statistics(
         self, experiments: Sequence[Experiment], passes: Sequence[Pass], stream: np.ndarray,
         checks: bool = True,
-    ) -> Statistics:  # fmt: skip
+    ) -> ScreenStatistics:  # fmt: skip
         """The statistics of one data set; without `checks` none of its predictions."""
         rows = np.concatenate([p.rows for p in passes])
         starts = starts_of(experiments)
@@ -168,7 +167,7 @@ class ScreenDesign:
             pits = np.concatenate(probability_transforms(passes, experiments, stream))
             ahead = [p.ahead for p in passes if p.ahead is not None]
             found = self._detection(pits, experiments, starts, ahead).values
-        return Statistics(
+        return ScreenStatistics(
             rows[:, :p].sum(axis=0),
             self._candidate_statistics(rows, starts),
             np.where(self._plain_sums, np.sum(rows**2, axis=0)[self.column_of], np.nan),
@@ -194,7 +193,7 @@ class ScreenDesign:
     def _detection(
         self, pits: np.ndarray, experiments: Sequence[Experiment], starts: list[int],
         ahead: Sequence[np.ndarray],
-    ) -> detection.Statistics:  # fmt: skip
+    ) -> detection.PredictionChecks:  # fmt: skip
         channels = [repr(s) for s in self.trace.observation_symbols]
         inputs = np.concatenate([e.u for e in experiments])
         names = [repr(s) for s in self.trace.input_symbols]
@@ -203,7 +202,7 @@ class ScreenDesign:
             found = found.with_values(channel, values)
         return found
 
-    def detection_names(self, experiments: Sequence[Experiment]) -> detection.Statistics:
+    def detection_names(self, experiments: Sequence[Experiment]) -> detection.PredictionChecks:
         """The detection statistics' names, with values of nothing."""
         rows = sum(e.steps for e in experiments)
         starts = starts_of(experiments)
@@ -221,8 +220,8 @@ class Screen:
 
     design: ScreenDesign
     theta: np.ndarray
-    observed: Statistics
-    simulated: Statistics
+    observed: ScreenStatistics
+    simulated: ScreenStatistics
     efficient: Efficient
     family: FamilyWise
     null: Null
@@ -237,9 +236,11 @@ class Screen:
         best = {self.design.candidates[k].group: int(k) for k in self.family.best}
         found = (known.get(c.key, best.get(c.group)) for c in chosen if c.first_order)
         own = sorted({k for k in found if k is not None})
-        return self.simulated.columns[:, own], self.observed.columns[own]
+        return self.simulated.candidate_scores[:, own], self.observed.candidate_scores[own]
 
-    def basis_group(self, columns: Sequence[int], others: Sequence[Candidate] = ()) -> Group:
+    def basis_group(
+        self, columns: Sequence[int], others: Sequence[Candidate] = ()
+    ) -> BasisGroupScore:
         """The statistic of these columns of the basis with the scores of others projected out."""
         own = list(columns)
         return group_score(
@@ -271,10 +272,10 @@ class Screen:
 
 def _columns(
     trace: Trace, candidates: Sequence[Candidate], held: Sequence[str], missing: Missing
-) -> tuple[Columns, dict[str, float]]:
+) -> tuple[ScoreExpressions, dict[str, float]]:
     """The score columns of the model with all candidates, and the values of their shapes."""
     made, shapes = symbolic_shapes(candidates)
-    superset = with_parameters(augment(trace, made), shapes)
+    superset = with_given_parameters(augment(trace, made), shapes)
     names = [c.strength for c in made]
     return score_columns(trace, superset, names, held, missing), dict(shapes)
 
@@ -286,7 +287,7 @@ def _compilable(
     """The candidates that have columns by themselves; the others are recorded as failures."""
     out = []
     for c in candidates:
-        with failures.part(f"the candidate {c}"):
+        with failures.guard(f"the candidate {c}"):
             _columns(trace, [c], held, missing)
             out.append(c)
     return out
@@ -326,14 +327,15 @@ def run_screen(
             f"sets{why}",
             fix="use more particles, or check the fit: the model may leave its domain",
         )
-    names = Statistics.__dataclass_fields__
+    names = ScreenStatistics.__dataclass_fields__
     each = {n: np.stack([s[n] for s in own]) for n in names}
-    observed = Statistics(**{n: v.mean(axis=0) for n, v in each.items()})
-    simulated = Statistics(**{n: np.stack([s[n] for s in drawn]) for n in names})
+    observed = ScreenStatistics(**{n: v.mean(axis=0) for n, v in each.items()})
+    simulated = ScreenStatistics(**{n: np.stack([s[n] for s in drawn]) for n in names})
     typical = typical_squares(simulated.squares)
-    noise = each["columns"] / information_scale(each["squares"], typical)
+    noise = each["candidate_scores"] / information_scale(each["squares"], typical)
     null = Null.of(
-        simulated.columns / information_scale(simulated.squares, typical), simulated.nuisance,
+        simulated.candidate_scores / information_scale(simulated.squares, typical),
+        simulated.nuisance,
         quadratic=design.quadratic, sided=design.sided,
         noise=noise.var(axis=0, ddof=min(1, len(own) - 1)),
     )  # fmt: skip
@@ -364,9 +366,9 @@ def screen_part(
             "the rows without the block did not go through the smoother", fix="use more particles"
         )
     empty = np.empty(0)
-    observed = Statistics(**{
+    observed = ScreenStatistics(**{
         n: np.mean([s[n] for s in own], axis=0) if n != "detection" else empty
-        for n in Statistics.__dataclass_fields__
+        for n in ScreenStatistics.__dataclass_fields__
     })  # fmt: skip
     found = compare_with_null(whole.null, whole.typical_squares, observed)
     family = familywise(found.statistic, found.null, sided=found.sided, groups=whole.groups)
@@ -397,31 +399,17 @@ def _one_set(
         return {}
     with np.errstate(over="ignore", invalid="ignore"):
         found = design.statistics(data, passes, stream, checks)
-    if not np.all(np.isfinite(found.columns)) or np.any(np.isinf(found.squares)):
+    if not np.all(np.isfinite(found.candidate_scores)) or np.any(np.isinf(found.squares)):
         return {}  # rows whose squares are beyond what a number can be
     return dict(vars(found))
 
 
-def compare_with_null(null: Null, typical: np.ndarray, seen: Statistics) -> Efficient:
+def compare_with_null(null: Null, typical: np.ndarray, seen: ScreenStatistics) -> Efficient:
     """Efficient statistics of the candidates in one data set, each on the scale of the information
     that these data hold."""
     by = information_scale(seen.squares, typical)
-    found = efficient(null, seen.columns / by, seen.nuisance)
+    found = efficient(null, seen.candidate_scores / by, seen.nuisance)
     return replace(
         found, score=found.score * by, variance=found.variance * by**2,
         strength=found.strength / by,
     )  # fmt: skip
-
-
-def with_parameters(
-    trace: Trace, names: Iterable[str], prior: Callable[[], Distribution] = Flat
-) -> Trace:
-    """The trace with further parameters: by default such as are given."""
-    location = next(iter(trace.transition.values())).distribution.location
-    parameters = dict(trace.parameters)
-    for name in names:
-        law = prior()
-        law.location = location
-        own = symbols("parameter", name, ())
-        parameters[name] = Site(name, "parameter", law, own, location)
-    return replace(trace, parameters=parameters)

@@ -11,11 +11,10 @@ from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.compiling import LOCK
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.model.augment import augment
+from ssmppl.diagnosis.model.augment import augment, with_given_parameters
 from ssmppl.diagnosis.model.basis import symbolic_shapes
 from ssmppl.diagnosis.model.initial_law import ProperInitialLaw, needs_proper_initial_law
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.screening.screen import with_parameters
 from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbol
@@ -41,6 +40,11 @@ class AugmentedModels:
     def __getstate__(self) -> dict:  # another process makes what it needs
         return {**self.__dict__, "_made": {}}
 
+    @property
+    def base_fitter(self) -> Fitter:
+        """The fitter of the model itself."""
+        return self.fitter(())
+
     def fitter(self, candidates: Sequence[Candidate]) -> Fitter:
         """The fitter of the model with these effects; shapes are fixed parameters, so that the
         generated code is the same for all data."""
@@ -48,7 +52,7 @@ class AugmentedModels:
         key = tuple((c.key, c.strength) for c in made)  # the shapes' symbols, not their values
 
         def trace() -> Trace:
-            return with_parameters(augment(self.trace, made), shapes) if made else self.trace
+            return with_given_parameters(augment(self.trace, made), shapes) if made else self.trace
 
         return self._cached(key, trace, shapes)
 
@@ -72,8 +76,8 @@ class AugmentedModels:
 
         def trace() -> Trace:
             own = [replace(c, shape=tuple((n, inside.get(v, v)) for n, v in c.shape)) for c in made]
-            whole = with_parameters(augment(self.trace, own), given)
-            return with_parameters(whole, map(range_fraction, free), lambda: Uniform(0, 1))
+            whole = with_given_parameters(augment(self.trace, own), given)
+            return with_given_parameters(whole, map(range_fraction, free), lambda: Uniform(0, 1))
 
         return self._cached(key, trace, given)
 

@@ -311,7 +311,7 @@ def _scores_under_input(
     if not all(np.all(np.isfinite(p.rows)) for p in passes):
         return {}
     found = design.statistics(data, passes, stream, checks=False)
-    return {"columns": found.columns[columns], "nuisance": found.nuisance}
+    return {"columns": found.candidate_scores[columns], "nuisance": found.nuisance}
 
 
 def simple_inputs(

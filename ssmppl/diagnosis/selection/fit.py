@@ -31,8 +31,9 @@ import numpy as np
 from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
-from ssmppl.diagnosis.model.score_columns import Columns, score_columns
+from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
+from ssmppl.diagnosis.run.seeds import Stream
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
@@ -69,6 +70,7 @@ SPREAD = 0.1  # least information of a logarithm that steps are made with
 PILOT_PARTICLES = 300
 PRECISE, DOUBLINGS = 0.2, 2  # nats: error of a log-likelihood for which particles are doubled
 INFORMATION_SETS = 24  # simulated data sets behind a first information matrix
+LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
 LARGEST = 1e100  # of a score: what is beyond is an overflow
 
 # Numbers that run to a bound of their support.
@@ -89,9 +91,12 @@ NUMBERS = (  # of a fit, in a checkpoint
 class Effort:
     """Settings of a fit: how much is done for it.
 
-    pilot : look for a better start around the one that is given. standard_errors : the information
-    at the end is needed. approximate : the top of the extended Kalman filter's likelihood will do,
-    where there is one, for what is fitted many times.
+    pilot : look for a better start around the one that is given. standard_errors : of linear
+    Gaussian models alone, whose information takes derivatives of its own: climb to the very top,
+    and take the information there; else climb to within what a decision needs, and there is none
+    (NaN). All other fits have the one that their climb has used or built up, either way.
+    approximate : the top of the extended Kalman filter's likelihood will do, where there is one,
+    for what is fitted many times.
     """
 
     pilot: bool = True
@@ -109,7 +114,9 @@ class Fit:
     """A model fitted to experiments (P parameters, F free numbers on the unconstrained scale).
 
     theta : (P,). z : (F,). log_likelihood : at theta; error : its Monte Carlo standard deviation,
-    0 where exact. information : (F, F), minus the second derivatives of log p(y) in z, about.
+    0 where exact. information : (F, F), minus the Hessian in z of log p(y | theta) + log prior
+    density of theta (no Jacobian), approximate unless `with_information` was called; NaN or
+    meaningless where at_bound.
     distance : nats from the top by the last score. converged : whether that is a small number.
     at_bound : (F,) bool, which numbers ran to a bound of their support, where they are held: they
     are left out of the information (`bounds`).
@@ -134,20 +141,52 @@ class Fit:
     def problem(self) -> Problem:
         return self.space.problem
 
-    def values(self) -> dict[str, float]:
+    @property
+    def by_component(self) -> dict[str, float]:
         """Values by the text of each component, `k`, `beta[0]`."""
         symbols = self.problem.trace.parameter_symbols
         return {repr(s): float(v) for s, v in zip(symbols, self.theta, strict=True)}
 
     @property
-    def start(self) -> dict[str, np.ndarray]:
-        """The values by name, for another fit to start at."""
+    def by_parameter(self) -> dict[str, np.ndarray]:
+        """Values by the name of each parameter, as of another fit's `start`."""
         return dict(unpack_parameters(self.problem.trace, self.theta))
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:
         """All that a checkpoint has to keep; see `Fitter.restored`."""
         return {n: np.asarray(getattr(self, n)) for n in NUMBERS}
+
+
+def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Standard errors by the text of each component, from `Fit.information`; 0 for what is fixed.
+
+    In a report "before" is of the model's own fit as it came: of a linear Gaussian model from the
+    exact second derivatives; of others from those of the extended Kalman filter's likelihood where
+    its top was kept, else from the matrix that the climb built up. "after" is of the chosen model,
+    `Fitter.with_information` called (`add_standard_errors`): from the exact second derivatives, or
+    the mean square of scores simulated at the fit.
+
+    NaN where there is no information: for what ran to a bound of its support, and for all where the
+    information about the others is not positive definite.
+    """
+    symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
+    nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
+    information = fit.information[np.ix_(free, free)]
+    if not np.all(np.isfinite(information)):
+        return nothing
+    scale = np.sqrt(np.abs(np.diagonal(information)))
+    if not np.all(scale > 0.0):
+        return nothing
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if len(values) and values[0] <= LEAST_INFORMATION:
+        return nothing
+    jacobian = UnconstrainedTransform(fit.space).at(fit.z).jacobian
+    root = (jacobian[:, free] / scale) @ (vectors / np.sqrt(values))
+    spread = np.sqrt(np.sum(root**2, axis=1))
+    held = np.any(jacobian[:, fit.at_bound] != 0.0, axis=1)
+    spread = np.where(held, np.nan, spread)
+    return {repr(s): float(v) for s, v in zip(symbols, spread, strict=True)}
 
 
 class Fitter:
@@ -162,7 +201,9 @@ class Fitter:
         self.initial_law = initial_law
         self.kalman = kalman_model(problem.trace)
         trace = problem.trace
-        self.columns: Columns = score_columns(trace, trace, (), self.fixed, problem.program.missing)
+        self.columns: ScoreExpressions = score_columns(
+            trace, trace, (), self.fixed, problem.program.missing
+        )
         self.smoother = Smoother(self.columns, problem.program.missing, settings)
         place = {s: i for i, s in enumerate(trace.parameter_symbols)}
         self.where = np.array([place[s] for s in self.columns.nuisance], dtype=int)
@@ -308,7 +349,7 @@ class Fitter:
 
         def estimate(s: Space) -> float:
             n = self.settings.particles
-            return self._estimate(s.problem, s.theta, n, random_state(seed, 8))
+            return self._estimate(s.problem, s.theta, n, random_state(seed, Stream.TOP))
 
         was = estimate(space)
         for top in sorted(tops, key=lambda top: -top.value):
@@ -434,7 +475,7 @@ class Fitter:
     def _fit_by_particles(
         self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
     ) -> Fit:
-        stream = random_state(seed, 1)
+        stream = random_state(seed, Stream.ASCENT)
         z = space.z[space.where]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
@@ -469,7 +510,9 @@ class Fitter:
             n = self.settings.particles * 2**doubling
 
             def one(r: int, n: int = n, doubling: int = doubling) -> float:
-                return self._estimate(problem, theta, n, random_state(seed, 2, r, doubling))
+                return self._estimate(
+                    problem, theta, n, random_state(seed, Stream.LIKELIHOOD, r, doubling)
+                )
 
             log_z = np.array(run_tasks(one, range(repeats)))
             if not np.any(log_z > -np.inf):
@@ -560,18 +603,11 @@ class Fitter:
     ) -> np.ndarray:
         """(F, F) in z: mean square of the scores of data simulated at theta, prior included."""
         problem = space.problem
-        smoother = Smoother(
-            self.columns,
-            problem.program.missing,
-            replace(self.settings, particles=self.pilot_particles),
-        )
-        smoother.__dict__.update(
-            {k: getattr(self.smoother, k) for k in ("program", "module", "problem")}
-        )
+        smoother = self.smoother.with_particles(self.pilot_particles)
         simulator = self.simulator
 
         def one(r: int) -> np.ndarray | None:
-            stream = random_state(seed, 3, r)
+            stream = random_state(seed, Stream.INFORMATION, r)
             sets = simulator.sets(problem.experiments, theta, stream)
             try:
                 passes = smoother.run(sets, theta, stream, predicted=False)

@@ -7,7 +7,7 @@ expects its top.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,7 +16,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate, refine_wave, starts_of
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Stream, Task, child_seed
 from ssmppl.diagnosis.screening.efficient_score import Efficient
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -27,9 +27,9 @@ from ssmppl.diagnosis.selection.fit import (
     Effort,
     Fit,
     Fitter,
+    standard_errors,
 )
 from ssmppl.errors import NotApplicable, SSMError
-from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.seeds import random_state
 
@@ -49,7 +49,6 @@ SHARES = (1.0, 0.5, 0.25)  # of the strengths that the score promises, from whic
 OPEN, OPEN_SHARE = 5.0, 0.25  # nats, and share of its gain, that a fit may leave and be ranked
 AGAIN = 2  # times that a fit which left more is taken up where it ended
 LOST = 2.0  # nats below the model that it contains: a fit that ends there has failed
-LEAST_INFORMATION = 1e-10  # least eigenvalue of the scaled information that is more than rounding
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Refit:
     @property
     def strengths(self) -> list[float]:
         """Estimated strengths of the effects."""
-        values = self.fit.values()
+        values = self.fit.by_component
         return [values[c.strength] for c in self.candidates]
 
     @property
@@ -87,34 +86,6 @@ class Refit:
     def errors(self) -> dict[str, float]:
         """Standard errors of all free parameters, from the information at the fit."""
         return standard_errors(self.fit, self.fitter.fixed)
-
-
-def standard_errors(fit: Fit, fixed: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Standard errors by the text of each component; 0 for what is fixed.
-
-    NaN where there is no information: for what ran to a bound of its support, and for all where the
-    information about the others is not positive definite.
-    """
-    symbols, free = fit.problem.trace.parameter_symbols, ~fit.at_bound
-    nothing = {repr(s): 0.0 if s.data[1] in fixed else np.nan for s in symbols}
-    information = fit.information[np.ix_(free, free)]
-    if not np.all(np.isfinite(information)):
-        return nothing
-    scale = np.sqrt(np.abs(np.diagonal(information)))
-    if not np.all(scale > 0.0):
-        return nothing
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    if len(values) and values[0] <= LEAST_INFORMATION:
-        return nothing
-    setup = Maximization(
-        fit.problem, fit.space, "posterior", dict(fixed), {}, np.random.SeedSequence(0)
-    )
-    jacobian = setup.transform.at(fit.z).jacobian
-    root = (jacobian[:, free] / scale) @ (vectors / np.sqrt(values))
-    spread = np.sqrt(np.sum(root**2, axis=1))
-    held = np.any(jacobian[:, fit.at_bound] != 0.0, axis=1)
-    spread = np.where(held, np.nan, spread)
-    return {repr(s): float(v) for s, v in zip(symbols, spread, strict=True)}
 
 
 def refit(
@@ -144,7 +115,7 @@ def refit(
         for _ in range(AGAIN):
             if not open_ended(fit, base):
                 break
-            more = fitter.fit(train, seed, fit.start, effort)
+            more = fitter.fit(train, seed, fit.by_parameter, effort)
             fit = max(fit, more, key=lambda f: f.log_likelihood)
     except SSMError as error:
         return NotApplicable(f"{' and '.join(map(str, candidates))}: {error.found}")
@@ -182,7 +153,7 @@ def _backtracked(
     quadratic may promise a top beyond the data's cliff."""
     if fitter.exact:
         return start
-    problem, stream = fitter.problem, random_state(seed, 4)
+    problem, stream = fitter.problem, random_state(seed, Stream.START)
     best, out = -np.inf, start
     for share in SHARES:
         tried = start | {n: share * start[n] for n in strengths}
@@ -203,7 +174,9 @@ def _information(
         return None
     names = [repr(s) for s in design.columns.nuisance]
     names += [design.candidates[k].strength for k in at]
-    scores = np.concatenate([screen.simulated.nuisance, screen.simulated.columns[:, at]], axis=1)
+    scores = np.concatenate(
+        [screen.simulated.nuisance, screen.simulated.candidate_scores[:, at]], axis=1
+    )
     rows = [sum(e.steps for e in es) for es in (train, screen.experiments)]
     found = scores.T @ scores / len(scores) * rows[0] / rows[1]
     place = {repr(s): i for i, s in enumerate(fitter.problem.trace.parameter_symbols)}
@@ -221,7 +194,7 @@ def start_at(
     at = list(index)
     v = found.covariance[np.ix_(at, at)]
     strengths = np.linalg.lstsq(v, found.score[at], rcond=1e-6)[0]
-    out = base.start
+    out = base.by_parameter
     for k, value in zip(at, strengths, strict=True):
         c = design.candidates[k]
         if design.quadratic[k]:
@@ -366,7 +339,7 @@ def _one(
     added: Sequence[tuple[Candidate, ...]], afresh: bool, approximate: bool, k: int,
 ) -> Numbers:  # fmt: skip
     """The numbers of one refit, or the reason why there are none."""
-    own = child_seed(seed, 5, k)
+    own = child_seed(seed, Task.REFIT, k)
     found = refit(augmented, base, screen, sets[k], train, own, added[k], afresh, approximate)
     if isinstance(found, NotApplicable):
         return {"reason": np.array(found.reason)}
@@ -386,7 +359,7 @@ def _shaped(
         return out
     try:
         passes = design.smoother.run(
-            train, design.theta(base.theta), random_state(seed, 9), predicted=False
+            train, design.theta(base.theta), random_state(seed, Stream.WAVES), predicted=False
         )
     except SSMError:
         return out

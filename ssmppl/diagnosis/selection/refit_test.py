@@ -18,7 +18,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.familywise import tail_p
 from ssmppl.diagnosis.screening.screen import Screen, compare_with_null
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -99,11 +99,11 @@ def _gain(
     seed: np.random.SeedSequence, k: int,
 ) -> float:  # fmt: skip
     """The largest gain in one data set; NaN where a fit failed."""
-    design, plain = screen.design, augmented.fitter(())
-    stream = random_state(seed, 200, k)
-    own = child_seed(seed, 100, k)
+    design, plain = screen.design, augmented.base_fitter
+    stream = random_state(seed, Task.TEST_SCORES, k)
+    own = child_seed(seed, Task.TEST_FIT, k)
     try:
-        fit = plain.fit(data, own, base.start, APPROXIMATELY)
+        fit = plain.fit(data, own, base.by_parameter, APPROXIMATELY)
         at = design.theta(fit.theta)
         passes = design.smoother.run(data, at, stream, predicted=False)
         seen = design.statistics(data, passes, stream, checks=False)
@@ -134,5 +134,5 @@ def _best(screen: Screen, gain: np.ndarray, silent: np.ndarray) -> list[int]:
 def affordable(augmented: AugmentedModels, experiments: Sequence[Experiment]) -> bool:
     """Whether the fits of the test can be afforded."""
     rows = sum(e.steps for e in experiments)
-    cheap = augmented.fitter(()).exact or rows * augmented.settings.particles <= MOST_WORK
+    cheap = augmented.base_fitter.exact or rows * augmented.settings.particles <= MOST_WORK
     return cheap and rows < MOST_ROWS

@@ -93,7 +93,7 @@ def _shaped(
     """The values of the shapes, in order, and the fit with them; empty where there is none, or one
     of them runs to its bound."""
     known = _bounded(r, scales)
-    start = {n: v for n, v in r.fit.start.items() if n not in known}
+    start = {n: v for n, v in r.fit.by_parameter.items() if n not in known}
     for name, (low, high, value) in known.items():
         share = (value - low) / (high - low)
         start[range_fraction(name)] = np.asarray(np.clip(share, INSIDE, 1.0 - INSIDE))
@@ -104,7 +104,7 @@ def _shaped(
         return {}
     if not np.isfinite(fit.log_likelihood):
         return {}
-    values = fit.values()
+    values = fit.by_component
     shares = np.array([values[range_fraction(n)] for n in known])
     if np.any(np.minimum(shares, 1.0 - shares) < 0.5 * INSIDE):  # it wants to be another effect
         return {}

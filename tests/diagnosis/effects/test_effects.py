@@ -13,7 +13,7 @@ from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.changed_laws import has_scale
 from ssmppl.diagnosis.model.equations import Equations, time_symbol
-from ssmppl.diagnosis.model.scales import Scale, Scales
+from ssmppl.diagnosis.model.scales import Scales, VariableScale
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
@@ -273,7 +273,7 @@ def test_the_number_of_columns_stays_moderate():
 # -- shapes
 def test_shapes_are_relative_to_the_variable():
     values = np.linspace(-1.0, 3.0, 4001)
-    scale = Scale.of(values)
+    scale = VariableScale.of(values)
     assert scale.quantile(0.9) == pytest.approx(2.6, abs=1e-3)
     assert scale.size(0.5) == pytest.approx(1.0, abs=1e-3)
     assert scale.quantile(0.85) == pytest.approx(2.4, abs=1e-3)  # between levels

@@ -9,7 +9,6 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout.parts import three_parts, without
 from ssmppl.diagnosis.heldout.predictions import (
     FreeRun,
     Predictions,
@@ -18,6 +17,7 @@ from ssmppl.diagnosis.heldout.predictions import (
     rmse,
     stretches,
 )
+from ssmppl.diagnosis.heldout.row_split import three_parts, without
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.selection.fit import Fitter
 from ssmppl.errors import SamplingError
@@ -128,11 +128,11 @@ def test_effects_stay_together_where_held_out_rows_cannot_be_predicted(monkeypat
 
     monkeypatch.setattr(diagnose, "predict", impossible)
     run = object.__new__(diagnose._Diagnosis)
-    run.parts, run.experiments = SimpleNamespace(held_out=[]), ()
+    run.split, run.experiments = SimpleNamespace(held_out=[]), ()
     run.root = np.random.SeedSequence(1)
     both = SimpleNamespace(fitter="both", fit=None, candidates=("drag", "friction"))
     found = SimpleNamespace(chosen=both, fewer=["one"], notes=[])
-    run._validate_on_held_out_rows(SimpleNamespace(attribution=found, base="base", fit=None))
+    run._validate_on_held_out_rows(SimpleNamespace(selection=found, base="base", fit=None))
     assert found.chosen is both
     assert len(asked) == which + 1
     assert found.notes == ["drag and friction fit better together, and whether they predict "

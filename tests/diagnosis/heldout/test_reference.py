@@ -22,7 +22,7 @@ def test_a_fit_below_where_it_started_is_not_used(monkeypatch):
     trace, missing = screen.design.trace, screen.design.smoother.missing
     augmented = AugmentedModels(trace, missing, FIXED, Settings(particles=100))
     start = {n: np.asarray(v) for n, v in THETA.items()}
-    base = augmented.fitter(())
+    base = augmented.base_fitter
     train = list(screen.experiments)
     fit = base.fit(train, seed_sequence(1), start, FROM_START)
     groups = reference.significant_groups(screen, ())

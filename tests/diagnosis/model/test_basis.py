@@ -14,6 +14,7 @@ from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.report import tables
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
+from ssmppl.diagnosis.verdict.decision import strongest_residual
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.statistics.checks import seed_of
@@ -144,7 +145,7 @@ def test_the_score_of_what_is_past_is_the_exact_one(plain, name, filtered):
 )
 def test_what_no_curve_can_be_is_found(variable, missing):
     screen = asked(simulated(missing, variable))
-    p, key = tables.residual_group(screen, ())
+    p, key = strongest_residual(screen, ())
     assert p <= 0.05
     assert key[0] == "x"  # its mean or, since q is held, its scale: which, hangs on the data set
     # rings that die away within a turn can be a low-pass, too
@@ -177,7 +178,7 @@ def test_a_resonance_is_found_at_its_own_frequency(turn):
 
 def test_nothing_stands_out_of_a_right_model(plain):
     """No claim about the level: only that it does not cry out."""
-    p, _ = tables.residual_group(plain, ())
+    p, _ = strongest_residual(plain, ())
     assert p > 0.001
 
 

@@ -172,7 +172,7 @@ def test_drag_is_refitted_though_the_model_starts_flat():
     data = recorded(150)
     problem = pose(driven(), data)
     (e,), missing, settings = problem.experiments, problem.program.missing, Settings(200)
-    base = AugmentedModels(problem.trace, missing, {}, settings).fitter(())
+    base = AugmentedModels(problem.trace, missing, {}, settings).base_fitter
     fit = base.fit([e], seed_sequence(1), {})
     states = base.states(e, fit.theta, random_state(seed_sequence(2)))
     start = proper_initial_law(problem.trace, [states[0].mean(axis=0)], [states])
@@ -195,7 +195,7 @@ def test_drag_is_refitted_though_the_model_starts_flat():
     )
     assert not notes
     assert "ssm.Flat()" not in text.split("@model.initial")[1]
-    given = {n: v for n, v in found.fit.values().items() if not n.startswith("size")}
+    given = {n: v for n, v in found.fit.by_component.items() if not n.startswith("size")}
     told = ssm.log_likelihood(model, data, given, particles=2000, seed=1)[0] + start.log_correction
     assert told == pytest.approx(found.fit.log_likelihood, abs=4.0 * (found.fit.error + 0.1))
 

@@ -5,7 +5,7 @@ import pytest
 
 from ssmppl.diagnosis.effects.effect import means, quantiles, sds, sizes
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.diagnosis.model.scales import DIGITS, LEVELS, Scale, Scales, value_of
+from ssmppl.diagnosis.model.scales import DIGITS, LEVELS, Scales, VariableScale, value_of
 from ssmppl.language.trace import trace
 from tests.diagnosis.small import level
 from tests.statistics.checks import seed_of
@@ -18,7 +18,7 @@ DRAWN = np.random.default_rng(seed_of("scales")).standard_normal(2000)
 def test_values_are_as_fine_as_the_spread(offset, unit):
     """Within 1e-3 of a standard deviation of what is meant, whatever zero and unit are."""
     v = unit * (offset + DRAWN)
-    scale = Scale.of(v)
+    scale = VariableScale.of(v)
     for level_ in LEVELS:
         wanted = np.quantile(v, level_), np.quantile(np.abs(v), level_)
         for grid, exact in zip((quantiles(level_), sizes(level_)), wanted, strict=True):
@@ -30,7 +30,7 @@ def test_values_are_as_fine_as_the_spread(offset, unit):
 
 @pytest.mark.parametrize("value", [0.0, 5.0, 101325.25, -1e-300])
 def test_without_spread_a_value_is_rounded_by_itself(value):
-    scale = Scale.of(np.full(4, value))
+    scale = VariableScale.of(np.full(4, value))
     assert value_of(quantiles(0.5), 0.5, scale, 100) == pytest.approx(value, rel=1e-3)
     assert value_of(sds(1.0), 1.0, scale, 100) == 0.0
 

@@ -11,8 +11,8 @@ from ssmppl.diagnosis import diagnose
 from ssmppl.diagnosis.heldout.gain_ratio import Gain, gain_ratio
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.report import build, tables
-from ssmppl.diagnosis.report.build import _curves_beat
 from ssmppl.diagnosis.report.words import headline
+from ssmppl.diagnosis.verdict.decision import curves_beat
 from ssmppl.drawing.numerals import interval
 from ssmppl.language.trace import trace
 from tests.diagnosis.harness import scales
@@ -33,8 +33,8 @@ from tests.models import gaps as models
 )
 def test_curves_beat_the_catalogue(nats, error, share, chosen, expected):
     far = SimpleNamespace(beyond_catalogue=Gain(nats, error, nats / 150), rows=[{"F": share}])
-    assert _curves_beat(far, chosen) is expected
-    assert _curves_beat(SimpleNamespace(beyond_catalogue=None, rows=[]), chosen) is False
+    assert curves_beat(far, chosen) is expected
+    assert curves_beat(SimpleNamespace(beyond_catalogue=None, rows=[]), chosen) is False
 
 
 # -- a verdict agrees with the checks

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmppl.diagnosis.report.findings import COLUMNS, MODES, VERDICTS, tabulate
+from ssmppl.diagnosis.report.findings import COLUMNS, MODES, tabulate
 from ssmppl.diagnosis.report.report import GapReport
 from ssmppl.diagnosis.report.words import (
     alternatives,
@@ -26,6 +26,7 @@ from ssmppl.diagnosis.report.words import (
     where,
     which,
 )
+from ssmppl.diagnosis.verdict.verdicts import VERDICTS
 from ssmppl.drawing.numerals import DASH, interval, number, p_text, percent, span, with_error
 from ssmppl.errors import ArgumentError
 from tests.diagnosis.made_up import ALL, NAN, effect_found, fast, no_gap, none_of_these, several

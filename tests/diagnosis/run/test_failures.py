@@ -8,14 +8,14 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis import diagnose
-from ssmppl.diagnosis.heldout import crossfit
+from ssmppl.diagnosis.heldout import cross_validation
 from ssmppl.diagnosis.model import candidates
 from ssmppl.diagnosis.report import tables
-from ssmppl.diagnosis.report.findings import VERDICTS
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.run.failures import FAULT, Failures, Tolerant, reason_of
 from ssmppl.diagnosis.screening import screen
-from ssmppl.diagnosis.selection import attribution, refit
+from ssmppl.diagnosis.selection import effect_selection, refit
+from ssmppl.diagnosis.verdict.verdicts import VERDICTS
 from ssmppl.errors import ExecutorError, SSMError
 from tests.diagnosis.made_up import effect_found
 from tests.diagnosis.small import BREAK, level, levels
@@ -27,9 +27,9 @@ EFFECTS = ["level break", "sensor drift"]
 @pytest.fixture(autouse=True)
 def few_sets(monkeypatch):
     monkeypatch.setattr(diagnose, "SETS", {"fast": FEW, "full": FEW})
-    monkeypatch.setattr(crossfit, "SETS", FEW)
-    monkeypatch.setattr(crossfit, "SINGLES", 1)
-    for module in (diagnose, crossfit):
+    monkeypatch.setattr(cross_validation, "SETS", FEW)
+    monkeypatch.setattr(cross_validation, "SINGLES", 1)
+    for module in (diagnose, cross_validation):
         monkeypatch.setattr(module, "FOLDS", BLOCKS)
 
 
@@ -69,7 +69,7 @@ def test_a_long_reason_is_cut():
 def test_an_interrupt_and_a_lost_executor_are_no_failures_of_a_part():
     failures = Failures()
     for error in (KeyboardInterrupt, ExecutorError("a worker died")):
-        with pytest.raises((KeyboardInterrupt, ExecutorError)), failures.part("a table"):
+        with pytest.raises((KeyboardInterrupt, ExecutorError)), failures.guard("a table"):
             raise error
     assert not len(failures)
 
@@ -177,14 +177,14 @@ def test_without_a_fit_the_error_is_one_of_ours(monkeypatch):
 
 
 FULL = [
-    (attribution, "refit_all", "refitting"),
-    (attribution, "shaped_all", "estimating shapes"),
-    (attribution.Selection, "_best_pair", "pairs of effects"),
-    (attribution.Selection, "_forward", "whether a second effect is missing"),
-    (attribution.Selection, "_by_refit", "the test of what a refit gains"),
+    (effect_selection, "refit_all", "refitting"),
+    (effect_selection, "shaped_all", "estimating shapes"),
+    (effect_selection.EffectSelection, "_best_pair", "pairs of effects"),
+    (effect_selection.EffectSelection, "_forward", "whether a second effect is missing"),
+    (effect_selection.EffectSelection, "_by_refit", "the test of what a refit gains"),
     (refit, "refit", "the refit with level break in x with date = 31"),
-    (crossfit.CrossFit, "gain", "how far the gap closes"),
-    (crossfit.CrossFit, "_one", "block 1 of 5"),
+    (cross_validation.CrossValidation, "gain", "how far the gap closes"),
+    (cross_validation.CrossValidation, "_one", "block 1 of 5"),
 ]
 
 
@@ -203,7 +203,7 @@ def test_a_stage_of_full_mode_that_fails_is_left_out(monkeypatch, module, name, 
 
 @pytest.mark.slow
 def test_an_interrupt_ends_the_run(monkeypatch):
-    broken(monkeypatch, attribution, "shaped_all", KeyboardInterrupt())
+    broken(monkeypatch, effect_selection, "shaped_all", KeyboardInterrupt())
     assert run(mode="full").interrupted
 
 

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from ssmppl.diagnosis.screening.detection import (
     LONG,
-    Statistics,
+    PredictionChecks,
     detection,
     normal_scores,
     statistics,
@@ -184,7 +184,7 @@ def test_what_is_wrong_stands_first(noise, names, pool):
 
 
 def test_more_statistics_can_be_added():
-    base = Statistics((("y", "mean"),), np.array([1.0]), np.array([False]))
+    base = PredictionChecks((("y", "mean"),), np.array([1.0]), np.array([False]))
     more = base.with_values("y", {"CRPS 10 ahead": 0.4})
     assert more.names == (("y", "mean"), ("y", "CRPS 10 ahead"))
     np.testing.assert_array_equal(more.values, [1.0, 0.4])

@@ -7,7 +7,7 @@ import pytest
 from scipy import special, stats
 
 from ssmppl.diagnosis.screening.efficient_score import Null, efficient, regress
-from ssmppl.diagnosis.screening.familywise import Scale, familywise, heights, tail_p, threshold
+from ssmppl.diagnosis.screening.familywise import NullScale, familywise, heights, tail_p, threshold
 from ssmppl.errors import ArgumentError
 from tests.statistics.checks import LEVEL, seed_of
 
@@ -23,7 +23,7 @@ def test_step_down_is_that_of_westfall_and_young():
     seen = np.linspace(0.3, 3.0, 12)[rng.permutation(12)]
     found = familywise(seen, null)
     # on the common scale, which is checked below
-    scale = Scale.of(np.abs(null))
+    scale = NullScale.of(np.abs(null))
     seen, null = scale.put(seen), scale.put(np.abs(null))
     order, running = np.argsort(-seen), 0.0
     for j, k in enumerate(order):
@@ -176,7 +176,7 @@ def test_the_common_scale_is_that_of_one_normal(shapes, sided):
         z = rng.standard_normal((sets, shapes))
         return (z if sided else np.abs(z)).max(axis=1)[:, None]
 
-    scale = Scale.of(largest())
+    scale = NullScale.of(largest())
     put = scale.put(largest())[:, 0]
     for level in (0.5, 0.8, 0.95, 0.99):
         at = stats.norm.isf((1.0 - level) / 2.0)
@@ -189,7 +189,7 @@ def test_the_common_scale_is_that_of_one_normal(shapes, sided):
 
 
 def test_the_common_scale_far_out():
-    scale = Scale(np.array([2.4, 600.0]), np.array([1.0, 1.2]))
+    scale = NullScale(np.array([2.4, 600.0]), np.array([1.0, 1.2]))
     high = np.array([0.0, 1.0, 3.0, 8.0, 20.0, 40.0])
     put = scale.put(np.stack([high, high], axis=1))
     assert np.all(np.isfinite(put))

@@ -79,7 +79,7 @@ def test_the_score_of_a_jump_is_the_exact_one():
         k = names.index(("level break", date))
         # Antithetic trajectories: linear scores come out without Monte Carlo error.
         np.testing.assert_allclose(
-            found.observed.columns[k], (t > date).astype(float) @ solved, rtol=1e-6
+            found.observed.candidate_scores[k], (t > date).astype(float) @ solved, rtol=1e-6
         )
 
 

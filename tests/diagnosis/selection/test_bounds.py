@@ -13,8 +13,8 @@ from ssmppl.diagnosis.selection.fit import (
     Fitter,
     bounds_note,
     hold_at_bounds,
+    standard_errors,
 )
-from ssmppl.diagnosis.selection.refit import standard_errors
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
 from tests.diagnosis.small import level
@@ -68,9 +68,9 @@ def test_a_level_that_does_not_move(exact):
     errors = standard_errors(fit, {})
     assert fit.bounds == ["q"]
     assert np.isnan(errors["q"])
-    assert fit.values()["q"] > 1e-4
+    assert fit.by_component["q"] > 1e-4
     assert errors["r"] == pytest.approx(
-        fit.values()["r"] / np.sqrt(400.0), rel=0.05 if exact else 0.5
+        fit.by_component["r"] / np.sqrt(400.0), rel=0.05 if exact else 0.5
     )
 
 

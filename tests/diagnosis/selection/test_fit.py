@@ -48,7 +48,7 @@ def test_particles_find_the_exact_mode(name):
     _, particles = fitter_of(name, exact=False)
     seed = seed_sequence(seed_of("fit", name))
     top = exact.fit(problem.experiments, seed, {})
-    start = {n: v * 1.4 for n, v in top.start.items() if n not in exact.fixed and n != "phi"}
+    start = {n: v * 1.4 for n, v in top.by_parameter.items() if n not in exact.fixed and n != "phi"}
     found = particles.fit(problem.experiments, seed, start, FROM_START)
     lost = log_posterior(exact, top, top.z) - log_posterior(exact, top, found.z)
     # The last steps average the score's noise out: no worse than the noise of one score alone.
@@ -72,7 +72,7 @@ def test_numbers_restore_a_fit():
     again = fitter.restored(problem.experiments, fit.numbers)
     for name, value in fit.numbers.items():
         np.testing.assert_array_equal(again.numbers[name], value)
-    assert again.values() == fit.values()
+    assert again.by_component == fit.by_component
     np.testing.assert_array_equal(again.space.theta, fit.space.theta)
 
 
@@ -149,7 +149,9 @@ def test_a_fit_may_start_with_an_information_matrix():
     setup = Maximization(top.problem, top.space, "posterior", {}, {}, np.random.SeedSequence(0))
     back = np.linalg.inv(setup.transform.at(top.z).jacobian)
     information = back.T @ top.information @ back
-    found = particles.fit(problem.experiments, seed, top.start, FROM_START, information=information)
+    found = particles.fit(
+        problem.experiments, seed, top.by_parameter, FROM_START, information=information
+    )
     assert "simulator" not in particles.__dict__
     lost = log_posterior(exact, top, top.z) - log_posterior(exact, top, found.z)
     assert lost < 1.0
@@ -166,7 +168,7 @@ def test_a_step_over_a_cliff_is_taken_back(monkeypatch, after):
     """Where the particles lose the data, the score sends the search to nowhere."""
     problem, particles = fitter_of("level", exact=False)
     seed = seed_sequence(seed_of("cliff"))
-    start = particles.fit(problem.experiments, seed, {}).start
+    start = particles.fit(problem.experiments, seed, {}).by_parameter
     whole, calls = particles.gradient, []
 
     def gradient(space, z, stream, transform):

@@ -8,19 +8,20 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.heldout.gain_ratio import Gain, HeldOutGain
-from ssmppl.diagnosis.heldout.parts import GAP, head, three_parts
+from ssmppl.diagnosis.heldout.row_split import GAP, head, three_parts
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
-from ssmppl.diagnosis.report import tables
-from ssmppl.diagnosis.report.build import Results, build_report, labels
+from ssmppl.diagnosis.report.build import build_report
 from ssmppl.diagnosis.report.panels import bars, ranked_effects
 from ssmppl.diagnosis.report.text import cause_rows
 from ssmppl.diagnosis.report.words import headline, how_far, how_sure, leaders, which
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection.attribution import Attribution
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.effect_selection import SelectionResult
 from ssmppl.diagnosis.selection.refit import refit, refit_all
+from ssmppl.diagnosis.verdict import decision
+from ssmppl.diagnosis.verdict.results import Results, labels
 from ssmppl.inference.run.problem import missing_of, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from tests.diagnosis.made_up import effect_found, fast
@@ -62,7 +63,7 @@ def loaded():
     problem = pose(pair(), {"y1": y[:, 0], "y2": y[:, 1]})
     train, missing = problem.experiments, missing_of(problem.experiments)
     augmented = AugmentedModels(problem.trace, missing, {}, Settings())
-    base, kept = augmented.fitter(()), Checkpoint(None, {})
+    base, kept = augmented.base_fitter, Checkpoint(None, {})
     fit = base.fit(train, seed_sequence(1), {})
     states = base.states(train[0], fit.theta, random_state(seed_sequence(2)))
     scales = Scales.of(problem.trace, states, train[0].y, train[0].u, 120)
@@ -79,10 +80,10 @@ def loaded():
     found = dataclasses.replace(
         found, fit=found.fitter.with_information(found.fit, seed_sequence(6))
     )
-    attribution = Attribution(fit, singles, [], found)
+    selection = SelectionResult(fit, singles, [], found)
     return Results(
         problem.trace, train, None, "full", 0.05, base, fit, screen, {"model": "pair"}, [],
-        attribution,
+        selection,
     )  # fmt: skip
 
 
@@ -114,8 +115,8 @@ def test_what_stands_out_and_could_not_be_fitted_is_named(loaded):
     (load,) = [k for k, c in enumerate(loaded.screen.design.candidates)
                if (c.effect.name, c.equation) == ("constant load", "v1")]  # fmt: skip
     rest = [r for r in loaded.refits if r.index != (load,)]
-    found = Attribution(loaded.fit, rest, unfitted=load, notes=["not refitted: it failed"])
-    report = build_report(dataclasses.replace(loaded, attribution=found), 1.0)
+    found = SelectionResult(loaded.fit, rest, unfitted=load, notes=["not refitted: it failed"])
+    report = build_report(dataclasses.replace(loaded, selection=found), 1.0)
     assert report.verdict == "effect"
     assert report.model is None
     assert [(r["effect"], r["equation"]) for r in leaders(report)] == [("constant load", "v1")]
@@ -132,8 +133,8 @@ def test_the_p_of_a_screen_at_another_fit_is_not_told(loaded):
     """Of a model that a refit led to a better fit of: only what refits were tested for is known."""
     base = build_report(loaded, 1.0).causes
     tested = {loaded.refits[0].index[0]: 0.3}
-    found = Attribution(loaded.fit, loaded.refits, p=tested, rebased=True)
-    report = build_report(dataclasses.replace(loaded, attribution=found), 1.0)
+    found = SelectionResult(loaded.fit, loaded.refits, p=tested, rebased=True)
+    report = build_report(dataclasses.replace(loaded, selection=found), 1.0)
     assert base["p"].min() < 0.001
     assert report.causes["p"].iloc[0] == pytest.approx(0.6)  # the larger of two tests
     assert report.causes["p"].iloc[1:].isna().all()
@@ -148,7 +149,7 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     e = loaded.experiments[0]
     two = (head(e, 20), e)
     parts = three_parts(two)
-    results = dataclasses.replace(loaded, experiments=two, parts=parts)
+    results = dataclasses.replace(loaded, experiments=two, split=parts)
     report = build_report(results, 1.0)
     assert report.parts == {"screen": (1, 84)}
     assert "The held-out gain has not been measured." in headline(report)
@@ -165,9 +166,9 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
     assert "t = 1 to 84 of experiment 2" in how_sure(report)[0]
     disjoint = "Likewise of the other experiments. Selection and evaluation rows are disjoint."
     assert disjoint in how_sure(report)[0]
-    results.attribution.left_out = True
+    results.selection.left_out = True
     report = build_report(dataclasses.replace(results, held_out=far), 1.0)
-    results.attribution.left_out = False
+    results.selection.left_out = False
     assert "rows are disjoint" not in str(report)
     assert "held-out data" not in str(report)
     assert "reduced by their held-out gain" in " ".join(how_sure(report))
@@ -176,7 +177,7 @@ def test_parts_tell_the_rows_that_were_measured(loaded):
 @pytest.mark.slow
 def test_an_effect_that_gained_is_not_denied_where_the_share_is_open(loaded, monkeypatch):
     """Curves predict better still, but it is not known how large the gap is in all."""
-    monkeypatch.setattr(tables, "residual_group", lambda *_: (1e-4, ("v1", "mean")))
+    monkeypatch.setattr(decision, "strongest_residual", lambda *_: (1e-4, ("v1", "mean")))
     e = loaded.experiments[0]
     run = SimpleNamespace(mean=e.y, low=e.y, high=e.y)
     row = {"effect": "x", "F_low": np.nan, "F_high": np.nan}

@@ -70,14 +70,14 @@ def setting(extra):
     drawn = models.ssm.simulate(model, theta, steps=ROWS, inputs=force, seed=5)
     problem = pose(model, inputs | {"y": drawn["y"].values[0]})
     augmented = AugmentedModels(problem.trace, missing_of(problem.experiments), {}, Settings())
-    return augmented, problem.experiments, augmented.fitter(()).fit(
+    return augmented, problem.experiments, augmented.base_fitter.fit(
         problem.experiments, seed_sequence(1), {}
     )  # fmt: skip
 
 
 def refitted(augmented, base, c, experiments, strength):
     fitter = augmented.fitter((c,))
-    start = base.start | {c.strength: np.asarray(strength)}
+    start = base.by_parameter | {c.strength: np.asarray(strength)}
     fit = fitter.fit(experiments, seed_sequence(2), start, FROM_START)
     return Refit((0,), (c,), fitter, fit, fit.log_likelihood - base.log_likelihood)
 
@@ -105,7 +105,7 @@ def test_a_share_of_the_way_between_bounds_is_the_shape(forced):
     (c,) = found.candidates
     limits = {f"{c.strength}_{n}": b for n, b in bounds(c).items()}
     free = augmented.with_free_shapes((c,), limits)
-    values = found.fit.values()
+    values = found.fit.by_component
     for n, (low, high) in limits.items():
         name = n.removeprefix(f"{c.strength}_")
         values |= {range_fraction(n): (dict(c.shape)[name] - low) / (high - low)}

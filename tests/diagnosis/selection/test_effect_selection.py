@@ -9,15 +9,15 @@ import pytest
 from ssmppl.diagnosis import diagnose as diagnosis
 from ssmppl.diagnosis.effects import catalogue_sensor as ssm_effects
 from ssmppl.diagnosis.effects.candidate import Candidate
-from ssmppl.diagnosis.model.scales import Scale, Scales
+from ssmppl.diagnosis.model.scales import Scales, VariableScale
 from ssmppl.diagnosis.model.smoothing import Settings
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
 from ssmppl.diagnosis.screening.familywise import familywise, tail_p
 from ssmppl.diagnosis.screening.screen import ScreenDesign, run_screen
-from ssmppl.diagnosis.selection import attribution as module
+from ssmppl.diagnosis.selection import effect_selection as module
 from ssmppl.diagnosis.selection import refit as refits_of
-from ssmppl.diagnosis.selection.attribution import Attribution, Selection
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
 from ssmppl.diagnosis.selection.refit import (
     Refit,
     best_of_groups,
@@ -78,7 +78,11 @@ def test_what_the_fit_cannot_show_is_fitted_anew():
              Candidate(ssm_effects.sensor_bias, "y", role="channel"),
              Candidate(replace(fold), "gain", role="parameter")]  # fmt: skip
     values = np.linspace(0.1, 3.0, 50)
-    scale = {"y": Scale.of(values), "z": Scale.of(values - 1.0), "noisy": Scale.of(values - 0.3)}
+    scale = {
+        "y": VariableScale.of(values),
+        "z": VariableScale.of(values - 1.0),
+        "noisy": VariableScale.of(values - 0.3),
+    }
     screen = SimpleNamespace(
         family=SimpleNamespace(leaders=[3, 1, 4, 2, 0]),
         design=SimpleNamespace(candidates=bound, scales=Scales(scale, 50)),
@@ -113,7 +117,7 @@ def asked():
     problem = pose(level(), levels(120, 0.0, "right"))
     missing = missing_of(problem.experiments)
     augmented = AugmentedModels(problem.trace, missing, {}, Settings())
-    fitter = augmented.fitter(())
+    fitter = augmented.base_fitter
     fit = fitter.fit(problem.experiments, seed_sequence(1), {})
     e = problem.experiments[0]
     states = fitter.states(e, fit.theta, np.ones(4, np.uint64))
@@ -127,7 +131,7 @@ def asked():
 
 def lower(augmented, fit):
     """The same fit, stopped at another place, some nats below."""
-    fitter, theta = augmented.fitter(()), fit.theta * np.array([6.0, 0.7])
+    fitter, theta = augmented.base_fitter, fit.theta * np.array([6.0, 0.7])
     experiments = fit.problem.experiments
     value = fitter.kalman.log_likelihood(experiments, theta)
     assert value < fit.log_likelihood - 5.0
@@ -166,9 +170,11 @@ def test_a_better_place_for_the_parameters_is_no_effect(asked):
         augmented, bad, screen, [[k] for k in leading(screen)], screen.experiments,
         seed_sequence(3), kept, "refitting",
     )  # fmt: skip
-    out = Attribution(bad, list(done))
+    out = SelectionResult(bad, list(done))
     assert out.refits[0].gain > 5.0
-    Selection(augmented, screen, screen.experiments, seed_sequence(4), 0.05, kept)._refit_base(out)
+    EffectSelection(
+        augmented, screen, screen.experiments, seed_sequence(4), 0.05, kept
+    )._refit_base(out)
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
     shift = fit.log_likelihood - bad.log_likelihood
     for before, after in zip(done, out.refits, strict=True):
@@ -178,9 +184,9 @@ def test_a_better_place_for_the_parameters_is_no_effect(asked):
 @pytest.mark.slow
 def test_a_right_model_is_not_accused_by_a_bad_start(asked):
     augmented, fit, screen = asked
-    out = Attribution(lower(augmented, fit))
+    out = SelectionResult(lower(augmented, fit))
     kept = Checkpoint(None, {})
-    Selection(augmented, screen, screen.experiments, seed_sequence(5), 0.05, kept).run(out)
+    EffectSelection(augmented, screen, screen.experiments, seed_sequence(5), 0.05, kept).run(out)
     assert out.chosen is None
     assert out.base.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.05)
 
@@ -193,14 +199,14 @@ def test_a_shape_that_was_sharpened_stands_for_its_group(asked):
     columns, seen = screen.columns_of([load])
     assert columns.shape == (screen.sets, 1)
     k = screen.design.candidates.index(load)
-    np.testing.assert_array_equal(columns[:, 0], screen.simulated.columns[:, k])
-    assert seen[0] == screen.observed.columns[k]
+    np.testing.assert_array_equal(columns[:, 0], screen.simulated.candidate_scores[:, k])
+    assert seen[0] == screen.observed.candidate_scores[k]
     jump = next(c for c in screen.design.candidates if c.effect.name == "level break")
     other = replace(jump, shape=(("date", 17.3),))
     found, _ = screen.columns_of([other])
     best = next(int(j) for j in screen.family.best
                 if screen.design.candidates[j].group == jump.group)  # fmt: skip
-    np.testing.assert_array_equal(found[:, 0], screen.simulated.columns[:, best])
+    np.testing.assert_array_equal(found[:, 0], screen.simulated.candidate_scores[:, best])
 
 
 # -- shapes that are whole numbers, and effects that fail
@@ -240,8 +246,8 @@ def test_of_refits_that_differ_in_their_shape_the_best_stands():
 def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left):
     """The number of effects left, by what each number of them gains on the held-out rows."""
     chain = [Refit(tuple(range(n)), ("effect",) * n, n, None, 10.0 * n) for n in (1, 2, 3)]
-    out = Attribution(None, chosen=chain[2], fewer=chain[:2])
-    results = SimpleNamespace(attribution=out, base=0, fit=None)
+    out = SelectionResult(None, chosen=chain[2], fewer=chain[:2])
+    results = SimpleNamespace(selection=out, base=0, fit=None)
 
     def predict(fitter, *_):
         return SimpleNamespace(log_density=np.full((8, 4), ({0: 0.0} | gains)[fitter] / 4.0))
@@ -249,7 +255,7 @@ def test_what_fails_on_held_out_rows_is_left_out_again(monkeypatch, gains, left)
     monkeypatch.setattr(diagnosis, "predict", predict)
     monkeypatch.setattr(diagnosis, "add_standard_errors", lambda out, *_: None)
     running = object.__new__(diagnosis._Diagnosis)
-    running.parts, running.experiments = SimpleNamespace(held_out=[]), ()
+    running.split, running.experiments = SimpleNamespace(held_out=[]), ()
     running.root, running.checkpoint = seed_sequence(1), Checkpoint(None, {})
     running._validate_on_held_out_rows(results)
     assert len(out.chosen.candidates) == left
@@ -288,13 +294,13 @@ def test_selection_in_a_fold_takes_as_many_steps_as_were_taken(monkeypatch, want
 
     one = Refit((0,), ("first",), None, None, 9.0)
     monkeypatch.setattr(module, "refit_all", lambda *_, **__: ([one], []))
-    monkeypatch.setattr(Selection, "_best_pair", lambda *_: None)
-    monkeypatch.setattr(Selection, "_forward", forward)
+    monkeypatch.setattr(EffectSelection, "_best_pair", lambda *_: None)
+    monkeypatch.setattr(EffectSelection, "_forward", forward)
     screen = screen_of([6.0, 3.0], np.eye(2))
     screen.design = SimpleNamespace(scales=None)
-    out = Attribution(None)
+    out = SelectionResult(None)
     kept = Checkpoint(None, {})
-    Selection(
+    EffectSelection(
         None, screen, (), seed_sequence(1), 0.05, kept, always=True, singles=2, most=wanted,
         approximate=True,
     ).run(out)  # fmt: skip

@@ -21,14 +21,14 @@ import numpy as np
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.effects.candidate import Candidate, is_dated
 from ssmppl.diagnosis.heldout.gain_ratio import FEWEST_BLOCKS, NOT_GIVEN, HeldOutGain, gain_ratio
-from ssmppl.diagnosis.heldout.parts import FOLDS, Fold, folds
 from ssmppl.diagnosis.heldout.predictions import Predictions, free_run, gain_of_mean, predict, rmse
 from ssmppl.diagnosis.heldout.reference import fit_reference
+from ssmppl.diagnosis.heldout.row_split import FOLDS, Fold, folds
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, Numbers
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Task, child_seed
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen, screen_part
-from ssmppl.diagnosis.selection.attribution import Attribution, Selection
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
+from ssmppl.diagnosis.selection.effect_selection import EffectSelection, SelectionResult
 from ssmppl.diagnosis.selection.fit import APPROXIMATELY, Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.errors import ArgumentError, SSMError
@@ -50,7 +50,7 @@ class _FoldModels:
 
 
 @dataclass(frozen=True)
-class CrossFit:
+class CrossValidation:
     """The gain on blocks left out: what every fold works with.
 
     design : of the screen. base : the model's fitter and its fit to all rows. alpha : family-wise
@@ -72,13 +72,13 @@ class CrossFit:
         out = HeldOutGain()
         out.simulate(self.base, self.experiments, self.chosen, seed)
         fed_back = feeds_back(self.augmented.trace)
-        parts = folds(self.experiments, FOLDS, fed_back=fed_back)
+        blocks = folds(self.experiments, FOLDS, fed_back=fed_back)
 
         def one(k: int) -> Numbers:
-            name = f"block {k + 1} of {len(parts)}"
-            own, kept = child_seed(seed, 20, k), checkpoint.within(name)
+            name = f"block {k + 1} of {len(blocks)}"
+            own, kept = child_seed(seed, Task.BLOCK, k), checkpoint.within(name)
             try:
-                return kept.computed("held out", partial(self._one, parts[k], own, kept))
+                return kept.computed("held out", partial(self._one, blocks[k], own, kept))
             except SSMError:  # a block that a model cannot predict is no block to leave out
                 raise
             except Exception as error:
@@ -86,12 +86,12 @@ class CrossFit:
                 return {}
 
         try:  # in threads of this process: their tasks go over the executor
-            each = [v for v in run_tasks(one, range(len(parts))) if v]
+            each = [v for v in run_tasks(one, range(len(blocks))) if v]
         except SSMError as error:
             out.notes.append(NOT_GIVEN.format(error.found))
             return out
         if len(each) < FEWEST_BLOCKS:
-            out.notes.append(NOT_GIVEN.format(f"{len(each)} of {len(parts)} blocks are done"))
+            out.notes.append(NOT_GIVEN.format(f"{len(each)} of {len(blocks)} blocks are done"))
             return out
         table = {n: np.stack([v[n] for v in each], axis=-1) for n in each[0]}
         ratio = gain_ratio(table["base"], table["effect"], table["reference"], block=1)
@@ -154,9 +154,9 @@ class CrossFit:
             )
         else:
             screen = screen_part(self.whole, fold.train, fit.theta, seed)
-        found = Attribution(fit)
+        found = SelectionResult(fit)
         if self.chosen is not None:
-            Selection(
+            EffectSelection(
                 self.augmented, screen, fold.train, seed, self.alpha, checkpoint, always=True,
                 singles=SINGLES, most=len(self.chosen.candidates), approximate=True,
             ).run(found)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Attribution of the gap: leading candidates refitted, pairs of them, and forward selection.
+"""The choice of effects: leading candidates refitted, pairs of them, and forward selection.
 
 Effects come together, and one at a time can look wrong: pairs are refitted beside single ones, and
 a second screen is run around the model with the best of these, for one more effect. From the better
@@ -15,7 +15,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.run.checkpoint import Checkpoint
-from ssmppl.diagnosis.run.seeds import child_seed
+from ssmppl.diagnosis.run.seeds import Choice, Task, child_seed
 from ssmppl.diagnosis.screening.familywise import threshold
 from ssmppl.diagnosis.screening.screen import Screen, ScreenDesign, run_screen
 from ssmppl.diagnosis.selection.augmented_models import AugmentedModels
@@ -41,7 +41,7 @@ FOLLOWERS, AGAIN = 3, 100  # refits after a second screen, and the simulated set
 
 
 @dataclass
-class Attribution:
+class SelectionResult:
     """The results of the refits, filled in as they come to an end.
 
     base : the model's own fit. refits, doubles : with one effect, with two; best first.
@@ -65,7 +65,7 @@ class Attribution:
 
 
 @dataclass(frozen=True)
-class Selection:
+class EffectSelection:
     """One choice among the candidates of a screen: what it works with, step by step.
 
     screen, train : of the same experiments. alpha : family-wise error rate. always : choose the
@@ -85,42 +85,42 @@ class Selection:
     most: int = MOST_EFFECTS
     approximate: bool = False
 
-    def run(self, out: Attribution) -> None:
-        """Refit, choose, and step forward; into `out`."""
-        part = self.checkpoint.failures.part
+    def run(self, out: SelectionResult) -> None:
+        """Refit, choose, and step forward; into `out`, which keeps what came before an error."""
+        guard = self.checkpoint.failures.guard
         self._refit_singles(out)
         found = self.always or self._significant(out)
         if not found or not out.refits or out.unfitted is not None:
             return
         if not self.approximate:
-            with part("estimating shapes"):
-                out.refits = self._shaped(out, out.refits, 7, "estimating shapes")
+            with guard("estimating shapes"):
+                out.refits = self._shaped(out, out.refits, Choice.SHAPES, "estimating shapes")
         out.chosen = out.refits[0]
         single, pair = out.chosen, None
         if self.most > 1:
             rival = None
-            with part("pairs of effects"):
+            with guard("pairs of effects"):
                 rival = self._best_pair(out)
             # a step from the best one, against the best pair
-            with part("whether a second effect is missing"):
+            with guard("whether a second effect is missing"):
                 self._forward(out, 2)
             if rival is not None and rival.penalised_gain > out.chosen.penalised_gain:
                 out.chosen = rival
             if len(out.chosen.candidates) == 2:
                 pair = out.chosen
-                with part("whether a third effect is missing"):
+                with guard("whether a third effect is missing"):
                     self._forward(out, self.most)
         out.fewer = [r for r in (single, pair) if r is not None and r is not out.chosen]
         if self.approximate:
             return
         if len(out.chosen.candidates) > 1:
-            with part("the shapes of all that was chosen"):
+            with guard("the shapes of all that was chosen"):
                 stage = "estimating the shapes of all that was chosen"
-                (out.chosen,) = self._shaped(out, [out.chosen], 8, stage)
-        add_standard_errors(out, child_seed(self.seed, 5), self.checkpoint)
+                (out.chosen,) = self._shaped(out, [out.chosen], Choice.CHOSEN_SHAPES, stage)
+        add_standard_errors(out, self._seed(Choice.STANDARD_ERRORS), self.checkpoint)
 
     # -- single effects
-    def _refit_singles(self, out: Attribution) -> None:
+    def _refit_singles(self, out: SelectionResult) -> None:
         screen, refits = self.screen, out.refits
         stages: dict[str, Callable[[], list[int]]] = {
             "refitting": lambda: leading(screen)[: self.singles]
@@ -132,9 +132,9 @@ class Selection:
             stages["refitting other delays"] = lambda: delays(screen, refits)
             stages[AFRESH] = lambda: one_signed_candidates(screen)
         for stage, which in stages.items():
-            with self.checkpoint.failures.part(stage):
+            with self.checkpoint.failures.guard(stage):
                 more, failed = self._refit(
-                    out.base, screen, [[k] for k in which()], child_seed(self.seed, 1), stage,
+                    out.base, screen, [[k] for k in which()], self._seed(Choice.SINGLES), stage,
                     afresh=stage == AFRESH,
                 )  # fmt: skip
                 refits = best_of_groups(screen, refits + more)
@@ -152,41 +152,41 @@ class Selection:
         )  # fmt: skip
 
     def _shaped(
-        self, out: Attribution, refits: Sequence[Refit], place: int, stage: str
+        self, out: SelectionResult, refits: Sequence[Refit], place: Choice, stage: str
     ) -> list[Refit]:
         return shaped_all(
             self.augmented, out.base, self.screen.design.scales, refits, self.train,
-            child_seed(self.seed, place), self.checkpoint, stage,
+            self._seed(place), self.checkpoint, stage,
         )  # fmt: skip
 
     # -- tests
-    def _significant(self, out: Attribution) -> bool:
+    def _significant(self, out: SelectionResult) -> bool:
         """Whether the screen or a refit finds more than chance: two tests, with half of alpha each;
         also whether what leads the screen could not be refitted."""
-        part, found = self.checkpoint.failures.part, False
-        with part("the model fitted from the best refit"):
+        guard, found = self.checkpoint.failures.guard, False
+        with guard("the model fitted from the best refit"):
             self._refit_base(out)
         if out.rebased:  # the screen was run at the wrong place
             out.p |= {r.index[0]: gain_p(self.screen, r) for r in out.refits}
         else:
             found = bool(np.min(self.screen.family.p, initial=1.0) <= self.alpha / 2)
             out.unfitted = _unfitted(self.screen, out.refits, self.alpha / 2)
-        with part("the test of what a refit gains"):
+        with guard("the test of what a refit gains"):
             found |= self._by_refit(out, self.alpha / 2)
         return found
 
-    def _refit_base(self, out: Attribution) -> None:
+    def _refit_base(self, out: SelectionResult) -> None:
         """Fit the model itself from where the best refit ended, too: a refit that found a better
         place for the parameters gains by that, and not by its effect. Only where it gains enough.
         """
         worth = critical_gain(self.screen, self.alpha)
         if not out.refits or out.refits[0].penalised_gain < worth:
             return
-        fitter, best = self.augmented.fitter(()), out.refits[0].fit
-        start = {n: v for n, v in best.start.items() if n in self.augmented.trace.parameters}
+        fitter, best = self.augmented.base_fitter, out.refits[0].fit
+        start = {n: v for n, v in best.by_parameter.items() if n in self.augmented.trace.parameters}
         numbers = self.checkpoint.computed(
             "fitting from the best refit",
-            lambda: fitter.fit(self.train, child_seed(self.seed, 6), start, FROM_START).numbers,
+            lambda: fitter.fit(self.train, self._seed(Choice.BASE), start, FROM_START).numbers,
         )
         found = fitter.restored(self.train, numbers)
         better = found.log_likelihood - out.base.log_likelihood
@@ -200,7 +200,7 @@ class Selection:
             )
             out.refits = [replace(r, gain=r.gain - better) for r in out.refits]
 
-    def _by_refit(self, out: Attribution, alpha: float) -> bool:
+    def _by_refit(self, out: SelectionResult, alpha: float) -> bool:
         """Whether a refit gains more than chance: by bootstrap where that is affordable, else by
         the law of the scores, the same to first order (likelihood ratio and score tests)."""
         found = {r.index[0]: gain_p(self.screen, r) for r in out.refits}
@@ -213,8 +213,8 @@ class Selection:
             if min(rest.values(), default=1.0) <= LAX * alpha:
                 best = min(rest, key=lambda k: rest[k])
                 found[best] = refit_p(
-                    self.augmented, out.base, self.screen, alpha, child_seed(self.seed, 4),
-                    self.checkpoint,
+                    self.augmented, out.base, self.screen, alpha,
+                    self._seed(Choice.REFIT_TEST), self.checkpoint,
                 )  # fmt: skip
         if not found:
             return False
@@ -222,11 +222,11 @@ class Selection:
         return min(found.values()) <= alpha
 
     # -- several effects
-    def _best_pair(self, out: Attribution) -> Refit | None:
+    def _best_pair(self, out: SelectionResult) -> Refit | None:
         """The best of the pairs of which the screen promises most, where it is clearly better than
         the best single one."""
         out.doubles, failed = self._refit(
-            out.base, self.screen, pairs(self.screen, out.refits), child_seed(self.seed, 2),
+            out.base, self.screen, pairs(self.screen, out.refits), self._seed(Choice.PAIRS),
             "refitting pairs",
         )  # fmt: skip
         out.notes += [f"not refitted: {reason}" for reason in failed]
@@ -235,9 +235,9 @@ class Selection:
         more = out.doubles[0].penalised_gain - out.refits[0].penalised_gain
         return out.doubles[0] if more >= critical_gain(self.screen, self.alpha) else None
 
-    def _forward(self, out: Attribution, most: int) -> None:
+    def _forward(self, out: SelectionResult, most: int) -> None:
         """Screen again around the chosen model, and add what stands out, up to `most` effects."""
-        chosen, seed = out.chosen, child_seed(self.seed, 3)
+        chosen, seed = out.chosen, self._seed(Choice.FURTHER)
         while chosen is not None and len(chosen.candidates) < most:
             number, rest = len(chosen.candidates), _others(self.screen, chosen)
             work = sum(e.steps for e in self.train) * self.augmented.settings.particles
@@ -257,7 +257,7 @@ class Selection:
                 return
             more, _ = self._refit(
                 chosen.fit, again, [[k] for k in leading(again)[:FOLLOWERS]],
-                child_seed(seed, 10 + number), "refitting", chosen.candidates,
+                child_seed(seed, Task.FURTHER_REFITS + number), "refitting", chosen.candidates,
                 checkpoint=self.checkpoint.within(f"with {number + 1} effects"),
             )  # fmt: skip
             if not more or more[0].penalised_gain < critical_gain(again, self.alpha):
@@ -269,6 +269,9 @@ class Selection:
                 index, best.candidates, best.fitter, best.fit, chosen.gain + best.gain,
                 chosen.cost + best.cost,
             )  # fmt: skip
+
+    def _seed(self, step: Choice) -> np.random.SeedSequence:
+        return child_seed(self.seed, step)
 
     def _screen_again(
         self, chosen: Refit, rest: Sequence[Candidate], seed: np.random.SeedSequence
@@ -314,14 +317,14 @@ def critical_gain(screen: Screen, alpha: float) -> float:
 
 
 def add_standard_errors(
-    out: Attribution, seed: np.random.SeedSequence, checkpoint: Checkpoint
+    out: SelectionResult, seed: np.random.SeedSequence, checkpoint: Checkpoint
 ) -> None:
     """Standard errors of what was chosen, from scores simulated at its fit."""
     old = out.chosen
     assert old is not None
     number = len(old.candidates)
     what = "standard errors" if number == 1 else f"standard errors of {number} effects"
-    with checkpoint.failures.part(what):
+    with checkpoint.failures.guard(what):
         numbers = checkpoint.computed(
             what, lambda: {"information": old.fitter.with_information(old.fit, seed).information}
         )

@@ -24,7 +24,7 @@ FOLDS = 10
 
 
 @dataclass(frozen=True)
-class Parts:
+class RowSplit:
     """The rows of each experiment by their use: train = [0, second), held_out = [second, T).
 
     Effects are looked for and chosen on `train`. The reference of the gain ratio is fitted to
@@ -71,10 +71,10 @@ def head(e: Experiment, rows: int) -> Experiment:
     )  # fmt: skip
 
 
-def three_parts(experiments: Sequence[Experiment]) -> Parts:
+def three_parts(experiments: Sequence[Experiment]) -> RowSplit:
     """Every experiment cut at the same shares of its rows; one of up to three is for `train`."""
     a, b = SHARES
-    return Parts(
+    return RowSplit(
         tuple(experiments),
         tuple(min(e.steps, max(2, round(a * e.steps))) for e in experiments),
         tuple(min(e.steps, max(3, round(b * e.steps))) for e in experiments),

@@ -1,0 +1,125 @@
+"""The decision between the verdicts.
+
+There is an effect where one was chosen; there is none of these where something stands out that the
+catalogue does not explain; else there is no measurable gap. Held-out rows may revise what the rows
+before them said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssmppl.diagnosis.effects.candidate import Candidate
+from ssmppl.diagnosis.heldout.gain_ratio import HeldOutGain
+from ssmppl.diagnosis.heldout.reference import residual_groups
+from ssmppl.diagnosis.screening.screen import Screen
+from ssmppl.diagnosis.verdict.results import Results
+from ssmppl.diagnosis.verdict.verdicts import EFFECT, NO_GAP, NONE_OF_THESE
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CLEARLY = 2.0  # standard errors
+MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"
+LEFT = 0.2  # of alpha, for what the catalogue leaves where no held-out rows validate it
+
+Place = tuple[str, str]  # equation and moment
+
+
+@dataclass(frozen=True)
+class Decision:
+    """verdict : one of `VERDICTS`. curve : the mean whose missing curve goes with it, None if none
+    does. others : candidates that are projected out of that curve."""
+
+    verdict: str
+    curve: Place | None = None
+    others: tuple[Candidate, ...] = ()
+
+
+def decide(r: Results, where: pd.DataFrame, checks: pd.DataFrame) -> Decision:
+    """The verdict, in the light of the gain on held-out rows and of what else stands out.
+
+    where, checks : the tables `where` and `detection` of the report.
+    """
+    found = _by_effects(r, where)
+    rows = r.held_out.rows if r.held_out else []
+    # Few held-out rows leave the share open where the test of the effect does not; what gains
+    # nothing on them was chance, and what curves gain beyond it is as open.
+    if rows and not r.blocks and not np.isfinite(rows[0]["F"]):
+        unlike = found.verdict == NONE_OF_THESE
+        if rows[0]["nats_per_sample"] <= 0.0 or (unlike and r.chosen is None):
+            found = Decision(NO_GAP)
+        elif unlike:
+            found = Decision(EFFECT, strongest_mean(where))
+    # Places and checks that are of a fit which was not the best one say nothing.
+    if found.verdict == NO_GAP and r.screened and stands_out(r.alpha, where, checks):
+        found = Decision(NONE_OF_THESE, strongest_mean(where))
+    return found
+
+
+def _by_effects(r: Results, where: pd.DataFrame) -> Decision:
+    """The decision but for whether a gap can be measured at all."""
+    least = float(np.min(r.screen.family.p, initial=1.0))
+    refitted = r.selection is not None and r.mode == "full" and r.unfitted is None
+    if r.held_out is not None and curves_beat(r.held_out, r.chosen is not None):
+        best = r.chosen or (r.refits[0] if r.refits else None)
+        tried = list(best.candidates) if best else []
+        residual, place = strongest_residual(r.screen, tried)
+        if residual <= r.alpha and place is not None:
+            return _none_of_these(place, tried)
+    if r.chosen is not None or (least <= r.alpha and not refitted):
+        return Decision(EFFECT, strongest_mean(where))
+    if not refitted:  # nothing is held out: what all of the catalogue leaves
+        tried = testable_candidates(r.screen)
+        residual, place = strongest_residual(r.screen, tried)
+        if residual <= LEFT * r.alpha and place is not None:
+            return _none_of_these(place, tried)
+    return Decision(NO_GAP)
+
+
+def _none_of_these(place: Place, tried: Sequence[Candidate]) -> Decision:
+    return Decision(NONE_OF_THESE, place if place[1] == "mean" else None, tuple(tried))
+
+
+def strongest_mean(where: pd.DataFrame) -> Place | None:
+    """The place where most is missing, if that is in the mean of an equation."""
+    if not len(where) or where.iloc[0]["moment"] != "mean":
+        return None
+    return where.iloc[0]["equation"], "mean"
+
+
+def stands_out(alpha: float, *found: pd.DataFrame) -> bool:
+    """Whether a place or a check of the predictions is more than chance: then there is a gap."""
+    return any(len(t) > 0 and float(np.nanmin(t["p"], initial=1.0)) <= alpha for t in found)
+
+
+def curves_beat(far: HeldOutGain, chosen: bool) -> bool:
+    """Whether smooth curves predict the held-out rows better than the best of the catalogue: more
+    than chance explains, and, where effects were chosen, by more than a trifle of the gap."""
+    if (
+        far.beyond_catalogue is None
+        or not far.beyond_catalogue.nats > CLEARLY * far.beyond_catalogue.error
+    ):
+        return False
+    share = float(far.rows[0]["F"]) if chosen and far.rows else np.nan
+    return not share > 1.0 - MATTERS
+
+
+def testable_candidates(screen: Screen) -> list[Candidate]:
+    """The candidates with a score that the parameters do not absorb."""
+    candidates = screen.design.candidates
+    return [c for c, s in zip(candidates, screen.efficient.status, strict=True) if not s]
+
+
+def strongest_residual(screen: Screen, others: Sequence[Candidate]) -> tuple[float, Place | None]:
+    """(family-wise p, equation and moment) of what of the basis stands out most with `others`
+    projected out."""
+    groups = residual_groups(screen, others)
+    if not groups:
+        return 1.0, None
+    best = max(groups, key=lambda key: groups[key].z)
+    return groups[best].p, best[:2]
