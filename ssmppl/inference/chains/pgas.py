@@ -287,17 +287,18 @@ def _trajectories_of(plan: Derived) -> str:
     flat = [s.name for s in plan.trace.initial.values() if not s.distribution.proper]
     if flat:
         return f"does not apply: {', '.join(flat)} starts from a flat law, which has no draws"
-    if plan.memory is None:
+    steps = plan.deterministic_memory
+    if steps is None:
         return (
             "conditional SMC without ancestor sampling: a deterministic component never "
             "forgets its past, so a path cannot be joined to another ancestor; take more "
             "particles, or PMMH"
         )
-    if plan.memory == 0:
+    if steps == 0:
         return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
     return (
         "conditional SMC with ancestor sampling, over the noisy components: deterministic "
-        f"ones forget their past in {plan.memory} step{'s' * (plan.memory > 1)}, whose "
+        f"ones forget their past in {steps} step{'s' * (steps > 1)}, whose "
         "densities enter the ancestor weights"
     )
 

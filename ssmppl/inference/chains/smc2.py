@@ -303,7 +303,7 @@ def run_smc2(setup: SamplingSetup, method: SMC2, executor: Any, progress: bool) 
     rows = setup.problem.rows
     chains: Sequence[ChainDraws[SMC2State]] = run_chains(
         partial(rows_block, filters), states, rows, executor=executor, progress=progress,
-        title="SMC2", describe=_describe, keep=setup.memory,
+        title="SMC2", describe=_describe, checkpoint=setup.checkpoint,
     )  # fmt: skip
     if any(c.interrupted for c in chains):
         raise chains[0].lost or KeyboardInterrupt("interrupted before all rows were seen")

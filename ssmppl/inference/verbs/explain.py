@@ -63,7 +63,8 @@ class Plan:
     finite : the values that its states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
-    memory : for how many steps a deterministic state remembers; None where it never forgets.
+    deterministic_memory : for how many steps a deterministic state remembers; None where it never
+        forgets.
     noises : what drives the states, or why it is not known.
     eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
@@ -75,7 +76,7 @@ class Plan:
     finite: FiniteStates | NotApplicable
     proposals: dict[str, Proposal | NotApplicable]
     updates: tuple[Update, ...]
-    memory: int | None
+    deterministic_memory: int | None
     noises: Noises | NotApplicable
     eliminable: Eliminable
     data: str = ""

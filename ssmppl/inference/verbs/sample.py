@@ -18,7 +18,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, written_as
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.parameter_steps import plan_updates
 from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
-from ssmppl.inference.checkpoints.chains import ChainFile
+from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
 from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
@@ -155,12 +155,12 @@ def sample(
     check_names(problem.trace, problem.experiments, states)
     if checkpoint is None:
         _check_room(problem, kind.by_row(chosen), chains, draws, states)
-    root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
+    root, space, file = seed_sequence(seed), space_of(problem, held, near), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
-        kept = ChainFile(checkpoint, origin, seed, root, _codec(), draws)
-        root = kept.root
-    setup = SamplingSetup(problem, space, held, chains, warmup, thin, root, states, kept)
+        file = CheckpointFile(checkpoint, origin, seed, root, _codec(), draws)
+        root = file.root
+    setup = SamplingSetup(problem, space, held, chains, warmup, thin, root, states, file)
     result, report = kind.draw(setup, chosen, draws, executor, progress)
     attrs = {
         "model": problem.trace.name,
@@ -171,10 +171,10 @@ def sample(
         "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
         "observes": observes(problem.trace),
         "interrupted": any(c.interrupted for c in result),
-        "seconds": time.perf_counter() - began if kept is None else kept.seconds,
+        "seconds": time.perf_counter() - began if file is None else file.seconds,
     }  # fmt: skip
     attrs |= kind.attributes(problem, result)
-    whole = stack(result) if kept is None else kept.stack(result)
+    whole = stack(result) if file is None else file.stack(result)
     if kind.markov:
         free = free_components(problem.trace, held)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
