@@ -49,7 +49,7 @@ def main() -> None:
         for _ in range(DRAWS):
             value, _ = draw(update, totals, value, {}, rng)
         times.append((time.perf_counter() - start) / DRAWS)
-    row = [update.family, f"{1e6 * min(times):.1f}", f"{1e6 * np.median(times):.1f}"]
+    row = [update.family_name, f"{1e6 * min(times):.1f}", f"{1e6 * np.median(times):.1f}"]
     show(["family", "µs a draw, least", f"median of {ROUNDS} rounds"], [row])
 
 

@@ -62,7 +62,7 @@ def row_forgotten(original):
         totals = totals.copy()
         for i, f in enumerate(update.functions):
             if f.op == "log":
-                totals[i] += 0.5 if "inverse" in update.family else -0.5
+                totals[i] += 0.5 if "inverse" in update.family_name else -0.5
         return original(update, totals, *rest)
 
     return draw
@@ -74,7 +74,7 @@ def rate_wrong(original):
     def totals(steps, k, theta, paths):
         found = original(steps, k, theta, paths).copy()
         for i, f in enumerate(steps.updates[k].functions):
-            if f.op == "div" and steps.updates[k].family == "inverse Gamma":
+            if f.op == "div" and steps.updates[k].family_name == "inverse Gamma":
                 found[i] *= 1.5
         return found
 
@@ -85,7 +85,7 @@ def correction_forgotten(original):
     """What lies outside of the family (here sqrt(1 - phi^2), of the stationary initial law)."""
 
     def draw(update, *rest):
-        return original(replace(update, correction=()), *rest)
+        return original(replace(update, outside_family=()), *rest)
 
     return draw
 

@@ -166,7 +166,7 @@ def test_the_initial_law_forgotten_is_found(monkeypatch):
         return tuple(
             dataclasses.replace(
                 u,
-                correction=(),
+                outside_family=(),
                 coefficients=u.coefficients | {"initial": (constant(0.0),) * len(u.functions)},
             )
             for u in plan(problem, held)

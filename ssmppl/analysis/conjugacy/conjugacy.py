@@ -78,31 +78,31 @@ def conjugate_update(search: Search, found: Found) -> Update:
     form, family = found.form, found.family
     site = search.site(found.components[0])
     where, reason = site.distribution.location, ""
-    if found.correction:
-        sources = [f for j in found.correction for f in form.origins[form.monomials[j]]]
+    if found.outside_family:
+        sources = [f for j in found.outside_family for f in form.origins[form.monomials[j]]]
         laws = " and the ".join(sorted({f"{f.role} law of {f.site}" for f in sources}))
-        left = ", ".join(to_text(form.functions[j]) for j in found.correction)
+        left = ", ".join(to_text(form.functions[j]) for j in found.outside_family)
         where = sources[0].where
         reason = f"the {laws} leaves {left} outside the {family.name} family"
-    if form.left:
-        where, reason = form.left[0][1].where or where, form.left[0][1].reason
+    if form.inseparable:
+        where, reason = form.inseparable[0][1].where or where, form.inseparable[0][1].reason
     update = Update(
         block=tuple(dict.fromkeys(c.data[1] for c in found.components)),
         components=found.components,
-        family=family.name,
+        family_name=family.name,
         functions=form.functions,
         coefficients=form.coefficients,
-        correction=found.correction,
+        outside_family=found.outside_family,
         bounds=tuple(search.bound[c] for c in found.components),
         explanation=Explanation(joined(found.components), ""),
         reason=reason,
         where=where,
         kind=kind_of(site),
-        conditional=family,
-        left=tuple(factor for factor, _ in form.left),
+        family=family,
+        inseparable_terms=tuple(term for term, _ in form.inseparable),
     )
     hyperparameters = search.unread(found.components)
-    if hyperparameters is not None and not found.correction and not form.left:
+    if hyperparameters is not None and not found.outside_family and not form.inseparable:
         explanation = describe.prior_alone(
             found.components, hyperparameters, "from which it is drawn"
         )
@@ -136,16 +136,18 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
-    if update.left:
-        laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
+    if update.inseparable_terms:
+        laws = " and the ".join(
+            dict.fromkeys(f"{f.role} law of {f.site}" for f in update.inseparable_terms)
+        )
         notes.append(
             f"corrected for the {laws} by a Metropolis step on the log joint density and a slice "
             f"sweep: {update.reason}"
         )
         if update.where is not None:
             notes.append(update.where.short)
-    elif update.correction:
-        text = describe.correction_text(form, update.correction)
+    elif update.outside_family:
+        text = describe.correction_text(form, update.outside_family)
         if _may_be_bounded(update):
             notes.append(f"accepted with probability proportional to {text}: {update.reason}")
         else:
@@ -167,7 +169,7 @@ def _known(update: Update, i: int) -> float | None:
 
 def _may_be_bounded(update: Update) -> bool:
     """Whether the correction has a known bound, for whatever sign its coefficients can have."""
-    for (low, high), j in zip(correction_ranges(update), update.correction, strict=True):
+    for (low, high), j in zip(correction_ranges(update), update.outside_family, strict=True):
         total = _known(update, j)
         if (total is None or total > 0.0) and high == math.inf:
             return False
@@ -200,10 +202,10 @@ def _slice(
     return Update(
         block=(unit[0].data[1],),
         components=unit,
-        family="slice",
+        family_name="slice",
         functions=form.functions if form else (),
         coefficients=form.coefficients if form else dict.fromkeys(ROLES, ()),
-        correction=(),
+        outside_family=(),
         bounds=tuple(search.bound[c] for c in unit),
         explanation=explanation,
         reason=why.reason,

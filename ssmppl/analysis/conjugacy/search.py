@@ -19,7 +19,7 @@ from ssmppl.analysis.conjugacy.sufficient import (
     BOUNDED_ROLES,
     BlockForm,
     CompleteData,
-    Factor,
+    JointTerm,
     separate_block,
     shorten,
 )
@@ -35,7 +35,7 @@ class Found:
     components: tuple[Expr, ...]
     form: BlockForm
     family: Family
-    correction: tuple[int, ...]
+    outside_family: tuple[int, ...]
 
 
 class Search:
@@ -94,7 +94,7 @@ class Search:
         found = [self._judged(unit, form, family) for family in candidates]
         good = [f for f in found if isinstance(f, Found)]
         if good:
-            return min(good, key=lambda f: len(f.correction))
+            return min(good, key=lambda f: len(f.outside_family))
         return next(
             (f for f in found if isinstance(f, NotApplicable)), self._outside(form, frozenset())
         )
@@ -113,8 +113,8 @@ class Search:
             return self._outside(form, family.used)
         if not family.used:
             return self._outside(form, frozenset())
-        if form.left and not any(_grows(form, i) for i in family.used):
-            return form.left[0][1]  # nothing but what was left tells of the block
+        if form.inseparable and not any(_grows(form, i) for i in family.used):
+            return form.inseparable[0][1]  # nothing but what was left tells of the block
         return Found(components, form, family, left)
 
     def _outside(self, form: BlockForm, used: frozenset[int]) -> NotApplicable:
@@ -125,14 +125,14 @@ class Search:
         for i in range(len(form.monomials)):
             if i not in used:
                 (growing if _grows(form, i) else others).append(i)
-        if form.left and not growing:
-            return form.left[0][1]
+        if form.inseparable and not growing:
+            return form.inseparable[0][1]
         positions = growing or others or list(range(len(form.functions)))
         if not positions:
             where = self.site(form.components[0]).distribution.location
             reason = f"no density depends on {names}: a constant prior, and no law names it"
             return NotApplicable(reason, where)
-        factor = form.origins[form.monomials[positions[0]]][-1]
+        term = form.origins[form.monomials[positions[0]]][-1]
         text = ", ".join(shorten(to_text(form.functions[i])) for i in positions[:4])
         more = ", ..." if len(positions) > 4 else ""
         laws = sorted(
@@ -141,7 +141,7 @@ class Search:
         return NotApplicable(
             f"{names} enters the {' and the '.join(laws)} through {text}{more}, outside the span "
             "of every family",
-            factor.where,
+            term.where,
         )
 
     # -- blocks
@@ -219,19 +219,19 @@ class Search:
         Otherwise (a prior Normal that is not scaled by the precision) separate updates are exact
         where a joint one would have to reject.
         """
-        for j in found.correction:
+        for j in found.outside_family:
             monomial = found.form.monomials[j]
             if not any(self._refused_alone(c, monomial) for c in found.components):
                 return False
         return all(
-            any(factor is other for c in found.components for other in self._left_alone(c))
-            for factor, _ in found.form.left
+            any(term is other for c in found.components for other in self._left_alone(c))
+            for term, _ in found.form.inseparable
         )
 
-    def _left_alone(self, component: Expr) -> list[Factor]:
+    def _left_alone(self, component: Expr) -> list[JointTerm]:
         unit = next(u for u in self.single if any(component is c for c in u))
         single = self.single[unit]
-        return [factor for factor, _ in single.form.left] if isinstance(single, Found) else []
+        return [term for term, _ in single.form.inseparable] if isinstance(single, Found) else []
 
     def _refused_alone(self, component: Expr, monomial: frozenset) -> bool:
         mine = frozenset((a, e) for a, e in monomial if component in symbols_of(a))
@@ -241,7 +241,7 @@ class Search:
         return any(
             frozenset((a, e) for a, e in single.form.monomials[j] if component in symbols_of(a))
             == mine
-            for j in single.correction
+            for j in single.outside_family
         )
 
     def _scaled(

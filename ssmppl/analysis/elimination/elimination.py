@@ -164,8 +164,8 @@ class _Build:
         """log Z, without what all particles have in common."""
         total = ZERO
         for update, c in self._blocks(self._all(which, carried)):
-            assert update.conditional is not None
-            for part in filter(_of_states, update.conditional.log_normaliser(c)):
+            assert update.family is not None
+            for part in filter(_of_states, update.family.log_normaliser(c)):
                 total = total + part
         return total
 
@@ -182,8 +182,8 @@ class _Build:
         """x drawn with the block drawn first, and the statistics that follow."""
         source, drawn = Draws("eliminated"), dict[Expr, Expr]()
         for update, c in self._blocks(self._all("before", earlier)):
-            assert update.conditional is not None
-            own = update.conditional.written_draw(c, source)
+            assert update.family is not None
+            own = update.family.written_draw(c, source)
             drawn.update(zip(update.components, own, strict=True))
         x = dict(zip(draws, substitute(list(draws.values()), drawn), strict=True))
         carried = (self.sums[k] for k in self.carried)

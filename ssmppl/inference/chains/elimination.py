@@ -188,12 +188,12 @@ class Eliminating(ParameterSteps):
         for update, where in zip(self.updates, self.where, strict=True):
             own = totals[at : at + len(update.functions)].tolist()
             at += len(update.functions)
-            assert update.conditional is not None
-            values = update.conditional.draw([*own, 0.0], generator)
+            assert update.family is not None
+            values = update.family.draw([*own, 0.0], generator)
             if values is None or not np.all(np.isfinite(values)):
                 raise SamplingError(
-                    f"the {update.family} law of {', '.join(update.block)} given the trajectory is "
-                    "improper, and cannot be integrated out",
+                    f"the {update.family_name} law of {', '.join(update.block)} given the "
+                    "trajectory is improper, and cannot be integrated out",
                     fix="give a proper prior, or use eliminate=False",
                     where=update.where,
                 )
@@ -257,14 +257,16 @@ def describe_elimination(found: Eliminable | NotApplicable) -> str:
     """What is eliminated, in words."""
     if isinstance(found, NotApplicable):
         return f"none: {found.reason}"
-    return "; ".join(f"{', '.join(map(repr, u.components))} ({u.family})" for u in found.updates)
+    return "; ".join(
+        f"{', '.join(map(repr, u.components))} ({u.family_name})" for u in found.updates
+    )
 
 
 def explain_elimination(found: Eliminable) -> PlanRows:
     """What `explain` says: what can be eliminated, and why others cannot."""
     rows = [
         (joined(u.components), "integrated out while trajectories are drawn, each particle "
-         f"carrying its statistics: {u.family}")
+         f"carrying its statistics: {u.family_name}")
         for u in found.updates
     ]  # fmt: skip
     refused = found.refused.items()

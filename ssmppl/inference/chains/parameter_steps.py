@@ -101,7 +101,7 @@ def draw_parameters(
         where = steps.where[k]
         rest = ThetaValues(steps.index, theta)
         totals = _totals(steps, k, theta, paths)
-        exact = update.needs_log_joint or update.left
+        exact = update.needs_log_joint or update.inseparable_terms
         density = partial(_with, steps, theta, where, paths=paths) if exact else None
         try:
             values, info = draw(update, totals, theta[where], rest, generator, density)

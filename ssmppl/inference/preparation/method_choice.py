@@ -73,7 +73,7 @@ def choose_sampler(
             f"the model is {kind}, so that its likelihood is exact, and its gradient, where "
             "there is one in closed form, guides the steps"
         )
-    open_ = [c for u in updates if u.conditional is None for c in u.block]
+    open_ = [c for u in updates if u.family is None for c in u.block]
     if not open_:
         if not updates:
             return Gibbs(), (

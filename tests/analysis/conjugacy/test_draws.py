@@ -54,17 +54,17 @@ def compare(conditional, n=1500, thin=None, seed=1):
     """Assert that draws follow the exact conditional; returns how they came about."""
     rng = np.random.default_rng(seed)
     if thin is None:
-        thin = 1 if conditional.update.conditional else 8
+        thin = 1 if conditional.update.family else 8
     draws, infos = conditional.draws(n, rng, thin)
     if thin == 1 and any(info.route == "metropolis" for info in infos):  # they depend on another
         draws, infos = conditional.draws(500, rng, 6)
     assert np.all(np.isfinite(draws))
     update = conditional.update
-    inside = not (update.correction or update.left or sampler_of(update).truncated)
-    if update.family == "joint Normal" and inside:
+    inside = not (update.outside_family or update.inseparable_terms or sampler_of(update).truncated)
+    if update.family_name == "joint Normal" and inside:
         _compare_normal(conditional, draws)
         return infos
-    if isinstance(update.conditional, MatrixNormalWishart):
+    if isinstance(update.family, MatrixNormalWishart):
         assert inside
         more, _ = conditional.draws(10_000, rng)
         _compare_matrix_normal(conditional, np.concatenate([draws, more]))
@@ -112,7 +112,7 @@ def _compare_matrix_normal(conditional, draws):
     Integrated over the numbers, the density as it was written is that of a Wishart law: their
     ratio is the same for all draws, and these are compared with draws by SciPy.
     """
-    family = conditional.update.conditional
+    family = conditional.update.family
     theta, matrix = draws[:, : family.thetas].T, draws[:, family.thetas :].T
     d, e = family.thetas, np.eye(family.thetas)
 

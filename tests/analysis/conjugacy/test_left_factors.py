@@ -1,4 +1,4 @@
-"""Draws where a factor of the prior or the initial law does not separate, and is left to the log
+"""Draws where a term of the prior or the initial law does not separate, and is left to the log
 joint density.
 
 One draw has to leave the exact conditional invariant. The family's own draws, which `test_draws.py`
@@ -186,8 +186,8 @@ def test_a_draw_leaves_the_conditional_invariant(declare):
     model = Model(declare.__name__)
     declare(model)
     data = complete_data(trace(model))
-    (update,) = [u for u in derive_updates(data.trace) if u.left]
-    assert (update.block, update.family) == MODELS[declare]
+    (update,) = [u for u in derive_updates(data.trace) if u.inseparable_terms]
+    assert (update.block, update.family_name) == MODELS[declare]
     rng = np.random.default_rng(seed_of(declare.__name__))
     series = check.random_series(data, rng, steps=2)
     made = (Conditional(data, update, series, k) for k in range(check.POINTS))

@@ -47,9 +47,9 @@ class Written:
     def log_density(self, theta):
         total = 0.0
         for role in self.rows:
-            factors = [f.density for f in self.data.factors if f.role == role and not f.degenerate]
+            terms = [f.density for f in self.data.terms if f.role == role and not f.degenerate]
             size = ROWS if role == "observation" else ROWS - 1 if role == "transition" else 1
-            for value in evaluate(factors, self.values(role, theta)):
+            for value in evaluate(terms, self.values(role, theta)):
                 total += np.sum(np.broadcast_to(value, size))
         return total if np.isfinite(total) else -np.inf
 

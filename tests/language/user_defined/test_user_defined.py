@@ -240,7 +240,7 @@ def test_conjugate_updates_are_found_in_the_density():
     ]
     told = [dict(p.sections())["Parameters given the states"] for p in plans]
     assert told[0] == told[1] == told[2]
-    families = {u.block[0]: u.family for u in plans[1].updates}
+    families = {u.block[0]: u.family_name for u in plans[1].updates}
     assert families == {"tau": "Gamma", "phi": "Normal", "lam": "Gamma"}
 
 
