@@ -18,7 +18,7 @@ from ssmppl.analysis.conjugacy import describe
 from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, MatrixWording, Wording, joined, named
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.search import Found, Search, kind_of
+from ssmppl.analysis.conjugacy.search import Found, Search, block_kind
 from ssmppl.analysis.conjugacy.sufficient import (
     BOUNDED_ROLES,
     NOTHING_MISSING,
@@ -97,7 +97,7 @@ def conjugate_update(search: Search, found: Found) -> Update:
         explanation=Explanation(joined(found.components), ""),
         reason=reason,
         where=where,
-        kind=kind_of(site),
+        kind=block_kind(site),
         family=family,
         inseparable_terms=tuple(term for term, _ in form.inseparable),
     )
@@ -182,7 +182,7 @@ def _slice(
     search: Search, unit: tuple[Expr, ...], why: NotApplicable, use_statistics: bool
 ) -> Update:
     """Slice steps on the exact conditional; through the statistics where it separates."""
-    kind = kind_of(search.site(unit[0]))
+    kind = block_kind(search.site(unit[0]))
     separated = separate_block(search.data, unit) if use_statistics else why
     form = separated if isinstance(separated, BlockForm) else None
     how = {

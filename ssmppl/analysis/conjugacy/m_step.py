@@ -36,7 +36,7 @@ import numpy as np
 from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, joined
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.search import Found, Search, connected, kind_of
+from ssmppl.analysis.conjugacy.search import Found, Search, block_kind, connected
 from ssmppl.analysis.conjugacy.sufficient import (
     NOTHING_MISSING,
     ROLES,
@@ -201,7 +201,7 @@ def _joined(
     ties += [
         frozenset(site.components) & members
         for site in trace.parameters.values()
-        if kind_of(site) != "real"
+        if block_kind(site) != "real"
     ]
     ties += [(symbols_of(bounds) & members) | {c} for c, bounds in search.bound.items()]
     used = frozenset().union(*(symbols_of(f) & members for f in form.functions))

@@ -53,7 +53,7 @@ class Search:
         """What is drawn at least together: a matrix, shares of one whole, else one component."""
         out: list[tuple[Expr, ...]] = []
         for site in self.sites.values():
-            kind = kind_of(site)
+            kind = block_kind(site)
             if kind == "simplex":  # a vector, or each row of a matrix
                 out += [tuple(row) for row in site.value.reshape(-1, site.shape[-1])]
             elif kind == "matrix":
@@ -80,7 +80,7 @@ class Search:
         form = separate_block(self.data, unit, leave=True)
         if not isinstance(form, BlockForm):
             return form
-        kind = kind_of(self.site(unit[0]))
+        kind = block_kind(self.site(unit[0]))
         if kind == "matrix" and len(unit) == 1:  # a precision or a variance
             candidates: list[Family] = [*Gamma.match(unit, form, positive=True)[:1]]
         else:
@@ -288,7 +288,7 @@ def connected(
     return sorted(ordered, key=lambda g: order[g[0]])
 
 
-def kind_of(site: Site) -> str:
+def block_kind(site: Site) -> str:
     support = site.distribution.support().kind
     return {"simplex": "simplex", "positive definite": "matrix"}.get(support, "real")
 

@@ -53,7 +53,7 @@ def natural_bounds(update: Update) -> list[Interval]:
     return [WHOLE] * len(update.components) if family is None else family.support
 
 
-def constant_bounds(update: Update) -> list[Interval | None]:
+def update_bounds(update: Update) -> list[Interval | None]:
     """The bounds of each component that are numbers; None where one depends on a parameter."""
     return [
         (low.data, high.data) if low.op == high.op == "const" else None
@@ -63,6 +63,6 @@ def constant_bounds(update: Update) -> list[Interval | None]:
 
 def correction_ranges(update: Update) -> list[Interval]:
     """An enclosure of each function that the family does not hold, over the bounds."""
-    bounds = zip(update.components, constant_bounds(update), strict=True)
+    bounds = zip(update.components, update_bounds(update), strict=True)
     known = {c: WHOLE if b is None else b for c, b in bounds}
     return [interval(update.functions[j], known) for j in update.outside_family]

@@ -59,7 +59,7 @@ from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.updates.slices import comparable
-from ssmppl.language.model.transforms import constant_bounds, free_number, transforms, unconstrain
+from ssmppl.language.model.transforms import free_number, parameter_bounds, transforms, unconstrain
 
 Paths = list[np.ndarray]
 _NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
@@ -379,7 +379,7 @@ def _refused(found: NotApplicable) -> ArgumentError:
     )
 
 
-def interweaving(
+def prepare_interweaving(
     setup: SamplingSetup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
 ) -> tuple[Interweaving | None, str]:
     """The further steps of a method's chains, and in words what they are or why there are none.
@@ -421,7 +421,7 @@ def interweaving(
     if not len(movable):
         return None, "none: no free parameter is in the law of a state"
     looking = 0 if setting is True else min(int(LOOK * adapting), LONGEST_LOOK)
-    bounds = constant_bounds(setup.problem.trace)
+    bounds = parameter_bounds(setup.problem.trace)
     steps = Interweaving(space, tuple(moves), movable, pilot.scale, adapting, looking, bounds)
     moved = ", ".join(dict.fromkeys(owner[space.where[k]] for k in movable))
     who = f"those slow in the plain chain, of {moved}" if looking else moved

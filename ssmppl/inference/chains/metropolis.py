@@ -111,7 +111,7 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
-    d, free, order = len(where), free_components(problem.trace, setup.held), method.order
+    d, free, order = len(where), free_components(problem.trace, setup.fixed), method.order
     if order is None:
         cheap = isinstance(exact, Deterministic) and d > 2
         order = int(cheap and not _without_gradient(exact, setup, free))

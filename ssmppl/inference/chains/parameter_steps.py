@@ -21,7 +21,7 @@ from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import without_density
+from ssmppl.inference.run.ranges import law_without_density_at
 from ssmppl.inference.updates.conjugate_draw import draw
 
 
@@ -106,7 +106,7 @@ def draw_parameters(
         try:
             values, info = draw(update, totals, theta[where], rest, generator, density)
         except SamplingError as error:
-            none = without_density(steps.problem.trace, theta)
+            none = law_without_density_at(steps.problem.trace, theta)
             if none is None:
                 raise
             raise SamplingError(f"{error.found}; {none[0]}", fix=none[1], where=none[2]) from None

@@ -41,14 +41,14 @@ ELIMINATED = "Eliminated in PGAS, where asked for"
 class SamplingSetup:
     """A call of `sample`, checked.
 
-    space : the free parameters, at the values near which to begin. held : the fixed ones.
+    space : the free parameters, at the values near which to begin. fixed : values of the others.
     chains, warmup, thin, states : as in `sample`. root : of all random numbers of the call.
     checkpoint : keeps the chains, and by name what was found before they began.
     """
 
     problem: Problem
     space: Space
-    held: dict[str, np.ndarray]
+    fixed: dict[str, np.ndarray]
     chains: int
     warmup: int
     thin: int

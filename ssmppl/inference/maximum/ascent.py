@@ -207,13 +207,13 @@ class Maximization:
     """The question: a problem, its free parameters, and what is to be maximised.
 
     objective : "likelihood", or "posterior" for log likelihood + log prior density of theta.
-    held : values of the fixed parameters; near : those to start from, by name.
+    fixed : values of the fixed parameters; near : those to start from, by name.
     """
 
     problem: Problem
     space: Space
     objective: str
-    held: dict[str, np.ndarray]
+    fixed: dict[str, np.ndarray]
     near: dict[str, np.ndarray]
     root: np.random.SeedSequence
     executor: Executor | None = None
@@ -255,7 +255,7 @@ class Maximization:
         moderate values at which it is finite; else the pilot's mode.
         """
         z = self.space.z[self.space.where]
-        free = set(self.problem.trace.parameters) - set(self.held)
+        free = set(self.problem.trace.parameters) - set(self.fixed)
         if free <= set(self.near) or not len(z):
             return z
         if isinstance(self.exact, NotApplicable):

@@ -144,11 +144,11 @@ class Deterministic(Scored):
     def _complete(self, data: tuple[Experiment, ...], wanted: np.ndarray) -> CompleteScores:
         symbols = self.trace.parameter_symbols
         free = {s.data[1] for s, w in zip(symbols, wanted, strict=True) if w}
-        held = frozenset(self.trace.parameters) - free
+        fixed = frozenset(self.trace.parameters) - free
         problem = self._problem(data)
-        key = held, problem.program.missing
+        key = fixed, problem.program.missing
         if key not in self._scores:
-            found = complete_scores(problem, held)
+            found = complete_scores(problem, fixed)
             if "score" in found.differences:
                 raise ArgumentError(
                     f"the states have no derivatives in closed form: {found.differences['score']}",

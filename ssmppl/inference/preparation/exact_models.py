@@ -65,7 +65,7 @@ def filter_name(model: ExactModel) -> str:
     return FILTER_NAME[type(model)]
 
 
-def kind_of(model: ExactModel | NotApplicable) -> str | NotApplicable:
+def exact_kind(model: ExactModel | NotApplicable) -> str | NotApplicable:
     """ "linear Gaussian", "of finitely many states" or "without noise in its states"; of a model
     that is not exact, why not."""
     return model if isinstance(model, NotApplicable) else KIND[type(model)]

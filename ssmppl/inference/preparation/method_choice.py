@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.proposals.smooth import smooth_filter_applies
-from ssmppl.analysis.structure import deterministic_memory, noisy_start, without_density
+from ssmppl.analysis.structure import deterministic_memory, noisy_start, singular_covariance
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.methods.methods import (
     IF2,
@@ -157,7 +157,7 @@ def choose_maximiser(
             "for one scalar state a particle filter's likelihood can be made continuous in the "
             "parameters"
         )
-    singular = without_density(trace)
+    singular = singular_covariance(trace)
     if singular is not None:
         return IF2(), f"{singular.reason}: iterated filtering, which needs none"
     if deterministic_memory(trace) is None and not noisy_start(trace):
@@ -178,7 +178,7 @@ def choose_smoother(
 ) -> tuple[KalmanSmoother | ForwardBackward | FFBSi, str]:
     """The method of `smooth` for a model of this kind, and the reason."""
     if isinstance(kind, NotApplicable):
-        singular = without_density(trace)
+        singular = singular_covariance(trace)
         if singular is not None:
             return FFBSi(kernel="genealogy"), (
                 f"{singular.reason}: the ancestors of the filter's own particles, which need none"

@@ -168,7 +168,7 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
     """
     least, stuck = 1.0, []
     kept = "path_0" in result[0].draws
-    draws = min(len(c.draws["path_0"]) if kept else c.state.watch.draws for c in result)
+    draws = min(len(c.draws["path_0"]) if kept else c.state.path_movement.draws for c in result)
     if draws < 2:
         return {}
     for i, e in enumerate(problem.experiments):
@@ -176,7 +176,7 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
         if kept:
             rate, ever, apart = movement([c.draws[f"path_{i}"] for c in result])
         else:
-            rate, ever, apart = watched_movement([c.state.watch for c in result], i)
+            rate, ever, apart = watched_movement([c.state.path_movement for c in result], i)
         # a continuous one that stands still is never right
         counted = free & (~discrete | (apart > STUCK_APART))
         varied = free & ever

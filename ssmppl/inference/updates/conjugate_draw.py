@@ -29,9 +29,9 @@ from ssmppl.analysis.conjugacy.family import Limits, Values
 from ssmppl.analysis.conjugacy.matrix_families import size_of_matrix
 from ssmppl.analysis.conjugacy.update import (
     Update,
-    constant_bounds,
     correction_ranges,
     natural_bounds,
+    update_bounds,
 )
 from ssmppl.analysis.lambdify import DOMAIN, python_function, python_sum
 from ssmppl.errors import SamplingError
@@ -71,7 +71,7 @@ class Sampler:
         self.correct = _guarded(
             python_sum([functions[j] for j in update.outside_family], components)
         )
-        self.bounds = constant_bounds(update)
+        self.bounds = update_bounds(update)
         self.open_bounds = [
             (i, *_open_bounds(b))
             for i, (b, fixed) in enumerate(zip(update.bounds, self.bounds, strict=True))

@@ -21,7 +21,7 @@ from ssmppl.analysis.structure import (
     LinearGaussian,
     deterministic_memory,
     linear_gaussian,
-    without_density,
+    singular_covariance,
 )
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
@@ -29,7 +29,7 @@ from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
-from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import (
     choose_maximiser,
     choose_sampler,
@@ -113,7 +113,7 @@ class Plan:
             out.append(("Particle filter", rows))
             out.append((TRAJECTORIES, of_methods.pop(TRAJECTORIES)))
         out.append(("Chosen, unless a method is named", self._choices()))
-        singular = without_density(t)
+        singular = singular_covariance(t)
         if singular is not None:
             out.append(("Parameters given the states", [("none", reason_and_line(singular))]))
         elif self.updates and noisy:
@@ -143,14 +143,14 @@ class Plan:
         return name, proposal.explanation
 
     def _choices(self) -> list[tuple[str, str]]:
-        kind = kind_of(exact_model(self.trace))
+        kind = exact_kind(exact_model(self.trace))
         choices: dict[str, tuple[Any, str]] = {
             "sample": choose_sampler(
                 kind,
                 self.updates,
                 self._numbers(),
                 why_stuck(self.trace, self.rows),
-                without_density(self.trace),
+                singular_covariance(self.trace),
             )
         }
         if self.trace.parameters:

@@ -70,14 +70,14 @@ def parameters_of(trace: Trace, posterior: Any) -> np.ndarray:
     ArgumentError : a parameter is neither drawn nor held.
     """
     fixed = posterior.attrs.get("fixed", "{}")
-    held = check_values(trace, json.loads(fixed) if isinstance(fixed, str) else fixed)
+    fixed_values = check_values(trace, json.loads(fixed) if isinstance(fixed, str) else fixed)
     shape = (posterior.sizes["chain"], posterior.sizes["draw"])
     values: dict[str, np.ndarray] = {}
     for name, site in trace.parameters.items():
         if name in posterior:
             values[name] = _drawn(posterior, name, site.shape, ())
-        elif name in held:
-            values[name] = np.broadcast_to(held[name], (*shape, *site.shape))
+        elif name in fixed_values:
+            values[name] = np.broadcast_to(fixed_values[name], (*shape, *site.shape))
         else:
             raise ArgumentError(
                 f"the posterior has no parameter {name!r}",

@@ -120,7 +120,7 @@ def watched(paths, waiting=3):
 
 
 def made_up_without_paths(paths):
-    states = [PGASState(*[None] * 4, watch=w) for w in watched(paths)]
+    states = [PGASState(*[None] * 4, path_movement=w) for w in watched(paths)]
     return [ChainDraws({"theta": np.zeros((len(p), 1))}, {}, {}, s)
             for p, s in zip(paths, states, strict=True)]  # fmt: skip
 
