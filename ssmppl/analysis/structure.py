@@ -14,7 +14,7 @@ from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, constant, depends_on, substitute, symbols_of
 from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 
 @dataclass(frozen=True)

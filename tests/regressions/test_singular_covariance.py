@@ -19,7 +19,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, topological
 from ssmppl.language.model.covariances import find_root
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 DT, ROWS = 0.5, 40
 F = np.array([[1.0, DT], [0.0, 1.0]])

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.inference.chains import elimination, gibbs, metropolis_kernel, parameter_steps, pgas
+from ssmppl.inference.chains import elimination, gibbs, gibbs_updates, metropolis_kernel, pgas
 from ssmppl.inference.chains.interweaving import NoiseMove
 from ssmppl.inference.preparation.space import Space
 
@@ -97,7 +97,7 @@ def others_old(original):
         before, infos = theta.copy(), []
         for update in steps.updates:
             own = before.copy()
-            alone = parameter_steps.ParameterSteps(steps.problem, (update,))
+            alone = gibbs_updates.GibbsUpdates(steps.problem, (update,))
             infos += original(alone, own, paths, generator)
             where = alone.where[0]
             theta[where] = own[where]
@@ -216,14 +216,14 @@ MUTANTS = {
     for m in (
         Mutant("data never renewed", "counts PGAS",
                ((Transitions, "data", lambda _: lambda made, theta, path: None),)),
-        Mutant("one row forgotten", "counts PGAS", ((parameter_steps, "draw", row_forgotten),)),
+        Mutant("one row forgotten", "counts PGAS", ((gibbs_updates, "draw", row_forgotten),)),
         Mutant("one row forgotten, exact states", "delay Gibbs",
-               ((parameter_steps, "draw", row_forgotten),)),
-        Mutant("wrong rate", "delay Gibbs", ((parameter_steps, "_totals", rate_wrong),)),
+               ((gibbs_updates, "draw", row_forgotten),)),
+        Mutant("wrong rate", "delay Gibbs", ((gibbs_updates, "_totals", rate_wrong),)),
         Mutant("stationary initial law forgotten", "proper_varves PGAS",
-               ((parameter_steps, "draw", correction_forgotten),)),
+               ((gibbs_updates, "draw", correction_forgotten),)),
         Mutant("prior's factors forgotten", "bounded PGAS",
-               ((parameter_steps, "draw", correction_forgotten),)),
+               ((gibbs_updates, "draw", correction_forgotten),)),
         Mutant("given the other blocks of before", "vector_ar_apart Gibbs",
                ((gibbs, "draw_parameters", others_old),)),
         Mutant("given the trajectory of before", "leverage PGAS",

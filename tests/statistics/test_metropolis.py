@@ -16,7 +16,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.expressions.expr import constant
 from ssmppl.inference.chains import gibbs
-from ssmppl.inference.chains.parameter_steps import draw_parameters
+from ssmppl.inference.chains.gibbs_updates import draw_parameters
 
 from .checks import (
     MCSE,

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, JointTerm, shorten
+from ssmppl.analysis.conjugacy.separation import ROLES, BlockForm, JointTerm, shorten
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import Separation, affine, separate
 from ssmppl.expressions.arrays import ExprArray, array
@@ -28,7 +28,7 @@ from ssmppl.expressions.expr import (
     topological,
 )
 from ssmppl.language import distributions as laws
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 MAX_STATISTICS = 12
 MAX_NAMES = 6  # of a block

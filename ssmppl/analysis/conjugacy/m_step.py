@@ -1,6 +1,6 @@
 """Both steps of expectation maximisation, derived.
 
-The complete-data log density is separated jointly in all free parameters (`sufficient.py`), so that
+The complete-data log density is separated jointly in all free parameters (`separation.py`), so that
 
     Q(theta) = sum_i S_i s_i(theta),        S_i = E[C_i | y],
 
@@ -33,11 +33,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, joined
 from ssmppl.analysis.conjugacy.family import Family
+from ssmppl.analysis.conjugacy.numerical_check import verify
 from ssmppl.analysis.conjugacy.search import Found, Search, block_kind, connected
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.separation import (
     NOTHING_MISSING,
     ROLES,
     BlockForm,
@@ -53,7 +53,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import Expr, constant, depends_on, symbol, symbols_of, to_text
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 IN_TIME = ("initial", "transition", "observation")
 

@@ -15,7 +15,7 @@ import numpy as np
 from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.conjugacy.families import SCALED, SINGLE, Gamma, Normal
 from ssmppl.analysis.conjugacy.family import Family, ScaledFamily
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.separation import (
     BOUNDED_ROLES,
     BlockForm,
     CompleteData,
@@ -25,7 +25,7 @@ from ssmppl.analysis.conjugacy.sufficient import (
 )
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ssmppl.analysis.bounds import WHOLE, Interval, interval
 from ssmppl.analysis.conjugacy.describe import Explanation
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.sufficient import JointTerm
+from ssmppl.analysis.conjugacy.separation import JointTerm
 from ssmppl.errors import Location
 from ssmppl.expressions.expr import Expr
 

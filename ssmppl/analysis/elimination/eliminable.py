@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from ssmppl.analysis.conjugacy.check import verify
-from ssmppl.analysis.conjugacy.conjugacy import conjugate_update
+from ssmppl.analysis.conjugacy.derive import conjugate_update
 from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.conjugacy.families import Gamma, NormalGamma
 from ssmppl.analysis.conjugacy.family import Family
+from ssmppl.analysis.conjugacy.numerical_check import verify
 from ssmppl.analysis.conjugacy.search import Found, Search
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.separation import (
     BlockForm,
     CompleteData,
     complete_data,
@@ -25,7 +25,7 @@ from ssmppl.analysis.conjugacy.update import Update, natural_bounds
 from ssmppl.analysis.density import Missing
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 LARGEST = 8  # numbers that are jointly Normal: their Cholesky factor is written out
 

@@ -1,7 +1,7 @@
 """Parameters that conditional SMC integrates out, on the way from one trajectory to the next.
 
 Given the states, a block of parameters with a conjugate family has log density sum_i C_i s_i, with
-statistics C that are sums over time (`sufficient.py`). So the states without the block have
+statistics C that are sums over time (`separation.py`). So the states without the block have
 
     p(x_{1:t}, y_{1:t}) = Z(C_prior + sum_{k <= t} c_k) prod_{k <= t} r_k,
 
@@ -39,7 +39,7 @@ from ssmppl.expressions.algebra import ONE, Separation, separate
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol, symbols_of
 from ssmppl.language.distributions import Dirac, Draws
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 COLUMNS = ("before", "moved", "now", "whole")  # of the base: see `Elimination.columns`
 INFINITY = float("inf")

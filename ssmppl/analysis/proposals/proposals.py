@@ -52,7 +52,7 @@ from ssmppl.expressions.expr import (
 from ssmppl.language.distributions import Draws
 from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite
-from ssmppl.language.model.traced import Site, Trace, seen
+from ssmppl.language.model.trace import Site, Trace, seen
 
 NEWTON_STEPS = 3
 LONGEST_STEP = 2.0  # in standard deviations of the transition

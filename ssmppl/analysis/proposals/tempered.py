@@ -15,7 +15,7 @@ from ssmppl.analysis.structure import deterministic, flat_start, singular_covari
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, depends_on, symbols_of
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 MOVABLE = ("real", "interval")  # supports that a random walk can move about in
 

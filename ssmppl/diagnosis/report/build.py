@@ -27,7 +27,7 @@ from ssmppl.diagnosis.selection.fit import Fit, Fitter, bounds_note
 from ssmppl.diagnosis.selection.refit import Refit, standard_errors
 from ssmppl.errors import SSMError
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 CLEARLY = 2.0  # standard errors
 MATTERS = 0.15  # share of the gap that the catalogue must leave before it is "none of these"

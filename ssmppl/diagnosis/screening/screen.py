@@ -39,7 +39,7 @@ from ssmppl.diagnosis.screening.statistics import information_scale, typical_squ
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Distribution, Flat
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.trace import Site, Trace, symbols
 
 OWN_RUNS = 6  # passes over the data themselves, which show the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through

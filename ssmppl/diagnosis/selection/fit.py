@@ -46,8 +46,8 @@ from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
 from ssmppl.inference.preparation.space import Space, at, space_of
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.transforms import transforms

@@ -36,7 +36,7 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.inference.chains.parameter_steps import ParameterSteps, ThetaValues
+from ssmppl.inference.chains.gibbs_updates import GibbsUpdates, ThetaValues
 from ssmppl.inference.chains.sampling import PlanRows, reason_and_line
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.run.problem import Problem
@@ -66,7 +66,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Eliminating(ParameterSteps):
+class Eliminating(GibbsUpdates):
     """Sweeps without the parameters of `updates`. adapting : sweeps of the warmup."""
 
     particles: int

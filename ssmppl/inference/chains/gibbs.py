@@ -16,6 +16,12 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.chains.gibbs_updates import (
+    GibbsUpdates,
+    draw_parameters,
+    log_joint,
+    plan_updates,
+)
 from ssmppl.inference.chains.interweaving import (
     Interweaving,
     InterweavingTuning,
@@ -23,12 +29,6 @@ from ssmppl.inference.chains.interweaving import (
     prepare_interweaving,
 )
 from ssmppl.inference.chains.metropolis import needed_model
-from ssmppl.inference.chains.parameter_steps import (
-    ParameterSteps,
-    draw_parameters,
-    log_joint,
-    plan_updates,
-)
 from ssmppl.inference.chains.sampling import (
     INTERWEAVED,
     Derived,
@@ -57,7 +57,7 @@ class GibbsState:
 
 
 @dataclass(frozen=True)
-class GibbsSteps(ParameterSteps):
+class GibbsSweeper(GibbsUpdates):
     """A problem with its updates. interweaving : the further steps of a sweep."""
 
     interweaving: Interweaving | None = None
@@ -81,7 +81,7 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
     interweaving, interweaved = prepare_interweaving(setup, method.interweave, pilot, model)
-    steps = GibbsSteps(problem, plan_updates(problem, setup.fixed), interweaving)
+    steps = GibbsSweeper(problem, plan_updates(problem, setup.fixed), interweaving)
     starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
     for chain, z in enumerate(starts):
@@ -100,7 +100,7 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
 
 
 def gibbs_block(
-    steps: GibbsSteps, thin: int, with_paths: bool, state: GibbsState, n: int
+    steps: GibbsSweeper, thin: int, with_paths: bool, state: GibbsState, n: int
 ) -> tuple[GibbsState, Block]:
     """n draws of one chain, each after `thin` sweeps; with_paths : whether with trajectories."""
     model = needed_model(steps.problem, "Gibbs")
@@ -131,7 +131,7 @@ def gibbs_block(
 
 
 def draw_paths(
-    steps: ParameterSteps, model: ExactModel, theta: np.ndarray, stream: np.ndarray
+    steps: GibbsUpdates, model: ExactModel, theta: np.ndarray, stream: np.ndarray
 ) -> list[np.ndarray]:
     """Independent trajectories (T, D), one per experiment, from p(x_{1:T} | y_{1:T}, theta)."""
     experiments = steps.problem.experiments

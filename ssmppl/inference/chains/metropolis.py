@@ -35,8 +35,8 @@ from ssmppl.inference.preparation.exact_models import (
 )
 from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.preparation.pilot import Pilot, find_mode
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import check_mode
-from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.problem import Problem
 
 

@@ -26,7 +26,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.problem import Problem
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 from ssmppl.language.model.transforms import transforms
 
 SCALES = ("unconstrained", "natural", "log", "reciprocal")

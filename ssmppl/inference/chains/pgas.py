@@ -23,6 +23,12 @@ from ssmppl.inference.chains.elimination import (
     explain_elimination,
     requested_elimination,
 )
+from ssmppl.inference.chains.gibbs_updates import (
+    GibbsUpdates,
+    draw_parameters,
+    log_joint,
+    plan_updates,
+)
 from ssmppl.inference.chains.interweaving import (
     Interweaving,
     InterweavingTuning,
@@ -30,12 +36,6 @@ from ssmppl.inference.chains.interweaving import (
     prepare_interweaving,
     requested_noises,
     with_states,
-)
-from ssmppl.inference.chains.parameter_steps import (
-    ParameterSteps,
-    draw_parameters,
-    log_joint,
-    plan_updates,
 )
 from ssmppl.inference.chains.sampling import (
     ELIMINATED,
@@ -55,8 +55,8 @@ from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.preparation.proposal_choice import choose_for_csmc
+from ssmppl.inference.run.convergence import PathMovement, update_rate_attributes
 from ssmppl.inference.run.draws import Block
-from ssmppl.inference.run.mixing import PathMovement, update_rate_attributes
 from ssmppl.inference.run.problem import Problem
 
 PARTICLES = 25
@@ -124,7 +124,7 @@ def csmc_settings(problem: Problem, particles: int | None, proposal: str) -> Fil
 
 
 @dataclass(frozen=True)
-class Sweeper(ParameterSteps):
+class Sweeper(GibbsUpdates):
     """A problem with its updates: what one iteration of PGAS needs.
 
     settings : of the conditional particle filter. interweaving : the further steps of a sweep.

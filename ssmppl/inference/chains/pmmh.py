@@ -68,8 +68,8 @@ from ssmppl.inference.preparation.pilot import (
     tune_particles,
 )
 from ssmppl.inference.preparation.proposal_choice import Choice, choose_by_pilot
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 
 LEAST_EIGENVALUE, MOST_EIGENVALUE = 0.2, 5.0  # of the information, in units of the pilot's

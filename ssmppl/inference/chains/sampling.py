@@ -24,7 +24,7 @@ from ssmppl.inference.run.draws import Block, ChainDraws, Checkpoint
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 Result = TypeVar("Result")
 DrawnChains = Sequence[ChainDraws[Any]]

@@ -33,8 +33,8 @@ from ssmppl.expressions.expr import Expr, constant
 from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.histories import Histories, histories
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
-from ssmppl.inference.run.ranges import law_without_density_at
-from ssmppl.language.model.traced import Trace, once_per_trace, previous
+from ssmppl.inference.run.invalid_laws import law_without_density_at
+from ssmppl.language.model.trace import Trace, once_per_trace, previous
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
 HALVINGS = 200  # of an interval between any two floats that differ in size by less than 1e40

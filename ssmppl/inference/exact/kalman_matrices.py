@@ -18,8 +18,8 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.inference.run.ranges import law_without_density_at, total_of
-from ssmppl.language.model.traced import Trace, previous
+from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
+from ssmppl.language.model.trace import Trace, previous
 
 CAUSE = {
     kernel.NOT_COVARIANCE: (

@@ -32,11 +32,11 @@ from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
 from ssmppl.inference.preparation.exact_score import exact_score
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import without_maximum
-from ssmppl.inference.run.estimate import free_components
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 
 SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of the likelihood

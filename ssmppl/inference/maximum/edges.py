@@ -21,7 +21,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.inference.maximum.ascent import Maximization
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 from ssmppl.language.model.transforms import Transform, transforms, unconstrain
 
 OUTWARDS = (1.0, 4.0)  # steps on the unconstrained scale

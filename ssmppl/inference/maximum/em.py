@@ -48,7 +48,7 @@ from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import filter_name
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.updates.symbolic_newton import Unconstrained
-from ssmppl.language.model.traced import Trace, previous, seen
+from ssmppl.language.model.trace import Trace, previous, seen
 
 
 def maximise_expectation(

@@ -53,9 +53,9 @@ from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import Space, space_of
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import Block, stack
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 

@@ -21,8 +21,8 @@ import numpy as np
 import scipy
 
 from ssmppl.analysis.conjugacy.m_step import MStep, counted, derive_m_step, unsuited
-from ssmppl.analysis.conjugacy.sufficient import complete_data, restricted
-from ssmppl.codegen.modules.trajectories import compile_statistics
+from ssmppl.analysis.conjugacy.separation import complete_data, restricted
+from ssmppl.codegen.modules.trajectory_sums import compile_statistics
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.maximum.ascent import (

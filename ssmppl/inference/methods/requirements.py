@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ssmppl.analysis.structure import linear_gaussian, singular_covariance
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 WITHOUT = {  # what to use instead: of a linear Gaussian model, and of others
     "sample": ("ssm.MetropolisHastings()", "ssm.PMMH()"),

@@ -30,8 +30,8 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
+from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import law_without_density_at, total_of
 
 __all__ = [
     "KERNELS",

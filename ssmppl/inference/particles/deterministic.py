@@ -28,10 +28,10 @@ from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.particles.scores import CompleteScores, complete_scores
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem, missing_of
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import Trace, once_per_trace
+from ssmppl.language.model.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)

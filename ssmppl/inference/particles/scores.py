@@ -24,7 +24,7 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.score import CompleteScore
-from ssmppl.codegen.modules.trajectories import ScoreProgram, compile_score
+from ssmppl.codegen.modules.trajectory_sums import ScoreProgram, compile_score
 from ssmppl.compiling import once_property
 from ssmppl.data import spelled
 from ssmppl.errors import ArgumentError, SamplingError

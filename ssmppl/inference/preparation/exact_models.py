@@ -12,7 +12,7 @@ from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.particles.deterministic import Deterministic, deterministic_model
 from ssmppl.inference.run.problem import EXACT
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 ExactModel = KalmanModel | HiddenMarkov | Deterministic
 

@@ -23,7 +23,7 @@ from ssmppl.inference.methods.methods import (
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import KIND
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
 FEW = 6  # numbers that a random walk moves at once without trouble

@@ -22,8 +22,8 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood
 from ssmppl.inference.preparation.space import Region, Space
+from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import EXACT, Problem
-from ssmppl.inference.run.ranges import law_without_density_at
 from ssmppl.inference.run.seeds import random_state
 
 PILOT_PARTICLES = 200

@@ -10,6 +10,7 @@ import numpy as np
 from ssmppl.data import unpack_parameters
 from ssmppl.inference.preparation.initial_values import ordinary_values
 from ssmppl.inference.run.problem import Problem
+from ssmppl.language.model.trace import Trace
 from ssmppl.language.model.transforms import transforms, unconstrain
 
 
@@ -79,3 +80,8 @@ def at(space: Space, theta: np.ndarray) -> Space:
     """The same space with other values of the parameters to stand on."""
     values = unpack_parameters(space.problem.trace, theta)
     return replace(space, theta=theta, z=unconstrain(space.problem.trace, theta, values))
+
+
+def free_components(trace: Trace, fixed: dict[str, np.ndarray]) -> np.ndarray:
+    """(P,) which components of theta belong to parameters that are not fixed."""
+    return np.array([s.data[1] not in fixed for s in trace.parameter_symbols], dtype=bool)

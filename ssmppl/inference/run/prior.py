@@ -10,7 +10,7 @@ from ssmppl.analysis.proposals.proposals import drawn
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 def draw_prior(

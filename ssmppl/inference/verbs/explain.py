@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssmppl import markup
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
@@ -39,9 +39,9 @@ from ssmppl.inference.preparation.method_choice import (
 from ssmppl.inference.run.problem import missing_of
 from ssmppl.inference.verbs.sample import METHODS
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 from ssmppl.language.model.transforms import transforms
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 PAGE = 100  # columns
 LONGEST_LAW = 600  # characters of a law, some six lines

@@ -24,6 +24,7 @@ from ssmppl.inference.maximum import (
 )
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.edges import Edges, edges
+from ssmppl.inference.maximum.estimate import NO_METHOD, Estimate, make_estimate
 from ssmppl.inference.methods.methods import (
     EM,
     IF2,
@@ -39,8 +40,7 @@ from ssmppl.inference.preparation.exact_models import exact_kind
 from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.method_choice import choose_maximiser, start_as_parameter
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
-from ssmppl.inference.preparation.space import space_of
-from ssmppl.inference.run.estimate import NO_METHOD, Estimate, free_components, make_estimate
+from ssmppl.inference.preparation.space import free_components, space_of
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence

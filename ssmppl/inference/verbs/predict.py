@@ -28,8 +28,8 @@ from ssmppl.inference.run.prior import draw_prior
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.simulate import check_drawable, check_finite, check_samplers, feeds_back
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Trace
+from ssmppl.language.tracing import trace
 from ssmppl.results import time_axes, to_inference_data
 
 # Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.

@@ -16,7 +16,7 @@ from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
-from ssmppl.inference.chains.parameter_steps import plan_updates
+from ssmppl.inference.chains.gibbs_updates import plan_updates
 from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
 from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec
@@ -25,12 +25,11 @@ from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, Me
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
-from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.preparation.space import free_components, space_of
+from ssmppl.inference.run.convergence import mixing_attributes
 from ssmppl.inference.run.draws import stack
-from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, observes
-from ssmppl.inference.run.mixing import mixing_attributes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.language.model.model import Model

@@ -13,6 +13,7 @@ import numpy as np
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.maximum.estimate import by_name, table
 from ssmppl.inference.particles.scores import (
     ParticleScore,
     Smoothing,
@@ -24,7 +25,7 @@ from ssmppl.inference.particles.scores import (
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
-from ssmppl.inference.run.estimate import by_name, free_components, table
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence

@@ -40,13 +40,13 @@ from ssmppl.inference.preparation.method_choice import choose_smoother
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.labels import component_dims, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_levels
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.check import verify
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
-from ssmppl.analysis.conjugacy.sufficient import complete_data
+from ssmppl.analysis.conjugacy import numerical_check
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.analysis.conjugacy.numerical_check import verify
+from ssmppl.analysis.conjugacy.separation import complete_data
 from ssmppl.expressions.expr import to_text
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 
 
@@ -146,14 +146,14 @@ def test_the_search_for_the_line_of_a_fault_passes_infinite_densities():
     (update,) = derive_updates(data.trace)
     p = next(iter(update.components))
     rows = [
-        {**row, p: np.full(check.POINTS, 50.0)}
-        for row in check.random_series(data, np.random.default_rng(1))
+        {**row, p: np.full(numerical_check.POINTS, 50.0)}
+        for row in numerical_check.random_series(data, np.random.default_rng(1))
     ]
     for row in rows:
-        row.update({s: np.zeros(check.POINTS) for s in data.trace.observation_symbols})
-    changed = {p: np.full(check.POINTS, 60.0)}
+        row.update({s: np.zeros(numerical_check.POINTS) for s in data.trace.observation_symbols})
+    changed = {p: np.full(numerical_check.POINTS, 60.0)}
     (line,) = {f.where for f in data.holding([p]) if f.role == "observation"}
-    assert check._culprit(data, update, rows, changed) in (None, line)
+    assert numerical_check._culprit(data, update, rows, changed) in (None, line)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -165,10 +165,15 @@ def test_statistics_of_both_infinities_are_no_number():
     model.observation(lambda x, m: {"y": ssm.Normal(m + x, sd=1)})
     data = complete_data(trace(model))
     (update,) = derive_updates(data.trace)
-    rows = check.random_series(data, np.random.default_rng(1))
+    rows = numerical_check.random_series(data, np.random.default_rng(1))
     for t, row in enumerate(rows):
-        row.update({s: np.full(check.POINTS, (-1) ** t * np.inf) for s in data.trace.state_symbols})
-    assert np.isnan(check.summed_statistics(update, rows)).any()
+        row.update(
+            {
+                s: np.full(numerical_check.POINTS, (-1) ** t * np.inf)
+                for s in data.trace.state_symbols
+            }
+        )
+    assert np.isnan(numerical_check.summed_statistics(update, rows)).any()
 
 
 @pytest.mark.parametrize("bounds", [(-1, 20), (-20, 1), (-0.1, np.inf), (-np.inf, 0.1)])

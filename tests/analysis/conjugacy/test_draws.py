@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy import numerical_check
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.matrix_families import MatrixNormalWishart
-from ssmppl.analysis.conjugacy.sufficient import complete_data
-from ssmppl.inference.updates.conjugate_draw import sampler_of
-from ssmppl.language.trace import trace
+from ssmppl.analysis.conjugacy.separation import complete_data
+from ssmppl.inference.updates.draw_update import sampler_of
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 from tests.analysis.conjugacy.exact import Conditional, kolmogorov_smirnov, matrices
 
@@ -41,11 +41,11 @@ def conditionals(model, seed=0):
     t = trace(model)
     data = complete_data(t)
     rng = np.random.default_rng(seed)
-    series = check.random_series(data, rng, steps=8)
+    series = numerical_check.random_series(data, rng, steps=8)
     for update in derive_updates(t):
         yield next(
             c
-            for k in range(check.POINTS)
+            for k in range(numerical_check.POINTS)
             if np.isfinite((c := Conditional(data, update, series, k)).log_joint(c.current))
         )
 

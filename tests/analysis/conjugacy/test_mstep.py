@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from ssmppl.analysis.conjugacy.check import random_series
 from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step
-from ssmppl.analysis.conjugacy.sufficient import complete_data
+from ssmppl.analysis.conjugacy.numerical_check import random_series
+from ssmppl.analysis.conjugacy.separation import complete_data
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
@@ -16,7 +16,7 @@ from ssmppl.language.distributions import Normal as NormalLaw
 from ssmppl.language.distributions import Uniform
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms, unconstrain
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 from tests.statistics.checks import seed_of
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
-from ssmppl.inference.updates.conjugate_draw import draw
-from ssmppl.language.trace import trace
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.inference.updates.draw_update import draw
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.near_misses import NEAR_MISSES, build
 from tests.analysis.conjugacy.test_draws import compare, conditionals
 

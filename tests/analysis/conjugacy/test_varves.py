@@ -11,11 +11,11 @@ import pickle
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, to_text
-from ssmppl.inference.updates.conjugate_draw import MAX_TRIES, draw, sampler_of
-from ssmppl.language.trace import trace
+from ssmppl.inference.updates.draw_update import MAX_TRIES, draw, sampler_of
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import build
 from tests.statistics.checks import some
 

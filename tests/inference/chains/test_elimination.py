@@ -24,10 +24,10 @@ from ssmppl.inference.chains.elimination import (
     describe_elimination,
     requested_elimination,
 )
-from ssmppl.inference.chains.parameter_steps import log_joint
+from ssmppl.inference.chains.gibbs_updates import log_joint
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import previous, seen
+from ssmppl.language.model.trace import previous, seen
 from tests.models import elimination as models
 from tests.models.elimination import GONE, MODELS, STEPS, joint_draws
 from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some

@@ -19,7 +19,7 @@ from ssmppl.expressions.calculus import NotDifferentiable
 from ssmppl.inference.particles.scores import complete_scores
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import Problem, pose
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models import standard as models
 from tests.models.statements import build
 from tests.statistics.checks import seed_of

@@ -9,7 +9,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.language.distributions import MvNormal, Normal
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 SPELLINGS: dict[str, Callable] = {
     "np.diag": lambda m, v: ssm.MvNormal(m, covariance=np.diag(v)),

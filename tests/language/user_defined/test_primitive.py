@@ -12,7 +12,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.model.closure_digest import fingerprint
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 LEVEL = 0.25
 

@@ -15,7 +15,7 @@ from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.checkpoints.origin import model_digest
 from ssmppl.language.distributions.draws import Draws
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.language.user_defined.user_defined_laws import (
     NAMES,
     TABLE,

@@ -13,20 +13,20 @@ from types import ModuleType
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
-from ssmppl.codegen.modules.trajectories import compile_updates, statistics_name
+from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
+from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import law_without_density_at
-from ssmppl.inference.updates.conjugate_draw import draw
+from ssmppl.inference.updates.draw_update import draw
 
 
 @dataclass(frozen=True)
-class ParameterSteps:
+class GibbsUpdates:
     """A problem with the updates of its parameters, in the order in which they are made."""
 
     problem: Problem
@@ -84,7 +84,7 @@ class ThetaValues(Mapping[Expr, float]):
 
 
 def draw_parameters(
-    steps: ParameterSteps,
+    steps: GibbsUpdates,
     theta: np.ndarray,
     paths: list[np.ndarray],
     generator: np.random.Generator,
@@ -118,7 +118,7 @@ def draw_parameters(
 
 
 def _with(
-    steps: ParameterSteps, theta: np.ndarray, where: np.ndarray, values: np.ndarray,
+    steps: GibbsUpdates, theta: np.ndarray, where: np.ndarray, values: np.ndarray,
     paths: list[np.ndarray],
 ) -> float:  # fmt: skip
     trial = theta.copy()
@@ -126,9 +126,7 @@ def _with(
     return log_joint(steps, trial, paths)
 
 
-def _totals(
-    steps: ParameterSteps, k: int, theta: np.ndarray, paths: list[np.ndarray]
-) -> np.ndarray:
+def _totals(steps: GibbsUpdates, k: int, theta: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
     """The statistics C_i of update k: the prior once, the rest summed over experiments."""
     update = steps.updates[k]
     if update.needs_log_joint or not update.functions:
@@ -145,7 +143,7 @@ def _totals(
     return total + prior
 
 
-def log_joint(steps: ParameterSteps, theta: np.ndarray, paths: list[np.ndarray]) -> float:
+def log_joint(steps: GibbsUpdates, theta: np.ndarray, paths: list[np.ndarray]) -> float:
     """log p(theta, x, y), deterministic components of x set on the way; -inf for nan.
 
     +inf where a density is infinite, which is no point to go to (`inference/updates/slices.py`).

@@ -12,14 +12,15 @@ from ssmppl import markup
 from ssmppl.data import unpack_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.model.traced import Trace
+from ssmppl.inference.preparation.space import free_components
+from ssmppl.language.model.trace import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["NO_METHOD", "Estimate", "by_name", "free_components", "make_estimate", "table"]
+__all__ = ["NO_METHOD", "Estimate", "by_name", "make_estimate", "table"]
 
 NO_METHOD = "none"  # where every parameter is fixed
 
@@ -138,11 +139,6 @@ class Estimate:
         ]
         how, _, reason = str(self.attrs.get("covariance", "")).partition(": ")
         return [*out, f"no standard errors: {reason}"] if how == "none" else out
-
-
-def free_components(trace: Trace, fixed: dict[str, np.ndarray]) -> np.ndarray:
-    """(P,) which components of theta belong to parameters that are not fixed."""
-    return np.array([s.data[1] not in fixed for s in trace.parameter_symbols], dtype=bool)
 
 
 def by_name(trace: Trace, values: np.ndarray) -> dict[str, float | np.ndarray]:

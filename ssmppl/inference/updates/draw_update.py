@@ -60,7 +60,7 @@ class DrawInfo(NamedTuple):
     accepted: bool
 
 
-class Sampler:
+class UpdateSampler:
     """An update made ready to draw from: nothing symbolic is left to do but in open bounds."""
 
     def __init__(self, update: Update):
@@ -243,14 +243,14 @@ class Sampler:
         )
 
 
-_samplers: WeakKeyDictionary[Update, Sampler] = WeakKeyDictionary()
+_samplers: WeakKeyDictionary[Update, UpdateSampler] = WeakKeyDictionary()
 
 
-def sampler_of(update: Update) -> Sampler:
+def sampler_of(update: Update) -> UpdateSampler:
     """The update's sampler, made when it is first asked for; it lives as long as the update."""
     found = _samplers.get(update)
     if found is None:
-        _samplers[update] = found = Sampler(update)
+        _samplers[update] = found = UpdateSampler(update)
     return found
 
 

@@ -27,7 +27,7 @@ from ssmppl.expressions.algebra import ONE, Monomial, Separation, monomial_expr,
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 ROLES = ("prior", "initial", "transition", "observation")
 BOUNDED_ROLES = ("prior", "initial")  # as many terms, however long the series

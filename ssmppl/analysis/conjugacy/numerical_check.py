@@ -18,13 +18,13 @@ from collections.abc import Callable
 import numpy as np
 
 from ssmppl.analysis.conjugacy.matrix_families import lower_half
-from ssmppl.analysis.conjugacy.sufficient import ROLES, CompleteData, JointTerm
+from ssmppl.analysis.conjugacy.separation import ROLES, CompleteData, JointTerm
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import Separation, separate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.language.model.traced import Site, previous, seen, symbols
+from ssmppl.language.model.trace import Site, previous, seen, symbols
 
 POINTS = 24
 NEEDED = 5

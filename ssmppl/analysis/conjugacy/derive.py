@@ -4,7 +4,7 @@
 table of families (`families.py`). What lies outside a family's span, if it comes from the prior or
 the initial law only (a bounded number of terms, however long the series), becomes a correction of
 the draw; if it grows with the series, the block is sampled by slices on its exact conditional.
-Every update is compared with the model's own density when it is derived (`check.py`).
+Every update is compared with the model's own density when it is derived (`numerical_check.py`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from dataclasses import replace
 from functools import partial
 
 from ssmppl.analysis.conjugacy import describe
-from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, MatrixWording, Wording, joined, named
 from ssmppl.analysis.conjugacy.family import Family
+from ssmppl.analysis.conjugacy.numerical_check import verify
 from ssmppl.analysis.conjugacy.search import Found, Search, block_kind
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.separation import (
     BOUNDED_ROLES,
     NOTHING_MISSING,
     ROLES,
@@ -32,7 +32,7 @@ from ssmppl.analysis.conjugacy.update import Update, correction_ranges, natural_
 from ssmppl.analysis.density import Missing
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, to_text
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 def derive_updates(

@@ -19,7 +19,7 @@ from ssmppl.language.distributions import (
     Truncated,
 )
 from ssmppl.language.distributions.nested import SUM_ROUNDING
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 _SHARES = (
     "that are shares of 1 whatever the state, such as [1 - p, p] with "

@@ -25,7 +25,7 @@ from scipy.special import ndtri
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 
 APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
 FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
