@@ -99,7 +99,7 @@ def others_old(original):
             own = before.copy()
             alone = gibbs_updates.GibbsUpdates(steps.problem, (update,))
             infos += original(alone, own, paths, generator)
-            where = alone.where[0]
+            where = alone.positions[0]
             theta[where] = own[where]
         return infos
 

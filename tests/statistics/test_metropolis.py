@@ -253,7 +253,7 @@ def test_updates_given_old_parameters_are_found(monkeypatch):
                 alone[k] = dataclasses.replace(steps, updates=(update,))
             own = before.copy()
             accepted += draw_parameters(alone[k], own, paths, generator)
-            theta[steps.where[k]] = own[steps.where[k]]
+            theta[steps.positions[k]] = own[steps.positions[k]]
         return accepted
 
     monkeypatch.setattr(gibbs, "draw_parameters", with_old)

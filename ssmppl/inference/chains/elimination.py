@@ -185,7 +185,7 @@ class Eliminating(GibbsUpdates):
     def _draw(self, totals: np.ndarray, theta: np.ndarray, generator: np.random.Generator) -> None:
         """The eliminated parameters from their law given the trajectories, in place."""
         at = 0
-        for update, where in zip(self.updates, self.where, strict=True):
+        for update, positions in zip(self.updates, self.positions, strict=True):
             own = totals[at : at + len(update.functions)].tolist()
             at += len(update.functions)
             assert update.family is not None
@@ -197,7 +197,7 @@ class Eliminating(GibbsUpdates):
                     fix="give a proper prior, or use eliminate=False",
                     where=update.where,
                 )
-            theta[where] = values
+            theta[positions] = values
 
 
 def requested_elimination(

@@ -75,7 +75,7 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     model = needed_model(problem, "Gibbs")
     need_density(problem.trace, "Gibbs", "sample")
     kind = filter_of(model)
-    if space.where.size:
+    if space.positions.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
         check_mode(model, problem.experiments, space.parameters(pilot.z)[0])
     else:

@@ -41,8 +41,8 @@ class GibbsUpdates:
         return {s: i for i, s in enumerate(self.problem.trace.parameter_symbols)}
 
     @cached_property
-    def where(self) -> list[np.ndarray]:
-        """Positions in theta of each update's components."""
+    def positions(self) -> list[np.ndarray]:
+        """Of each update's components in theta."""
         return [np.array([self.index[c] for c in u.components]) for u in self.updates]
 
     @cached_property
@@ -98,19 +98,19 @@ def draw_parameters(
     """
     infos = []
     for k, update in enumerate(steps.updates):
-        where = steps.where[k]
+        positions = steps.positions[k]
         rest = ThetaValues(steps.index, theta)
         totals = _totals(steps, k, theta, paths)
         exact = update.needs_log_joint or update.inseparable_terms
-        density = partial(_with, steps, theta, where, paths=paths) if exact else None
+        density = partial(_with, steps, theta, positions, paths=paths) if exact else None
         try:
-            values, info = draw(update, totals, theta[where], rest, generator, density)
+            values, info = draw(update, totals, theta[positions], rest, generator, density)
         except SamplingError as error:
             none = law_without_density_at(steps.problem.trace, theta)
             if none is None:
                 raise
             raise SamplingError(f"{error.found}; {none[0]}", fix=none[1], where=none[2]) from None
-        theta[where] = values
+        theta[positions] = values
         if update.needs_log_joint:
             log_joint(steps, theta, paths)  # sets what is deterministic in the trajectories
         infos.append(info.accepted)
@@ -118,11 +118,11 @@ def draw_parameters(
 
 
 def _with(
-    steps: GibbsUpdates, theta: np.ndarray, where: np.ndarray, values: np.ndarray,
+    steps: GibbsUpdates, theta: np.ndarray, positions: np.ndarray, values: np.ndarray,
     paths: list[np.ndarray],
 ) -> float:  # fmt: skip
     trial = theta.copy()
-    trial[where] = values
+    trial[positions] = values
     return log_joint(steps, trial, paths)
 
 

@@ -66,7 +66,7 @@ class Coordinates:
             return z_free
         theta, _ = self.space.parameters(z_free)
         z = self.space.z.copy()
-        z[self.space.where] = z_free
+        z[self.space.positions] = z_free
         w = np.where(self.kinds == "unconstrained", z[self._in_z], theta[self._in_theta])
         log, reciprocal = self.kinds == "log", self.kinds == "reciprocal"
         with np.errstate(divide="ignore", invalid="ignore"):  # seen below

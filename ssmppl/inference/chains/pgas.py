@@ -73,7 +73,7 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     settings = csmc_settings(problem, method.particles, proposal)
     eliminated = requested_elimination(problem, method.eliminate, setup.fixed, settings.proposal)
     requested_noises(problem, method.interweave, None)  # refused before anything is compiled
-    if space.where.size:
+    if space.positions.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root))
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)

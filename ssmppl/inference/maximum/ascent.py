@@ -254,7 +254,7 @@ class Maximization:
         The user's own point where `start` gives every free parameter; where the likelihood is exact
         moderate values at which it is finite; else the pilot's mode.
         """
-        z = self.space.z[self.space.where]
+        z = self.space.z[self.space.positions]
         free = set(self.problem.trace.parameters) - set(self.fixed)
         if free <= set(self.near) or not len(z):
             return z
@@ -273,7 +273,7 @@ class Maximization:
     def space_at(self, theta: np.ndarray) -> np.ndarray:
         """(F,) the unconstrained place of theta (P,)."""
         moved = at(self.space, theta)
-        return moved.z[moved.where]
+        return moved.z[moved.positions]
 
     def natural(self, z: np.ndarray, information: np.ndarray) -> np.ndarray:
         """(P, P) minus the second derivatives in theta, from those in z (F, F) at a maximum.

@@ -173,4 +173,4 @@ def _inside(setup: Maximization, theta: np.ndarray) -> np.ndarray:
             value = np.maximum(value, INSIDE)
             value = value / value.sum(axis=-1, keepdims=True)
         values[name] = value
-    return unconstrain(trace, theta, values)[setup.space.where]
+    return unconstrain(trace, theta, values)[setup.space.positions]

@@ -240,7 +240,7 @@ def climb(setup: Maximization, method: IF2) -> Ascent:
     SamplingError : the likelihood cannot be evaluated where any of the runs ended.
     """
     setup.problem.proposal("bootstrap")
-    check_points(method, len(setup.space.where))
+    check_points(method, len(setup.space.positions))
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
     perturbed_filter = PerturbedFilter(
@@ -369,7 +369,7 @@ def begin(setup: Maximization, method: IF2) -> list[np.ndarray]:
         for k, values in enumerate(wanted):
             own = check_values(setup.problem.trace, values, argument=f"starts[{k}]")
             space = space_of(setup.problem, setup.fixed, {**setup.near, **own})
-            out.append(space.z[space.where])
+            out.append(space.z[space.positions])
         return out
     others = starts(setup, int(wanted) - 1) if int(wanted) > 1 else []  # type: ignore[call-overload]
     return [setup.start, *(setup.space_at(theta) for theta in others)]

@@ -236,7 +236,7 @@ class Maximiser:
 
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
         moved = at(self.space, theta)
-        return moved.z[moved.where]
+        return moved.z[moved.positions]
 
     def __getstate__(self) -> dict:
         return {k: self.__dict__[k] for k in ("space", "fixed", "posterior")}

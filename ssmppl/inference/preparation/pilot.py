@@ -82,7 +82,7 @@ def climb_to_mode(
         theta, log_prior = space.parameters(z)
         return -np.inf if log_prior == -np.inf else estimate(theta, seed) + log_prior
 
-    z = space.z[space.where]
+    z = space.z[space.positions]
     if not len(z):
         return z, log_density(z)
     z = finite_point(z, log_density, np.random.default_rng(seed))

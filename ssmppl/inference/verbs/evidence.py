@@ -148,7 +148,7 @@ def evidence(
     chosen = _chosen(problem, method)
     if isinstance(chosen, PMMH):
         chosen = _with_filter(problem, space, chosen, root)
-    d = space.where.size
+    d = space.positions.size
     if not d:
         return _without_parameters(problem, space, chosen, root)
     if draws * chains < 2 * POINTS * (d + 1):
@@ -289,7 +289,7 @@ def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
     trace = space.problem.trace
     posterior, likelihood = result["posterior"], result["sample_stats"]["log_likelihood"].values
     fixed = dict(zip(trace.parameter_symbols, space.theta, strict=True))
-    z = np.empty((*likelihood.shape, len(space.where)))
+    z = np.empty((*likelihood.shape, len(space.positions)))
     total = likelihood.astype(float).copy()
     drawn = {n: posterior[n].values for n in trace.parameters if n in posterior}
     for index in np.ndindex(likelihood.shape):
@@ -298,7 +298,7 @@ def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
             if site.name not in values:
                 values[site.name] = np.reshape([fixed[s] for s in site.value.ravel()], site.shape)
         theta = np.array([values[s.data[1]][s.data[2]] for s in trace.parameter_symbols])
-        z[index] = unconstrain(trace, theta, values)[space.where]
+        z[index] = unconstrain(trace, theta, values)[space.positions]
         total[index] += space.parameters(z[index])[1]
     return z, total
 

@@ -124,7 +124,7 @@ def maximize(
     root = seed_sequence(seed)
     space = space_of(problem, fixed_values, near)
     setup = Maximization(problem, space, objective, fixed_values, near, root, executor, progress)
-    if not len(space.where):
+    if not len(space.positions):
         chosen, reason = None, "every parameter is fixed, or the model has none"
         ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
     else:
@@ -193,7 +193,7 @@ def _log_likelihood(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) 
 
 def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:
     """(P, P) inverse observed information of the free components; `attrs` says how, or why not."""
-    p, where = len(ascent.theta), setup.space.where
+    p, where = len(ascent.theta), setup.space.positions
     nothing = np.full((p, p), np.nan)
     if not len(where):
         return nothing

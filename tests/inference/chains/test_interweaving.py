@@ -175,7 +175,7 @@ def changes(name, steered, kind, draws=2000, sweeps=5):
             found = noises(problem.trace, problem.program.missing)
             first = kind(problem, found, steered, theta.copy())
             space = space_of(problem, {}, {})
-            d, bounds = len(space.where), parameter_bounds(problem.trace)
+            d, bounds = len(space.positions), parameter_bounds(problem.trace)
         move = replace(first, problem=problem)
         move.__dict__["module"] = first.module  # else it is generated anew for each data set
         kernel = Interweaving(
@@ -259,7 +259,7 @@ def test_a_move_that_cannot_be_made_is_not_chosen(other, place):
     problem, theta, paths = posed("linear", 2)
     moves = (other, OnPrior()) if place == 0 else (OnPrior(), other)
     space, adapting = space_of(problem, {}, {}), 400
-    d = len(space.where)
+    d = len(space.positions)
     kernel = Interweaving(
         space, moves, np.arange(d), np.full(d, 3.0), adapting, 0, parameter_bounds(problem.trace)
     )

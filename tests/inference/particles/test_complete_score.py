@@ -119,7 +119,9 @@ def posed(model, seed, steps=12, experiments=2, missing=True):
         group = {n: made[n].values[i::experiments] for n in traced.initial}
         paths.append(np.ascontiguousarray(pack(traced.initial.values(), group)))
     problem = pose(model, data)
-    theta, _ = space.parameters(space.z[space.where] + 0.1 * rng.normal(size=len(space.where)))
+    theta, _ = space.parameters(
+        space.z[space.positions] + 0.1 * rng.normal(size=len(space.positions))
+    )
     return problem, theta.copy(), paths
 
 
