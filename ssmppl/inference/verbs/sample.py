@@ -158,12 +158,14 @@ def sample(
     check_names(problem.trace, problem.experiments, states)
     if checkpoint is None:
         _check_room(problem, sampling_method.by_row(chosen), chains, draws, states)
-    root, space, file = seed_sequence(seed), space_of(problem, fixed_values, near), None
+    root, space, checkpoint_file = seed_sequence(seed), space_of(problem, fixed_values, near), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, fixed_values, near, chains, warmup, thin, states)
-        file = CheckpointFile(checkpoint, origin, seed, root, _codec(), draws)
-        root = file.root
-    setup = SamplingSetup(problem, space, fixed_values, chains, warmup, thin, root, states, file)
+        checkpoint_file = CheckpointFile(checkpoint, origin, seed, root, _codec(), draws)
+        root = checkpoint_file.root
+    setup = SamplingSetup(
+        problem, space, fixed_values, chains, warmup, thin, root, states, checkpoint_file
+    )
     result, report = sampling_method.draw(setup, chosen, draws, executor, progress)
     attrs = {
         "model": problem.trace.name,
@@ -174,10 +176,10 @@ def sample(
         "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
         "observes": observes(problem.trace),
         "interrupted": any(c.interrupted for c in result),
-        "seconds": time.perf_counter() - began if file is None else file.seconds,
+        "seconds": checkpoint_file.seconds if checkpoint_file else time.perf_counter() - began,
     }  # fmt: skip
     attrs |= sampling_method.attributes(problem, result)
-    whole = stack(result) if file is None else file.stack(result)
+    whole = stack(result) if checkpoint_file is None else checkpoint_file.stack(result)
     if sampling_method.markov:
         free = free_components(problem.trace, fixed_values)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
