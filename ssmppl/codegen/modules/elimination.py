@@ -83,9 +83,14 @@ def row_functions(layout: Layout, found: Elimination) -> Section:
         return [Target(f"out[{k}, i]", e) for k, e in enumerate(values)]
 
     for role, doc, arguments, values in (
-        ("tell_initial", "What x_1 adds.", "theta, c, s, states, out", found.initial),
-        ("tell", "What x_t adds.", "theta, c, s, states_prev, states, out", found.later),
-        ("tell_observed", "What y_t adds.", "theta, c, s, states, out", found.measured),
+        ("initial_statistics", "What x_1 adds.", "theta, c, s, states, out", found.initial),
+        (
+            "transition_statistics",
+            "What x_t adds.",
+            "theta, c, s, states_prev, states, out",
+            found.later,
+        ),
+        ("observed_statistics", "What y_t adds.", "theta, c, s, states, out", found.measured),
     ):
         section.particle_pass(role, doc, arguments, listed(values))
     return section
