@@ -33,7 +33,7 @@ from ssmppl.inference.particles.filtering import (
     log_of_mean,
 )
 from ssmppl.inference.preparation.exact_models import exact_model
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import random_state
 
@@ -64,7 +64,7 @@ def report(case: Case) -> tuple[list[list[str]], list[str]]:
     problem = pose(case.model, case.data)
     theta = check_parameters(problem.trace, case.parameters)
     start = time.perf_counter()
-    choice = choose(problem, theta, exact=False, whole=True, integrate=True)
+    choice = choose_by_pilot(problem, theta, exact=False, whole=True, integrate=True)
     pilot = time.perf_counter() - start
     found = [
         (name, n, *runs(problem, theta, name, n)) for name in names(problem) for n in PARTICLES
@@ -82,7 +82,7 @@ def report(case: Case) -> tuple[list[list[str]], list[str]]:
             case.label, name, f"{n:,}", f"{mean - reference:.2f}", f"{spread:.3g}",
             f"{1e3 * seconds:.3g}", "yes" if survives else "no",
         ])  # fmt: skip
-    alone = choose(problem, theta, whole=True, integrate=True).name
+    alone = choose_by_pilot(problem, theta, whole=True, integrate=True).name
     return rows, [case.label, f"{reference:.2f} ({by})", alone, choice.name, f"{pilot:.1f}"]
 
 

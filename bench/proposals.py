@@ -23,7 +23,7 @@ from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.data import check_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
-from ssmppl.inference.preparation.proposal_choice import TEMPERING, choose, cost
+from ssmppl.inference.preparation.proposal_choice import TEMPERING, choose_by_pilot, cost
 from ssmppl.inference.run.problem import Problem, pose
 
 PARTICLES = (100, 1000)
@@ -71,7 +71,7 @@ def report(case: Case) -> tuple[list[list[str]], list[list[str]]]:
         rng = new_state(np.random.SeedSequence(0))
         log_likelihood_estimate(problem, theta, FilterSettings(10, k), rng)
     start = time.perf_counter()
-    choice = choose(problem, theta, exact=False, whole=True, integrate=True, temper=True)
+    choice = choose_by_pilot(problem, theta, exact=False, whole=True, integrate=True, temper=True)
     pilot = time.perf_counter() - start
     rows, chosen = [], []
     for n in PARTICLES:

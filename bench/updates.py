@@ -14,12 +14,12 @@ import numpy as np
 from table import show
 
 import ssmppl as ssm
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.demo import varves
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
-from ssmppl.inference.updates.conjugate_draw import draw
-from ssmppl.language.trace import trace
+from ssmppl.inference.updates.draw_update import draw
+from ssmppl.language.tracing import trace
 
 STEPS, DRAWS, ROUNDS = 600, 1_000, 20
 TRUE = {"phi": 0.9, "tau": 40.0}
@@ -49,7 +49,7 @@ def main() -> None:
         for _ in range(DRAWS):
             value, _ = draw(update, totals, value, {}, rng)
         times.append((time.perf_counter() - start) / DRAWS)
-    row = [update.family, f"{1e6 * min(times):.1f}", f"{1e6 * np.median(times):.1f}"]
+    row = [update.family_name, f"{1e6 * min(times):.1f}", f"{1e6 * np.median(times):.1f}"]
     show(["family", "µs a draw, least", f"median of {ROUNDS} rounds"], [row])
 
 

@@ -31,7 +31,7 @@ from ssmppl.errors import (
 )
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 GOOD = {
     "prior": lambda: {"phi": ssm.Uniform(-1, 1), "q": ssm.Gamma(2, rate=1)},

@@ -16,7 +16,7 @@ from ssmppl.expressions.expr import Expr, apply, attributed, constant
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite
-from ssmppl.language.model.traced import Site, Trace, seen
+from ssmppl.language.model.trace import Site, Trace, seen
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import JUMPING, differentiate
 from ssmppl.expressions.expr import Expr, constant, dependent, symbol, symbols_of, topological
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 ROLES = ("initial", "transition", "observation")
 Sensitivity = tuple[Expr, tuple[Expr, ...]]  # a component, and the parameters it is derived in

@@ -14,7 +14,7 @@ from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, constant, depends_on, substitute, symbols_of
 from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def _gaussian_law(
     return array(mean), array(covariance)
 
 
-def without_density(trace: Trace) -> NotApplicable | None:
+def singular_covariance(trace: Trace) -> NotApplicable | None:
     """Why the states have no joint density beside their Dirac components: a covariance that is
     singular whatever the parameters are, or in some cases of the conditions in it."""
     for role, sites in (("initial law", trace.initial), ("transition", trace.transition)):

@@ -13,7 +13,7 @@ from ssmppl.cli.options import DATA, INPUTS, MODEL, PARAMETERS, SEED, drawn_seed
 from ssmppl.cli.reading import as_table, read_data, read_table
 from ssmppl.cli.rendering import answer, file_of_model, say, target, write
 from ssmppl.data.channels import column_names
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.tables import wide_table
 

@@ -25,7 +25,7 @@ from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.distributions.base import Support
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 
 @dataclass(frozen=True)

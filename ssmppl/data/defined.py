@@ -15,7 +15,7 @@ from ssmppl.errors import DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of, to_text
 from ssmppl.expressions.properties import Undefined, first_undefined, may_be_undefined
 from ssmppl.language.distributions.base import Distribution
-from ssmppl.language.model.traced import Site, Trace, once_per_trace, previous
+from ssmppl.language.model.trace import Site, Trace, once_per_trace, previous
 
 CHUNK = 1 << 16  # rows that are looked at together
 

@@ -10,7 +10,7 @@ import numpy as np
 from ssmppl.data.values import Fault, as_numbers, asymmetry, number, outside, short
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 
 def check_parameters(

@@ -12,8 +12,8 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.run.prior import draw_prior
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Site, Trace
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Site, Trace
+from ssmppl.language.tracing import trace
 from ssmppl.plots.reading import components
 from ssmppl.results import time_axes
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ssmppl.drawing.style import DATA, FAINT, MAIN, OTHER, bare
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.run.ranges import total_of
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.plots.drawing import few, handed, key, only_below, panels, shown_time, styled
 from ssmppl.plots.reading import components, is_dataset, pick, wrong_kind
 

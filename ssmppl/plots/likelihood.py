@@ -13,10 +13,10 @@ from ssmppl.counts import check_count
 from ssmppl.data import check_values
 from ssmppl.drawing.style import DATA, OTHER, bare
 from ssmppl.errors import ArgumentError, SamplingError, listing
+from ssmppl.inference.maximum.estimate import Estimate
 from ssmppl.inference.particles.filtering import FilterSettings, log_of_mean, repeated_estimates
 from ssmppl.inference.preparation.exact_models import EXACT, exact_log_likelihood
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
-from ssmppl.inference.run.estimate import Estimate
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence

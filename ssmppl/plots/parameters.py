@@ -9,7 +9,7 @@ import numpy as np
 from ssmppl.drawing.numerals import with_error
 from ssmppl.drawing.style import MAIN, OTHER, bare
 from ssmppl.errors import ArgumentError
-from ssmppl.inference.run.estimate import Estimate, beside
+from ssmppl.inference.maximum.estimate import Estimate, beside
 from ssmppl.inference.verbs.predict import group
 from ssmppl.language.model.model import Model
 from ssmppl.plots.density import Prior, estimated, prior_draws, priors_of, window

@@ -10,7 +10,7 @@ from scipy import stats
 
 from ssmppl.analysis.lambdify import python_sum
 from ssmppl.expressions.expr import apply, symbol
-from ssmppl.inference.updates.conjugate_draw import _guarded
+from ssmppl.inference.updates.draw_update import _guarded
 from ssmppl.inference.updates.slices import slice_step
 from tests.statistics.checks import seed_of
 

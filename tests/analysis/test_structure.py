@@ -11,7 +11,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 def model_of(*, mean=None, transition=None, observation=None, initial=None, prior=None, inputs=()):

@@ -18,7 +18,7 @@ from bench.gap.records import Record
 from bench.gap.sealing import digest, seal, unseal
 from bench.gap.truth import SYSTEMS
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 from tests.bench_gap import made_up
 

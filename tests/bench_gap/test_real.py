@@ -10,7 +10,7 @@ from scipy.io import savemat
 
 import ssmppl as ssm
 from bench.gap.real import run
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"

@@ -10,8 +10,8 @@ from bench.gap.truth import SYSTEMS
 from bench.gap.truth.forms import SLOTS, delayed, driven, lagged, play
 from ssmppl.diagnosis.effects.catalogue import effects
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.model.traced import previous
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import previous
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 
 

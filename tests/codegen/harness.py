@@ -11,7 +11,7 @@ from ssmppl.codegen.text.module import Layout
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol, topological
-from ssmppl.language.model.traced import previous, seen, symbols
+from ssmppl.language.model.trace import previous, seen, symbols
 
 STEPS, PARTICLES, ROOM = 4, 5, 400
 

@@ -24,7 +24,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.translate import Untranslatable
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.statements import MODELS
 
 NAMES = ("linear_vector", "wishart_noise", "matrices", "pendulum", "switching", "linear_scalar")

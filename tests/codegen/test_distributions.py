@@ -22,8 +22,8 @@ from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.distributions.draws import Draws
-from ssmppl.language.model.traced import Site, Trace, symbols
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Site, Trace, symbols
+from ssmppl.language.tracing import trace
 from tests.language.distributions.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
 from tests.language.distributions.test_truncated import COUNTS, check_counts
 from tests.models.statements import declare

@@ -29,7 +29,7 @@ from ssmppl.expressions.expr import (
 )
 from ssmppl.expressions.operations import KERNELS, OPERATIONS
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.codegen.harness import plain, run_plainly
 
 

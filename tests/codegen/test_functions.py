@@ -16,7 +16,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.distributions import Dirac, MvNormal
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.codegen.harness import (
     PARTICLES,
     ROOM,

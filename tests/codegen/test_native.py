@@ -19,7 +19,7 @@ from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.codegen.store import folder
 from ssmppl.expressions.operations import KERNELS
 from ssmppl.inference.run.problem import pose
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.codegen.harness import Numbers
 from tests.codegen.native_calls import MATRIX, both_ways, called, sections
 from tests.models.statements import MODELS, build

@@ -13,7 +13,7 @@ import pytest
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.store import folder
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.statements import MODELS, build
 
 ROOT = Path(__file__).parents[2]
@@ -91,7 +91,7 @@ SCRIPT = """
 import numpy as np, sys
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.kernels.math.random import new_state
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.statements import build
 program = compile_trace(trace(build("linear_scalar")))
 run = program.module.simulate  # the variant that Numba compiles and keeps

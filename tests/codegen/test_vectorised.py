@@ -9,7 +9,7 @@ from llvmlite import binding
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.codegen.modules.program import compile_trace
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.statements import build
 
 PACKED = re.compile(r"\bv(?:mul|add|sub|fn?m(?:add|sub)\d+)pd\b.*%[yz]mm")

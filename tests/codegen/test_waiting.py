@@ -29,7 +29,7 @@ def told(monkeypatch):
         screen, notice = Screen(terminal), loading.Notice()
         monkeypatch.setattr("sys.stderr", screen)
         monkeypatch.setattr(loading, "SILENT_SECONDS", silent)
-        monkeypatch.setattr(loading.notice, "told", True)
+        monkeypatch.setattr(loading.notice, "given", True)
         loading.event.register("numba:compile", notice)
         try:
             for _ in range(compilations):

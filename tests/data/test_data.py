@@ -24,7 +24,7 @@ from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import DataError
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 NAN = np.nan
 

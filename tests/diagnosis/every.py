@@ -23,7 +23,7 @@ from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 from tests.diagnosis import harness
 

@@ -8,7 +8,7 @@ from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.expressions.arrays import array
 from ssmppl.language.distributions import Truncated
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy import corpus
 from tests.models import gaps as models
 from tests.models import statements as features

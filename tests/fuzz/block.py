@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import ssmppl as ssm
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 from tests.codegen.harness import Numbers
 from tests.codegen.native_calls import MATRIX, both_ways, sections

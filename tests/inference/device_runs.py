@@ -21,7 +21,7 @@ from ssmppl.data import unpack_observations
 from ssmppl.inference.particles.on_device import random_numbers, run_on_device
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.codegen.harness import Numbers
 from tests.models.statements import build
 

@@ -11,7 +11,7 @@ import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.run.problem import pose
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 # --- AR(2) in companion form: noisy laws with parameters, a deterministic state without ----------
 

@@ -11,7 +11,7 @@ from ssmppl.analysis.finite import finite_states
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.inference.exact.kalman_matrices import values_of
-from ssmppl.language.model.traced import previous, seen
+from ssmppl.language.model.trace import previous, seen
 
 
 def weather():

@@ -7,7 +7,7 @@
 import numpy as np
 
 import ssmppl as ssm
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.statistics.checks import seed_of
 
 MODELS, THETA, INPUTS = {}, {}, {}

@@ -8,7 +8,7 @@ from ssmppl.data import bind, check_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 # -- models: the laws as users write them, run by the dense computation on plain numbers

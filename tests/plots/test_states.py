@@ -14,7 +14,7 @@ from ssmppl.drawing.style import DATA, MAIN, OTHER
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.labels import observes
 from ssmppl.inference.verbs.predict import group
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.plots.drawing import styled
 from ssmppl.results import to_dataset, to_inference_data
 from ssmppl.tables import quantiles_of

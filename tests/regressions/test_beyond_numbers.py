@@ -11,7 +11,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.diagnosis.model.scales import VariableScale
 from ssmppl.inference.chains.bridge import Student
-from ssmppl.inference.chains.parameter_steps import log_joint
+from ssmppl.inference.chains.gibbs_updates import log_joint
 from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.direct_optimization import SmoothLikelihood
 from ssmppl.inference.particles import backward

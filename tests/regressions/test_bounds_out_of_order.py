@@ -10,8 +10,8 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.run.prior import draw_prior
-from ssmppl.language.model.traced import Site
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Site
+from ssmppl.language.tracing import trace
 
 A = symbol("parameter", "a")
 LAWS = {

@@ -13,7 +13,7 @@ import scipy.sparse
 import xarray as xr
 
 import ssmppl as ssm
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 @dataclasses.dataclass

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 import ssmppl as ssm
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 def walk(**laws):

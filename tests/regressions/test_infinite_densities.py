@@ -20,16 +20,16 @@ from ssmppl.analysis.density import terms
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
+from ssmppl.inference.chains.gibbs_updates import GibbsUpdates, draw_parameters, plan_updates
 from ssmppl.inference.chains.interweaving import Collapsed
-from ssmppl.inference.chains.parameter_steps import ParameterSteps, draw_parameters, plan_updates
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.particles.backward import pair_failure
 from ssmppl.inference.particles.filtering import failure
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.problem import pose
-from ssmppl.inference.updates.conjugate_draw import draw
-from ssmppl.language.model.traced import seen
-from ssmppl.language.trace import trace
+from ssmppl.inference.updates.draw_update import draw
+from ssmppl.language.model.trace import seen
+from ssmppl.language.tracing import trace
 from tests.statistics.checks import seed_of
 
 UNDERFLOWN = 1e-170  # whose square is 0
@@ -345,7 +345,7 @@ def test_a_start_names_the_law_without_a_density():
 
 def test_an_update_names_the_law_without_a_density():
     problem = pose(vector("covariance"), {"y": ROWS})
-    steps = ParameterSteps(problem, plan_updates(problem, {}))
+    steps = GibbsUpdates(problem, plan_updates(problem, {}))
     theta, paths = np.array([1e-200, 0.8, 0.3]), [np.zeros((len(ROWS), 1))]
     with pytest.raises(ssm.SamplingError, match=NO_COVARIANCE) as caught:
         draw_parameters(steps, theta, paths, np.random.default_rng(1))
@@ -354,7 +354,7 @@ def test_an_update_names_the_law_without_a_density():
 
 def test_an_update_says_that_a_density_is_infinite():
     problem = pose(moving(np.inf), {"y": fenced_data()})
-    steps = ParameterSteps(problem, plan_updates(problem, {}))
+    steps = GibbsUpdates(problem, plan_updates(problem, {}))
     with pytest.raises(ssm.SamplingError, match="infinite at the current value: s = 0"):
         draw_parameters(steps, np.array([0.1, 1.0]), [np.zeros((12, 1))], np.random.default_rng(1))
 

@@ -14,12 +14,12 @@ import scipy.optimize
 import scipy.stats
 
 import ssmppl as ssm
-from ssmppl.analysis.structure import without_density
+from ssmppl.analysis.structure import singular_covariance
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, topological
 from ssmppl.language.model.covariances import find_root
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 DT, ROWS = 0.5, 40
 F = np.array([[1.0, DT], [0.0, 1.0]])
@@ -199,7 +199,7 @@ def test_ranks():
         model.initial(lambda: {"x": ssm.Normal(np.zeros(3), sd=1)})
         model.transition(lambda x, q, s: {"x": ssm.MvNormal(x, covariance=matrix(q, s))})
         model.observation(lambda x: {"y": ssm.Normal(x[0], sd=1)})
-        found = without_density(trace(model))
+        found = singular_covariance(trace(model))
         return "" if found is None else found.reason
 
     a, b = np.array([0.0, 1.0, 2.0]), np.array([0.0, -1.0, 1.0])

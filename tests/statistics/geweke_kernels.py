@@ -26,9 +26,9 @@ import numpy as np
 import ssmppl as ssm
 from ssmppl.data import unpack_parameters
 from ssmppl.inference.chains.gibbs import GibbsState
+from ssmppl.inference.chains.gibbs_updates import GibbsUpdates, log_joint
 from ssmppl.inference.chains.interweaving import NoiseMove
 from ssmppl.inference.chains.metropolis_kernel import ChainPoint, Metropolis, WalkState
-from ssmppl.inference.chains.parameter_steps import ParameterSteps, log_joint
 from ssmppl.inference.chains.pgas import PGASState
 from ssmppl.inference.chains.sampling import PreparedChains, SamplingSetup
 from ssmppl.inference.exact import histories
@@ -60,10 +60,10 @@ class Transitions:
     stream: np.ndarray
     renew: Renew | None = None
     transforms: Any = field(init=False)
-    _prior: ParameterSteps = field(init=False)
+    _prior: GibbsUpdates = field(init=False)
 
     def __post_init__(self) -> None:
-        self._prior = ParameterSteps(self.problem, ())
+        self._prior = GibbsUpdates(self.problem, ())
         self.transforms = transforms(self.problem.trace)
 
     def data(self, theta: np.ndarray, path: np.ndarray) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.inference.chains import elimination, gibbs, metropolis_kernel, parameter_steps, pgas
+from ssmppl.inference.chains import elimination, gibbs, gibbs_updates, metropolis_kernel, pgas
 from ssmppl.inference.chains.interweaving import NoiseMove
 from ssmppl.inference.preparation.space import Space
 
@@ -62,7 +62,7 @@ def row_forgotten(original):
         totals = totals.copy()
         for i, f in enumerate(update.functions):
             if f.op == "log":
-                totals[i] += 0.5 if "inverse" in update.family else -0.5
+                totals[i] += 0.5 if "inverse" in update.family_name else -0.5
         return original(update, totals, *rest)
 
     return draw
@@ -74,7 +74,7 @@ def rate_wrong(original):
     def totals(steps, k, theta, paths):
         found = original(steps, k, theta, paths).copy()
         for i, f in enumerate(steps.updates[k].functions):
-            if f.op == "div" and steps.updates[k].family == "inverse Gamma":
+            if f.op == "div" and steps.updates[k].family_name == "inverse Gamma":
                 found[i] *= 1.5
         return found
 
@@ -85,7 +85,7 @@ def correction_forgotten(original):
     """What lies outside of the family (here sqrt(1 - phi^2), of the stationary initial law)."""
 
     def draw(update, *rest):
-        return original(replace(update, correction=()), *rest)
+        return original(replace(update, outside_family=()), *rest)
 
     return draw
 
@@ -97,9 +97,9 @@ def others_old(original):
         before, infos = theta.copy(), []
         for update in steps.updates:
             own = before.copy()
-            alone = parameter_steps.ParameterSteps(steps.problem, (update,))
+            alone = gibbs_updates.GibbsUpdates(steps.problem, (update,))
             infos += original(alone, own, paths, generator)
-            where = alone.where[0]
+            where = alone.positions[0]
             theta[where] = own[where]
         return infos
 
@@ -216,14 +216,14 @@ MUTANTS = {
     for m in (
         Mutant("data never renewed", "counts PGAS",
                ((Transitions, "data", lambda _: lambda made, theta, path: None),)),
-        Mutant("one row forgotten", "counts PGAS", ((parameter_steps, "draw", row_forgotten),)),
+        Mutant("one row forgotten", "counts PGAS", ((gibbs_updates, "draw", row_forgotten),)),
         Mutant("one row forgotten, exact states", "delay Gibbs",
-               ((parameter_steps, "draw", row_forgotten),)),
-        Mutant("wrong rate", "delay Gibbs", ((parameter_steps, "_totals", rate_wrong),)),
+               ((gibbs_updates, "draw", row_forgotten),)),
+        Mutant("wrong rate", "delay Gibbs", ((gibbs_updates, "_totals", rate_wrong),)),
         Mutant("stationary initial law forgotten", "proper_varves PGAS",
-               ((parameter_steps, "draw", correction_forgotten),)),
+               ((gibbs_updates, "draw", correction_forgotten),)),
         Mutant("prior's factors forgotten", "bounded PGAS",
-               ((parameter_steps, "draw", correction_forgotten),)),
+               ((gibbs_updates, "draw", correction_forgotten),)),
         Mutant("given the other blocks of before", "vector_ar_apart Gibbs",
                ((gibbs, "draw_parameters", others_old),)),
         Mutant("given the trajectory of before", "leverage PGAS",

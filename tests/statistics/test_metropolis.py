@@ -16,7 +16,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.expressions.expr import constant
 from ssmppl.inference.chains import gibbs
-from ssmppl.inference.chains.parameter_steps import draw_parameters
+from ssmppl.inference.chains.gibbs_updates import draw_parameters
 
 from .checks import (
     MCSE,
@@ -166,7 +166,7 @@ def test_the_initial_law_forgotten_is_found(monkeypatch):
         return tuple(
             dataclasses.replace(
                 u,
-                correction=(),
+                outside_family=(),
                 coefficients=u.coefficients | {"initial": (constant(0.0),) * len(u.functions)},
             )
             for u in plan(problem, held)
@@ -253,7 +253,7 @@ def test_updates_given_old_parameters_are_found(monkeypatch):
                 alone[k] = dataclasses.replace(steps, updates=(update,))
             own = before.copy()
             accepted += draw_parameters(alone[k], own, paths, generator)
-            theta[steps.where[k]] = own[steps.where[k]]
+            theta[steps.positions[k]] = own[steps.positions[k]]
         return accepted
 
     monkeypatch.setattr(gibbs, "draw_parameters", with_old)

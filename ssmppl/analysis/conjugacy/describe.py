@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmppl.analysis.conjugacy.sufficient import ROLES, BlockForm, Factor, shorten
+from ssmppl.analysis.conjugacy.separation import ROLES, BlockForm, JointTerm, shorten
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import Separation, affine, separate
 from ssmppl.expressions.arrays import ExprArray, array
@@ -28,7 +28,7 @@ from ssmppl.expressions.expr import (
     topological,
 )
 from ssmppl.language import distributions as laws
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 MAX_STATISTICS = 12
 MAX_NAMES = 6  # of a block
@@ -38,16 +38,16 @@ ARITHMETIC = frozenset(["add", "sub", "mul", "neg", "const", "symbol"])
 
 @dataclass(frozen=True)
 class Explanation:
-    """title : what is drawn; conditional : its law, one line; statistics : one line for each C_i;
+    """title : what is drawn; law : one line; statistics : one line for each C_i;
     notes : truncation, correction, fallbacks, reasons."""
 
     title: str
-    conditional: str
+    law: str
     statistics: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        lines = [f"{self.title}: {self.conditional}"]
+        lines = [f"{self.title}: {self.law}"]
         lines += [f"    {s}" for s in self.statistics]
         lines += [f"  {n}" for n in self.notes]
         return "\n".join(lines)
@@ -323,17 +323,17 @@ class MatrixWording:
         ]  # fmt: skip
         self.sizes = Counter(s.data[1] for s in quantities)
         by_role = (trace.parameters, trace.initial, trace.transition, trace.observations)
-        factors = {(f.role, f.site): f for found in form.origins.values() for f in found}
+        terms = {(f.role, f.site): f for found in form.origins.values() for f in found}
         self.own: list[Site] = []
-        self.others: list[tuple[Factor, Site]] = []
+        self.others: list[tuple[JointTerm, Site]] = []
         for role, sites in zip(ROLES, by_role, strict=True):
             for name, site in sites.items():
-                if (role, name) not in factors:
+                if (role, name) not in terms:
                     continue
                 if role == "prior" and members & set(site.components):
                     self.own.append(site)
                 else:
-                    self.others.append((factors[role, name], site))
+                    self.others.append((terms[role, name], site))
         self.parameters = trace.parameters
 
     # -- the families
@@ -341,21 +341,21 @@ class MatrixWording:
         """H and h, as sums over the laws whose means hold the block."""
         first = ["prior"] if self._told_by_prior() else []
         h, linear, notes = [*first], [*first], []
-        for factor, site in self.others:
+        for term, site in self.others:
             found = self._regression(site)
             if found is None:
                 return None
             weight = self._weight(site.distribution)
             rest, z = self._residual(site.name, found[1]), _kronecker(found[0])
             if z is None:
-                h.append(_summed(factor, f"J' {weight} J"))
-                linear.append(_summed(factor, f"J' {weight} {rest}"))
+                h.append(_summed(term, f"J' {weight} J"))
+                linear.append(_summed(term, f"J' {weight} {rest}"))
                 notes.append(f"J = d mean of {site.name} / d {self._names()}")
             else:
                 outer = "z z'" if len(found[0]) == 1 else f"kron({weight}, z z')"
                 scale = f"{weight} " if len(found[0]) == 1 else ""
-                h.append(_summed(factor, scale + outer))
-                linear.append(_summed(factor, f"{weight} {rest} z'"))
+                h.append(_summed(term, scale + outer))
+                linear.append(_summed(term, f"{weight} {rest} z'"))
                 notes.append(f"z = ({self._list(z)}) in the mean of {site.name}")
         return (f"H: {' + '.join(h)}", f"h: {' + '.join(linear)}", *notes)
 
@@ -364,15 +364,15 @@ class MatrixWording:
         first = ["prior"] if self._told_by_prior() else []
         yy, yz, zz, notes = [*first], [*first], [*first], []
         block = self.block[:thetas]
-        for factor, site in self.others:
+        for term, site in self.others:
             found, scale = self._regression(site, block), self._scale(site)
             z = None if found is None else _kronecker(found[0])
             if found is None or z is None or scale is None:
                 return None
             rest = self._residual(site.name, found[1])
-            yy.append(_summed(factor, f"{scale}{rest} {rest}'"))
-            yz.append(_summed(factor, f"{scale}{rest} z'"))
-            zz.append(_summed(factor, f"{scale}z z'"))
+            yy.append(_summed(term, f"{scale}{rest} {rest}'"))
+            yz.append(_summed(term, f"{scale}{rest} z'"))
+            zz.append(_summed(term, f"{scale}z z'"))
             notes.append(f"z = ({self._list(z)}) in the mean of {site.name}")
         columns = dict.fromkeys(block[i].data[1] for i in row)
         if len(columns) > 1:
@@ -388,15 +388,15 @@ class MatrixWording:
             return None
         scale = matrix_text(own.parameters["scale"])
         parts, notes = [f"{scale}^-1" if isinstance(own, laws.Wishart) else scale], []
-        for factor, site in self.others:
+        for term, site in self.others:
             if not isinstance(site.distribution, laws.MvNormal):
                 return None
             times = self._scale(site)
             if times is None:
                 return None
-            parts.append(_summed(factor, f"{times}r r'"))
+            parts.append(_summed(term, f"{times}r r'"))
             mean = self._product(list(array(site.distribution.mean()).ravel()))
-            when = " at t = 1" if factor.role == "initial" else ""
+            when = " at t = 1" if term.role == "initial" else ""
             less = "" if mean == "0" else f" - {mean}"
             notes.append(f"r = {site.name}{less}{when}")
         return (f"S: {' + '.join(parts)}", *dict.fromkeys(notes))
@@ -546,14 +546,14 @@ def _kronecker(j: ExprArray) -> list[Expr] | None:
     return rows[0] if same and rows[0] else None
 
 
-def _summed(factor: Factor, text: str) -> str:
-    if factor.role == "initial":
+def _summed(term: JointTerm, text: str) -> str:
+    if term.role == "initial":
         return f"[{text}]_1"
-    if factor.role == "prior":
+    if term.role == "prior":
         return f"[{text}]"
-    if any(s.data[0] == "seen" for s in factor.symbols):
-        return f"sum_{{t: {factor.site} measured}} {text}"
-    return f"sum_{{t={2 if factor.role == 'transition' else 1}}}^T {text}"
+    if any(s.data[0] == "seen" for s in term.symbols):
+        return f"sum_{{t: {term.site} measured}} {text}"
+    return f"sum_{{t={2 if term.role == 'transition' else 1}}}^T {text}"
 
 
 def _tight(text: str) -> str:

@@ -51,7 +51,7 @@ from ssmppl.analysis.conjugacy.family import (
     truncated_normal,
 )
 from ssmppl.analysis.conjugacy.matrix_families import MatrixNormalWishart, Wishart
-from ssmppl.analysis.conjugacy.sufficient import BlockForm, shorten
+from ssmppl.analysis.conjugacy.separation import BlockForm, shorten
 from ssmppl.expressions.algebra import Monomial, Separation, separate
 from ssmppl.expressions.expr import Expr, apply, constant
 from ssmppl.language.distributions import Draws

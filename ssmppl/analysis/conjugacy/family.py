@@ -18,7 +18,7 @@ import numpy as np
 import scipy.special as sp
 
 from ssmppl.analysis.bounds import Interval
-from ssmppl.analysis.conjugacy.sufficient import BlockForm
+from ssmppl.analysis.conjugacy.separation import BlockForm
 from ssmppl.expressions.expr import Expr, apply, constant
 from ssmppl.language.distributions import Draws
 

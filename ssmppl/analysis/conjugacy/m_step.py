@@ -1,10 +1,10 @@
 """Both steps of expectation maximisation, derived.
 
-The complete-data log density is separated jointly in all free parameters (`sufficient.py`), so that
+The complete-data log density is separated jointly in all free parameters (`separation.py`), so that
 
     Q(theta) = sum_i S_i s_i(theta),        S_i = E[C_i | y],
 
-with the prior among the factors where the posterior is maximised, without it where the likelihood
+with the prior among the terms where the posterior is maximised, without it where the likelihood
 is.
 
 M-step. Parameters that share no function s_i are maximised apart, in groups. Within a group, Q with
@@ -33,16 +33,16 @@ from functools import cached_property
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, joined
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.search import Found, Search, connected, kind_of
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.numerical_check import verify
+from ssmppl.analysis.conjugacy.search import Found, Search, block_kind, connected
+from ssmppl.analysis.conjugacy.separation import (
     NOTHING_MISSING,
     ROLES,
     BlockForm,
     CompleteData,
-    Factor,
+    JointTerm,
     complete_data,
     degenerate,
     restricted,
@@ -53,7 +53,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import Expr, constant, depends_on, symbol, symbols_of, to_text
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 IN_TIME = ("initial", "transition", "observation")
 
@@ -156,14 +156,14 @@ def derive_m_step(
 
 
 def counted(data: CompleteData, posterior: bool) -> CompleteData:
-    """The data with the factors that the objective counts.
+    """The data with the terms that the objective counts.
 
     Bounds that one parameter's prior sets to another are kept by maximising under them, so that
     only those of states and observations restrict.
     """
-    factors = tuple(f for f in data.factors if posterior or f.role != "prior")
+    terms = tuple(f for f in data.terms if posterior or f.role != "prior")
     restrictions = tuple(r for r in data.restrictions if r.role != "prior")
-    return replace(data, factors=factors, restrictions=restrictions)
+    return replace(data, terms=terms, restrictions=restrictions)
 
 
 def _as_update(free: Sequence[Expr], form: BlockForm) -> Update:
@@ -171,23 +171,25 @@ def _as_update(free: Sequence[Expr], form: BlockForm) -> Update:
     return Update(
         block=tuple(dict.fromkeys(c.data[1] for c in free)),
         components=tuple(free),
-        family="Q",
+        family_name="Q",
         functions=form.functions,
         coefficients=form.coefficients,
-        correction=(),
+        outside_family=(),
         bounds=(),
         explanation=Explanation(joined(free) if free else "", "expected log density"),
     )
 
 
 def _pseudo_data(data: CompleteData, form: BlockForm, statistics: Sequence[Expr]) -> CompleteData:
-    """Q as if it were a model's density: one factor S_i s_i for each function."""
-    factors = []
+    """Q as if it were a model's density: one term S_i s_i for each function."""
+    terms = []
     for s, function, monomial in zip(statistics, form.functions, form.monomials, strict=True):
         source = max(form.origins[monomial], key=lambda f: ROLES.index(f.role))
         density = s * function
-        factors.append(Factor(source.role, source.site, density, source.where, symbols_of(density)))
-    return CompleteData(data.trace, tuple(factors), ())
+        terms.append(
+            JointTerm(source.role, source.site, density, source.where, symbols_of(density))
+        )
+    return CompleteData(data.trace, tuple(terms), ())
 
 
 def _joined(
@@ -199,7 +201,7 @@ def _joined(
     ties += [
         frozenset(site.components) & members
         for site in trace.parameters.values()
-        if kind_of(site) != "real"
+        if block_kind(site) != "real"
     ]
     ties += [(symbols_of(bounds) & members) | {c} for c, bounds in search.bound.items()]
     used = frozenset().union(*(symbols_of(f) & members for f in form.functions))
@@ -222,14 +224,18 @@ def _group(search: Search, components: tuple[Expr, ...], form: BlockForm) -> Gro
         if not isinstance(found, Found):
             reasons.append(found)
             continue
-        reasons += [_left(found, j) for j in found.correction]
+        reasons += [_left(found, j) for j in found.outside_family]
         totals = [constant(0.0)] * len(found.form.functions)
         for role in ROLES:
             totals = [a + b for a, b in zip(totals, found.form.coefficients[role], strict=True)]
         bounds = tuple(search.bound[c] for c in found.components)
         blocks.append(
             ClosedForm(
-                found.components, found.family, tuple(totals), bounds, exact=not found.correction
+                found.components,
+                found.family,
+                tuple(totals),
+                bounds,
+                exact=not found.outside_family,
             )
         )
     functions = tuple(form.functions[i] for i in indices)
@@ -333,9 +339,9 @@ def expected_density(
     members, summands = frozenset(free), {}
     for role in ("prior", *IN_TIME):
         total = constant(0.0)
-        for factor in data.factors:
-            if factor.role == role and factor.symbols & members:
-                total = total + factor.density
+        for term in data.terms:
+            if term.role == role and term.symbols & members:
+                total = total + term.density
         found = [total] if role == "prior" else expectation([total], trace)
         if isinstance(found, NotApplicable):
             return found

@@ -23,7 +23,7 @@ from ssmppl.analysis.conjugacy.family import (
     Values,
     held,
 )
-from ssmppl.analysis.conjugacy.sufficient import BlockForm
+from ssmppl.analysis.conjugacy.separation import BlockForm
 from ssmppl.expressions.expr import Expr, item, matrix_op
 from ssmppl.expressions.zero import cancels
 

@@ -15,17 +15,17 @@ import numpy as np
 from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.conjugacy.families import SCALED, SINGLE, Gamma, Normal
 from ssmppl.analysis.conjugacy.family import Family, ScaledFamily
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.separation import (
     BOUNDED_ROLES,
     BlockForm,
     CompleteData,
-    Factor,
+    JointTerm,
     separate_block,
     shorten,
 )
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Found:
     components: tuple[Expr, ...]
     form: BlockForm
     family: Family
-    correction: tuple[int, ...]
+    outside_family: tuple[int, ...]
 
 
 class Search:
@@ -53,7 +53,7 @@ class Search:
         """What is drawn at least together: a matrix, shares of one whole, else one component."""
         out: list[tuple[Expr, ...]] = []
         for site in self.sites.values():
-            kind = kind_of(site)
+            kind = block_kind(site)
             if kind == "simplex":  # a vector, or each row of a matrix
                 out += [tuple(row) for row in site.value.reshape(-1, site.shape[-1])]
             elif kind == "matrix":
@@ -80,7 +80,7 @@ class Search:
         form = separate_block(self.data, unit, leave=True)
         if not isinstance(form, BlockForm):
             return form
-        kind = kind_of(self.site(unit[0]))
+        kind = block_kind(self.site(unit[0]))
         if kind == "matrix" and len(unit) == 1:  # a precision or a variance
             candidates: list[Family] = [*Gamma.match(unit, form, positive=True)[:1]]
         else:
@@ -94,7 +94,7 @@ class Search:
         found = [self._judged(unit, form, family) for family in candidates]
         good = [f for f in found if isinstance(f, Found)]
         if good:
-            return min(good, key=lambda f: len(f.correction))
+            return min(good, key=lambda f: len(f.outside_family))
         return next(
             (f for f in found if isinstance(f, NotApplicable)), self._outside(form, frozenset())
         )
@@ -113,8 +113,8 @@ class Search:
             return self._outside(form, family.used)
         if not family.used:
             return self._outside(form, frozenset())
-        if form.left and not any(_grows(form, i) for i in family.used):
-            return form.left[0][1]  # nothing but what was left tells of the block
+        if form.inseparable and not any(_grows(form, i) for i in family.used):
+            return form.inseparable[0][1]  # nothing but what was left tells of the block
         return Found(components, form, family, left)
 
     def _outside(self, form: BlockForm, used: frozenset[int]) -> NotApplicable:
@@ -125,14 +125,14 @@ class Search:
         for i in range(len(form.monomials)):
             if i not in used:
                 (growing if _grows(form, i) else others).append(i)
-        if form.left and not growing:
-            return form.left[0][1]
+        if form.inseparable and not growing:
+            return form.inseparable[0][1]
         positions = growing or others or list(range(len(form.functions)))
         if not positions:
             where = self.site(form.components[0]).distribution.location
             reason = f"no density depends on {names}: a constant prior, and no law names it"
             return NotApplicable(reason, where)
-        factor = form.origins[form.monomials[positions[0]]][-1]
+        term = form.origins[form.monomials[positions[0]]][-1]
         text = ", ".join(shorten(to_text(form.functions[i])) for i in positions[:4])
         more = ", ..." if len(positions) > 4 else ""
         laws = sorted(
@@ -141,7 +141,7 @@ class Search:
         return NotApplicable(
             f"{names} is not conjugate: its full conditional contains {text}{more}, from the "
             f"{' and the '.join(laws)}",
-            factor.where,
+            term.where,
         )
 
     # -- blocks
@@ -219,19 +219,19 @@ class Search:
         Otherwise (a prior Normal that is not scaled by the precision) separate updates are exact
         where a joint one would have to reject.
         """
-        for j in found.correction:
+        for j in found.outside_family:
             monomial = found.form.monomials[j]
             if not any(self._refused_alone(c, monomial) for c in found.components):
                 return False
         return all(
-            any(factor is other for c in found.components for other in self._left_alone(c))
-            for factor, _ in found.form.left
+            any(term is other for c in found.components for other in self._left_alone(c))
+            for term, _ in found.form.inseparable
         )
 
-    def _left_alone(self, component: Expr) -> list[Factor]:
+    def _left_alone(self, component: Expr) -> list[JointTerm]:
         unit = next(u for u in self.single if any(component is c for c in u))
         single = self.single[unit]
-        return [factor for factor, _ in single.form.left] if isinstance(single, Found) else []
+        return [term for term, _ in single.form.inseparable] if isinstance(single, Found) else []
 
     def _refused_alone(self, component: Expr, monomial: frozenset) -> bool:
         mine = frozenset((a, e) for a, e in monomial if component in symbols_of(a))
@@ -241,7 +241,7 @@ class Search:
         return any(
             frozenset((a, e) for a, e in single.form.monomials[j] if component in symbols_of(a))
             == mine
-            for j in single.correction
+            for j in single.outside_family
         )
 
     def _scaled(
@@ -288,7 +288,7 @@ def connected(
     return sorted(ordered, key=lambda g: order[g[0]])
 
 
-def kind_of(site: Site) -> str:
+def block_kind(site: Site) -> str:
     support = site.distribution.support().kind
     return {"simplex": "simplex", "positive definite": "matrix"}.get(support, "real")
 

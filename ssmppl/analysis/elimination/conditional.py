@@ -18,7 +18,7 @@ from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 MOST = 8  # components of z, and of x that move with it: the filter of each is written out
 

@@ -1,6 +1,6 @@
 """Which parameters can be integrated out of conditional SMC: what `elimination.py` goes by.
 
-Only what is exact: a family that holds every factor of the block, the initial law included, and no
+Only what is exact: a family that holds every term of the block, the initial law included, and no
 truncation. Blocks are eliminated together if no term of the density holds two of them.
 """
 
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from ssmppl.analysis.conjugacy.check import verify
-from ssmppl.analysis.conjugacy.conjugacy import conjugate_update
+from ssmppl.analysis.conjugacy.derive import conjugate_update
 from ssmppl.analysis.conjugacy.describe import joined
 from ssmppl.analysis.conjugacy.families import Gamma, NormalGamma
 from ssmppl.analysis.conjugacy.family import Family
+from ssmppl.analysis.conjugacy.numerical_check import verify
 from ssmppl.analysis.conjugacy.search import Found, Search
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.separation import (
     BlockForm,
     CompleteData,
     complete_data,
@@ -25,7 +25,7 @@ from ssmppl.analysis.conjugacy.update import Update, natural_bounds
 from ssmppl.analysis.density import Missing
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 LARGEST = 8  # numbers that are jointly Normal: their Cholesky factor is written out
 
@@ -98,7 +98,7 @@ def _exact(
         return found
     update, family = conjugate_update(search, found), found.family
     name = joined(found.components)
-    if update.left or update.correction:
+    if update.inseparable_terms or update.outside_family:
         return NotApplicable(update.reason, update.where)
     if not family.written_out:
         return NotApplicable(f"a law of matrices, {family.name}, is not written out in scalars")
@@ -124,11 +124,11 @@ def _apart(data: CompleteData, taken: Sequence[Update], update: Update) -> Updat
         for monomial in form.monomials:
             held = symbols_of([a for a, _ in monomial])
             if held & set(other.components) and held & set(update.components):
-                factor = form.origins[monomial][0]
+                term = form.origins[monomial][0]
                 return NotApplicable(
-                    f"the {factor.role} law of {factor.site} holds it together with "
+                    f"the {term.role} law of {term.site} holds it together with "
                     f"{joined(other.components)}, which is eliminated, and both have no common "
                     "family",
-                    factor.where,
+                    term.where,
                 )
     return update

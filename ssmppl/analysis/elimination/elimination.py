@@ -1,7 +1,7 @@
 """Parameters that conditional SMC integrates out, on the way from one trajectory to the next.
 
 Given the states, a block of parameters with a conjugate family has log density sum_i C_i s_i, with
-statistics C that are sums over time (`sufficient.py`). So the states without the block have
+statistics C that are sums over time (`separation.py`). So the states without the block have
 
     p(x_{1:t}, y_{1:t}) = Z(C_prior + sum_{k <= t} c_k) prod_{k <= t} r_k,
 
@@ -39,7 +39,7 @@ from ssmppl.expressions.algebra import ONE, Separation, separate
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol, symbols_of
 from ssmppl.language.distributions import Dirac, Draws
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 COLUMNS = ("before", "moved", "now", "whole")  # of the base: see `Elimination.columns`
 INFINITY = float("inf")
@@ -164,8 +164,8 @@ class _Build:
         """log Z, without what all particles have in common."""
         total = ZERO
         for update, c in self._blocks(self._all(which, carried)):
-            assert update.conditional is not None
-            for part in filter(_of_states, update.conditional.log_normaliser(c)):
+            assert update.family is not None
+            for part in filter(_of_states, update.family.log_normaliser(c)):
                 total = total + part
         return total
 
@@ -182,8 +182,8 @@ class _Build:
         """x drawn with the block drawn first, and the statistics that follow."""
         source, drawn = Draws("eliminated"), dict[Expr, Expr]()
         for update, c in self._blocks(self._all("before", earlier)):
-            assert update.conditional is not None
-            own = update.conditional.written_draw(c, source)
+            assert update.family is not None
+            own = update.family.written_draw(c, source)
             drawn.update(zip(update.components, own, strict=True))
         x = dict(zip(draws, substitute(list(draws.values()), drawn), strict=True))
         carried = (self.sums[k] for k in self.carried)

@@ -46,7 +46,7 @@ from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_
 from ssmppl.language.distributions import Dirac, MvNormal, Normal
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.multivariate import SequentialNormal
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 
 @dataclass(frozen=True)

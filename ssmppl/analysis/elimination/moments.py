@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.analysis.density import Missing
 from ssmppl.expressions.expr import Expr, apply, constant
-from ssmppl.language.model.traced import seen
+from ssmppl.language.model.trace import seen
 
 ZERO = constant(0.0)
 

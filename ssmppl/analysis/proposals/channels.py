@@ -20,7 +20,7 @@ from ssmppl.language.distributions import (
 )
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.multivariate import SequentialNormal
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.expr import Expr, apply, constant, symbol, symbols_of
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 
 @dataclass(frozen=True)

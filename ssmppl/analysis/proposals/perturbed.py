@@ -23,7 +23,7 @@ from ssmppl.errors import Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed, substitute, symbol, symbols_of
 from ssmppl.language.distributions import Draws, Normal
-from ssmppl.language.model.traced import Site, Trace, previous, symbols
+from ssmppl.language.model.trace import Site, Trace, previous, symbols
 from ssmppl.language.model.transforms import Unconstrained, unconstrained
 
 

@@ -28,7 +28,7 @@ from ssmppl.analysis.structure import (
     affine_observation,
     flat_start,
     gaussian_block,
-    without_density,
+    singular_covariance,
 )
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import (
@@ -52,7 +52,7 @@ from ssmppl.expressions.expr import (
 from ssmppl.language.distributions import Draws
 from ssmppl.language.distributions.continuous import LOG_2PI
 from ssmppl.language.distributions.multivariate import surely_positive, where_definite
-from ssmppl.language.model.traced import Site, Trace, seen
+from ssmppl.language.model.trace import Site, Trace, seen
 
 NEWTON_STEPS = 3
 LONGEST_STEP = 2.0  # in standard deviations of the transition
@@ -223,7 +223,7 @@ def _locally_optimal(trace: Trace, missing: Missing) -> Proposal | NotApplicable
     sites = list(trace.observations.values())
     if not sites:
         return NotApplicable("there is no observation")
-    singular = without_density(trace)
+    singular = singular_covariance(trace)
     if singular is not None:
         return singular
     transition = split(trace, list(trace.transition.values()))
@@ -337,7 +337,7 @@ def _laplace(trace: Trace, missing: Missing) -> Proposal | NotApplicable:
     total = constant(0.0)
     for t in smooth:
         total = total + t.guarded()
-    singular = without_density(trace)
+    singular = singular_covariance(trace)
     if singular is not None:
         return singular
     transition = split(trace, list(trace.transition.values()))

@@ -13,7 +13,7 @@ from ssmppl.expressions.calculus import JUMPING
 from ssmppl.expressions.expr import dependent, topological
 from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
 from ssmppl.language.distributions.from_density import UserDefined
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 def smooth_filter_applies(trace: Trace) -> NotApplicable | None:

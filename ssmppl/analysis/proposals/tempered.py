@@ -11,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ssmppl.analysis.density import Missing, Term, terms
-from ssmppl.analysis.structure import deterministic, flat_start, without_density
+from ssmppl.analysis.structure import deterministic, flat_start, singular_covariance
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, depends_on, symbols_of
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 MOVABLE = ("real", "interval")  # supports that a random walk can move about in
 
@@ -39,7 +39,7 @@ def tempered(trace: Trace, missing: Missing) -> Tempered | NotApplicable:
     if flat:
         where = flat[0].distribution.location
         return NotApplicable(f"the initial law of {flat[0].name!r} is Flat", where)
-    singular = without_density(trace)
+    singular = singular_covariance(trace)
     if singular is not None:
         return singular
     states = trace.state_symbols

@@ -44,7 +44,7 @@ from ssmppl.expressions.calculus import (
 )
 from ssmppl.expressions.expr import Expr, apply, constant, depends_on, substitute, symbol
 from ssmppl.language.distributions import Dirac, Draws, MvNormal
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 DEFENSIVE = 0.02  # share of the transition in the proposal's mixture
 # Noises up to which the matrices are written out, in which LLVM finds what they have in common;

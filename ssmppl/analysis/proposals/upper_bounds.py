@@ -22,7 +22,7 @@ from ssmppl.expressions.arrays import elementwise as ew
 from ssmppl.expressions.expr import Expr, apply, attributed, constant, depends_on
 from ssmppl.language import distributions as laws
 from ssmppl.language.distributions.base import Distribution
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 
 def transition_upper_bound(trace: Trace) -> Expr | NotApplicable:

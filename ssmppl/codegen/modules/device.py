@@ -32,7 +32,7 @@ from ssmppl.codegen.text.specialise import specialise
 from ssmppl.compiling import once, one_at_a_time, parse
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.operations import KERNELS, MATRIX_OPS
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
 
 THREADS = 256

@@ -22,7 +22,7 @@ from ssmppl.codegen.text.render import identifier
 from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 @one_at_a_time

@@ -39,7 +39,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
 from ssmppl.expressions.expr import Expr, constant, depends_on, topological
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 XI_INITIAL = "theta, c, s, states, out"
 XI = "theta, c, s, states_prev, states, out"

@@ -21,7 +21,7 @@ from ssmppl.codegen.text.module import Layout, ModuleText
 from ssmppl.codegen.text.render import identifier
 from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import NotApplicable
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 # Names of the filters -> the proposal of the sampled states.
 NAMES = {"marginal": "bootstrap", "marginal_guided": "guided", "marginal_auxiliary": "auxiliary"}

@@ -56,7 +56,7 @@ from ssmppl.codegen.text.render import identifier
 from ssmppl.compiling import LOCK, once_property
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 # Proposals whose filters stand in a module of their own -> what a `Program` calls that.
 OWN_MODULES = {"twisted": "twisted", **dict.fromkeys(MARGINAL, "marginal"), "tempered": "tempered"}

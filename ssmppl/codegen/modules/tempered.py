@@ -32,7 +32,7 @@ from ssmppl.codegen.text.module import Layout, ModuleText, Section
 from ssmppl.codegen.text.render import identifier
 from ssmppl.compiling import one_at_a_time
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 MOVES, MOST_MOVES = 2, 8  # Metropolis steps at each temperature: so many and one for each component
 LEVELS = 30  # temperatures of a row at most

@@ -48,7 +48,7 @@ from ssmppl.codegen.text.render import depends, identifier
 from ssmppl.compiling import once, one_at_a_time
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, constant, symbol
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 MOST_STEPS = 12  # forward passes that improve the reference
 CLOSE = 0.05  # nats of improvement with which they end

@@ -20,7 +20,7 @@ from ssmppl.codegen.text.sums import scalar_function, time_sum
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 from ssmppl.language.model.transforms import transforms
 
 DRAW_INITIAL = "theta, c, s, states, normals, uniforms, rng"

@@ -26,7 +26,7 @@ from ssmppl.codegen.text.render import (
 from ssmppl.codegen.text.specialise import specialise
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.expressions.operations import KERNELS
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
 
 CONSTANT, THETA, STEP, PARTICLE = 0, 1, 2, 3

@@ -32,7 +32,7 @@ from ssmppl.errors import ArgumentError, Location, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, attributed
 from ssmppl.language.distributions import Distribution, Flat, HalfFlat, Uniform
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.trace import Site, Trace, symbols
 
 Sum = dict[tuple[str, tuple[int, ...]], Expr]  # (name, index) -> what is added
 _LAWS = {"transition": shifted, "observation": shifted, "initial": shifted, "noise": scaled,

@@ -29,7 +29,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbol, symbols_of
 from ssmppl.language.distributions import Dirac, Distribution
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 BEND = 2.0  # standard deviations at which the functions begin to level off
 MEAN, SCALE = 4, 2  # functions of a variable, for the mean and for the scale

@@ -19,7 +19,7 @@ from ssmppl.expressions.expr import Expr, as_expr, constant, substitute, symbol,
 from ssmppl.expressions.zero import wide_points
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.model.calling import call
-from ssmppl.language.model.traced import previous, symbols
+from ssmppl.language.model.trace import previous, symbols
 
 _POINTS = 200  # at which an effect of strength 0 is held against the model
 _WITHOUT_STATES = ("parameter", "input", "time")  # what an initial law may depend on

@@ -20,7 +20,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SSMError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
 from ssmppl.language.checks.rules import RESERVED
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 # What an effect of each kind can be bound to.
 BOUND_TO = {

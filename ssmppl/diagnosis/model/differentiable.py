@@ -16,7 +16,7 @@ from ssmppl.analysis.score import ROLES, CompleteScore
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, symbols_of, topological
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 _LAW_OF = {"initial": "the initial law of", "transition": "the transition of",
            "observation": "the observation of"}  # fmt: skip

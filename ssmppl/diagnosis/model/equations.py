@@ -28,7 +28,7 @@ from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_of, topological
 from ssmppl.language.distributions import Dirac, Distribution
-from ssmppl.language.model.traced import Trace, previous, symbols
+from ssmppl.language.model.trace import Trace, previous, symbols
 
 Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
 

@@ -22,7 +22,7 @@ from ssmppl.diagnosis.model.smoothing import LAG, Smoother
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.language.distributions import Normal
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 WIDE = 5.0  # times how far the states go, root mean square, or the starts differ in all
 KEPT = 64  # means of x_1 at a time

@@ -11,7 +11,7 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.effect import Grid
 from ssmppl.diagnosis.model.equations import label_of
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 LEVELS = (
     0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.9, 0.95, 0.98, 0.99

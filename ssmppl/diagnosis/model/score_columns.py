@@ -22,7 +22,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol, topological
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.verbs.simulate import feeds_back
 from ssmppl.language.distributions import Dirac, Flat
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.trace import Site, Trace, symbols
 
 # Of a pass.
 LAG = 40  # rows of the fixed-lag smoother

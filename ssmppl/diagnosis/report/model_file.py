@@ -30,7 +30,7 @@ from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated
 from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.trace import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive
 
 LINE = 96

@@ -33,7 +33,7 @@ from ssmppl.inference.checkpoints.origin import (
 )
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.closure_digest import fingerprint
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 SECONDS = 5.0  # between two writings, at least
 SHARE = 0.05  # of the time that may go into writing

@@ -38,7 +38,7 @@ from ssmppl.diagnosis.screening.location import BasisGroupScore, bin_edges, binn
 from ssmppl.diagnosis.screening.statistics import information_scale, typical_squares
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 OWN_RUNS = 6  # passes over the data themselves, which show the smoother's own noise
 FEWEST = 60  # simulated sets that must have gone through

@@ -20,7 +20,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Uniform
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 class AugmentedModels:

@@ -47,8 +47,8 @@ from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.preparation.pilot import climb_to_mode
 from ssmppl.inference.preparation.space import Space, at, space_of
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model.transforms import transforms
@@ -343,7 +343,7 @@ class Fitter:
         tops = []
         for share in shares:
             begin = self._with_process_noise(space, share)
-            top = climb(function, begin.z[begin.where])
+            top = climb(function, begin.z[begin.positions])
             if top is not None:
                 tops.append(top)
 
@@ -418,10 +418,10 @@ class Fitter:
         function = density_of(space, smooth)
         top = None
         if not effort.pilot:
-            top = climb(function, space.z[space.where])
+            top = climb(function, space.z[space.positions])
         if top is not None and top.distance < (GOOD if effort.standard_errors else NEAR):
             theta, converged = space.parameters(top.z)[0].copy(), True
-        elif len(space.where):
+        elif len(space.positions):
             ascent = climb_exactly(setup, DirectOptimization(restarts=int(effort.pilot)))
             theta, converged = ascent.theta, bool(ascent.report["converged"])
         else:
@@ -429,7 +429,7 @@ class Fitter:
         z, mask = hold_at_bounds(function, setup.space_at(theta), ~space.on_the_line)
         theta = space.parameters(z)[0].copy() if mask.any() else theta
         value = kalman.log_likelihood(problem.experiments, theta)
-        size = len(space.where)
+        size = len(space.positions)
         information = np.full((size, size), np.nan)
         fit = Fit(at(space, theta), theta, z, value, 0.0, information, 0.0, converged, mask)
         return self.with_information(fit, seed) if effort.standard_errors else fit
@@ -476,7 +476,7 @@ class Fitter:
         self, space: Space, seed: np.random.SeedSequence, information: np.ndarray | None
     ) -> Fit:
         stream = random_state(seed, Stream.ASCENT)
-        z = space.z[space.where]
+        z = space.z[space.positions]
         if information is None:
             information = self._simulated_information(space, space.theta, seed)
         transform = UnconstrainedTransform(space)
@@ -683,7 +683,7 @@ def component_names(space: Space, mask: np.ndarray) -> list[str]:
     for t in transforms(space.problem.trace):
         single = len(t.free) == len(t.components)
         every += (repr(t.components[k]) if single else t.site.name for k in range(len(t.free)))
-    free = [every[i] for i in space.where]
+    free = [every[i] for i in space.positions]
     return list(dict.fromkeys(n for n, m in zip(free, mask, strict=True) if m))
 
 

@@ -17,7 +17,7 @@ from ssmppl.diagnosis.selection.equivalence import Classes, equivalence_classes,
 from ssmppl.diagnosis.selection.fit import Fit, Fitter
 from ssmppl.diagnosis.selection.refit import Refit
 from ssmppl.diagnosis.verdict.verdicts import CURVES
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 @dataclass

@@ -36,7 +36,7 @@ from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.inference.chains.parameter_steps import ParameterSteps, ThetaValues
+from ssmppl.inference.chains.gibbs_updates import GibbsUpdates, ThetaValues
 from ssmppl.inference.chains.sampling import PlanRows, reason_and_line
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.run.problem import Problem
@@ -66,7 +66,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Eliminating(ParameterSteps):
+class Eliminating(GibbsUpdates):
     """Sweeps without the parameters of `updates`. adapting : sweeps of the warmup."""
 
     particles: int
@@ -94,7 +94,7 @@ class Eliminating(ParameterSteps):
         return EliminationState(0, self._mean_increment(self._totals(theta, list(paths))))
 
     def sweep(
-        self, learned: EliminationState, theta: np.ndarray, paths: list[np.ndarray],
+        self, state: EliminationState, theta: np.ndarray, paths: list[np.ndarray],
         stream: np.ndarray, generator: np.random.Generator,
     ) -> tuple[EliminationState, tuple[float, float]]:  # fmt: skip
         """New trajectories and eliminated parameters, in place; (share of steps that changed,
@@ -107,15 +107,15 @@ class Eliminating(ParameterSteps):
             base = prior + sum(c for i, c in enumerate(totals) if i != j)
             rows = self.rows(e, theta, paths[j])
             paths[j], totals[j], own = self.trajectory(
-                base, learned.rate, rows, e, theta, paths[j], stream
+                base, state.rate, rows, e, theta, paths[j], stream
             )
             figures += own / len(paths)
         self._draw(prior + sum(totals), theta, generator)
-        if learned.sweep < self.adapting:
-            gain = (learned.sweep + 1.0) ** -FORGETTING
-            rate = learned.rate + gain * (self._mean_increment(totals) - learned.rate)
-            learned = replace(learned, rate=rate)
-        return replace(learned, sweep=learned.sweep + 1), (float(figures[0]), float(figures[1]))
+        if state.sweep < self.adapting:
+            gain = (state.sweep + 1.0) ** -FORGETTING
+            rate = state.rate + gain * (self._mean_increment(totals) - state.rate)
+            state = replace(state, rate=rate)
+        return replace(state, sweep=state.sweep + 1), (float(figures[0]), float(figures[1]))
 
     def trajectory(
         self, base: np.ndarray, rate: np.ndarray, rows: Rows, e: Experiment, theta: np.ndarray,
@@ -185,23 +185,23 @@ class Eliminating(ParameterSteps):
     def _draw(self, totals: np.ndarray, theta: np.ndarray, generator: np.random.Generator) -> None:
         """The eliminated parameters from their law given the trajectories, in place."""
         at = 0
-        for update, where in zip(self.updates, self.where, strict=True):
+        for update, positions in zip(self.updates, self.positions, strict=True):
             own = totals[at : at + len(update.functions)].tolist()
             at += len(update.functions)
-            assert update.conditional is not None
-            values = update.conditional.draw([*own, 0.0], generator)
+            assert update.family is not None
+            values = update.family.draw([*own, 0.0], generator)
             if values is None or not np.all(np.isfinite(values)):
                 raise SamplingError(
-                    f"the {update.family} law of {', '.join(update.block)} given the trajectory is "
-                    "improper, and cannot be integrated out",
+                    f"the {update.family_name} law of {', '.join(update.block)} given the "
+                    "trajectory is improper, and cannot be integrated out",
                     fix="give a proper prior, or use eliminate=False",
                     where=update.where,
                 )
-            theta[where] = values
+            theta[positions] = values
 
 
 def requested_elimination(
-    problem: Problem, setting: bool | str | tuple[str, ...], held: Mapping[str, np.ndarray],
+    problem: Problem, setting: bool | str | tuple[str, ...], fixed: Mapping[str, np.ndarray],
     proposal: str,
 ) -> Eliminable | NotApplicable:  # fmt: skip
     """What is to be eliminated; NotApplicable where nothing is.
@@ -216,7 +216,7 @@ def requested_elimination(
         return NotApplicable("eliminate=False")
     trace, names = problem.trace, None
     if not (setting is True or setting == "auto"):
-        names = _named(problem, setting, held)
+        names = _named(problem, setting, fixed)
     if proposal != "bootstrap":
         if setting == "auto":
             return NotApplicable(f"particles move by the proposal {proposal!r}")
@@ -225,7 +225,7 @@ def requested_elimination(
             "does not",
             fix='use proposal="auto" or "bootstrap" with it',
         )
-    found = eliminable(trace, tuple(held), problem.program.missing, names)
+    found = eliminable(trace, tuple(fixed), problem.program.missing, names)
     missed = [r for c, r in found.refused.items() if names is not None]
     if missed or not found.updates:
         reason = next(iter(found.refused.values()), NotApplicable("no parameter is free"))
@@ -241,8 +241,8 @@ def requested_elimination(
     return found
 
 
-def _named(problem: Problem, setting: object, held: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    free = [n for n in problem.trace.parameters if n not in held]
+def _named(problem: Problem, setting: object, fixed: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    free = [n for n in problem.trace.parameters if n not in fixed]
     assert isinstance(setting, (tuple, list))
     for name in setting:
         if name not in free:
@@ -257,14 +257,16 @@ def describe_elimination(found: Eliminable | NotApplicable) -> str:
     """What is eliminated, in words."""
     if isinstance(found, NotApplicable):
         return f"none: {found.reason}"
-    return "; ".join(f"{', '.join(map(repr, u.components))} ({u.family})" for u in found.updates)
+    return "; ".join(
+        f"{', '.join(map(repr, u.components))} ({u.family_name})" for u in found.updates
+    )
 
 
 def explain_elimination(found: Eliminable) -> PlanRows:
     """What `explain` says: what can be eliminated, and why others cannot."""
     rows = [
         (joined(u.components), "marginalised in the trajectory update, each particle carrying "
-         f"sufficient statistics: {u.family}")
+         f"sufficient statistics: {u.family_name}")
         for u in found.updates
     ]  # fmt: skip
     refused = found.refused.items()

@@ -16,19 +16,19 @@ from functools import partial
 import numpy as np
 
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.chains.interweaving import (
-    Interweaving,
-    InterweavingTuning,
-    applicable,
-    interweaving,
-)
-from ssmppl.inference.chains.metropolis import needed_model
-from ssmppl.inference.chains.parameter_steps import (
-    ParameterSteps,
+from ssmppl.inference.chains.gibbs_updates import (
+    GibbsUpdates,
     draw_parameters,
     log_joint,
     plan_updates,
 )
+from ssmppl.inference.chains.interweaving import (
+    Interweaving,
+    InterweavingTuning,
+    applicable,
+    prepare_interweaving,
+)
+from ssmppl.inference.chains.metropolis import needed_model
 from ssmppl.inference.chains.sampling import (
     INTERWEAVED,
     Derived,
@@ -57,7 +57,7 @@ class GibbsState:
 
 
 @dataclass(frozen=True)
-class GibbsSteps(ParameterSteps):
+class GibbsSweeper(GibbsUpdates):
     """A problem with its updates. interweaving : the further steps of a sweep."""
 
     interweaving: Interweaving | None = None
@@ -75,19 +75,19 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
     model = needed_model(problem, "Gibbs")
     need_density(problem.trace, "Gibbs", "sample")
     kind = filter_of(model)
-    if space.where.size:
+    if space.positions.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
         check_mode(model, problem.experiments, space.parameters(pilot.z)[0])
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
-    further, interweaved = interweaving(setup, method.interweave, pilot, model)
-    steps = GibbsSteps(problem, plan_updates(problem, setup.held), further)
+    interweaving, interweaved = prepare_interweaving(setup, method.interweave, pilot, model)
+    steps = GibbsSweeper(problem, plan_updates(problem, setup.fixed), interweaving)
     starts = setup.once("starts", lambda: dispersed(space, pilot, setup.chains, setup.root, kind))
     states = []
     for chain, z in enumerate(starts):
         generator, stream = setup.streams(chain)
         theta = space.parameters(z)[0] if len(z) else space.theta
-        tuning = further.begin() if further is not None else None
+        tuning = interweaving.begin() if interweaving is not None else None
         states.append(GibbsState(theta.copy(), generator, stream, tuning))
     report = {
         "trajectories": "exact, by backward sampling",
@@ -100,22 +100,22 @@ def prepare(setup: SamplingSetup, method: Gibbs) -> PreparedChains:
 
 
 def gibbs_block(
-    steps: GibbsSteps, thin: int, with_paths: bool, state: GibbsState, n: int
+    steps: GibbsSweeper, thin: int, with_paths: bool, state: GibbsState, n: int
 ) -> tuple[GibbsState, Block]:
     """n draws of one chain, each after `thin` sweeps; with_paths : whether with trajectories."""
     model = needed_model(steps.problem, "Gibbs")
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
-    theta, tuning, further = state.theta.copy(), state.tuning, steps.interweaving
+    theta, tuning, interweaving = state.theta.copy(), state.tuning, steps.interweaving
     draws: dict[str, list[np.ndarray]] = {"theta": []}
     draws |= {f"path_{i}": [] for i in range(len(steps.problem.experiments)) if with_paths}
     stats: dict[str, list[float]] = {"lp": [], "acceptance_rate": []}
-    if further is not None:
+    if interweaving is not None:
         stats["interweaved"] = []
     for _ in range(n):
         accepted, made, interweaved = 0, 0, 0.0
         for _ in range(thin):
-            if further is not None and tuning is not None:
-                tuning, share = further.step(tuning, theta, [], generator)
+            if interweaving is not None and tuning is not None:
+                tuning, share = interweaving.step(tuning, theta, [], generator)
                 interweaved += share / thin
             paths = draw_paths(steps, model, theta, stream)
             infos = draw_parameters(steps, theta, paths, generator)
@@ -125,13 +125,13 @@ def gibbs_block(
             draws[f"path_{i}"].append(path)
         stats["lp"].append(log_joint(steps, theta, paths))
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
-        if further is not None:
+        if interweaving is not None:
             stats["interweaved"].append(interweaved)
     return GibbsState(theta, generator, stream, tuning), Block.of(draws, stats)
 
 
 def draw_paths(
-    steps: ParameterSteps, model: ExactModel, theta: np.ndarray, stream: np.ndarray
+    steps: GibbsUpdates, model: ExactModel, theta: np.ndarray, stream: np.ndarray
 ) -> list[np.ndarray]:
     """Independent trajectories (T, D), one per experiment, from p(x_{1:T} | y_{1:T}, theta)."""
     experiments = steps.problem.experiments

@@ -59,7 +59,7 @@ from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.updates.slices import comparable
-from ssmppl.language.model.transforms import constant_bounds, free_number, transforms, unconstrain
+from ssmppl.language.model.transforms import free_number, parameter_bounds, transforms, unconstrain
 
 Paths = list[np.ndarray]
 _NO_GUIDE = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty((0, 0))
@@ -308,8 +308,8 @@ class Interweaving:
         trace = self.space.problem.trace
         if self.bounds is not None:  # much the fastest, and most models are so
             pairs = zip(theta.tolist(), self.bounds, strict=True)
-            return np.array([free_number(v, *b) for v, b in pairs])[self.space.where]
-        return unconstrain(trace, theta, unpack_parameters(trace, theta))[self.space.where]
+            return np.array([free_number(v, *b) for v, b in pairs])[self.space.positions]
+        return unconstrain(trace, theta, unpack_parameters(trace, theta))[self.space.positions]
 
     def _slow(self, seen: Sequence[np.ndarray]) -> np.ndarray:
         """Which numbers move: those whose plain chain is slow, by the lag-1 autocorrelation of its
@@ -379,7 +379,7 @@ def _refused(found: NotApplicable) -> ArgumentError:
     )
 
 
-def interweaving(
+def prepare_interweaving(
     setup: SamplingSetup, setting: str | bool, pilot: Pilot, model: ExactModel | None = None
 ) -> tuple[Interweaving | None, str]:
     """The further steps of a method's chains, and in words what they are or why there are none.
@@ -394,7 +394,7 @@ def interweaving(
     if isinstance(found, NotApplicable):
         return None, f"none: {found.reason}"
     space, adapting = setup.space, setup.warmup * setup.thin
-    if not len(space.where):
+    if not len(space.positions):
         return None, "none: no parameter is free"
     if setting == "auto" and adapting < LEAST_WARMUP:
         return None, f"none: fewer than {LEAST_WARMUP} sweeps of warmup, too few to tune them"
@@ -417,13 +417,13 @@ def interweaving(
         moves.append(NoiseMove(setup.problem, found, False, near))
     names = found.tied if steered or model is not None else found.parameters
     owner = [t.site.name for t in transforms(setup.problem.trace) for _ in t.free]
-    movable = np.array([k for k, i in enumerate(space.where) if owner[i] in names], dtype=int)
+    movable = np.array([k for k, i in enumerate(space.positions) if owner[i] in names], dtype=int)
     if not len(movable):
         return None, "none: no free parameter is in the law of a state"
     looking = 0 if setting is True else min(int(LOOK * adapting), LONGEST_LOOK)
-    bounds = constant_bounds(setup.problem.trace)
+    bounds = parameter_bounds(setup.problem.trace)
     steps = Interweaving(space, tuple(moves), movable, pilot.scale, adapting, looking, bounds)
-    moved = ", ".join(dict.fromkeys(owner[space.where[k]] for k in movable))
+    moved = ", ".join(dict.fromkeys(owner[space.positions[k]] for k in movable))
     who = f"those with high autocorrelation in the plain chain, of {moved}" if looking else moved
     return steps, f"{who}: moved with {describe_interweaving(found, model)}"
 

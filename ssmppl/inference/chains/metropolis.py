@@ -35,8 +35,8 @@ from ssmppl.inference.preparation.exact_models import (
 )
 from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.preparation.pilot import Pilot, find_mode
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import check_mode
-from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.problem import Problem
 
 
@@ -111,7 +111,7 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
     pilot = setup.once("pilot", lambda: find_mode(space, setup.root, kind))
     check_mode(exact, problem.experiments, space.parameters(pilot.z)[0])
-    d, free, order = len(where), free_components(problem.trace, setup.held), method.order
+    d, free, order = len(where), free_components(problem.trace, setup.fixed), method.order
     if order is None:
         cheap = isinstance(exact, Deterministic) and d > 2
         order = int(cheap and not _without_gradient(exact, setup, free))

@@ -26,7 +26,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.problem import Problem
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 from ssmppl.language.model.transforms import transforms
 
 SCALES = ("unconstrained", "natural", "log", "reciprocal")
@@ -66,7 +66,7 @@ class Coordinates:
             return z_free
         theta, _ = self.space.parameters(z_free)
         z = self.space.z.copy()
-        z[self.space.where] = z_free
+        z[self.space.positions] = z_free
         w = np.where(self.kinds == "unconstrained", z[self._in_z], theta[self._in_theta])
         log, reciprocal = self.kinds == "log", self.kinds == "reciprocal"
         with np.errstate(divide="ignore", invalid="ignore"):  # seen below

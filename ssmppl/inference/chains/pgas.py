@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.analysis.structure import deterministic_memory, without_density
+from ssmppl.analysis.structure import deterministic_memory, singular_covariance
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.elimination import (
@@ -23,19 +23,19 @@ from ssmppl.inference.chains.elimination import (
     explain_elimination,
     requested_elimination,
 )
+from ssmppl.inference.chains.gibbs_updates import (
+    GibbsUpdates,
+    draw_parameters,
+    log_joint,
+    plan_updates,
+)
 from ssmppl.inference.chains.interweaving import (
     Interweaving,
     InterweavingTuning,
     applicable,
-    interweaving,
+    prepare_interweaving,
     requested_noises,
     with_states,
-)
-from ssmppl.inference.chains.parameter_steps import (
-    ParameterSteps,
-    draw_parameters,
-    log_joint,
-    plan_updates,
 )
 from ssmppl.inference.chains.sampling import (
     ELIMINATED,
@@ -54,8 +54,9 @@ from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
+from ssmppl.inference.preparation.proposal_choice import choose_for_csmc
+from ssmppl.inference.run.convergence import PathMovement, update_rate_attributes
 from ssmppl.inference.run.draws import Block
-from ssmppl.inference.run.mixing import PathMovement, update_rate_attributes
 from ssmppl.inference.run.problem import Problem
 
 PARTICLES = 25
@@ -69,23 +70,23 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     need_density(problem.trace, "PGAS", "sample")
     by_transition = method.proposal == "auto" and method.eliminate not in (False, "auto")
     proposal = "bootstrap" if by_transition else method.proposal
-    settings = conditional_settings(problem, method.particles, proposal)
-    eliminated = requested_elimination(problem, method.eliminate, setup.held, settings.proposal)
+    settings = csmc_settings(problem, method.particles, proposal)
+    eliminated = requested_elimination(problem, method.eliminate, setup.fixed, settings.proposal)
     requested_noises(problem, method.interweave, None)  # refused before anything is compiled
-    if space.where.size:
+    if space.positions.size:
         pilot = setup.once("pilot", lambda: find_mode(space, setup.root))
     else:
         pilot = Pilot(np.empty(0), np.empty(0), 0.0)
-    further, interweaved = interweaving(setup, method.interweave, pilot)
-    updates = plan_updates(problem, setup.held)
+    interweaving, interweaved = prepare_interweaving(setup, method.interweave, pilot)
+    updates = plan_updates(problem, setup.fixed)
     plan = "\n".join(str(u.explanation) for u in updates)
-    without = None
+    elimination = None
     if not isinstance(eliminated, NotApplicable):
         adapting = setup.warmup * setup.thin
-        without = Eliminating(problem, eliminated.updates, settings.particles, adapting)
+        elimination = Eliminating(problem, eliminated.updates, settings.particles, adapting)
         gone = set(eliminated.components)
         updates = tuple(u for u in updates if not gone.issuperset(u.components))
-    sweeper = Sweeper(problem, updates, settings, further, without)
+    sweeper = Sweeper(problem, updates, settings, interweaving, elimination)
     starts = setup.once(
         "starts", lambda: dispersed(space, pilot, setup.chains, setup.root, "bootstrap")
     )
@@ -94,7 +95,9 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
         generator, stream = setup.streams(chain)
         theta, _ = space.parameters(z) if len(z) else (space.theta, 0.0)
         begun = start_chain(sweeper, theta, generator, stream)
-        states.append(begun if setup.states else replace(begun, watch=PathMovement(setup.warmup)))
+        if not setup.states:
+            begun = replace(begun, path_movement=PathMovement(setup.warmup))
+        states.append(begun)
     report = {
         "particles": settings.particles,
         "proposal": settings.proposal,
@@ -109,10 +112,10 @@ def prepare(setup: SamplingSetup, method: PGAS) -> PreparedChains:
     return PreparedChains(step, states, report)
 
 
-def conditional_settings(problem: Problem, particles: int | None, proposal: str) -> FilterSettings:
+def csmc_settings(problem: Problem, particles: int | None, proposal: str) -> FilterSettings:
     """Of the conditional particle filter: what was asked for, else what suits the model."""
     if proposal == "auto":
-        proposal = pgas_proposal(problem)
+        proposal = choose_for_csmc(problem)
     problem.proposal(proposal)
     if particles is None:
         joined = deterministic_memory(problem.trace) is not None
@@ -120,28 +123,17 @@ def conditional_settings(problem: Problem, particles: int | None, proposal: str)
     return FilterSettings(int(particles), proposal)
 
 
-def pgas_proposal(problem: Problem) -> str:
-    """The user's, else the locally optimal one where it is exact, else the transition."""
-    proposals = problem.program.proposals
-    if "user" in proposals:
-        return "user"
-    auxiliary = proposals.get("auxiliary")
-    if auxiliary is None or isinstance(auxiliary, NotApplicable):
-        return "bootstrap"
-    return "auxiliary" if auxiliary.exact_look_ahead else "bootstrap"
-
-
 @dataclass(frozen=True)
-class Sweeper(ParameterSteps):
+class Sweeper(GibbsUpdates):
     """A problem with its updates: what one iteration of PGAS needs.
 
     settings : of the conditional particle filter. interweaving : the further steps of a sweep.
-    without : the sweeps where parameters are eliminated; `updates` are those of the others.
+    elimination : the sweeps where parameters are eliminated; `updates` are those of the others.
     """
 
     settings: FilterSettings
     interweaving: Interweaving | None = None
-    without: Eliminating | None = None
+    elimination: Eliminating | None = None
 
 
 @dataclass(frozen=True)
@@ -155,8 +147,8 @@ class PGASState:
     generator: np.random.Generator
     stream: np.ndarray
     tuning: InterweavingTuning | None = None
-    learned: EliminationState | None = None
-    watch: PathMovement | None = None
+    elimination_state: EliminationState | None = None
+    path_movement: PathMovement | None = None
 
 
 def start_chain(
@@ -180,10 +172,12 @@ def start_chain(
         if status != OK:
             raise failure(problem, theta, status, t, e)
         paths.append(path)
-    further = sweeper.interweaving
-    tuning = further.begin() if further is not None else None
-    learned = sweeper.without.begin(theta, tuple(paths)) if sweeper.without is not None else None
-    return PGASState(theta.copy(), tuple(paths), generator, stream, tuning, learned)
+    interweaving = sweeper.interweaving
+    tuning = interweaving.begin() if interweaving is not None else None
+    elimination, elimination_state = sweeper.elimination, None
+    if elimination is not None:
+        elimination_state = elimination.begin(theta, tuple(paths))
+    return PGASState(theta.copy(), tuple(paths), generator, stream, tuning, elimination_state)
 
 
 def pgas_block(
@@ -195,29 +189,32 @@ def pgas_block(
     """
     generator, stream = copy.deepcopy(state.generator), state.stream.copy()
     theta, paths, tuning = state.theta.copy(), [p.copy() for p in state.paths], state.tuning
-    further, without, learned = sweeper.interweaving, sweeper.without, state.learned
-    watch, draws = state.watch, dict[str, list[np.ndarray]](theta=[])
-    draws |= {f"path_{i}": [] for i in range(len(paths)) if watch is None}
+    interweaving, elimination = sweeper.interweaving, sweeper.elimination
+    elimination_state = state.elimination_state
+    path_movement, draws = state.path_movement, dict[str, list[np.ndarray]](theta=[])
+    draws |= {f"path_{i}": [] for i in range(len(paths)) if path_movement is None}
     stats: dict[str, list[float]] = {"lp": [], "update_rate": [], "ess": [], "acceptance_rate": []}
-    if further is not None:
+    if interweaving is not None:
         stats["interweaved"] = []
     for _ in range(n):
         moved, ess, accepted, made, interweaved = 0.0, 0.0, 0, 0, 0.0
         for _ in range(thin):
-            if without is not None and learned is not None:
-                learned, rates = without.sweep(learned, theta, paths, stream, generator)
+            if elimination is not None and elimination_state is not None:
+                elimination_state, rates = elimination.sweep(
+                    elimination_state, theta, paths, stream, generator
+                )
             else:
                 rates = _trajectories(sweeper, theta, paths, stream)
             infos = draw_parameters(sweeper, theta, paths, generator)
-            if further is not None and tuning is not None:
-                tuning, share = further.step(tuning, theta, paths, generator)
+            if interweaving is not None and tuning is not None:
+                tuning, share = interweaving.step(tuning, theta, paths, generator)
                 interweaved += share / thin
             moved, ess = moved + rates[0] / thin, ess + rates[1] / thin
             accepted, made = accepted + sum(infos), made + len(infos)
         draws["theta"].append(theta.copy())
-        if watch is not None:
-            watch = watch.after(paths)
-        for i, path in enumerate(paths if watch is None else ()):
+        if path_movement is not None:
+            path_movement = path_movement.after(paths)
+        for i, path in enumerate(paths if path_movement is None else ()):
             draws[f"path_{i}"].append(path.copy())
         if predictive:
             for i, increments in enumerate(_predictive(sweeper, theta, stream)):
@@ -226,9 +223,11 @@ def pgas_block(
         stats["update_rate"].append(moved)
         stats["ess"].append(ess)
         stats["acceptance_rate"].append(accepted / made if made else 1.0)
-        if further is not None:
+        if interweaving is not None:
             stats["interweaved"].append(interweaved)
-    state = PGASState(theta, tuple(paths), generator, stream, tuning, learned, watch)
+    state = PGASState(
+        theta, tuple(paths), generator, stream, tuning, elimination_state, path_movement
+    )
     return state, Block.of(draws, stats)
 
 
@@ -281,7 +280,7 @@ def explain(plan: Derived) -> Mapping[str, PlanRows]:
 
 
 def _trajectories_of(plan: Derived) -> str:
-    singular = without_density(plan.trace)
+    singular = singular_covariance(plan.trace)
     if singular is not None:
         return f"does not apply: {reason_and_line(singular)}"
     flat = [s.name for s in plan.trace.initial.values() if not s.distribution.proper]
@@ -290,17 +289,18 @@ def _trajectories_of(plan: Derived) -> str:
             f"does not apply: {', '.join(flat)} {'has' if len(flat) == 1 else 'have'} an improper "
             "(flat) initial distribution, which cannot be sampled"
         )
-    if plan.memory is None:
+    steps = plan.deterministic_memory
+    if steps is None:
         return (
             "conditional SMC without ancestor sampling, which is impossible: the model has a "
             "deterministic state with infinite memory; take more particles, or PMMH"
         )
-    if plan.memory == 0:
+    if steps == 0:
         return "conditional SMC with ancestor sampling, weights w f(x'_t | x_{t-1})"
-    steps = "noisy state" if plan.memory == 1 else f"{plan.memory} noisy states"
+    last = "noisy state" if steps == 1 else f"{steps} noisy states"
     return (
         "conditional SMC with ancestor sampling over the noisy states: deterministic states depend "
-        f"on the last {steps} only, whose densities enter the ancestor weights"
+        f"on the last {last} only, whose densities enter the ancestor weights"
     )
 
 

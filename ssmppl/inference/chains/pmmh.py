@@ -67,9 +67,9 @@ from ssmppl.inference.preparation.pilot import (
     particles_for,
     tune_particles,
 )
-from ssmppl.inference.preparation.proposal_choice import Choice, choose
+from ssmppl.inference.preparation.proposal_choice import Choice, choose_by_pilot
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 
 LEAST_EIGENVALUE, MOST_EIGENVALUE = 0.2, 5.0  # of the information, in units of the pilot's
@@ -377,7 +377,7 @@ def prepare(setup: SamplingSetup, method: PMMH) -> PreparedChains:
         temper = plain and not method.rescue
         choice = setup.once(
             "proposal",
-            lambda: choose(
+            lambda: choose_by_pilot(
                 problem, theta, exact=False, whole=plain, integrate=plain, temper=temper
             ),
         )
@@ -449,9 +449,9 @@ def _likelihood(setup: SamplingSetup, method: PMMH, settings: FilterSettings) ->
         _ = correlated.filter
         return correlated
     if method.order:
-        held = [n not in setup.held for n, s in problem.trace.parameters.items()
+        free = [n not in setup.fixed for n, s in problem.trace.parameters.items()
                 for _ in s.components]  # fmt: skip
-        wanted = tuple(np.flatnonzero(held).tolist())
+        wanted = tuple(np.flatnonzero(free).tolist())
         second = method.order == 2
         scored = ScoredLikelihood(problem, settings, method.lag, wanted, second, setup.states)
         _ = scored.filter

@@ -20,11 +20,11 @@ from ssmppl.data import unpack_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.chain_runner import run_chains
-from ssmppl.inference.run.draws import Block, ChainDraws, Keep
+from ssmppl.inference.run.draws import Block, ChainDraws, Checkpoint
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 Result = TypeVar("Result")
 DrawnChains = Sequence[ChainDraws[Any]]
@@ -37,41 +37,29 @@ INTERWEAVED = "Joint parameter-trajectory moves (ASIS interweaving)"
 ELIMINATED = "Parameters that PGAS can marginalise (`eliminate=`)"
 
 
-class Memory(Keep, Protocol):
-    """Outlives the process: `ChainFile`. report : of the chains, once they were made ready."""
-
-    report: dict[str, Any] | None
-
-    def once(self, name: str, make: Callable[[], Any]) -> Any:
-        """What `make` gives, or gave in an earlier process."""
-
-    def finished(self, draws: int) -> bool:
-        """Whether every chain has so many draws, those of the warmup included."""
-
-
 @dataclass(frozen=True)
 class SamplingSetup:
     """A call of `sample`, checked.
 
-    space : the free parameters, at the values near which to begin. held : the fixed ones.
+    space : the free parameters, at the values near which to begin. fixed : values of the others.
     chains, warmup, thin, states : as in `sample`. root : of all random numbers of the call.
-    memory : what was found before the chains began, by name, and goes on being known.
+    checkpoint : keeps the chains, and by name what was found before they began.
     """
 
     problem: Problem
     space: Space
-    held: dict[str, np.ndarray]
+    fixed: dict[str, np.ndarray]
     chains: int
     warmup: int
     thin: int
     root: np.random.SeedSequence
     states: bool = True
-    memory: Memory | None = None
+    checkpoint: Checkpoint | None = None
 
     def once(self, name: str, make: Callable[[], Result]) -> Result:
         """What `make` gives, or gave in the call that this one continues: for what takes long, and
         for what the kernel of the chains depends on."""
-        return make() if self.memory is None else self.memory.once(name, make)
+        return make() if self.checkpoint is None else self.checkpoint.once(name, make)
 
     def streams(self, chain: int) -> tuple[np.random.Generator, np.ndarray]:
         """The random numbers of a chain: for the parameters, and for the kernels."""
@@ -107,7 +95,7 @@ class Derived(Protocol):
     @property
     def noises(self) -> Noises | NotApplicable: ...
     @property
-    def memory(self) -> int | None: ...
+    def deterministic_memory(self) -> int | None: ...
     @property
     def eliminable(self) -> Eliminable: ...
 
@@ -150,17 +138,21 @@ class SamplingMethod:
         if self.prepare is None:
             assert self.independent is not None
             return self.independent(setup, settings, draws, executor, progress)
-        title, memory = type(settings).__name__, setup.memory
-        if memory is None or memory.report is None or not memory.finished(setup.warmup + draws):
+        title, checkpoint = type(settings).__name__, setup.checkpoint
+        if (
+            checkpoint is None
+            or checkpoint.report is None
+            or not checkpoint.finished(setup.warmup + draws)
+        ):
             with announced(title, "preparing", shown=progress):
                 chains = self.prepare(setup, settings)
-            if memory is not None:
-                memory.report = chains.report
+            if checkpoint is not None:
+                checkpoint.report = chains.report
         else:  # nothing is left to draw, and nothing needs to be compiled for it
-            chains = PreparedChains(_finished, [None] * setup.chains, memory.report)
+            chains = PreparedChains(_finished, [None] * setup.chains, checkpoint.report)
         result = run_chains(
             chains.step_block, chains.states, draws, setup.warmup, executor=executor,
-            progress=progress, title=title, keep=memory,
+            progress=progress, title=title, checkpoint=checkpoint,
         )  # fmt: skip
         return result, chains.report
 

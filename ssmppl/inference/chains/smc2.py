@@ -36,7 +36,7 @@ from ssmppl.expressions.expr import symbols_of
 from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import SMC2
 from ssmppl.inference.particles.filtering import failure, log_of_mean
-from ssmppl.inference.preparation.proposal_choice import Choice, choose
+from ssmppl.inference.preparation.proposal_choice import Choice, choose_by_pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import Block, ChainDraws
@@ -160,7 +160,7 @@ def begin(filters: Filters, setup: SamplingSetup, run: int) -> SMC2State:
     method, trace, space = filters.method, setup.problem.trace, setup.space
     assert method.parameters is not None
     generator, stream = setup.streams(run)
-    theta = draw_prior(trace, generator, method.parameters, setup.held)
+    theta = draw_prior(trace, generator, method.parameters, setup.fixed)
     # a fixed one may lie outside of bounds that were drawn: these have no weight
     made = [t for t, free in zip(transforms(trace), space.free, strict=True) if free]
     z = np.array([unconstrain(trace, t, unpack_parameters(trace, t), made) for t in theta])
@@ -173,7 +173,7 @@ def begin(filters: Filters, setup: SamplingSetup, run: int) -> SMC2State:
     values = dict(zip(trace.parameter_symbols, theta.T, strict=True))
     for term in terms(trace, "prior"):
         names = {s.data[1] for s in symbols_of(term.log_density)}
-        if term.site.name in setup.held and not names <= setup.held.keys():
+        if term.site.name in setup.fixed and not names <= setup.fixed.keys():
             factor = np.broadcast_to(evaluate([term.log_density], values)[0], (m,))
             state = state.weighted(np.asarray(factor, dtype=float))
     return state
@@ -296,14 +296,14 @@ def run_smc2(setup: SamplingSetup, method: SMC2, executor: Any, progress: bool) 
     """
     check_count("parameters", method.parameters, 2)  # as many as draws, where none were given
     draw_prior(  # improper: refused now
-        setup.problem.trace, np.random.default_rng(0), 1, setup.held, "or its value by fixed="
+        setup.problem.trace, np.random.default_rng(0), 1, setup.fixed, "or its value by fixed="
     )
     filters = Filters(setup.space, method, _proposal(setup, method))
     states = [begin(filters, setup, r) for r in range(setup.chains)]
     rows = setup.problem.rows
     chains: Sequence[ChainDraws[SMC2State]] = run_chains(
         partial(rows_block, filters), states, rows, executor=executor, progress=progress,
-        title="SMC2", describe=_describe, keep=setup.memory,
+        title="SMC2", describe=_describe, checkpoint=setup.checkpoint,
     )  # fmt: skip
     if any(c.interrupted for c in chains):
         raise chains[0].lost or KeyboardInterrupt("interrupted before all rows were seen")
@@ -359,7 +359,9 @@ def _proposal(setup: SamplingSetup, method: SMC2) -> str:
     name = method.proposal
     if name == "auto":
         theta = setup.space.theta
-        name = setup.once("proposal", lambda: choose(setup.problem, theta, exact=False)).name
+        name = setup.once(
+            "proposal", lambda: choose_by_pilot(setup.problem, theta, exact=False)
+        ).name
         name = {"auxiliary": "guided", "twisted": "bootstrap"}.get(name, name)
     found = setup.problem.proposal(name)
     if found.look_ahead is not None or found.unsuited:

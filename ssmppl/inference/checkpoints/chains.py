@@ -31,7 +31,7 @@ from ssmppl.inference.checkpoints.archive import clear, no_checkpoint, read, unw
 from ssmppl.inference.checkpoints.codec import Codec, Store
 from ssmppl.inference.checkpoints.origin import Origin, origin_of
 from ssmppl.inference.checkpoints.spool import Spool
-from ssmppl.inference.run.draws import Block, ChainDraws, Standing, stack
+from ssmppl.inference.run.draws import Block, ChainDraws, Checkpoint, Standing, stack
 
 SECONDS = 30.0  # between two writings, at least
 SHARE = 0.03  # of the time that may go into writing
@@ -41,8 +41,8 @@ WHAT = "`sample`"
 KINDS = ("draws", "stats")
 
 
-class ChainFile:
-    """A checkpoint of `sample`, and the `Keep` of its chains.
+class CheckpointFile(Checkpoint):
+    """The `Checkpoint` of a call of `sample`, as a file.
 
     path : the file, in a folder that exists. origin : of the call. seed : as in the call; None goes
     on with the random numbers of the file, if there is one. root : the random numbers of the call,
@@ -100,7 +100,7 @@ class ChainFile:
         chains = self._standings
         return chains is not None and min(s.done for s in chains) >= draws
 
-    # -- as a `Keep`
+    # -- what the chains ask of it
     def standings(self) -> list[Standing[Any]] | None:
         """How far the chains have come."""
         return self._standings

@@ -19,7 +19,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.distributions.from_density import UserDefined
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 from ssmppl.language.user_defined.primitive import Primitive
 
 # What the digits of draws depend on besides this package: compilers, random number generators,

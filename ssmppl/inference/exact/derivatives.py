@@ -13,7 +13,7 @@ import numpy as np
 
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 LEVELS = 7
 SHRINK = 1.6

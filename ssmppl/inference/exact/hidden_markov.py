@@ -33,8 +33,8 @@ from ssmppl.expressions.expr import Expr, constant
 from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.histories import Histories, histories
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
-from ssmppl.inference.run.ranges import without_density
-from ssmppl.language.model.traced import Trace, once_per_trace, previous
+from ssmppl.inference.run.invalid_laws import law_without_density_at
+from ssmppl.language.model.trace import Trace, once_per_trace, previous
 
 ENTRIES = 2_000_000  # of an array over rows and pairs of values: more rows are done in pieces
 HALVINGS = 200  # of an interval between any two floats that differ in size by less than 1e40
@@ -462,7 +462,7 @@ class HiddenMarkov(Scored):
                 where = next(iter(self.trace.observations.values())).distribution.location
                 why, fix = "", ("check this row of the data, and whether the laws leave each value "
                                 "a chance")  # fmt: skip
-                if none := without_density(self.trace, theta):
+                if none := law_without_density_at(self.trace, theta):
                     why, fix, where = none
                 raise SamplingError(
                     f"no value of the states is possible at t={t + 1}{of}; parameters: "

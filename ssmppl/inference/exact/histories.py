@@ -16,7 +16,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.language.model.traced import Trace, previous, seen
+from ssmppl.language.model.trace import Trace, previous, seen
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,8 @@ from ssmppl.inference.exact.kalman_matrices import (
     smoothed,
     values_of,
 )
-from ssmppl.inference.run.ranges import total_of
-from ssmppl.language.model.traced import Trace, once_per_trace
+from ssmppl.inference.run.invalid_laws import total_of
+from ssmppl.language.model.trace import Trace, once_per_trace
 
 __all__ = ["Disturbances", "Matrices", "SmoothedMoments"]
 

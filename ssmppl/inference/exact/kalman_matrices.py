@@ -18,8 +18,8 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.inference.run.ranges import total_of, without_density
-from ssmppl.language.model.traced import Trace, previous
+from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
+from ssmppl.language.model.trace import Trace, previous
 
 CAUSE = {
     kernel.NOT_COVARIANCE: (
@@ -72,7 +72,7 @@ def failure(trace: Trace, theta: np.ndarray, status: int, t: int) -> SamplingErr
     found, fix = CAUSE[status]
     where = next(iter((trace.transition if t else trace.initial).values())).distribution.location
     why = ""
-    if none := without_density(trace, theta):
+    if none := law_without_density_at(trace, theta):
         why, fix, where = none
     return SamplingError(
         f"{found} at t={t + 1}; parameters: {spelled(trace, theta)}" + (why and f"; {why}"),

@@ -207,13 +207,13 @@ class Maximization:
     """The question: a problem, its free parameters, and what is to be maximised.
 
     objective : "likelihood", or "posterior" for log likelihood + log prior density of theta.
-    held : values of the fixed parameters; near : those to start from, by name.
+    fixed : values of the fixed parameters; near : those to start from, by name.
     """
 
     problem: Problem
     space: Space
     objective: str
-    held: dict[str, np.ndarray]
+    fixed: dict[str, np.ndarray]
     near: dict[str, np.ndarray]
     root: np.random.SeedSequence
     executor: Executor | None = None
@@ -254,8 +254,8 @@ class Maximization:
         The user's own point where `start` gives every free parameter; where the likelihood is exact
         moderate values at which it is finite; else the pilot's mode.
         """
-        z = self.space.z[self.space.where]
-        free = set(self.problem.trace.parameters) - set(self.held)
+        z = self.space.z[self.space.positions]
+        free = set(self.problem.trace.parameters) - set(self.fixed)
         if free <= set(self.near) or not len(z):
             return z
         if isinstance(self.exact, NotApplicable):
@@ -273,7 +273,7 @@ class Maximization:
     def space_at(self, theta: np.ndarray) -> np.ndarray:
         """(F,) the unconstrained place of theta (P,)."""
         moved = at(self.space, theta)
-        return moved.z[moved.where]
+        return moved.z[moved.positions]
 
     def natural(self, z: np.ndarray, information: np.ndarray) -> np.ndarray:
         """(P, P) minus the second derivatives in theta, from those in z (F, F) at a maximum.

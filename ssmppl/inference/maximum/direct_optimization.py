@@ -32,11 +32,11 @@ from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
 from ssmppl.inference.preparation.exact_score import exact_score
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import without_maximum
-from ssmppl.inference.run.estimate import free_components
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 
 SLOPE_STEP = 0.03  # of the differences for slopes, in standard deviations of the likelihood
@@ -248,7 +248,7 @@ class ExactClimb:
     def __init__(self, setup: Maximization, model: ExactModel, method: DirectOptimization):
         self.setup, self.model, self.method = setup, model, method
         self.experiments = setup.problem.experiments
-        free = free_components(setup.problem.trace, setup.held)
+        free = free_components(setup.problem.trace, setup.fixed)
         self.exact = exact_score(model, self.experiments, free, setup.space.theta)
         self.best, self.best_value = np.empty(0), -np.inf
         self.without_slope = ""  # at the last point of that kind
@@ -414,7 +414,7 @@ class ExactClimb:
 
 def observed_information(setup: Maximization, model: ExactModel, z: np.ndarray) -> np.ndarray:
     """Minus the second derivatives of the objective in z (F,), (F, F), by the exact score."""
-    free = free_components(setup.problem.trace, setup.held)
+    free = free_components(setup.problem.trace, setup.fixed)
     theta = setup.transform.at(z).theta
     return _curvature(setup, exact_score(model, setup.problem.experiments, free, theta), z)
 

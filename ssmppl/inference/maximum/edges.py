@@ -21,7 +21,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.inference.maximum.ascent import Maximization
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 from ssmppl.language.model.transforms import Transform, transforms, unconstrain
 
 OUTWARDS = (1.0, 4.0)  # steps on the unconstrained scale
@@ -95,10 +95,10 @@ def edges(setup: Maximization, theta: np.ndarray, information: np.ndarray) -> Ed
         return None
     place = {s: i for i, s in enumerate(setup.problem.trace.parameter_symbols)}
     known = dict(zip(place, theta, strict=True))
-    held = {s for s in place if s.data[1] in setup.held}
+    fixed = {s for s in place if s.data[1] in setup.fixed}
     kept, components, moving, first = found == 0.0, {}, set(), 0
     for t in transforms(setup.problem.trace):
-        if t.site.name in setup.held:
+        if t.site.name in setup.fixed:
             continue
         own = slice(first, first + len(t.free))
         first += len(t.free)
@@ -106,7 +106,7 @@ def edges(setup: Maximization, theta: np.ndarray, information: np.ndarray) -> Ed
         bounds = [e for end in (support.lower, support.upper) for e in array(end).ravel()]
         for i, edge in _reached(t, found[own], kept[own], known):
             components[place[t.components[i]]] = edge
-            if symbols_of(bounds) - held:
+            if symbols_of(bounds) - fixed:
                 moving.add(place[t.components[i]])
     return Edges(z, kept, components, frozenset(moving)) if components else None
 
@@ -173,4 +173,4 @@ def _inside(setup: Maximization, theta: np.ndarray) -> np.ndarray:
             value = np.maximum(value, INSIDE)
             value = value / value.sum(axis=-1, keepdims=True)
         values[name] = value
-    return unconstrain(trace, theta, values)[setup.space.where]
+    return unconstrain(trace, theta, values)[setup.space.positions]

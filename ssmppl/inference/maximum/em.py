@@ -48,7 +48,7 @@ from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import filter_name
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.updates.symbolic_newton import Unconstrained
-from ssmppl.language.model.traced import Trace, previous, seen
+from ssmppl.language.model.trace import Trace, previous, seen
 
 
 def maximise_expectation(
@@ -95,7 +95,7 @@ class FiniteSteps:
         self.maximum = maximiser(setup, "EM")
         self.step: MStep | NotApplicable = self.maximum.step
         self.free = [
-            s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held
+            s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.fixed
         ]
 
     def __call__(self, theta: np.ndarray) -> np.ndarray:
@@ -184,7 +184,7 @@ class ExactSteps:
                 self.coefficients = found
         if not isinstance(self.step, MStep):
             missing = setup.problem.program.missing
-            density = expected_density(trace, tuple(setup.held), missing, setup.with_prior)
+            density = expected_density(trace, tuple(setup.fixed), missing, setup.with_prior)
             if isinstance(density, NotApplicable):
                 raise ArgumentError(
                     f"EM does not apply: {density.reason}",
@@ -226,7 +226,7 @@ class ExactSteps:
             (self._values(e, rows, theta), e.steps)
             for e, rows in zip(self.setup.problem.experiments, self.rows, strict=True)
         ]
-        place = [i for i, s in enumerate(symbols) if s.data[1] not in self.setup.held]
+        place = [i for i, s in enumerate(symbols) if s.data[1] not in self.setup.fixed]
 
         def expected(at: np.ndarray) -> tuple[float, np.ndarray]:
             here = dict(zip(symbols, at, strict=True))
@@ -285,7 +285,7 @@ class _Climb:
             if isinstance(model, HiddenMarkov)
             else ExactSteps(setup, model)
         )
-        free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held]
+        free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.fixed]
         self.to_z = Unconstrained(setup.problem.trace, free)
         self.theta = setup.space.parameters(setup.start)[0].copy()
         self.value = self.objective(self.theta)

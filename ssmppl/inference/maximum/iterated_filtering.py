@@ -49,13 +49,13 @@ from ssmppl.inference.particles.filtering import (
     log_of_mean,
     repeated_estimates,
 )
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import Space, space_of
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import Block, stack
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
 from ssmppl.inference.run.tasks import run_tasks
 
@@ -225,7 +225,7 @@ def _estimates(
 ) -> np.ndarray | SamplingError:
     theta, seed = piece
     try:
-        settings = FilterSettings(particles, choose(problem, theta, exact=False).name)
+        settings = FilterSettings(particles, choose_by_pilot(problem, theta, exact=False).name)
         return repeated_estimates(problem, theta, settings, seed, range(repeats))
     except SamplingError as error:
         return error
@@ -240,7 +240,7 @@ def climb(setup: Maximization, method: IF2) -> Ascent:
     SamplingError : the likelihood cannot be evaluated where any of the runs ended.
     """
     setup.problem.proposal("bootstrap")
-    check_points(method, len(setup.space.where))
+    check_points(method, len(setup.space.positions))
     model = perturbed_model(setup.space, setup.with_prior)
     scales = step_scales(setup, method, model)
     perturbed_filter = PerturbedFilter(
@@ -340,7 +340,7 @@ def step_scales(setup: Maximization, method: IF2, model: Perturbed) -> np.ndarra
     """
     given = method.perturbation
     named = given if isinstance(given, Mapping) else {}
-    free = [n for n in setup.problem.trace.parameters if n not in setup.held]
+    free = [n for n in setup.problem.trace.parameters if n not in setup.fixed]
     for name in named:
         if name not in free:
             raise ArgumentError(
@@ -368,8 +368,8 @@ def begin(setup: Maximization, method: IF2) -> list[np.ndarray]:
         out = []
         for k, values in enumerate(wanted):
             own = check_values(setup.problem.trace, values, argument=f"starts[{k}]")
-            space = space_of(setup.problem, setup.held, {**setup.near, **own})
-            out.append(space.z[space.where])
+            space = space_of(setup.problem, setup.fixed, {**setup.near, **own})
+            out.append(space.z[space.positions])
         return out
     others = starts(setup, int(wanted) - 1) if int(wanted) > 1 else []  # type: ignore[call-overload]
     return [setup.start, *(setup.space_at(theta) for theta in others)]

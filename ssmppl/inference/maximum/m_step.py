@@ -21,8 +21,8 @@ import numpy as np
 import scipy
 
 from ssmppl.analysis.conjugacy.m_step import MStep, counted, derive_m_step, unsuited
-from ssmppl.analysis.conjugacy.sufficient import complete_data, restricted
-from ssmppl.codegen.modules.trajectories import compile_statistics
+from ssmppl.analysis.conjugacy.separation import complete_data, restricted
+from ssmppl.codegen.modules.trajectory_sums import compile_statistics
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.maximum.ascent import (
@@ -236,7 +236,7 @@ class Maximiser:
 
     def _unconstrained(self, theta: np.ndarray) -> np.ndarray:
         moved = at(self.space, theta)
-        return moved.z[moved.where]
+        return moved.z[moved.positions]
 
     def __getstate__(self) -> dict:
         return {k: self.__dict__[k] for k in ("space", "fixed", "posterior")}
@@ -262,7 +262,7 @@ def maximiser(setup: Maximization, method: str) -> Maximiser:
         deterministic state, so that given the states it cannot move; names parameter and line.
     """
     problem = setup.problem
-    free = [s for s in problem.trace.parameter_symbols if s.data[1] not in setup.held]
+    free = [s for s in problem.trace.parameter_symbols if s.data[1] not in setup.fixed]
     data = counted(complete_data(problem.trace, problem.program.missing), setup.with_prior)
     if method == "ParticleEM":  # its numerical M-step takes the noisy components alone
         reason = restricted(data, free)
@@ -276,7 +276,7 @@ def maximiser(setup: Maximization, method: str) -> Maximiser:
             fix=f"use another method, for example {others}, or hold the parameter by fixed={{...}}",
             where=reason.where,
         )
-    return Maximiser(setup.space, tuple(setup.held), setup.with_prior)
+    return Maximiser(setup.space, tuple(setup.fixed), setup.with_prior)
 
 
 def starts(setup: Maximization, chains: int) -> list[np.ndarray]:
@@ -355,7 +355,7 @@ def pool(setup: Maximization, iterates: np.ndarray, by_regression: bool = False)
     by_regression : the fixed point of the regression of iterates on those before, instead of their
     mean.
     """
-    free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.held]
+    free = [s for s in setup.problem.trace.parameter_symbols if s.data[1] not in setup.fixed]
     to_z = Unconstrained(setup.problem.trace, free)
     z = np.array([[to_z(theta) for theta in chain] for chain in iterates])
     chains = len(z)

@@ -21,7 +21,7 @@ from ssmppl.inference.methods.methods import IF2
 from ssmppl.inference.optimisation.quadratic import LocalQuadratic, count, fit_quadratic
 from ssmppl.inference.particles.filtering import FilterSettings, log_of_mean, repeated_estimates
 from ssmppl.inference.preparation.pilot import scale_of
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.tasks import run_tasks
 
@@ -191,7 +191,7 @@ def local_maximum(
     if isinstance(setup.exact, NotApplicable):
         theta, _ = setup.space.parameters(z)
         settings = FilterSettings(
-            method.particles, choose(setup.problem, theta.copy(), exact=False).name
+            method.particles, choose_by_pilot(setup.problem, theta.copy(), exact=False).name
         )
     scale = scales(setup, settings, z)
     runs = int(np.clip(np.ceil(noise**2 / NOISE), 2, MOST_RUNS)) if settings else 1

@@ -35,7 +35,7 @@ from ssmppl.inference.methods.requirements import need_density
 from ssmppl.inference.particles.backward import choose_kernel, draw_paths, particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.particles.scores import complete_scores
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.seeds import random_state
 
@@ -54,7 +54,7 @@ def climb(setup: Maximization, method: ParticleEM) -> Ascent:
     theta = setup.space.parameters(setup.start)[0]
     proposal = method.proposal
     if proposal == "auto":
-        proposal = choose(problem, theta, exact=False).name
+        proposal = choose_by_pilot(problem, theta, exact=False).name
     problem.proposal(proposal)
     settings = FilterSettings(int(method.particles), proposal)
     each = -(-method.trajectories // method.runs)

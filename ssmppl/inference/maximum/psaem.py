@@ -27,7 +27,7 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.pgas import (
     Sweeper,
-    conditional_settings,
+    csmc_settings,
     start_chain,
 )
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
@@ -50,7 +50,7 @@ def climb(setup: Maximization, method: PSAEM) -> Ascent:
     """
     need_density(setup.problem.trace, "PSAEM", "maximize")
     maximum = _by_statistics(setup)
-    settings = conditional_settings(setup.problem, method.particles, method.proposal)
+    settings = csmc_settings(setup.problem, method.particles, method.proposal)
     states = []
     for chain, theta in enumerate(starts(setup, method.chains)):
         seed = setup.seed(2, chain)

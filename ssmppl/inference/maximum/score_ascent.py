@@ -37,7 +37,7 @@ from ssmppl.inference.particles.scores import (
     run_weights,
     several_runs,
 )
-from ssmppl.inference.preparation.proposal_choice import choose, resolve_settings
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
 from ssmppl.inference.run.progress import Progress
 from ssmppl.language.model.transforms import transforms
 
@@ -90,12 +90,12 @@ def climb(setup: Maximization, method: ScoreAscent) -> Ascent:
     counts = dict(PAPER if paper else NEWTON)
     counts |= {n: getattr(method, n) for n in counts if getattr(method, n) is not None}
     need_density(setup.problem.trace, "ScoreAscent", "maximize")
-    scores = complete_scores(setup.problem, setup.held)
+    scores = complete_scores(setup.problem, setup.fixed)
     start = setup.start
     theta, _ = setup.space.parameters(start)
     proposal = method.proposal
     if proposal == "auto":
-        proposal = choose(setup.problem, theta, exact=False).name
+        proposal = choose_by_pilot(setup.problem, theta, exact=False).name
     settings = resolve_settings(setup.problem, theta, counts["particles"], proposal)
     kernel, why = choose_kernel(
         setup.problem, settings, counts["trajectories"], method.kernel,

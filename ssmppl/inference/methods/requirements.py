@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ssmppl.analysis.structure import linear_gaussian, without_density
+from ssmppl.analysis.structure import linear_gaussian, singular_covariance
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 WITHOUT = {  # what to use instead: of a linear Gaussian model, and of others
     "sample": ("ssm.MetropolisHastings()", "ssm.PMMH()"),
@@ -21,7 +21,7 @@ def need_density(trace: Trace, method: str, verb: str) -> None:
     ------
     ArgumentError : a covariance is singular; names the law, and what needs no density.
     """
-    reason = without_density(trace)
+    reason = singular_covariance(trace)
     if reason is None:
         return
     linear = not isinstance(linear_gaussian(trace), NotApplicable)

@@ -30,8 +30,8 @@ from ssmppl.data import Experiment, spelled
 from ssmppl.data.times import label_text
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
+from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import total_of, without_density
 
 __all__ = [
     "KERNELS",
@@ -240,7 +240,7 @@ def pair_failure(
         what = "lies above the bound that was derived for it"
         fix = 'a fault of ssmppl: use kernel="exact", and report the model'
     where, why = site.distribution.location, ""
-    if none := without_density(problem.trace, theta):
+    if none := law_without_density_at(problem.trace, theta):
         why, fix, where = none
     return SamplingError(
         f"the transition density into t={t + 2}{label} {what}; "

@@ -28,10 +28,10 @@ from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.particles.scores import CompleteScores, complete_scores
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem, missing_of
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import Trace, once_per_trace
+from ssmppl.language.model.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,11 @@ class Deterministic(Scored):
     def _complete(self, data: tuple[Experiment, ...], wanted: np.ndarray) -> CompleteScores:
         symbols = self.trace.parameter_symbols
         free = {s.data[1] for s, w in zip(symbols, wanted, strict=True) if w}
-        held = frozenset(self.trace.parameters) - free
+        fixed = frozenset(self.trace.parameters) - free
         problem = self._problem(data)
-        key = held, problem.program.missing
+        key = fixed, problem.program.missing
         if key not in self._scores:
-            found = complete_scores(problem, held)
+            found = complete_scores(problem, fixed)
             if "score" in found.differences:
                 raise ArgumentError(
                     f"the states have no derivatives in closed form: {found.differences['score']}",

@@ -40,7 +40,7 @@ from ssmppl.inference.particles.backward import ParticleSystem, draw_particles, 
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, failure, run_filter
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import previous, seen
+from ssmppl.language.model.trace import previous, seen
 
 MOST_VALUES = 100_000  # particles times steps whose moments are computed at a time
 MOST_PAIRS = 2_000_000  # particles times trajectories that are weighed at a time

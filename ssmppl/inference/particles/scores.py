@@ -24,7 +24,7 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.score import CompleteScore
-from ssmppl.codegen.modules.trajectories import ScoreProgram, compile_score
+from ssmppl.codegen.modules.trajectory_sums import ScoreProgram, compile_score
 from ssmppl.compiling import once_property
 from ssmppl.data import spelled
 from ssmppl.errors import ArgumentError, SamplingError
@@ -161,8 +161,8 @@ class CompleteScores:
         return np.stack(out, axis=-1)
 
 
-def complete_scores(problem: Problem, held: Collection[str] = ()) -> CompleteScores:
-    """The complete-data score of a problem, in all parameters but those held fixed.
+def complete_scores(problem: Problem, fixed: Collection[str] = ()) -> CompleteScores:
+    """The complete-data score of a problem, in all parameters but the fixed ones.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def complete_scores(problem: Problem, held: Collection[str] = ()) -> CompleteSco
         the law by steps, depends on it; names the line.
     """
     need_density(problem.trace, "the score by particles", "score")
-    symbols = [s for s in problem.trace.parameter_symbols if s.data[1] not in held]
+    symbols = [s for s in problem.trace.parameter_symbols if s.data[1] not in fixed]
     derived = CompleteScore(problem.trace, symbols, problem.program.missing)
     for s in symbols:
         reason = derived.obstacle(s)

@@ -12,7 +12,7 @@ from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.particles.deterministic import Deterministic, deterministic_model
 from ssmppl.inference.run.problem import EXACT
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 ExactModel = KalmanModel | HiddenMarkov | Deterministic
 
@@ -65,7 +65,7 @@ def filter_name(model: ExactModel) -> str:
     return FILTER_NAME[type(model)]
 
 
-def kind_of(model: ExactModel | NotApplicable) -> str | NotApplicable:
+def exact_kind(model: ExactModel | NotApplicable) -> str | NotApplicable:
     """ "linear Gaussian", "of finitely many states" or "without noise in its states"; of a model
     that is not exact, why not."""
     return model if isinstance(model, NotApplicable) else KIND[type(model)]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.proposals.smooth import smooth_filter_applies
-from ssmppl.analysis.structure import deterministic_memory, noisy_start, without_density
+from ssmppl.analysis.structure import deterministic_memory, noisy_start, singular_covariance
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.methods.methods import (
     IF2,
@@ -23,7 +23,7 @@ from ssmppl.inference.methods.methods import (
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import KIND
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 ROWS_WITHOUT_ANCESTORS = 100  # over which the particles of PGAS still move all of a trajectory
 FEW = 6  # numbers that a random walk moves at once without trouble
@@ -76,7 +76,7 @@ def choose_sampler(
             f"the model is {kind}, so that its likelihood is exact, and its gradient, where "
             "there is one in closed form, guides the steps"
         )
-    open_ = [c for u in updates if u.conditional is None for c in u.block]
+    open_ = [c for u in updates if u.family is None for c in u.block]
     if not open_:
         if not updates:
             return Gibbs(), (
@@ -160,7 +160,7 @@ def choose_maximiser(
             "for one scalar state a particle filter's likelihood can be made continuous in the "
             "parameters"
         )
-    singular = without_density(trace)
+    singular = singular_covariance(trace)
     if singular is not None:
         return IF2(), f"{singular.reason}: iterated filtering, which needs none"
     if deterministic_memory(trace) is None and not noisy_start(trace):
@@ -181,7 +181,7 @@ def choose_smoother(
 ) -> tuple[KalmanSmoother | ForwardBackward | FFBSi, str]:
     """The method of `smooth` for a model of this kind, and the reason."""
     if isinstance(kind, NotApplicable):
-        singular = without_density(trace)
+        singular = singular_covariance(trace)
         if singular is not None:
             return FFBSi(kernel="genealogy"), (
                 f"{singular.reason}: the ancestors of the filter's own particles, which need none"

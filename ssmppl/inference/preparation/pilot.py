@@ -22,8 +22,8 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood
 from ssmppl.inference.preparation.space import Region, Space
+from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import EXACT, Problem
-from ssmppl.inference.run.ranges import without_density
 from ssmppl.inference.run.seeds import random_state
 
 PILOT_PARTICLES = 200
@@ -82,7 +82,7 @@ def climb_to_mode(
         theta, log_prior = space.parameters(z)
         return -np.inf if log_prior == -np.inf else estimate(theta, seed) + log_prior
 
-    z = space.z[space.where]
+    z = space.z[space.positions]
     if not len(z):
         return z, log_density(z)
     z = finite_point(z, log_density, np.random.default_rng(seed))
@@ -167,7 +167,7 @@ def averaged_density(
 
 def explained(error: ArgumentError, space: Space) -> ArgumentError:
     """The error of `finite_point`, with the law that has no density at the space's own point."""
-    none = without_density(space.problem.trace, space.theta)
+    none = law_without_density_at(space.problem.trace, space.theta)
     if none is None:
         return error
     return ArgumentError(

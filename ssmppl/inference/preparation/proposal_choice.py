@@ -1,4 +1,5 @@
-"""Choice of the particle filter's proposal by a pilot: the least variance of log Z per second.
+"""Choice of the particle filter's proposal by a pilot: the least variance of log Z per second; and
+of that of conditional SMC, without one.
 
 The cost of a step is counted from the expressions that the generated code evaluates, not timed,
 so that the choice, and with it every result, is the same wherever and whenever a seed is run.
@@ -82,7 +83,7 @@ def _pass_cost(roots: list[Expr], known: dict[Expr, bool]) -> float:
 _choices: dict[tuple, Choice] = {}
 
 
-def choose(
+def choose_by_pilot(
     problem: Problem, theta: np.ndarray, exact: bool = True, *, whole: bool = False,
     integrate: bool = False, temper: bool = False, look_ahead: bool = True,
 ) -> Choice:  # fmt: skip
@@ -123,6 +124,18 @@ def choose(
     if key not in _choices:
         _choices[key] = _pilot(problem, theta, candidates, last)
     return _choices[key]
+
+
+def choose_for_csmc(problem: Problem) -> str:
+    """For conditional SMC, without a pilot: the user's, else the locally optimal one where it is
+    exact, else the transition."""
+    proposals = problem.program.proposals
+    if "user" in proposals:
+        return "user"
+    auxiliary = proposals.get("auxiliary")
+    if auxiliary is None or isinstance(auxiliary, NotApplicable):
+        return "bootstrap"
+    return "auxiliary" if auxiliary.exact_look_ahead else "bootstrap"
 
 
 def _digest(problem: Problem) -> bytes:
@@ -197,7 +210,7 @@ def resolve_settings(
 ) -> FilterSettings:
     """The settings of a call with "auto" resolved, checked against what could be derived.
 
-    whole, integrate : as in `choose`.
+    whole, integrate : as in `choose_by_pilot`.
     """
     settings = filter_settings(particles, proposal, resampling, ess_threshold, rescue)
     each = 2 * len(problem.trace.state_symbols) + 2  # of this row and the last; weight and ancestor
@@ -207,7 +220,7 @@ def resolve_settings(
     if proposal == "auto":
         fixed = settings.scheme == SYSTEMATIC and ess_threshold >= 1.0 and not rescue
         flags = {"whole": whole, "integrate": integrate, "temper": whole and fixed}
-        chosen = choose(problem, theta, **flags).name
+        chosen = choose_by_pilot(problem, theta, **flags).name
         return replace(settings, proposal=chosen)
     if proposal in EXACT:
         found = form_of(proposal, problem.trace)
@@ -229,7 +242,7 @@ def _on_device(
         raise ArgumentError(f"device={device!r} is unknown", fix="use 'cpu' or 'cuda'")
     name = settings.proposal
     if name == "auto":
-        name = choose(problem, theta, look_ahead=False).name
+        name = choose_by_pilot(problem, theta, look_ahead=False).name
     if name not in EXACT:
         check_device(
             problem, name, resampling=(resampling, "systematic"),

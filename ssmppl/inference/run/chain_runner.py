@@ -22,7 +22,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from ssmppl.errors import ExecutorError
-from ssmppl.inference.run.draws import Arrays, Block, ChainDraws, Keep, Standing, joined
+from ssmppl.inference.run.draws import Arrays, Block, ChainDraws, Checkpoint, Standing, joined
 from ssmppl.inference.run.executors import (
     Absent,
     Sent,
@@ -65,7 +65,7 @@ def run_chains(
     keep_warmup_stats: bool = False,
     describe: Describe = describe_acceptance,
     title: str = "sampling",
-    keep: Keep | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> list[ChainDraws[State]]:
     """Run a chain from each of `states`: `warmup` draws that are dropped, then `draws` more.
 
@@ -94,20 +94,20 @@ def run_chains(
         Draws in a block; None adapts to a fraction of a second.
     describe
         From the statistics of the last block of each chain, a few words for the progress line.
-    keep
+    checkpoint
         Keeps the chains now and then, at Ctrl-C, at an error and at the end. Where it has them
         from an earlier call, they go on from there, and `states` are not used.
     """
     run = _RunningChains(step_block, list(states), draws, warmup, block, keep_warmup_stats)
-    if keep is not None:
-        run.go_on(keep.standings())
+    if checkpoint is not None:
+        run.go_on(checkpoint.standings())
     total = len(run.chains) * (warmup + draws)
     before = sum(min(chain.done, warmup + draws) for chain in run.chains)
 
     def report(n: int) -> None:
         bar.advance(n, run.note(describe))
-        if keep is not None and keep.due(run.standings()):
-            run.go_on(keep.keep(run.standings(), last=False))
+        if checkpoint is not None and checkpoint.due(run.standings()):
+            run.go_on(checkpoint.keep(run.standings(), last=False))
 
     with (
         threads_unless(executor, len(run.chains)) as pool,
@@ -121,8 +121,8 @@ def run_chains(
             run.drain()
             raise
         finally:
-            if keep is not None:
-                run.go_on(keep.keep(run.standings(), last=True))
+            if checkpoint is not None:
+                run.go_on(checkpoint.keep(run.standings(), last=True))
     return run.result()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -72,8 +72,19 @@ class Standing(Generic[State]):
     blocks: tuple[Block, ...] = ()
 
 
-class Keep(Protocol):
-    """What keeps chains beyond the life of a process."""
+class Checkpoint(Protocol):
+    """What a run goes on from after a kill: it outlives the process.
+
+    report : of the chains, once they were made ready.
+    """
+
+    report: dict[str, Any] | None
+
+    def once(self, name: str, make: Callable[[], Any]) -> Any:
+        """What `make` gives, or gave in an earlier process."""
+
+    def finished(self, draws: int) -> bool:
+        """Whether every chain has so many draws, those of the warmup included."""
 
     def standings(self) -> Sequence[Standing[Any]] | None:
         """How far the chains have come in an earlier process; None: they have not begun."""

@@ -16,7 +16,7 @@ import numpy as np
 from ssmppl.data import Experiment
 from ssmppl.errors import ModelError
 from ssmppl.expressions.arrays import array
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 if TYPE_CHECKING:
     import xarray as xr

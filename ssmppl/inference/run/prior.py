@@ -10,14 +10,14 @@ from ssmppl.analysis.proposals.proposals import drawn
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import Expr
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 def draw_prior(
     trace: Trace, rng: np.random.Generator, draws: int,
-    held: Mapping[str, np.ndarray] | None = None, alternative: str = "or its value by parameters=",
+    fixed: Mapping[str, np.ndarray] | None = None, alternative: str = "or its value by parameters=",
 ) -> np.ndarray:  # fmt: skip
-    """(draws, P) independent draws of theta, parents before children; those held keep their value.
+    """(draws, P) independent draws of theta, parents before children; the fixed keep their value.
 
     alternative : what else the caller's user can give, for the message.
 
@@ -29,8 +29,8 @@ def draw_prior(
     source = numpy_draws(rng, (draws,))
     for site in trace.parameters.values():
         d = site.distribution
-        if held is not None and site.name in held:
-            for s, v in zip(site.value.ravel(), held[site.name].ravel(), strict=True):
+        if fixed is not None and site.name in fixed:
+            for s, v in zip(site.value.ravel(), fixed[site.name].ravel(), strict=True):
                 values.setdefault(s, np.full(draws, v))
             continue
         if not d.proper:

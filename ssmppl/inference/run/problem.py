@@ -16,8 +16,8 @@ from ssmppl.codegen.modules.program import OWN_MODULES, Program, compile_trace
 from ssmppl.data import Experiment, bind
 from ssmppl.errors import ArgumentError, ModelError, NotApplicable, listing
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Trace
+from ssmppl.language.tracing import trace
 
 # What filters without particles are called where a proposal is asked for.
 EXACT = ("kalman", "forward", "deterministic")

@@ -20,7 +20,7 @@ from ssmppl.analysis.lambdify import DOMAIN, Function, python_function
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient, hessian
 from ssmppl.expressions.expr import Expr, apply, substitute
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 from ssmppl.language.model.transforms import Transform, transforms
 
 NEWTON_SIZE = 8  # the number of unconstrained parameters up to which a Hessian is derived

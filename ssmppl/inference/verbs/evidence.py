@@ -36,7 +36,7 @@ from ssmppl.inference.particles.filtering import (
 )
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood, exact_model, filter_of
 from ssmppl.inference.preparation.pilot import find_mode, tune_particles
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import Space, space_of
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import Problem, pose
@@ -136,19 +136,19 @@ def evidence(
     check_executor(executor)
     check_settings(method)
     problem = pose(model, data)
-    held = check_values(problem.trace, fixed, argument="fixed")
+    fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
-    _refuse_improper(problem, held)
+    _refuse_improper(problem, fixed_values)
     root = seed_sequence(seed)
-    space = space_of(problem, held, near)
+    space = space_of(problem, fixed_values, near)
     if isinstance(method, SMC2):
         check_count("chains", chains, 2)
-        setup = SamplingSetup(problem, space, held, chains, 0, 1, root, False)
+        setup = SamplingSetup(problem, space, fixed_values, chains, 0, 1, root, False)
         return _by_smc2(setup, method, executor, progress)
     chosen = _chosen(problem, method)
     if isinstance(chosen, PMMH):
         chosen = _with_filter(problem, space, chosen, root)
-    d = space.where.size
+    d = space.positions.size
     if not d:
         return _without_parameters(problem, space, chosen, root)
     if draws * chains < 2 * POINTS * (d + 1):
@@ -184,7 +184,7 @@ def evidence(
             fix="give more draws, or method=ssm.SMC2(), which needs no such law",
         )
     found, check = bridge(own_ratio, other_ratio), importance(other_ratio)
-    known = _log_prior_of_fixed(problem, held)
+    known = _log_prior_of_fixed(problem, fixed_values)
     return Evidence(
         found.log_constant - known, found.standard_error,
         {
@@ -204,9 +204,9 @@ def _by_smc2(
     return Evidence(value, error, {"method": "SMC2", **found.report})
 
 
-def _refuse_improper(problem: Problem, held: Mapping[str, np.ndarray]) -> None:
+def _refuse_improper(problem: Problem, fixed_values: Mapping[str, np.ndarray]) -> None:
     for site in problem.trace.parameters.values():
-        if not site.distribution.proper and site.name not in held:
+        if not site.distribution.proper and site.name not in fixed_values:
             kind = type(site.distribution).__name__
             raise ArgumentError(
                 f"the prior of {site.name!r} is {kind}, which is improper: the evidence is then "
@@ -215,16 +215,16 @@ def _refuse_improper(problem: Problem, held: Mapping[str, np.ndarray]) -> None:
             )
 
 
-def _log_prior_of_fixed(problem: Problem, held: Mapping[str, np.ndarray]) -> float:
+def _log_prior_of_fixed(problem: Problem, fixed_values: Mapping[str, np.ndarray]) -> float:
     """What the priors of fixed parameters add to the log density; they are conditioned on.
 
     That of one whose prior depends on a free parameter stays: it is data for that parameter.
     """
-    known = {s: held[s.data[1]][s.data[2]] for s in problem.trace.parameter_symbols
-             if s.data[1] in held}  # fmt: skip
+    known = {s: fixed_values[s.data[1]][s.data[2]] for s in problem.trace.parameter_symbols
+             if s.data[1] in fixed_values}  # fmt: skip
     total = 0.0
     for term in terms(problem.trace, "prior"):
-        if term.site.name in held and symbols_of(term.log_density) <= known.keys():
+        if term.site.name in fixed_values and symbols_of(term.log_density) <= known.keys():
             total += float(evaluate([term.log_density], known)[0])
     return total
 
@@ -258,7 +258,7 @@ def _with_filter(
         theta, _ = space.parameters(find_mode(space, root, rescue=method.rescue).z)
         if proposal == "auto":
             plain = method.order == 0  # filters with scores know all states, and no guide
-            choice = choose(problem, theta, exact=False, whole=plain, integrate=plain)
+            choice = choose_by_pilot(problem, theta, exact=False, whole=plain, integrate=plain)
             proposal = choice.name
         problem.proposal(proposal, integrate=method.order == 0)
         if particles is None:
@@ -289,7 +289,7 @@ def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
     trace = space.problem.trace
     posterior, likelihood = result["posterior"], result["sample_stats"]["log_likelihood"].values
     fixed = dict(zip(trace.parameter_symbols, space.theta, strict=True))
-    z = np.empty((*likelihood.shape, len(space.where)))
+    z = np.empty((*likelihood.shape, len(space.positions)))
     total = likelihood.astype(float).copy()
     drawn = {n: posterior[n].values for n in trace.parameters if n in posterior}
     for index in np.ndindex(likelihood.shape):
@@ -298,7 +298,7 @@ def _posterior(space: Space, result: Any) -> tuple[np.ndarray, np.ndarray]:
             if site.name not in values:
                 values[site.name] = np.reshape([fixed[s] for s in site.value.ravel()], site.shape)
         theta = np.array([values[s.data[1]][s.data[2]] for s in trace.parameter_symbols])
-        z[index] = unconstrain(trace, theta, values)[space.where]
+        z[index] = unconstrain(trace, theta, values)[space.positions]
         total[index] += space.parameters(z[index])[1]
     return z, total
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssmppl import markup
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
@@ -21,7 +21,7 @@ from ssmppl.analysis.structure import (
     LinearGaussian,
     deterministic_memory,
     linear_gaussian,
-    without_density,
+    singular_covariance,
 )
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
@@ -29,7 +29,7 @@ from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
-from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import (
     choose_maximiser,
     choose_sampler,
@@ -39,9 +39,9 @@ from ssmppl.inference.preparation.method_choice import (
 from ssmppl.inference.run.problem import missing_of
 from ssmppl.inference.verbs.sample import METHODS
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 from ssmppl.language.model.transforms import transforms
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 PAGE = 100  # columns
 LONGEST_LAW = 600  # characters of a law, some six lines
@@ -64,7 +64,8 @@ class Plan:
     finite : the values that its states take where they are few, or why they are not.
     proposals : by name, how particles move, or why that could not be derived.
     updates : the Gibbs updates of the parameters, in the order in which they are made.
-    memory : for how many steps a deterministic state remembers; None where it never forgets.
+    deterministic_memory : for how many steps a deterministic state remembers; None where it never
+        forgets.
     noises : what drives the states, or why it is not known.
     eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
@@ -76,7 +77,7 @@ class Plan:
     finite: FiniteStates | NotApplicable
     proposals: dict[str, Proposal | NotApplicable]
     updates: tuple[Update, ...]
-    memory: int | None
+    deterministic_memory: int | None
     noises: Noises | NotApplicable
     eliminable: Eliminable
     data: str = ""
@@ -113,7 +114,7 @@ class Plan:
             out.append(("Particle filter", rows))
             out.append((TRAJECTORIES, of_methods.pop(TRAJECTORIES)))
         out.append(("Default methods", self._choices()))
-        singular = without_density(t)
+        singular = singular_covariance(t)
         if singular is not None:
             out.append((UPDATES, [("none", reason_and_line(singular))]))
         elif self.updates and noisy:
@@ -143,14 +144,14 @@ class Plan:
         return name, proposal.explanation
 
     def _choices(self) -> list[tuple[str, str]]:
-        kind = kind_of(exact_model(self.trace))
+        kind = exact_kind(exact_model(self.trace))
         choices: dict[str, tuple[Any, str]] = {
             "sample": choose_sampler(
                 kind,
                 self.updates,
                 self._numbers(),
                 why_stuck(self.trace, self.rows),
-                without_density(self.trace),
+                singular_covariance(self.trace),
             )
         }
         if self.trace.parameters:

@@ -20,7 +20,7 @@ from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, full_run
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
-from ssmppl.inference.preparation.proposal_choice import choose, resolve_settings
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import component_dims, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
@@ -105,7 +105,7 @@ def particle_filter(
     theta = check_parameters(problem.trace, parameters)
     check_count("repeats", repeats, 1)
     if proposal == "auto":
-        proposal = choose(problem, theta, exact=False, integrate=not history).name
+        proposal = choose_by_pilot(problem, theta, exact=False, integrate=not history).name
     if history and is_marginal(proposal):
         raise ArgumentError(
             f'history=True with proposal="{proposal}", whose particles are of some states only',

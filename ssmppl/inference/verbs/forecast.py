@@ -30,8 +30,8 @@ from ssmppl.inference.verbs.predict import all_draws, group, parameters_of, post
 from ssmppl.inference.verbs.simulate import check_finite, check_samplers, feeds_back
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Trace
+from ssmppl.language.tracing import trace
 from ssmppl.results import time_axes, to_dataset
 
 if TYPE_CHECKING:

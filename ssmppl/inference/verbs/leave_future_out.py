@@ -30,7 +30,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.methods.methods import Method
 from ssmppl.inference.particles.filtering import FilterSettings, failure
 from ssmppl.inference.preparation.exact_models import exact_model
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -237,7 +237,7 @@ def _increments(
     settings = None
     if isinstance(exact_model(problem.trace), NotApplicable):
         middle = np.median(flat, axis=0)
-        chosen = choose(problem, middle, exact=False, integrate=True).name
+        chosen = choose_by_pilot(problem, middle, exact=False, integrate=True).name
         settings = FilterSettings(particles, chosen)
     pieces = [p for p in np.array_split(np.arange(len(flat)), TASKS) if len(p)]
     task = partial(_some_increments, problem, flat, settings, root)

@@ -24,6 +24,7 @@ from ssmppl.inference.maximum import (
 )
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.maximum.edges import Edges, edges
+from ssmppl.inference.maximum.estimate import NO_METHOD, Estimate, make_estimate
 from ssmppl.inference.methods.methods import (
     EM,
     IF2,
@@ -35,12 +36,11 @@ from ssmppl.inference.methods.methods import (
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, log_of_mean
 from ssmppl.inference.particles.scores import Smoothing, combine, complete_scores, several_runs
-from ssmppl.inference.preparation.exact_models import kind_of
+from ssmppl.inference.preparation.exact_models import exact_kind
 from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.method_choice import choose_maximiser, start_as_parameter
-from ssmppl.inference.preparation.proposal_choice import choose
-from ssmppl.inference.preparation.space import space_of
-from ssmppl.inference.run.estimate import NO_METHOD, Estimate, free_components, make_estimate
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
+from ssmppl.inference.preparation.space import free_components, space_of
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
@@ -114,17 +114,17 @@ def maximize(
     check_executor(executor)
     check_settings(method)
     problem = pose(model, data)
-    held = check_values(problem.trace, fixed, argument="fixed")
+    fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
-    twice = [n for n in near if n in held]
+    twice = [n for n in near if n in fixed_values]
     if twice:
         raise ArgumentError(
             f"{twice[0]!r} is given in start and in fixed", fix=f"leave {twice[0]!r} out of one"
         )
     root = seed_sequence(seed)
-    space = space_of(problem, held, near)
-    setup = Maximization(problem, space, objective, held, near, root, executor, progress)
-    if not len(space.where):
+    space = space_of(problem, fixed_values, near)
+    setup = Maximization(problem, space, objective, fixed_values, near, root, executor, progress)
+    if not len(space.positions):
         chosen, reason = None, "every parameter is fixed, or the model has none"
         ascent = Ascent(space.theta, None, space.theta[None], {"converged": True})
     else:
@@ -145,7 +145,7 @@ def maximize(
     covariance = _covariance(setup, ascent, attrs)
     if ascent.error is not None:
         labels, errors = map(repr, problem.trace.parameter_symbols), np.diagonal(ascent.error)
-        free = free_components(problem.trace, held)
+        free = free_components(problem.trace, fixed_values)
         attrs["monte_carlo_errors"] = {
             label: float(np.sqrt(max(e, 0.0)))
             for label, e, f in zip(labels, errors, free, strict=True)
@@ -153,7 +153,7 @@ def maximize(
         }
     attrs["seconds"] = time.perf_counter() - began
     return make_estimate(
-        problem.trace, ascent.theta, covariance, value, ascent.iterates, held, attrs,
+        problem.trace, ascent.theta, covariance, value, ascent.iterates, fixed_values, attrs,
         ascent.figures,
     )  # fmt: skip
 
@@ -161,7 +161,7 @@ def maximize(
 def choose_method(setup: Maximization) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
     trace = setup.problem.trace
-    chosen, reason = choose_maximiser(kind_of(setup.exact), trace)
+    chosen, reason = choose_maximiser(exact_kind(setup.exact), trace)
     if isinstance(chosen, ScoreAscent) and noisy_start(trace):
         warnings.warn(
             f"{type(chosen).__name__} may take minutes for each hundred rows here: "
@@ -179,7 +179,7 @@ def _log_likelihood(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) 
     if not isinstance(setup.exact, NotApplicable):
         return setup.exact.log_likelihood(problem.experiments, theta)
     try:
-        settings = FilterSettings(PARTICLES, choose(problem, theta).name)
+        settings = FilterSettings(PARTICLES, choose_by_pilot(problem, theta).name)
         task = estimates_task(problem, theta, settings, setup.seed(1))
         pieces = [range(r, r + 1) for r in range(REPEATS)]
         log_z = np.concatenate(run_tasks(task, pieces, executor=setup.executor))
@@ -193,7 +193,7 @@ def _log_likelihood(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) 
 
 def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> np.ndarray:
     """(P, P) inverse observed information of the free components; `attrs` says how, or why not."""
-    p, where = len(ascent.theta), setup.space.where
+    p, where = len(ascent.theta), setup.space.positions
     nothing = np.full((p, p), np.nan)
     if not len(where):
         return nothing
@@ -238,8 +238,10 @@ def _information(setup: Maximization, theta: np.ndarray, found: Edges | None) ->
     if not isinstance(setup.exact, NotApplicable):
         return _score_of(setup, found).information(theta)
     try:
-        scores = complete_scores(setup.problem, setup.held)
-        settings = FilterSettings(PARTICLES, choose(setup.problem, theta, exact=False).name)
+        scores = complete_scores(setup.problem, setup.fixed)
+        settings = FilterSettings(
+            PARTICLES, choose_by_pilot(setup.problem, theta, exact=False).name
+        )
         smoothing = Smoothing(settings, TRAJECTORIES)
         runs = several_runs(
             scores, theta, smoothing, True, setup.seed(2), range(REPEATS), setup.executor
@@ -252,7 +254,7 @@ def _information(setup: Maximization, theta: np.ndarray, found: Edges | None) ->
 def _score_of(setup: Maximization, found: Edges | None) -> ExactScore:
     """Of an exact likelihood, in what is free and not held at an edge that stays where it is."""
     assert not isinstance(setup.exact, NotApplicable), setup.exact
-    free = free_components(setup.problem.trace, setup.held)
+    free = free_components(setup.problem.trace, setup.fixed)
     free[[] if found is None else [i for i in found.components if i not in found.moving]] = False
     return exact_score(setup.exact, setup.problem.experiments, free, setup.space.theta)
 

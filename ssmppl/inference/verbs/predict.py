@@ -28,8 +28,8 @@ from ssmppl.inference.run.prior import draw_prior
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.simulate import check_drawable, check_finite, check_samplers, feeds_back
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Trace
+from ssmppl.language.tracing import trace
 from ssmppl.results import time_axes, to_inference_data
 
 # Of one experiment: states (n, T, D) and observations (n, T, K) of n draws.
@@ -70,14 +70,14 @@ def parameters_of(trace: Trace, posterior: Any) -> np.ndarray:
     ArgumentError : a parameter is neither drawn nor held.
     """
     fixed = posterior.attrs.get("fixed", "{}")
-    held = check_values(trace, json.loads(fixed) if isinstance(fixed, str) else fixed)
+    fixed_values = check_values(trace, json.loads(fixed) if isinstance(fixed, str) else fixed)
     shape = (posterior.sizes["chain"], posterior.sizes["draw"])
     values: dict[str, np.ndarray] = {}
     for name, site in trace.parameters.items():
         if name in posterior:
             values[name] = _drawn(posterior, name, site.shape, ())
-        elif name in held:
-            values[name] = np.broadcast_to(held[name], (*shape, *site.shape))
+        elif name in fixed_values:
+            values[name] = np.broadcast_to(fixed_values[name], (*shape, *site.shape))
         else:
             raise ArgumentError(
                 f"the posterior has no parameter {name!r}",

@@ -11,26 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.structure import without_density
+from ssmppl.analysis.structure import singular_covariance
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
 from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
-from ssmppl.inference.chains.parameter_steps import plan_updates
+from ssmppl.inference.chains.gibbs_updates import plan_updates
 from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
-from ssmppl.inference.checkpoints.chains import ChainFile
+from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
 from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.methods.settings import check_settings
-from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
-from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.preparation.space import free_components, space_of
+from ssmppl.inference.run.convergence import mixing_attributes
 from ssmppl.inference.run.draws import stack
-from ssmppl.inference.run.estimate import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, observes
-from ssmppl.inference.run.mixing import mixing_attributes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
 from ssmppl.language.model.model import Model
@@ -132,21 +131,25 @@ def sample(
     check_executor(executor)
     check_settings(method)
     problem = pose(model, data)
-    held = check_values(problem.trace, fixed, argument="fixed")
+    fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
-    chosen, reason = (method, "") if method is not None else _chosen(problem, held)
-    kind = METHODS.get(type(chosen))
-    if kind is None:
+    chosen, reason = (method, "") if method is not None else _chosen(problem, fixed_values)
+    sampling_method = METHODS.get(type(chosen))
+    if sampling_method is None:
         names = ", ".join(f"ssm.{m.__name__}(...)" for m in METHODS)
         raise ArgumentError(
             f"method={method!r} is no method of sampling",
             fix=written_as(method, METHODS) or f"use {names} or None",
         )
-    if not kind.markov:
+    if not sampling_method.markov:
         states, warmup, thin = False, 0, 1
-    chosen = kind.complete(chosen, draws)
-    if not states and all(name in held for name in problem.trace.parameters):
-        what = "states=False" if kind.markov else f"{type(chosen).__name__} draws parameters only"
+    chosen = sampling_method.complete(chosen, draws)
+    if not states and all(name in fixed_values for name in problem.trace.parameters):
+        what = (
+            "states=False"
+            if sampling_method.markov
+            else f"{type(chosen).__name__} draws parameters only"
+        )
         raise ArgumentError(
             f"there is nothing to draw: no parameter is free, and {what}",
             fix="draw the states, by another method than SMC2 and without states=False, or leave a "
@@ -154,14 +157,16 @@ def sample(
         )
     check_names(problem.trace, problem.experiments, states)
     if checkpoint is None:
-        _check_room(problem, kind.by_row(chosen), chains, draws, states)
-    root, space, kept = seed_sequence(seed), space_of(problem, held, near), None
+        _check_room(problem, sampling_method.by_row(chosen), chains, draws, states)
+    root, space, checkpoint_file = seed_sequence(seed), space_of(problem, fixed_values, near), None
     if checkpoint is not None:
-        origin = _origin(problem, chosen, held, near, chains, warmup, thin, states)
-        kept = ChainFile(checkpoint, origin, seed, root, _codec(), draws)
-        root = kept.root
-    setup = SamplingSetup(problem, space, held, chains, warmup, thin, root, states, kept)
-    result, report = kind.draw(setup, chosen, draws, executor, progress)
+        origin = _origin(problem, chosen, fixed_values, near, chains, warmup, thin, states)
+        checkpoint_file = CheckpointFile(checkpoint, origin, seed, root, _codec(), draws)
+        root = checkpoint_file.root
+    setup = SamplingSetup(
+        problem, space, fixed_values, chains, warmup, thin, root, states, checkpoint_file
+    )
+    result, report = sampling_method.draw(setup, chosen, draws, executor, progress)
     attrs = {
         "model": problem.trace.name,
         "method": type(chosen).__name__,
@@ -171,16 +176,18 @@ def sample(
         "seed": str(root.entropy), "warmup": warmup, "thin": thin, "fixed": dict(fixed or {}),
         "observes": observes(problem.trace),
         "interrupted": any(c.interrupted for c in result),
-        "seconds": time.perf_counter() - began if kept is None else kept.seconds,
+        "seconds": checkpoint_file.seconds if checkpoint_file else time.perf_counter() - began,
     }  # fmt: skip
-    attrs |= kind.attributes(problem, result)
-    whole = stack(result) if kept is None else kept.stack(result)
-    if kind.markov:
-        free = free_components(problem.trace, held)
+    attrs |= sampling_method.attributes(problem, result)
+    whole = stack(result) if checkpoint_file is None else checkpoint_file.stack(result)
+    if sampling_method.markov:
+        free = free_components(problem.trace, fixed_values)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
         theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])
-        attrs |= mixing_attributes(labels, theta, interrupted, kind.advice(chosen), warmup)
-    return _to_arviz(problem, whole, held, states, attrs)
+        attrs |= mixing_attributes(
+            labels, theta, interrupted, sampling_method.advice(chosen), warmup
+        )
+    return _to_arviz(problem, whole, fixed_values, states, attrs)
 
 
 def _codec() -> Codec:
@@ -204,7 +211,7 @@ def _check_room(problem: Problem, by_row: bool, chains: int, draws: int, states:
 
 
 def _origin(
-    problem: Problem, method: Method, held: Mapping[str, np.ndarray],
+    problem: Problem, method: Method, fixed_values: Mapping[str, np.ndarray],
     near: Mapping[str, np.ndarray], chains: int, warmup: int, thin: int, states: bool,
 ) -> Origin:  # fmt: skip
     """All that the draws depend on, but for the seed and their number."""
@@ -212,28 +219,30 @@ def _origin(
     plain = {
         "method": f"{type(method).__name__}({own})", "chains=": str(chains),
         "warmup=": str(warmup), "thin=": str(thin), "states=": str(states),
-        "fixed=": f"{{{text_of(held)}}}", "start=": f"{{{text_of(near)}}}",
+        "fixed=": f"{{{text_of(fixed_values)}}}", "start=": f"{{{text_of(near)}}}",
     }  # fmt: skip
     digests = {"model": model_digest(problem.trace), "data": data_digest(problem.experiments)}
     return Origin(digests, plain | versions())
 
 
-def _chosen(problem: Problem, held: dict[str, np.ndarray]) -> tuple[Method, str]:
-    exact, singular = exact_model(problem.trace), without_density(problem.trace)
-    numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in held)
+def _chosen(problem: Problem, fixed_values: dict[str, np.ndarray]) -> tuple[Method, str]:
+    exact, singular = exact_model(problem.trace), singular_covariance(problem.trace)
+    numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in fixed_values)
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
     drawn = not isinstance(exact, NotApplicable) and singular is None
-    updates = plan_updates(problem, held) if drawn else ()
-    return choose_sampler(kind_of(exact), updates, numbers, stuck, singular)
+    updates = plan_updates(problem, fixed_values) if drawn else ()
+    return choose_sampler(exact_kind(exact), updates, numbers, stuck, singular)
 
 
 def _to_arviz(
     problem: Problem, whole: tuple[dict[str, np.ndarray], dict[str, np.ndarray]],
-    held: dict[str, np.ndarray], states: bool, attrs: dict[str, Any],
+    fixed_values: dict[str, np.ndarray], states: bool, attrs: dict[str, Any],
 ) -> Any:  # fmt: skip
     drawn, stats = whole
     trace = problem.trace
-    posterior = {n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in held}
+    posterior = {
+        n: v for n, v in unpack_parameters(trace, drawn["theta"]).items() if n not in fixed_values
+    }
     labels = Labels(problem.experiments)
     over_time: list[str] = []
     observed: dict[str, np.ndarray] = {}

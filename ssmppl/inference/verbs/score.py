@@ -13,6 +13,7 @@ import numpy as np
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters, check_values
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.maximum.estimate import by_name, table
 from ssmppl.inference.particles.scores import (
     ParticleScore,
     Smoothing,
@@ -24,7 +25,7 @@ from ssmppl.inference.particles.scores import (
 from ssmppl.inference.preparation.exact_models import exact_model
 from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
-from ssmppl.inference.run.estimate import by_name, free_components, table
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.problem import EXACT, Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
@@ -128,8 +129,8 @@ def score(
     check_executor(executor)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, fixed)
-    held = check_values(problem.trace, fixed, argument="fixed")
-    free = free_components(problem.trace, held)
+    fixed_values = check_values(problem.trace, fixed, argument="fixed")
+    free = free_components(problem.trace, fixed_values)
     if not np.any(free):
         raise ArgumentError(
             "there is no parameter in which to differentiate: "
@@ -150,7 +151,7 @@ def score(
             attrs["method"] = "differences of the exact likelihood"
             attrs["central_differences"] = exact.differences
     else:
-        scores = complete_scores(problem, held)
+        scores = complete_scores(problem, fixed_values)
         smoothing = Smoothing(settings, trajectories, kernel)
         runs = several_runs(scores, theta, smoothing, True, root, range(repeats), executor)
         found = combine(runs)
@@ -162,7 +163,7 @@ def score(
         }  # fmt: skip
         if scores.differences:
             attrs["central_differences"] = scores.differences
-    return _score(problem, found, held, attrs)
+    return _score(problem, found, fixed_values, attrs)
 
 
 def _exact(exact: ExactScore, theta: np.ndarray) -> ParticleScore:
@@ -178,14 +179,17 @@ def _exact(exact: ExactScore, theta: np.ndarray) -> ParticleScore:
 
 
 def _score(
-    problem: Problem, found: ParticleScore, held: dict[str, np.ndarray], attrs: dict[str, Any]
+    problem: Problem,
+    found: ParticleScore,
+    fixed_values: dict[str, np.ndarray],
+    attrs: dict[str, Any],
 ) -> Score:
     trace = problem.trace
-    free = free_components(trace, held)
+    free = free_components(trace, fixed_values)
     labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
 
     def named(values: np.ndarray) -> dict[str, float | np.ndarray]:
-        return {n: v for n, v in by_name(trace, values).items() if n not in held}
+        return {n: v for n, v in by_name(trace, values).items() if n not in fixed_values}
 
     def labelled(matrix: np.ndarray | None) -> pd.DataFrame:
         whole = np.full((len(free), len(free)), np.nan) if matrix is None else matrix

@@ -21,12 +21,12 @@ from ssmppl.data import (
 )
 from ssmppl.errors import ModelError, SamplingError
 from ssmppl.expressions.expr import topological
+from ssmppl.inference.run.invalid_laws import out_of_range
 from ssmppl.inference.run.prior import draw_prior
-from ssmppl.inference.run.ranges import out_of_range
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import Trace
+from ssmppl.language.tracing import trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:

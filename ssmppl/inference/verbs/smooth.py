@@ -35,18 +35,18 @@ from ssmppl.inference.particles.backward import choose_kernel, draw_paths, parti
 from ssmppl.inference.particles.filtering import FilterSettings
 from ssmppl.inference.particles.fixed_lag import LAG, collapse, distinct, lag_moments
 from ssmppl.inference.particles.marginal import is_marginal, marginal_paths, may_integrate
-from ssmppl.inference.preparation.exact_models import exact_model, kind_of
+from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import choose_smoother
-from ssmppl.inference.preparation.proposal_choice import choose, resolve_settings
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.chain_runner import run_chains
+from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.labels import component_dims, observes, with_data
 from ssmppl.inference.run.problem import EXACT, Problem, pose
-from ssmppl.inference.run.ranges import total_of
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.filters import LEVELS, normal_quantiles, quantile_levels
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
@@ -159,7 +159,9 @@ def _filter(
             fix=f"use {exact.get(proposal, '')}another proposal",
         )
     if proposal == "auto":
-        proposal = choose(setup.problem, setup.theta, exact=False, integrate=integrate).name
+        proposal = choose_by_pilot(
+            setup.problem, setup.theta, exact=False, integrate=integrate
+        ).name
     n = PARTICLES if setup.particles is None else setup.particles
     settings = resolve_settings(
         setup.problem, setup.theta, n, proposal, method.resampling, method.ess_threshold,
@@ -240,9 +242,9 @@ def by_pgas(setup: SmoothingSetup, method: PGAS) -> list[SmoothedStates]:
     draws = TRAJECTORIES if setup.trajectories is None else setup.trajectories
     if method.particles is None and setup.particles is not None:
         method = PGAS(setup.particles, method.proposal)
-    held = unpack_parameters(setup.problem.trace, setup.theta)
-    space = space_of(setup.problem, held, {})
-    one_chain = SamplingSetup(setup.problem, space, held, 1, PGAS_WARMUP, 1, setup.root)
+    fixed = unpack_parameters(setup.problem.trace, setup.theta)
+    space = space_of(setup.problem, fixed, {})
+    one_chain = SamplingSetup(setup.problem, space, fixed, 1, PGAS_WARMUP, 1, setup.root)
     sampler = pgas.prepare(one_chain, method)
     (chain,) = run_chains(
         sampler.step_block, sampler.states, draws, PGAS_WARMUP, progress=False
@@ -360,7 +362,7 @@ def smooth(
 
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
     if method is None:
-        chosen, why = choose_smoother(kind_of(exact_model(problem.trace)), problem.trace)
+        chosen, why = choose_smoother(exact_kind(exact_model(problem.trace)), problem.trace)
         return chosen, f"automatically: {why}"
     if isinstance(method, str):
         if method not in NAMES:

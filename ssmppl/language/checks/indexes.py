@@ -15,7 +15,7 @@ from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import plain
 from ssmppl.expressions.expr import Expr, symbols_of, to_text, topological
 from ssmppl.expressions.properties import Undefined, first_undefined
-from ssmppl.language.model.traced import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, previous
 
 MOST = 4096  # combinations of values that are tried
 

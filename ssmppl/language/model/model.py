@@ -1,6 +1,6 @@
 """Model: what a user declares, held and not yet looked at.
 
-The decorators only remember the functions; `trace.py` runs them on symbols when a verb first
+The decorators only remember the functions; `tracing.py` runs them on symbols when a verb first
 needs the model, and raises there what is wrong with them.
 """
 

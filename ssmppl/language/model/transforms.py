@@ -18,7 +18,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, apply, constant, substitute, symbol
 from ssmppl.language.distributions.positive import LEAST_SHARE
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 ZERO = constant(0.0)
 
@@ -193,7 +193,7 @@ def _cholesky(z: list[Expr], p: int, site: Site) -> tuple[list[Expr], Expr]:
     return [matrix.ravel()[place[s]] for s in site.components], log_jacobian
 
 
-def constant_bounds(trace: Trace) -> list[tuple[float, float]] | None:
+def parameter_bounds(trace: Trace) -> list[tuple[float, float]] | None:
     """Bounds of every component; None where some depend on other parameters, or a parameter is
     not made of free numbers (a simplex, a positive definite matrix)."""
     out = []

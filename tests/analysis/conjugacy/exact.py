@@ -3,13 +3,13 @@
 import numpy as np
 from scipy import stats
 
-from ssmppl.analysis.conjugacy import check
+from ssmppl.analysis.conjugacy import numerical_check
 from ssmppl.analysis.conjugacy.matrix_families import lower_half
 from ssmppl.analysis.density import terms
 from ssmppl.analysis.lambdify import DOMAIN, python_function
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbols_of
-from ssmppl.inference.updates.conjugate_draw import draw, sampler_of
+from ssmppl.inference.updates.draw_update import draw, sampler_of
 
 
 class Conditional:
@@ -26,7 +26,7 @@ class Conditional:
                     float(evaluate(update.coefficients[role][i], row))
                     for role in update.coefficients
                     for t, row in enumerate(self.rows)
-                    if check._counts(role, t)
+                    if numerical_check._counts(role, t)
                 )
                 for i in range(len(update.functions))
             ]
@@ -52,7 +52,7 @@ class Conditional:
                 if not symbols_of(density) & block:
                     continue
                 for t, row in enumerate(self.rows):
-                    if check._counts(role, t):
+                    if numerical_check._counts(role, t):
                         numbers = {s: constant(v) for s, v in row.items() if s not in block}
                         total = total + substitute([density], numbers)[0]
         return total

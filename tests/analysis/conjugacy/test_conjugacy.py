@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.check import verify
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
-from ssmppl.analysis.conjugacy.sufficient import complete_data
+from ssmppl.analysis.conjugacy import numerical_check
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.analysis.conjugacy.numerical_check import verify
+from ssmppl.analysis.conjugacy.separation import complete_data
 from ssmppl.expressions.expr import to_text
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 
 
@@ -20,10 +20,10 @@ from tests.analysis.conjugacy.corpus import CORPUS, build
 def test_corpus(name):
     model, blocks, corrections = build(name)
     updates = derive_updates(trace(model))
-    found = sorted((u.block, u.family) for u in updates)
+    found = sorted((u.block, u.family_name) for u in updates)
     expected = sorted(b[:2] for b in blocks for _ in range(b[2] if len(b) > 2 else 1))
     assert found == expected, "\n".join(str(u.explanation) for u in updates)
-    outside = [to_text(u.functions[j]) for u in updates for j in u.correction]
+    outside = [to_text(u.functions[j]) for u in updates for j in u.outside_family]
     assert outside == list(corrections)
 
 
@@ -44,8 +44,8 @@ def test_the_check_notices_a_wrong_family():
     model, *_ = build("shared_precision")
     data = complete_data(trace(model))
     (update,) = derive_updates(data.trace)
-    swapped = replace(update.conditional, log=update.conditional.pow, pow=update.conditional.log)
-    failure = verify(data, replace(update, conditional=swapped))
+    swapped = replace(update.family, log=update.family.pow, pow=update.family.log)
+    failure = verify(data, replace(update, family=swapped))
     assert failure is not None
     assert "disagrees" in failure.reason
 
@@ -53,13 +53,13 @@ def test_the_check_notices_a_wrong_family():
 def test_fixed_parameters_have_no_update():
     model, *_ = build("intercept")
     updates = derive_updates(trace(model), fixed={"q", "c"})
-    assert [(u.block, u.family) for u in updates] == [(("a",), "Normal")]
+    assert [(u.block, u.family_name) for u in updates] == [(("a",), "Normal")]
 
 
 def test_precision_is_drawn_alone_when_its_partner_is_fixed():
     model, *_ = build("varves")
     (update,) = derive_updates(trace(model), fixed=["phi"])
-    assert (update.block, update.family, update.correction) == (("tau",), "Gamma", ())
+    assert (update.block, update.family_name, update.outside_family) == (("tau",), "Gamma", ())
 
 
 @pytest.mark.parametrize("name", CORPUS)
@@ -68,7 +68,7 @@ def test_explanations_have_every_part(name):
     for update in derive_updates(trace(model)):
         explanation = update.explanation
         assert explanation.title
-        assert explanation.conditional
+        assert explanation.law
         assert update.needs_log_joint or explanation.statistics
         assert update.where is not None
         assert all(len(line) < 700 for line in str(explanation).splitlines())
@@ -90,7 +90,7 @@ def test_matrices_are_told_in_matrix_notation():
         "h: prior + sum_{t=2}^T Q^-1 x z'",
         "z = (x_prev, u_prev, 1) in the mean of x",
     )
-    assert wishart.conditional == "Q ~ inverse Wishart(df = 5 + (T - 1), scale S)"
+    assert wishart.law == "Q ~ inverse Wishart(df = 5 + (T - 1), scale S)"
     assert wishart.statistics == (
         "S: [[1, 0], [0, 1]] + sum_{t=2}^T r r'",
         "r = x - (A x_prev + B u_prev + c)",
@@ -146,14 +146,14 @@ def test_the_search_for_the_line_of_a_fault_passes_infinite_densities():
     (update,) = derive_updates(data.trace)
     p = next(iter(update.components))
     rows = [
-        {**row, p: np.full(check.POINTS, 50.0)}
-        for row in check.random_series(data, np.random.default_rng(1))
+        {**row, p: np.full(numerical_check.POINTS, 50.0)}
+        for row in numerical_check.random_series(data, np.random.default_rng(1))
     ]
     for row in rows:
-        row.update({s: np.zeros(check.POINTS) for s in data.trace.observation_symbols})
-    changed = {p: np.full(check.POINTS, 60.0)}
+        row.update({s: np.zeros(numerical_check.POINTS) for s in data.trace.observation_symbols})
+    changed = {p: np.full(numerical_check.POINTS, 60.0)}
     (line,) = {f.where for f in data.holding([p]) if f.role == "observation"}
-    assert check._culprit(data, update, rows, changed) in (None, line)
+    assert numerical_check._culprit(data, update, rows, changed) in (None, line)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -165,10 +165,15 @@ def test_statistics_of_both_infinities_are_no_number():
     model.observation(lambda x, m: {"y": ssm.Normal(m + x, sd=1)})
     data = complete_data(trace(model))
     (update,) = derive_updates(data.trace)
-    rows = check.random_series(data, np.random.default_rng(1))
+    rows = numerical_check.random_series(data, np.random.default_rng(1))
     for t, row in enumerate(rows):
-        row.update({s: np.full(check.POINTS, (-1) ** t * np.inf) for s in data.trace.state_symbols})
-    assert np.isnan(check.summed_statistics(update, rows)).any()
+        row.update(
+            {
+                s: np.full(numerical_check.POINTS, (-1) ** t * np.inf)
+                for s in data.trace.state_symbols
+            }
+        )
+    assert np.isnan(numerical_check.summed_statistics(update, rows)).any()
 
 
 @pytest.mark.parametrize("bounds", [(-1, 20), (-20, 1), (-0.1, np.inf), (-np.inf, 0.1)])

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy import numerical_check
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.matrix_families import MatrixNormalWishart
-from ssmppl.analysis.conjugacy.sufficient import complete_data
-from ssmppl.inference.updates.conjugate_draw import sampler_of
-from ssmppl.language.trace import trace
+from ssmppl.analysis.conjugacy.separation import complete_data
+from ssmppl.inference.updates.draw_update import sampler_of
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 from tests.analysis.conjugacy.exact import Conditional, kolmogorov_smirnov, matrices
 
@@ -41,11 +41,11 @@ def conditionals(model, seed=0):
     t = trace(model)
     data = complete_data(t)
     rng = np.random.default_rng(seed)
-    series = check.random_series(data, rng, steps=8)
+    series = numerical_check.random_series(data, rng, steps=8)
     for update in derive_updates(t):
         yield next(
             c
-            for k in range(check.POINTS)
+            for k in range(numerical_check.POINTS)
             if np.isfinite((c := Conditional(data, update, series, k)).log_joint(c.current))
         )
 
@@ -54,17 +54,17 @@ def compare(conditional, n=1500, thin=None, seed=1):
     """Assert that draws follow the exact conditional; returns how they came about."""
     rng = np.random.default_rng(seed)
     if thin is None:
-        thin = 1 if conditional.update.conditional else 8
+        thin = 1 if conditional.update.family else 8
     draws, infos = conditional.draws(n, rng, thin)
     if thin == 1 and any(info.route == "metropolis" for info in infos):  # they depend on another
         draws, infos = conditional.draws(500, rng, 6)
     assert np.all(np.isfinite(draws))
     update = conditional.update
-    inside = not (update.correction or update.left or sampler_of(update).truncated)
-    if update.family == "joint Normal" and inside:
+    inside = not (update.outside_family or update.inseparable_terms or sampler_of(update).truncated)
+    if update.family_name == "joint Normal" and inside:
         _compare_normal(conditional, draws)
         return infos
-    if isinstance(update.conditional, MatrixNormalWishart):
+    if isinstance(update.family, MatrixNormalWishart):
         assert inside
         more, _ = conditional.draws(10_000, rng)
         _compare_matrix_normal(conditional, np.concatenate([draws, more]))
@@ -112,7 +112,7 @@ def _compare_matrix_normal(conditional, draws):
     Integrated over the numbers, the density as it was written is that of a Wishart law: their
     ratio is the same for all draws, and these are compared with draws by SciPy.
     """
-    family = conditional.update.conditional
+    family = conditional.update.family
     theta, matrix = draws[:, : family.thetas].T, draws[:, family.thetas :].T
     d, e = family.thetas, np.eye(family.thetas)
 

@@ -1,4 +1,4 @@
-"""Draws where a factor of the prior or the initial law does not separate, and is left to the log
+"""Draws where a term of the prior or the initial law does not separate, and is left to the log
 joint density.
 
 One draw has to leave the exact conditional invariant. The family's own draws, which `test_draws.py`
@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ssmppl.analysis.conjugacy import check
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
-from ssmppl.analysis.conjugacy.sufficient import complete_data
-from ssmppl.inference.updates.conjugate_draw import draw, sampler_of
+from ssmppl.analysis.conjugacy import numerical_check
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.analysis.conjugacy.separation import complete_data
+from ssmppl.inference.updates.draw_update import draw, sampler_of
 from ssmppl.language.distributions import (
     Beta,
     Binomial,
@@ -35,7 +35,7 @@ from ssmppl.language.distributions import (
     Wishart,
 )
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.exact import Conditional
 from tests.statistics.checks import LEVEL, seed_of
 
@@ -186,11 +186,11 @@ def test_a_draw_leaves_the_conditional_invariant(declare):
     model = Model(declare.__name__)
     declare(model)
     data = complete_data(trace(model))
-    (update,) = [u for u in derive_updates(data.trace) if u.left]
-    assert (update.block, update.family) == MODELS[declare]
+    (update,) = [u for u in derive_updates(data.trace) if u.inseparable_terms]
+    assert (update.block, update.family_name) == MODELS[declare]
     rng = np.random.default_rng(seed_of(declare.__name__))
-    series = check.random_series(data, rng, steps=2)
-    made = (Conditional(data, update, series, k) for k in range(check.POINTS))
+    series = numerical_check.random_series(data, rng, steps=2)
+    made = (Conditional(data, update, series, k) for k in range(numerical_check.POINTS))
     conditional = next(c for c in made if _near(*_weighted(c, 200, rng)))
 
     points, w = _weighted(conditional, 1_000 if declare in LONG else 4_000, rng)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from ssmppl.analysis.conjugacy.check import random_series
 from ssmppl.analysis.conjugacy.m_step import counted, derive_m_step
-from ssmppl.analysis.conjugacy.sufficient import complete_data
+from ssmppl.analysis.conjugacy.numerical_check import random_series
+from ssmppl.analysis.conjugacy.separation import complete_data
 from ssmppl.data import unpack_parameters
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
@@ -16,7 +16,7 @@ from ssmppl.language.distributions import Normal as NormalLaw
 from ssmppl.language.distributions import Uniform
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms, unconstrain
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import CORPUS, build
 from tests.statistics.checks import seed_of
 
@@ -47,9 +47,9 @@ class Written:
     def log_density(self, theta):
         total = 0.0
         for role in self.rows:
-            factors = [f.density for f in self.data.factors if f.role == role and not f.degenerate]
+            terms = [f.density for f in self.data.terms if f.role == role and not f.degenerate]
             size = ROWS if role == "observation" else ROWS - 1 if role == "transition" else 1
-            for value in evaluate(factors, self.values(role, theta)):
+            for value in evaluate(terms, self.values(role, theta)):
                 total += np.sum(np.broadcast_to(value, size))
         return total if np.isfinite(total) else -np.inf
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
-from ssmppl.inference.updates.conjugate_draw import draw
-from ssmppl.language.trace import trace
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.inference.updates.draw_update import draw
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.near_misses import NEAR_MISSES, build
 from tests.analysis.conjugacy.test_draws import compare, conditionals
 
@@ -15,7 +15,7 @@ def test_near_miss(name):
     model, parameter, family, line, words = build(name)
     update = next(u for u in derive_updates(trace(model)) if parameter in u.block)
     text = str(update.explanation)
-    assert update.family == family, text
+    assert update.family_name == family, text
     assert line in update.where.text, (update.where.text, text)
     for word in words:
         assert word in update.reason, text
@@ -53,7 +53,7 @@ def test_a_parameter_of_a_deterministic_law_moves_on_the_density_of_the_noisy_st
     model, *_ = build("deterministic")
     (update,) = derive_updates(trace(model))
     assert update.needs_log_joint
-    assert "noisy states only" in update.explanation.conditional
+    assert "noisy states only" in update.explanation.law
     rng, value, draws = np.random.default_rng(1), np.ones(1), []
     for _ in range(4000):
         value, _ = draw(

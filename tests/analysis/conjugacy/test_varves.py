@@ -11,11 +11,11 @@ import pickle
 import numpy as np
 import pytest
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, to_text
-from ssmppl.inference.updates.conjugate_draw import MAX_TRIES, draw, sampler_of
-from ssmppl.language.trace import trace
+from ssmppl.inference.updates.draw_update import MAX_TRIES, draw, sampler_of
+from ssmppl.language.tracing import trace
 from tests.analysis.conjugacy.corpus import build
 from tests.statistics.checks import some
 
@@ -54,7 +54,7 @@ def totals(update, x):
 def test_shape_rate_mean_and_precision(update, steps):
     x = series(steps, seed=steps)
     c = [*totals(update, x), 0.0]
-    family, normal = update.conditional, update.conditional.normal
+    family, normal = update.family, update.family.normal
     a = b = 0.01
     s_xx, s_xy = np.sum(x[1:-1] ** 2), np.sum(x[1:] * x[:-1])
     h, precision = normal.parameters(c)
@@ -67,8 +67,8 @@ def test_shape_rate_mean_and_precision(update, steps):
 
 
 def test_correction_and_bounds(update):
-    assert [to_text(update.functions[j]) for j in update.correction] == ["log(1 - phi**2)"]
-    assert update.coefficients["initial"][update.correction[0]].data == 0.5
+    assert [to_text(update.functions[j]) for j in update.outside_family] == ["log(1 - phi**2)"]
+    assert update.coefficients["initial"][update.outside_family[0]].data == 0.5
     assert sampler_of(update).limits({}) == [(-1.0, 1.0), (0.0, np.inf)]
     assert sampler_of(update).ceiling([*totals(update, series(50)), 0.0]) == 0.0
 

@@ -15,8 +15,8 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.model.model import Model
-from ssmppl.language.model.traced import previous, seen
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import previous, seen
+from ssmppl.language.tracing import trace
 
 DRAWS = 200_000
 

@@ -26,7 +26,7 @@ from ssmppl.analysis.proposals.twisted import (
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import topological
-from ssmppl.language.model.traced import previous, seen
+from ssmppl.language.model.trace import previous, seen
 from tests.analysis.proposals.test_proposals import model_of, total, values
 
 COMPLETE = Missing(none=True)

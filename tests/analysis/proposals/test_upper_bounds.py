@@ -11,7 +11,7 @@ from ssmppl.analysis.proposals.upper_bounds import transition_upper_bound
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import depends_on
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.statistics.checks import seed_of
 
 GRID = np.linspace(-8, 8, 4001)

@@ -18,7 +18,7 @@ from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, symbols_of
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.harness import EVERY, offered, scales, traced
 
 # gap.md's catalogue, item by item, and what was added to it.

@@ -17,7 +17,7 @@ from ssmppl.diagnosis.effects.candidate import (
     with_all_dates,
 )
 from ssmppl.diagnosis.model.candidates import offers
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.harness import scales
 from tests.diagnosis.small import level
 from tests.statistics.checks import seed_of

@@ -11,7 +11,7 @@ from ssmppl.diagnosis.model.smoothing import Simulator
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.small import level, levels
 from tests.models import gaps as models
 from tests.statistics.checks import seed_of

@@ -17,7 +17,7 @@ from ssmppl.diagnosis.model.smoothing import FEWEST, HORIZONS, crps, crps_ahead,
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.simulate import feeds_back
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.statistics.checks import LEVEL, seed_of
 
 A, B, Q, R = 0.8, 0.5, 0.5, 0.4

@@ -21,7 +21,7 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import constant, substitute, symbol, symbols_of
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.harness import EVERY, content, nodes, offered, scales, traced
 from tests.models import gaps as models
 

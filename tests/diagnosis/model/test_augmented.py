@@ -15,7 +15,7 @@ from ssmppl.diagnosis.model.equations import Augmented, Equations, as_it_was
 from ssmppl.diagnosis.model.initial_law import ProperInitialLaw
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.language.distributions import Normal
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.every import candidates, different, traced
 from tests.diagnosis.harness import content, differences, scales
 from tests.diagnosis.small import level

@@ -14,7 +14,7 @@ from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.errors import ModelError
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.every import MODELS, candidates, traced
 from tests.diagnosis.harness import scales
 

@@ -6,7 +6,7 @@ import pytest
 from ssmppl.diagnosis.effects.effect import means, quantiles, sds, sizes
 from ssmppl.diagnosis.model.candidates import offers
 from ssmppl.diagnosis.model.scales import DIGITS, LEVELS, Scales, VariableScale, value_of
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.small import level
 from tests.statistics.checks import seed_of
 

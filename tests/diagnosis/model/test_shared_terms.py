@@ -11,7 +11,7 @@ from ssmppl.diagnosis.model.equations import Equations, carried, shared_terms
 from ssmppl.diagnosis.model.score_columns import score_columns
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbols_of
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.harness import scales, traced
 
 DT = 0.05

@@ -25,7 +25,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.inference.exact.kalman import KalmanModel
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.gaps import THETA, build, simulated
 from tests.statistics.checks import LEVEL, seed_of, some
 

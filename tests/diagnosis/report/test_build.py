@@ -14,7 +14,7 @@ from ssmppl.diagnosis.report import build, tables
 from ssmppl.diagnosis.report.words import headline
 from ssmppl.diagnosis.verdict.decision import curves_beat
 from ssmppl.drawing.numerals import interval
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.harness import scales
 from tests.diagnosis.small import level, levels
 from tests.models import gaps as models

@@ -15,7 +15,7 @@ from ssmppl.diagnosis.model.changed_laws import substituted
 from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.errors import ArgumentError, ModelError
 from ssmppl.expressions.expr import symbol
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 from tests.diagnosis.harness import EVERY, differences, offered, traced
 from tests.language.user_defined.user_defined_laws import Gumbel
@@ -250,7 +250,7 @@ def test_a_script_does_not_run_again(tmp_path):
     """Its import ran the whole of it, a diagnosis at its end included."""
     (tmp_path / "script.py").write_text(
         "import ssmppl as ssm\nfrom ssmppl.diagnosis.report.model_file import to_model\n"
-        "from ssmppl.language.trace import trace\n\n"
+        "from ssmppl.language.tracing import trace\n\n"
         "print('begun')\n\n@ssm.primitive\ndef rub(v):\n    return -0.5 * v\n\n"
         'model = ssm.Model("loose")\n'
         "model.initial(lambda: {'x': ssm.Normal(0, sd=1)})\n"

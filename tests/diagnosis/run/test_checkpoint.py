@@ -8,7 +8,7 @@ from ssmppl.data import bind
 from ssmppl.diagnosis.effects.catalogue import effects
 from ssmppl.diagnosis.run.checkpoint import Checkpoint, digests
 from ssmppl.errors import ArgumentError
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.small import level, levels
 
 MADE_FROM = {"mode": "fast", "model": "m", "data": "d", "settings": "s"}

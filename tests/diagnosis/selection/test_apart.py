@@ -13,7 +13,7 @@ from ssmppl.diagnosis.selection.equivalence import (
     best_separating_input,
     simple_inputs,
 )
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.diagnosis.small import level, levels
 
 T = 80

@@ -24,10 +24,10 @@ from ssmppl.inference.chains.elimination import (
     describe_elimination,
     requested_elimination,
 )
-from ssmppl.inference.chains.parameter_steps import log_joint
+from ssmppl.inference.chains.gibbs_updates import log_joint
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.model.traced import previous, seen
+from ssmppl.language.model.trace import previous, seen
 from tests.models import elimination as models
 from tests.models.elimination import GONE, MODELS, STEPS, joint_draws
 from tests.statistics.checks import LEVEL, assert_within, mcse_mean, seed_of, some
@@ -92,7 +92,7 @@ def test_density_without_the_block_is_the_integral_over_it(name):
         c = steps.prior(theta) + rows.total
         total, at = 0.0, 0
         for u in steps.updates:
-            total += constant_of(u.conditional, c[at : at + len(u.functions)])
+            total += constant_of(u.family, c[at : at + len(u.functions)])
             at += len(u.functions)
         for t in range(STEPS):
             at_t = values_at(problem, theta, x, t)
@@ -382,9 +382,9 @@ def test_blocks_that_share_a_term_are_not_both_eliminated():
     problem = pose(models.lags, joint_draws("lags", 1, 1)[2](0))
     missing = problem.program.missing
     both = eliminable(problem.trace, (), missing)
-    assert [u.family for u in both.updates] == ["Normal-inverse-Gamma"]
+    assert [u.family_name for u in both.updates] == ["Normal-inverse-Gamma"]
     one = eliminable(problem.trace, (), missing, ("a",))
-    assert [u.family for u in one.updates] == ["joint Normal"]
+    assert [u.family_name for u in one.updates] == ["joint Normal"]
     apart = eliminable(slope_and_variance(), (), missing)
     assert [u.block for u in apart.updates] == [("q",)]
     assert "holds it together with q" in next(iter(apart.refused.values())).reason

@@ -19,7 +19,7 @@ from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.chains.interweaving import Interweaving, InterweavingTuning, NoiseMove
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
-from ssmppl.language.model.transforms import constant_bounds
+from ssmppl.language.model.transforms import parameter_bounds
 from tests.models import noise as models
 from tests.models.noise import CASES, STEPS, joint_draws
 from tests.statistics.checks import LEVEL, some
@@ -175,7 +175,7 @@ def changes(name, steered, kind, draws=2000, sweeps=5):
             found = noises(problem.trace, problem.program.missing)
             first = kind(problem, found, steered, theta.copy())
             space = space_of(problem, {}, {})
-            d, bounds = len(space.where), constant_bounds(problem.trace)
+            d, bounds = len(space.positions), parameter_bounds(problem.trace)
         move = replace(first, problem=problem)
         move.__dict__["module"] = first.module  # else it is generated anew for each data set
         kernel = Interweaving(
@@ -259,9 +259,9 @@ def test_a_move_that_cannot_be_made_is_not_chosen(other, place):
     problem, theta, paths = posed("linear", 2)
     moves = (other, OnPrior()) if place == 0 else (OnPrior(), other)
     space, adapting = space_of(problem, {}, {}), 400
-    d = len(space.where)
+    d = len(space.positions)
     kernel = Interweaving(
-        space, moves, np.arange(d), np.full(d, 3.0), adapting, 0, constant_bounds(problem.trace)
+        space, moves, np.arange(d), np.full(d, 3.0), adapting, 0, parameter_bounds(problem.trace)
     )
     tuning, rng, drawn = kernel.begin(), np.random.default_rng(7), []
     for k in range(adapting + 12_000):
@@ -282,7 +282,7 @@ def test_of_two_moves_that_can_be_made_the_wider_is_chosen():
     narrow, wide = (OnPrior(lambda t, w=w: abs(t[0] - start) < w) for w in (0.02, 0.1))
     space = space_of(problem, {}, {})
     kernel = Interweaving(
-        space, (narrow, wide), np.arange(1), np.ones(3), 400, 0, constant_bounds(problem.trace)
+        space, (narrow, wide), np.arange(1), np.ones(3), 400, 0, parameter_bounds(problem.trace)
     )
     tuning, rng = kernel.begin(), np.random.default_rng(7)
     for _ in range(402):

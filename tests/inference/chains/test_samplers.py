@@ -201,7 +201,7 @@ def test_walk_stands_still_without_adaptation():
 def test_coordinates_are_one_to_one_with_their_jacobian():
     """exp(log density) integrates to the same over every scale: densities differ by |dw / dw'|."""
     space = space_of(pose(chosen, {"y": np.array([0.3, 0.1])}), {}, {"a": 0.4, "q": 1.7})
-    z = space.z[space.where]
+    z = space.z[space.positions]
     theta, log_p = space.parameters(z)
     for kind, slope in (("natural", 1.0), ("log", 1.0 / 1.7), ("reciprocal", 1.0 / 1.7**2)):
         w = coordinates(space, "natural", {"q": kind})
@@ -239,7 +239,7 @@ def test_a_chain_goes_nowhere_that_the_prior_density_is_infinite():
 def test_chart_gives_derivatives_of_the_change_of_scale():
     space = space_of(pose(chosen, {"y": np.array([0.3, 0.1])}), {}, {"a": 0.4, "q": 1.7})
     w = coordinates(space, "unconstrained", {"q": "reciprocal"})
-    point = w.at(space.z[space.where])
+    point = w.at(space.z[space.positions])
     found = local_derivatives(w, point, np.array([0.3, 0.2]), second=True)
     v = 1 / 1.7
     np.testing.assert_allclose(found.jacobian, [[1, 0], [0, -1 / v**2]], atol=1e-6)
@@ -415,7 +415,7 @@ def test_a_logarithm_is_taken_where_the_support_has_one(name):
     space = space_of(bounded(parent, child), held, {"a": np.asarray(2.0)})
     if fits:
         where = coordinates(space, "unconstrained", {"a": "log"})
-        w = where.at(space.z[space.where])
+        w = where.at(space.z[space.positions])
         np.testing.assert_allclose(where.parameters(w)[0], space.theta, rtol=1e-12)
         return
     with pytest.raises(ssm.ArgumentError, match="a is not confined to positive numbers"):
@@ -427,7 +427,7 @@ def test_a_start_without_a_reciprocal_is_refused():
     assert space.theta[1] == 0.0
     where = coordinates(space, "unconstrained", {"a": "reciprocal"})
     with pytest.raises(ssm.ArgumentError, match=r"start at a = 0, .* reciprocal scale"):
-        where.at(space.z[space.where])
+        where.at(space.z[space.positions])
 
 
 def test_a_logarithm_is_of_every_component():

@@ -27,7 +27,7 @@ import pytest
 
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.checkpoints import archive, chains
-from ssmppl.inference.checkpoints.chains import ChainFile
+from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec, Store
 from ssmppl.inference.checkpoints.origin import Origin
 from ssmppl.inference.run.chain_runner import run_chains
@@ -77,13 +77,13 @@ def starts(seed, width=WIDTH):
 
 def opened(path, seed=1, draws=N, **changes):
     origin = Origin({"model": "m", "data": "d"}, {"chains=": "3", "numpy": "2.0", **changes})
-    return ChainFile(path, origin, seed, np.random.SeedSequence(seed), CODEC, draws)
+    return CheckpointFile(path, origin, seed, np.random.SeedSequence(seed), CODEC, draws)
 
 
 def run(path, draws=N, step=walk, block=7, seed=1, **changes):
     kept = opened(path, seed, draws, **changes)
     first = starts(kept.root.entropy)
-    return run_chains(step, first, draws, WARMUP, block=block, progress=False, keep=kept)
+    return run_chains(step, first, draws, WARMUP, block=block, progress=False, checkpoint=kept)
 
 
 def drawn(result):
@@ -116,7 +116,7 @@ def crash_at(count, step=walk):
 
 
 class Dies:
-    """A ChainFile whose process dies at a write: nothing is written after."""
+    """A CheckpointFile whose process dies at a write: nothing is written after."""
 
     def __init__(self, monkeypatch, after):
         self.left, self.write = after, archive.write
@@ -232,7 +232,7 @@ def test_without_a_seed_that_of_the_file_is_taken_up(tmp_path, expected):
 
 
 def test_ctrl_c_writes_before_it_returns(tmp_path):
-    class Pressed(ChainFile):
+    class Pressed(CheckpointFile):
         def due(self, chains):
             if min(c.done for c in chains) > WARMUP + 10 and not pressed:
                 pressed.append(os.kill(os.getpid(), signal.SIGINT))
@@ -242,7 +242,7 @@ def test_ctrl_c_writes_before_it_returns(tmp_path):
     kept = opened(tmp_path / "a.npz")
     kept.__class__ = Pressed
     result = run_chains(
-        walk, starts(1), 10**6, WARMUP, block=3, progress=False, keep=kept
+        walk, starts(1), 10**6, WARMUP, block=3, progress=False, checkpoint=kept
     )  # fmt: skip
     assert result[0].interrupted
     assert [s.done for s in opened(tmp_path / "a.npz").standings()] == [
@@ -316,7 +316,7 @@ def test_a_checkpoint_of_another_call_is_refused(finished):
     origin, root = Origin({"model": "n", "data": "e"}, {}), np.random.SeedSequence(1)
     for seed in (None, 1):
         unchanged_after(
-            finished, lambda s=seed: ChainFile(finished, origin, s, root, CODEC, N),
+            finished, lambda s=seed: CheckpointFile(finished, origin, s, root, CODEC, N),
             "another model and other data",
         )  # fmt: skip
 
@@ -474,10 +474,10 @@ def test_a_write_that_fails_late_leaves_the_older(tmp_path, monkeypatch, expecte
 def test_two_runs_do_not_write_over_each_other(tmp_path, expected):
     path = tmp_path / "a.npz"
     one, two = opened(path), opened(path)
-    run_chains(walk, starts(1), N, WARMUP, block=7, progress=False, keep=one)
+    run_chains(walk, starts(1), N, WARMUP, block=7, progress=False, checkpoint=one)
     before = path.read_bytes()
     with pytest.warns(UserWarning, match="another run has written it"):
-        result = run_chains(walk, starts(1), 5, WARMUP, block=7, progress=False, keep=two)
+        result = run_chains(walk, starts(1), 5, WARMUP, block=7, progress=False, checkpoint=two)
     np.testing.assert_array_equal(drawn(result), expected[:, :5])
     assert path.read_bytes() == before
 
@@ -485,7 +485,7 @@ def test_two_runs_do_not_write_over_each_other(tmp_path, expected):
 def test_a_file_that_was_deleted_is_written_again(tmp_path, expected):
     kept = opened(tmp_path / "a.npz")
     (tmp_path / "a.npz").unlink()
-    run_chains(walk, starts(1), N, WARMUP, progress=False, keep=kept)
+    run_chains(walk, starts(1), N, WARMUP, progress=False, checkpoint=kept)
     np.testing.assert_array_equal(drawn(run(tmp_path / "a.npz", step=crash_at(0))), expected)
 
 
@@ -502,7 +502,7 @@ def child(path):
     chains.SECONDS, chains.SHARE = -1.0, 1e9
     kept = opened(path)
     print("ready", flush=True)
-    run_chains(wide, starts(1, WIDE), LONG, WARMUP, block=5, progress=False, keep=kept)
+    run_chains(wide, starts(1, WIDE), LONG, WARMUP, block=5, progress=False, checkpoint=kept)
     print("done", flush=True)
 
 
@@ -519,6 +519,6 @@ def test_kill_9_at_any_moment(tmp_path):
         opened(path)
         assert not list(tmp_path.glob("*.part"))
     kept = opened(path)
-    result = run_chains(wide, starts(1, WIDE), LONG, WARMUP, progress=False, keep=kept)
+    result = run_chains(wide, starts(1, WIDE), LONG, WARMUP, progress=False, checkpoint=kept)
     whole = run_chains(wide, starts(1, WIDE), LONG, WARMUP, progress=False)
     np.testing.assert_array_equal(drawn(result), drawn(whole), str(delays))

@@ -13,7 +13,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.checkpoints import archive, chains, origin
-from ssmppl.inference.checkpoints.chains import ChainFile
+from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.run import chain_runner
 from ssmppl.inference.verbs.sample import METHODS
 from tests.models import checkpoints as models
@@ -88,13 +88,13 @@ def test_every_method_goes_on(killed, tmp_path, name):
 @pytest.mark.parametrize("name", ["PGAS", "PMMH, gradient", "Gibbs"])
 def test_a_call_without_states_goes_on_and_keeps_none(killed, tmp_path, monkeypatch, name):
     """All other draws, and how often trajectories changed, are those of a call that keeps them."""
-    path, whole, kept, real = tmp_path / "a.npz", bits(call(name)), [], ChainFile.stack
+    path, whole, kept, real = tmp_path / "a.npz", bits(call(name)), [], CheckpointFile.stack
 
     def stack(self, chains):
         kept.append(real(self, chains))
         return kept[-1]
 
-    monkeypatch.setattr(ChainFile, "stack", stack)
+    monkeypatch.setattr(CheckpointFile, "stack", stack)
     expected = {k: v for k, v in whole.items() if k[:11] != "posterior x"}
     assert len(expected) == len(whole) - 2
     for n in (9, 30):

@@ -53,7 +53,7 @@ def spooled(path, draws=N, step=walk, block=7):
     """(draws, statistics) as `sample` takes them."""
     kept = opened(path, draws=draws)
     result = run_chains(
-        step, starts(1), draws, WARMUP, block=block, progress=False, keep=kept
+        step, starts(1), draws, WARMUP, block=block, progress=False, checkpoint=kept
     )  # fmt: skip
     return kept.stack(result)
 
@@ -138,7 +138,9 @@ def test_memory_does_not_grow_with_the_draws(tmp_path, monkeypatch):
     kept = opened(tmp_path / "a.npz", draws=3000)
     tracemalloc.start()
     try:
-        result = run_chains(wide, starts(1, 1000), 3000, 10, block=10, progress=False, keep=kept)
+        result = run_chains(
+            wide, starts(1, 1000), 3000, 10, block=10, progress=False, checkpoint=kept
+        )
         draws, _ = kept.stack(result)
         _, most = tracemalloc.get_traced_memory()
     finally:
@@ -173,7 +175,7 @@ def test_kill_9_at_any_moment(tmp_path):
             time.sleep(delay)
             process.kill()
     kept = opened(path)
-    result = run_chains(wide, starts(1, 1000), 400, WARMUP, progress=False, keep=kept)
+    result = run_chains(wide, starts(1, 1000), 400, WARMUP, progress=False, checkpoint=kept)
     whole = run_chains(wide, starts(1, 1000), 400, WARMUP, progress=False)
     np.testing.assert_array_equal(kept.stack(result)[0]["x"], drawn(whole))
 
@@ -186,7 +188,7 @@ def child(path):
     chains.SECONDS, chains.SHARE, chains.HELD = -1.0, 1e9, 10**6
     kept = opened(path)
     print("ready", flush=True)
-    run_chains(wide, starts(1, 1000), 400, WARMUP, block=3, progress=False, keep=kept)
+    run_chains(wide, starts(1, 1000), 400, WARMUP, block=3, progress=False, checkpoint=kept)
 
 
 # -- through `sample`

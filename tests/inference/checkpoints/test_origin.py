@@ -7,7 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.checkpoints.origin import model_digest
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 def model(law, inputs=()):

@@ -11,7 +11,7 @@ from ssmppl.data import bind
 from ssmppl.errors import NotApplicable, SamplingError
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.finite import MODELS, data_of, enumerated, independent, weather
 from tests.statistics.checks import LEVEL, seed_of
 

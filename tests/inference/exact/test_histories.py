@@ -12,7 +12,7 @@ from ssmppl.inference.exact import hidden_markov as tables
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.finite import MODELS, data_of, enumerated, weather
 from tests.statistics.checks import LEVEL, seed_of
 

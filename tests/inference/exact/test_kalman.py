@@ -17,7 +17,7 @@ from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.exact.kalman import kalman_filter, kalman_log_likelihood, kalman_model
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.kalman import MODELS, posed
 
 

@@ -10,7 +10,7 @@ from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, ModelError, SamplingError
 from ssmppl.inference.exact.derivatives import jacobian
 from ssmppl.inference.exact.kalman import kalman_model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.statistics.checks import seed_of
 
 

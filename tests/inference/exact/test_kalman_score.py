@@ -12,7 +12,7 @@ from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.exact.derivatives import jacobian
 from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.language.model.model import Model
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.inference.exact.test_kalman import lgss
 from tests.models.kalman import MODELS, posed, scalar, time_varying
 from tests.statistics.checks import seed_of

@@ -13,7 +13,7 @@ from ssmppl.inference.maximum.direct_optimization import SmoothLikelihood
 from ssmppl.inference.particles.filtering import FilterSettings, log_likelihood_estimate
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models import standard as models
 from tests.statistics.checks import mean_one_p, seed_of
 from tests.statistics.exact import varve_log_likelihood

@@ -97,7 +97,7 @@ def test_each_particle_carries_its_own_parameters(with_prior):
     perturbed = PerturbedFilter(
         perturbed.space, with_prior, 0.0 * perturbed.perturbation, perturbed.moving, 0.5
     )
-    one = setup.space.z[setup.space.where]
+    one = setup.space.z[setup.space.positions]
     atoms = [one, one + np.array([0.3, 0.4, -0.3, 0.5])]  # m, phi, q, r
     exact = []
     for z in atoms:
@@ -319,7 +319,7 @@ def tops_of_walk(objective, count, particles=300):
     for k in range(count):
         seed = seed_of("walk", k)
         setup = setup_of(OPAQUE, data, start=exact.parameters, objective=objective, seed=seed)
-        z = setup.space.z[setup.space.where]
+        z = setup.space.z[setup.space.positions]
         inverse = np.linalg.pinv(setup.transform.at(z).jacobian)
         inner = inverse @ exact.covariance.to_numpy() @ inverse.T
         rng = np.random.default_rng(seed)
@@ -405,7 +405,9 @@ def test_filters_run_side_by_side():
 
     data = simulated(30, "workers", parameters=WALK, model=PLAIN)
     setup = replace(setup_of(OPAQUE, data, start=WALK), executor=Counting(1))
-    local_maximum(setup, ssm.IF2(particles=50, points=160), setup.space.z[setup.space.where], 0.5)
+    local_maximum(
+        setup, ssm.IF2(particles=50, points=160), setup.space.z[setup.space.positions], 0.5
+    )
     assert setup.executor.most > 10
 
 

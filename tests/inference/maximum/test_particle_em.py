@@ -10,7 +10,7 @@ from scipy import stats
 import ssmppl as ssm
 from ssmppl.data import check_parameters
 from ssmppl.datasets import ice_varves, load
-from ssmppl.inference.chains.pgas import Sweeper, conditional_settings, start_chain
+from ssmppl.inference.chains.pgas import Sweeper, csmc_settings, start_chain
 from ssmppl.inference.maximum.em import ExactSteps
 from ssmppl.inference.maximum.m_step import fixed_point, maximiser, ratio_weights
 from ssmppl.inference.maximum.particle_em import climb as climb_particle_em
@@ -110,7 +110,7 @@ def test_blocks_neither_depend_on_their_borders_nor_on_the_process():
     setup = setup_of(models.lgss, {"y": load("lgss_appendix")["y"]}, fixed={"c": 1.0})
     method = ssm.PSAEM(particles=8, burn_in=5)
     maximum = maximiser(setup, "PSAEM")
-    settings = conditional_settings(setup.problem, method.particles, method.proposal)
+    settings = csmc_settings(setup.problem, method.particles, method.proposal)
     theta = np.array([2.0, 1.0])
     paths, stream = started(setup, theta, settings, "blocks")
     state = PSAEMState(theta, paths, stream, np.empty(0), 0)

@@ -19,7 +19,7 @@ from ssmppl.expressions.calculus import NotDifferentiable
 from ssmppl.inference.particles.scores import complete_scores
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import Problem, pose
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models import standard as models
 from tests.models.statements import build
 from tests.statistics.checks import seed_of
@@ -119,7 +119,9 @@ def posed(model, seed, steps=12, experiments=2, missing=True):
         group = {n: made[n].values[i::experiments] for n in traced.initial}
         paths.append(np.ascontiguousarray(pack(traced.initial.values(), group)))
     problem = pose(model, data)
-    theta, _ = space.parameters(space.z[space.where] + 0.1 * rng.normal(size=len(space.where)))
+    theta, _ = space.parameters(
+        space.z[space.positions] + 0.1 * rng.normal(size=len(space.positions))
+    )
     return problem, theta.copy(), paths
 
 
@@ -157,12 +159,12 @@ def test_first_and_second_derivatives(name):
 
 def test_parameters_left_out_have_no_score():
     problem, theta, paths = posed(models.varves, seed_of("left out"))
-    whole, part = complete_scores(problem), complete_scores(problem, held={"phi"})
+    whole, part = complete_scores(problem), complete_scores(problem, fixed={"phi"})
     gradient = part.gradient(theta, paths)
     np.testing.assert_allclose(gradient[:, 1], whole.gradient(theta, paths)[:, 1], rtol=1e-12)
     assert np.all(gradient[:, 0] == 0.0)
     np.testing.assert_array_equal(part.hessian(theta, paths)[:, 0], 0.0)
-    nothing = complete_scores(problem, held={"phi", "tau"})
+    nothing = complete_scores(problem, fixed={"phi", "tau"})
     assert not nothing.gradient(theta, paths).any()
     assert not nothing.hessian(theta, paths).any()
 
@@ -226,7 +228,7 @@ def test_where_the_identity_fails_it_is_refused(law, reason):
         complete_scores(problem)
     assert raised.value.where is not None
     assert "fix 'a'" in raised.value.fix
-    complete_scores(problem, held={"a"})
+    complete_scores(problem, fixed={"a"})
 
 
 def test_a_step_in_the_states_alone_is_allowed():

@@ -18,7 +18,7 @@ from numba import cuda, types
 import ssmppl as ssm
 from ssmppl.codegen.modules import device
 from ssmppl.codegen.modules.program import compile_trace
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.inference.particles.test_blocks import AT, MODEL, data
 from tests.models.statements import MODELS, build
 from tests.statistics.checks import LEVEL, mean_one_p, seed_of

@@ -17,7 +17,7 @@ from ssmppl.inference.particles.filtering import FilterSettings, repeated_estima
 from ssmppl.inference.particles.marginal import _Step, backward_pass, draw_given, marginal_paths
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.conditional import THETA, enumerated, four_states, regimes
 from tests.statistics.checks import LEVEL, MCSE, deviations, mean_one_p, seed_of
 

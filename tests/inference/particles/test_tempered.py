@@ -6,7 +6,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.codegen.kernels.particle.tempered_filter import accept
-from ssmppl.inference.preparation.proposal_choice import choose
+from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.run.problem import pose
 
 COVARIANCE = np.array([[1.0, 0.6], [0.6, 1.0]])
@@ -179,8 +179,8 @@ def test_it_is_explained_and_chosen_where_nothing_better_is_derived():
     model.observation(lambda x: {"y": ssm.Normal(opaque(x), sd=0.01)})
     assert "increasing powers" in str(ssm.explain(model))
     problem = pose(model, {"y": np.array([0.3, -1.2, 2.0, 4.0, 3.0])})
-    assert choose(problem, np.empty(0), whole=True, temper=True).name == "tempered"
-    assert choose(problem, np.empty(0), whole=True).name == "bootstrap"
+    assert choose_by_pilot(problem, np.empty(0), whole=True, temper=True).name == "tempered"
+    assert choose_by_pilot(problem, np.empty(0), whole=True).name == "bootstrap"
     assert "increasing powers" not in str(ssm.explain(PAIR))
 
 

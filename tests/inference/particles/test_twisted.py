@@ -19,7 +19,7 @@ from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.chains.pmmh import ParticleLikelihood
 from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
 from ssmppl.inference.preparation import proposal_choice
-from ssmppl.inference.preparation.proposal_choice import ENOUGH, choose
+from ssmppl.inference.preparation.proposal_choice import ENOUGH, choose_by_pilot
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state
 from tests.models import standard as models
@@ -278,7 +278,7 @@ def pilot(monkeypatch):
 
         monkeypatch.setattr(proposal_choice, "_choices", {})
         monkeypatch.setattr(proposal_choice, "repeated_estimates", pretended)
-        return tried, choose(problem, theta, whole=whole)
+        return tried, choose_by_pilot(problem, theta, whole=whole)
 
     return run
 
@@ -352,13 +352,13 @@ def test_variants_that_know_no_guide_say_so(variant):
 @pytest.mark.slow
 def test_the_pendulum_chooses_it_and_the_varves_do_not(monkeypatch):
     y = ssm.simulate(pendulum, {}, steps=200, seed=seed_of("swing"))["y"].values[0]
-    choice = choose(pose(pendulum, {"y": y}), np.empty(0), whole=True)
+    choice = choose_by_pilot(pose(pendulum, {"y": y}), np.empty(0), whole=True)
     assert choice.name == "twisted", choice
     assert list(choice.figures) == ["bootstrap", "twisted"]
     assert 10 * choice.figures["twisted"][0] < choice.figures["bootstrap"][0]
     assert generated(pose(pendulum, {"y": y}))
     problem = forgotten(pose(models.varves, {"y": ice_varves()}), monkeypatch)
-    choice = choose(problem, np.array([0.6, 5.0]), whole=True)
+    choice = choose_by_pilot(problem, np.array([0.6, 5.0]), whole=True)
     assert sorted(choice.figures) == sorted(OTHERS)
     assert not generated(problem)
 

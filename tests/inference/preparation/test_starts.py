@@ -5,7 +5,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.preparation.initial_values import ordinary_values
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 SHORT = {"draws": 6, "warmup": 4, "chains": 1, "seed": 1, "progress": False}
 DATA = {"y": np.cumsum(np.random.default_rng(2).normal(size=40))}

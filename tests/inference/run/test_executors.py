@@ -30,7 +30,7 @@ from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.executors import Absent, Sent, workers_of
 from ssmppl.inference.run.tasks import run_tasks
 from ssmppl.language.model import pickling
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models import standard as models
 from tests.statistics.test_reproducibility import DATA, THETA, VERBS
 

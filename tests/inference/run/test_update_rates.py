@@ -7,15 +7,15 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.chains.pgas import PGASState
-from ssmppl.inference.run import mixing
-from ssmppl.inference.run.draws import ChainDraws
-from ssmppl.inference.run.mixing import (
+from ssmppl.inference.run import convergence
+from ssmppl.inference.run.convergence import (
     PathMovement,
     movement,
     random_components,
     update_rate_attributes,
     watched_movement,
 )
+from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.verbs.sample import _chosen
 
@@ -120,7 +120,7 @@ def watched(paths, waiting=3):
 
 
 def made_up_without_paths(paths):
-    states = [PGASState(*[None] * 4, watch=w) for w in watched(paths)]
+    states = [PGASState(*[None] * 4, path_movement=w) for w in watched(paths)]
     return [ChainDraws({"theta": np.zeros((len(p), 1))}, {}, {}, s)
             for p, s in zip(paths, states, strict=True)]  # fmt: skip
 
@@ -209,7 +209,7 @@ def test_draws_that_are_read_in_pieces_count_as_whole_ones(monkeypatch, size):
     rng = np.random.default_rng(4)
     paths = np.floor(rng.normal(size=(3, 101, 4, 2)) * 2.0)
     paths[:, :, 1], paths[1:, :60, 2] = 3.1, 7.0
-    monkeypatch.setattr(mixing, "PIECE", size)
+    monkeypatch.setattr(convergence, "PIECE", size)
     rate, ever, apart = movement(paths)
     np.testing.assert_array_equal(rate, np.mean(paths[:, 1:] != paths[:, :-1], axis=(0, 1)))
     np.testing.assert_array_equal(ever, (paths != paths[:1, :1]).any(axis=(0, 1)))

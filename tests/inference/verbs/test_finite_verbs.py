@@ -9,7 +9,7 @@ import ssmppl as ssm
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact.hidden_markov import hidden_markov
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.models.finite import MODELS, independent, second_order, weather
 from tests.statistics.checks import LEVEL, seed_of
 

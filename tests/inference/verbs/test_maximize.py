@@ -60,7 +60,7 @@ def shapes_observation(x):
 def shaped():
     problem = pose(shapes, {"y": np.zeros(3)})
     space = space_of(problem, {"free": np.array([0.3, -0.2])}, {})
-    z = np.random.default_rng(seed_of("chart")).normal(size=len(space.where))
+    z = np.random.default_rng(seed_of("chart")).normal(size=len(space.positions))
     return space, UnconstrainedTransform(space), z
 
 

@@ -6,7 +6,7 @@ import pytest
 import ssmppl as ssm
 from ssmppl.errors import ModelError
 from ssmppl.language.model.pickling import packed, unpacked
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 def model_of(law, chosen, first=None):

@@ -9,7 +9,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.language.distributions import MvNormal, Normal
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 SPELLINGS: dict[str, Callable] = {
     "np.diag": lambda m, v: ssm.MvNormal(m, covariance=np.diag(v)),
@@ -48,7 +48,7 @@ def test_components_are_independent(spelling: str):
     sites = [found.trace.transition["x"], found.trace.observations["y"]]
     assert all(isinstance(s.distribution, Normal) for s in sites)
     assert {s.distribution.location.line for s in sites} == {law.__code__.co_firstlineno}
-    assert [u.family for u in found.updates] == ["inverse Gamma"] * 4
+    assert [u.family_name for u in found.updates] == ["inverse Gamma"] * 4
     if spelling not in ("precision", "cholesky", "cholesky of it"):  # these square a root
         assert [str(u.explanation) for u in found.updates] == [
             str(u.explanation) for u in expected.updates

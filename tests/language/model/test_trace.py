@@ -9,8 +9,8 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol, symbols_of
 from ssmppl.language import distributions as ssm
 from ssmppl.language.model.model import Model, location_of
-from ssmppl.language.model.traced import previous, seen
-from ssmppl.language.trace import trace
+from ssmppl.language.model.trace import previous, seen
+from ssmppl.language.tracing import trace
 
 
 def names(symbols):

@@ -9,7 +9,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.model.transforms import transforms, unconstrain
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 
 def bounded():

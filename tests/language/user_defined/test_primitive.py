@@ -12,7 +12,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.model.closure_digest import fingerprint
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 
 LEVEL = 0.25
 
@@ -75,8 +75,8 @@ def test_same_numbers_as_the_law_written_out():
 def test_what_can_still_be_derived():
     plan = ssm.explain(build(friction))
     updates = {u.block: u for u in plan.updates}
-    assert updates[("q",)].family == "Gamma"
-    assert updates[("k",)].family == "slice"
+    assert updates[("q",)].family_name == "Gamma"
+    assert updates[("k",)].family_name == "slice"
     assert updates[("k",)].needs_log_joint
     assert isinstance(plan.structure, NotApplicable)
 

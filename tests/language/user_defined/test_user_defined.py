@@ -15,7 +15,7 @@ from ssmppl.expressions.evaluate import evaluate, numpy_draws
 from ssmppl.expressions.expr import symbol
 from ssmppl.inference.checkpoints.origin import model_digest
 from ssmppl.language.distributions.draws import Draws
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.language.user_defined.user_defined_laws import (
     NAMES,
     TABLE,
@@ -242,7 +242,7 @@ def test_conjugate_updates_are_found_in_the_density():
         dict(p.sections())["Gibbs updates (full conditionals given states and data)"] for p in plans
     ]
     assert told[0] == told[1] == told[2]
-    families = {u.block[0]: u.family for u in plans[1].updates}
+    families = {u.block[0]: u.family_name for u in plans[1].updates}
     assert families == {"tau": "Gamma", "phi": "Normal", "lam": "Gamma"}
 
 

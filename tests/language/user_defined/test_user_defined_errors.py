@@ -10,7 +10,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.errors import ModelError
-from ssmppl.language.trace import trace
+from ssmppl.language.tracing import trace
 from tests.language.user_defined.user_defined_laws import Gumbel, Lomax
 
 BAD = []  # (builder, fragments)

@@ -12,14 +12,15 @@ from ssmppl import markup
 from ssmppl.data import unpack_parameters
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.language.model.traced import Trace
+from ssmppl.inference.preparation.space import free_components
+from ssmppl.language.model.trace import Trace
 from ssmppl.results import to_dataset
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["NO_METHOD", "Estimate", "by_name", "free_components", "make_estimate", "table"]
+__all__ = ["NO_METHOD", "Estimate", "by_name", "make_estimate", "table"]
 
 NO_METHOD = "none"  # where every parameter is fixed
 
@@ -140,11 +141,6 @@ class Estimate:
         return [*out, f"no standard errors: {reason}"] if how == "none" else out
 
 
-def free_components(trace: Trace, held: dict[str, np.ndarray]) -> np.ndarray:
-    """(P,) which components of theta belong to parameters that are not fixed."""
-    return np.array([s.data[1] not in held for s in trace.parameter_symbols], dtype=bool)
-
-
 def by_name(trace: Trace, values: np.ndarray) -> dict[str, float | np.ndarray]:
     """Values (P,) of the components by name, numbers for scalar parameters."""
     named = unpack_parameters(trace, values)
@@ -183,7 +179,7 @@ def beside(parameters: Collection[str], name: str) -> str:
 
 def make_estimate(
     trace: Trace, theta: np.ndarray, covariance: np.ndarray, log_likelihood: float,
-    iterates: np.ndarray, held: dict[str, np.ndarray], attrs: dict[str, Any],
+    iterates: np.ndarray, fixed: dict[str, np.ndarray], attrs: dict[str, Any],
     figures: Mapping[str, np.ndarray] | None = None,
 ) -> Estimate:  # fmt: skip
     """An Estimate from arrays over all P components: theta (P,), covariance (P, P), iterates
@@ -192,7 +188,7 @@ def make_estimate(
     Rows and columns of fixed parameters are left out of the covariance.
     """
     dims = [beside(trace.parameters, n) for n in ("start", "iteration")[3 - iterates.ndim :]]
-    free = free_components(trace, held)
+    free = free_components(trace, fixed)
     labels = [repr(s) for s, f in zip(trace.parameter_symbols, free, strict=True) if f]
     errors = np.full(len(theta), np.nan)
     with np.errstate(invalid="ignore"):
@@ -204,7 +200,7 @@ def make_estimate(
     return Estimate(
         parameters=by_name(trace, theta),
         covariance=table(labels, covariance[np.ix_(free, free)]),
-        standard_errors={n: v for n, v in by_name(trace, errors).items() if n not in held},
+        standard_errors={n: v for n, v in by_name(trace, errors).items() if n not in fixed},
         log_likelihood=log_likelihood,
         iterates=to_dataset(
             variables,

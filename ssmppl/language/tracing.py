@@ -26,7 +26,7 @@ from ssmppl.language.checks.rules import (
 from ssmppl.language.model.calling import call, check_outer_names, return_location
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
-from ssmppl.language.model.traced import Site, Trace, symbols
+from ssmppl.language.model.trace import Site, Trace, symbols
 
 
 def _time(role: str) -> str:

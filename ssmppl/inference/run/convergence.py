@@ -25,7 +25,7 @@ from scipy.special import ndtri
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import Problem
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Site
+from ssmppl.language.model.trace import Site
 
 APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
 FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
@@ -168,7 +168,7 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
     """
     least, stuck = 1.0, []
     kept = "path_0" in result[0].draws
-    draws = min(len(c.draws["path_0"]) if kept else c.state.watch.draws for c in result)
+    draws = min(len(c.draws["path_0"]) if kept else c.state.path_movement.draws for c in result)
     if draws < 2:
         return {}
     for i, e in enumerate(problem.experiments):
@@ -176,7 +176,7 @@ def update_rate_attributes(problem: Problem, result: Sequence[ChainDraws[Any]]) 
         if kept:
             rate, ever, apart = movement([c.draws[f"path_{i}"] for c in result])
         else:
-            rate, ever, apart = watched_movement([c.state.watch for c in result], i)
+            rate, ever, apart = watched_movement([c.state.path_movement for c in result], i)
         # a continuous one that stands still is never right
         counted = free & (~discrete | (apart > STUCK_APART))
         varied = free & ever

@@ -29,9 +29,9 @@ from ssmppl.analysis.conjugacy.family import Limits, Values
 from ssmppl.analysis.conjugacy.matrix_families import size_of_matrix
 from ssmppl.analysis.conjugacy.update import (
     Update,
-    constant_bounds,
     correction_ranges,
     natural_bounds,
+    update_bounds,
 )
 from ssmppl.analysis.lambdify import DOMAIN, python_function, python_sum
 from ssmppl.errors import SamplingError
@@ -60,16 +60,18 @@ class DrawInfo(NamedTuple):
     accepted: bool
 
 
-class Sampler:
+class UpdateSampler:
     """An update made ready to draw from: nothing symbolic is left to do but in open bounds."""
 
     def __init__(self, update: Update):
         self._update = ref(update)  # which keeps its sampler; the other way round both would stay
         functions, components = update.functions, update.components
         self.log_density = _guarded(python_sum(functions, components))
-        self.corrections = update.correction
-        self.correct = _guarded(python_sum([functions[j] for j in update.correction], components))
-        self.bounds = constant_bounds(update)
+        self.corrections = update.outside_family
+        self.correct = _guarded(
+            python_sum([functions[j] for j in update.outside_family], components)
+        )
+        self.bounds = update_bounds(update)
         self.open_bounds = [
             (i, *_open_bounds(b))
             for i, (b, fixed) in enumerate(zip(update.bounds, self.bounds, strict=True))
@@ -81,11 +83,14 @@ class Sampler:
             for b, n in zip(self.bounds, self.natural, strict=True)
         )
         self.ranges = correction_ranges(update)
-        beside = [*(functions[j] for j in update.correction), *(f.density for f in update.left)]
+        beside = [
+            *(functions[j] for j in update.outside_family),
+            *(f.density for f in update.inseparable_terms),
+        ]
         self.last_is_held = any(components[-1] in symbols_of(e) for e in beside)
         self.matrix_size = size_of_matrix(len(components)) if update.kind == "matrix" else 0
-        if update.conditional is not None:
-            self.matrix_size = update.conditional.matrix_size or self.matrix_size
+        if update.family is not None:
+            self.matrix_size = update.family.matrix_size or self.matrix_size
 
     @property
     def update(self) -> Update:
@@ -117,7 +122,7 @@ class Sampler:
         self, c: Sequence[float], limits: list[Interval], rng: np.random.Generator
     ) -> Values | None:
         """A draw of the conjugate part; None where it is improper."""
-        family = self.update.conditional
+        family = self.update.family
         assert family is not None
         return family.draw_within(c, limits, rng) if self.truncated else family.draw(c, rng)
 
@@ -135,11 +140,11 @@ class Sampler:
         limits = self.limits(rest)
         c = totals.tolist()
         c.append(0.0)
-        if update.conditional is None:
+        if update.family is None:
             return self.slices(c, current, limits, rng, log_joint, 0)
         weights = [c[j] for j in self.corrections]
         ceiling = self.ceiling(c) if weights else 0.0
-        if update.left or not ceiling < math.inf:
+        if update.inseparable_terms or not ceiling < math.inf:
             return self.metropolis(c, current, limits, rng, log_joint)
         for tries in range(1, MAX_TRIES + 1):
             v = self.conjugate(c, limits, rng)
@@ -164,7 +169,7 @@ class Sampler:
         def excess(v: Sequence[float]) -> float:
             """Log of the conditional over the conjugate part's density."""
             correction = self.correct(v, weights) if weights else 0.0
-            if not self.update.left:
+            if not self.update.inseparable_terms:
                 return correction
             return self.exactly(log_joint)(v) - self.log_density(v, c) + correction
 
@@ -199,7 +204,7 @@ class Sampler:
     ) -> tuple[np.ndarray, DrawInfo]:  # fmt: skip
         """A sweep of slice steps over the exact conditional."""
         update, values = self.update, current.tolist()
-        exact = update.needs_log_joint or bool(update.left)
+        exact = update.needs_log_joint or bool(update.inseparable_terms)
         at: Density = self.exactly(log_joint) if exact else partial(self._separated, c)
         if not at(values) > -math.inf:
             raise self._impossible(values, log_joint)
@@ -214,8 +219,8 @@ class Sampler:
             natural = [
                 (max(a, n[0]), min(b, n[1])) for (a, b), n in zip(limits, self.natural, strict=True)
             ]
-            if update.conditional is not None and not self.last_is_held:
-                last = update.conditional.draw_last(c, values, limits, rng)
+            if update.family is not None and not self.last_is_held:
+                last = update.family.draw_last(c, values, limits, rng)
                 values[-1] = values[-1] if last is None else last
             new = sweep_real(at, values, natural, rng)
         return np.array(new), DrawInfo("slice", tries, True)
@@ -238,14 +243,14 @@ class Sampler:
         )
 
 
-_samplers: WeakKeyDictionary[Update, Sampler] = WeakKeyDictionary()
+_samplers: WeakKeyDictionary[Update, UpdateSampler] = WeakKeyDictionary()
 
 
-def sampler_of(update: Update) -> Sampler:
+def sampler_of(update: Update) -> UpdateSampler:
     """The update's sampler, made when it is first asked for; it lives as long as the update."""
     found = _samplers.get(update)
     if found is None:
-        _samplers[update] = found = Sampler(update)
+        _samplers[update] = found = UpdateSampler(update)
     return found
 
 
@@ -265,7 +270,7 @@ def draw(
     current : values of the components.
     rest : values of the other parameters, read where bounds depend on them.
     log_joint : log joint density as a function of the components' values; needed (and used) only
-        where update.needs_log_joint or update.left.
+        where update.needs_log_joint or update.inseparable_terms.
     """
     return sampler_of(update).draw(totals, current, rest, rng, log_joint)
 

@@ -1,14 +1,14 @@
-"""The complete-data log density as factors, and each factor separated in a block of parameters.
+"""The complete-data log density as terms, and each of them separated in a block of parameters.
 
     log p(theta, x_{1:T}, y_{1:T}) = prior + initial + sum_{t=2}^T transition_t
                                    + sum_{t=1}^T observation_t
 
-With everything but a block fixed, every factor is sum_i c_i(rest) s_i(block), so that
+With everything but a block fixed, every term is sum_i c_i(rest) s_i(block), so that
 
     log p(block | rest) = const + sum_i C_i s_i(block),
     C_i = prior_i + initial_i + sum_t transition_i + sum_t observation_i.
 
-The functions s_i are common to all roles; the C_i are the statistics. Factors that do not hold
+The functions s_i are common to all roles; the C_i are the statistics. Terms that do not hold
 the block are left out. Supports are kept apart: the densities here are unguarded, and what a
 support asks of the block is given by `CompleteData.restrictions`.
 """
@@ -27,7 +27,7 @@ from ssmppl.expressions.algebra import ONE, Monomial, Separation, monomial_expr,
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant, symbols_of, to_text
 from ssmppl.language.distributions import Dirac
-from ssmppl.language.model.traced import Site, Trace
+from ssmppl.language.model.trace import Site, Trace
 
 ROLES = ("prior", "initial", "transition", "observation")
 BOUNDED_ROLES = ("prior", "initial")  # as many terms, however long the series
@@ -35,7 +35,7 @@ _BOUNDED = ("interval", "integers")
 
 
 @dataclass(frozen=True)
-class Factor:
+class JointTerm:
     """One summand of the complete-data log density: of one site, or one component of it.
 
     density : log density on the support; of an observation 0 where it is missing.
@@ -67,16 +67,16 @@ class Restriction:
 
 @dataclass(frozen=True)
 class CompleteData:
-    """The factors of a model and the bounds that its supports set."""
+    """The terms of a model and the bounds that its supports set."""
 
     trace: Trace
-    factors: tuple[Factor, ...]
+    terms: tuple[JointTerm, ...]
     restrictions: tuple[Restriction, ...]
 
-    def holding(self, block: Iterable[Expr]) -> list[Factor]:
-        """The factors that hold a symbol of the block."""
+    def holding(self, block: Iterable[Expr]) -> list[JointTerm]:
+        """The terms that hold a symbol of the block."""
         wanted = frozenset(block)
-        return [f for f in self.factors if f.symbols & wanted]
+        return [f for f in self.terms if f.symbols & wanted]
 
 
 @dataclass(frozen=True)
@@ -85,17 +85,17 @@ class BlockForm:
 
     functions : the s_i; `monomials` holds them as products of powers.
     coefficients : role -> the summands of C_i, aligned with `functions`.
-    origins : monomial -> the factors it comes from.
-    left : factors of the prior and the initial law that do not separate, and why; they are missing
-        in the sum. Empty unless it was asked for.
+    origins : monomial -> the terms it comes from.
+    inseparable : terms of the prior and the initial law that do not separate, and why; they are
+        missing in the sum. Empty unless it was asked for.
     """
 
     components: tuple[Expr, ...]
     monomials: tuple[Monomial, ...]
     functions: tuple[Expr, ...]
     coefficients: dict[str, tuple[Expr, ...]]
-    origins: dict[Monomial, tuple[Factor, ...]] = field(repr=False)
-    left: tuple[tuple[Factor, NotApplicable], ...] = ()
+    origins: dict[Monomial, tuple[JointTerm, ...]] = field(repr=False)
+    inseparable: tuple[tuple[JointTerm, NotApplicable], ...] = ()
 
     @cached_property
     def places(self) -> dict[Monomial, int]:
@@ -103,7 +103,7 @@ class BlockForm:
         return {m: i for i, m in enumerate(self.monomials)}
 
     def roles(self, monomial: Monomial) -> frozenset[str]:
-        """The roles of the factors that a function comes from."""
+        """The roles of the terms that a function comes from."""
         return frozenset(f.role for f in self.origins[monomial])
 
 
@@ -111,24 +111,24 @@ NOTHING_MISSING = Missing()
 
 
 def complete_data(trace: Trace, missing: Missing = NOTHING_MISSING) -> CompleteData:
-    """All factors of a traced model, in the order prior, initial, transition, observation."""
-    factors: list[Factor] = []
+    """All terms of a traced model, in the order prior, initial, transition, observation."""
+    found: list[JointTerm] = []
     restrictions: list[Restriction] = []
     by_role = (trace.parameters, trace.initial, trace.transition, trace.observations)
     for role, sites in zip(ROLES, by_role, strict=True):
         for site in sites.values():
             if role != "observation":
-                factors += _factors(role, site)
+                found += _terms_of(role, site)
             restrictions += _restrictions(role, site)
     for term in terms(trace, "observation", missing, guard=False):
         density = term.guarded()
-        factors.append(
-            Factor("observation", term.site.name, density, term.where, symbols_of(density))
+        found.append(
+            JointTerm("observation", term.site.name, density, term.where, symbols_of(density))
         )
-    return CompleteData(trace, tuple(factors), tuple(restrictions))
+    return CompleteData(trace, tuple(found), tuple(restrictions))
 
 
-def _factors(role: str, site: Site) -> list[Factor]:
+def _terms_of(role: str, site: Site) -> list[JointTerm]:
     law, out = site.distribution, []
     degenerate = isinstance(law, Dirac)
     if degenerate:
@@ -136,7 +136,7 @@ def _factors(role: str, site: Site) -> list[Factor]:
     else:
         densities = list(array(law.log_densities(site.value)).ravel())
     for e in densities:
-        out.append(Factor(role, site.name, e, law.location, symbols_of(e), degenerate))
+        out.append(JointTerm(role, site.name, e, law.location, symbols_of(e), degenerate))
     return out
 
 
@@ -162,34 +162,34 @@ def separate_block(
 ) -> BlockForm | NotApplicable:
     """The separated log density of a block of parameter components, given all else.
 
-    leave : go on where a factor that does not grow with the series does not separate, without it.
+    leave : go on where a term that does not grow with the series does not separate, without it.
 
-    NotApplicable where a factor does not separate, where a Dirac's value depends on the block
+    NotApplicable where a term does not separate, where a Dirac's value depends on the block
     (its density is degenerate), or where the support of another quantity does.
     """
     data = trace if isinstance(trace, CompleteData) else complete_data(trace)
     components = tuple(block)
     wanted = frozenset(components)
     sums_by_role: dict[str, dict[Monomial, Expr]] = {role: {} for role in ROLES}
-    origins: dict[Monomial, list[Factor]] = {}
-    left: list[tuple[Factor, NotApplicable]] = []
+    origins: dict[Monomial, list[JointTerm]] = {}
+    inseparable: list[tuple[JointTerm, NotApplicable]] = []
     for refusal in (degenerate(data, components), restricted(data, components)):
         if refusal is not None:
             return refusal
-    for factor in data.holding(components):
-        form = separate(factor.density, wanted)
+    for term in data.holding(components):
+        form = separate(term.density, wanted)
         if not isinstance(form, Separation):
-            why = NotApplicable(f"{_law(factor)}: {shorten(form.reason, 160)}", factor.where)
-            if not leave or factor.role not in BOUNDED_ROLES:
+            why = NotApplicable(f"{_law(term)}: {shorten(form.reason, 160)}", term.where)
+            if not leave or term.role not in BOUNDED_ROLES:
                 return why
-            left.append((factor, why))
+            inseparable.append((term, why))
             continue
         for monomial, coefficient in form.terms.items():
             if monomial == ONE:
                 continue
-            sums = sums_by_role[factor.role]
+            sums = sums_by_role[term.role]
             sums[monomial] = sums.get(monomial, constant(0.0)) + coefficient
-            origins.setdefault(monomial, []).append(factor)
+            origins.setdefault(monomial, []).append(term)
     texts = {m: monomial_expr(m) for m in origins}
     monomials = tuple(sorted(origins, key=lambda m: to_text(texts[m])))
     zero = constant(0.0)
@@ -199,19 +199,19 @@ def separate_block(
         tuple(texts[m] for m in monomials),
         {role: tuple(sums_by_role[role].get(m, zero) for m in monomials) for role in ROLES},
         {m: tuple(o) for m, o in origins.items()},
-        tuple(left),
+        tuple(inseparable),
     )
 
 
 def degenerate(data: CompleteData, block: Iterable[Expr]) -> NotApplicable | None:
     """Why the block has no density given the states: a Dirac's value depends on it."""
-    for factor in data.holding(block):
-        if factor.degenerate:
-            names = _names(factor.symbols & frozenset(block))
+    for term in data.holding(block):
+        if term.degenerate:
+            names = _names(term.symbols & frozenset(block))
             return NotApplicable(
-                f"the {factor.role} of {factor.site} is Dirac and its value depends on {names}: "
+                f"the {term.role} of {term.site} is Dirac and its value depends on {names}: "
                 "given the states the value determines the parameter, so that it cannot move",
-                factor.where,
+                term.where,
             )
     return None
 
@@ -230,8 +230,8 @@ def restricted(data: CompleteData, block: Iterable[Expr]) -> NotApplicable | Non
     return None
 
 
-def _law(factor: Factor) -> str:
-    return f"{factor.role} of {factor.site}"
+def _law(term: JointTerm) -> str:
+    return f"{term.role} of {term.site}"
 
 
 def _names(symbols: Iterable[Expr]) -> str:

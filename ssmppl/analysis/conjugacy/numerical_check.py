@@ -18,20 +18,20 @@ from collections.abc import Callable
 import numpy as np
 
 from ssmppl.analysis.conjugacy.matrix_families import lower_half
-from ssmppl.analysis.conjugacy.sufficient import ROLES, CompleteData, Factor
+from ssmppl.analysis.conjugacy.separation import ROLES, CompleteData, JointTerm
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import Separation, separate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
-from ssmppl.language.model.traced import Site, previous, seen, symbols
+from ssmppl.language.model.trace import Site, previous, seen, symbols
 
 POINTS = 24
 NEEDED = 5
 STEPS = 4
 TOLERANCE = 1e-8
 _ATTEMPTS = 4
-# What a factor does far out must be seen, too, as a hinge of an input bends where the input is; but
+# What a term does far out must be seen, too, as a hinge of an input bends where the input is; but
 # at most points a density should be a number.
 _LATE = (0.0, 0.0, 0.0, 30.0, 1000.0)  # steps before the first
 _SIZES = (1.0, 1.0, 1.0, -1.0, 30.0, -30.0, 1e3)
@@ -62,24 +62,24 @@ def verify(data: CompleteData, update: Update, seed: int = 1) -> NotApplicable |
             q2, size2 = log_q(update, totals[:, k], there[:, k])
             if not np.isfinite(q1 - q2):
                 return NotApplicable(
-                    f"the {update.family} update of {names} has no density where the model has "
-                    f"one{_HINT}",
+                    f"the {update.family_name} update of {names} has no density where the model "
+                    f"has one{_HINT}",
                     _culprit(data, update, series, changed) or update.where,
                 )
             size = np.abs(first[:, k]).sum() + np.abs(second[:, k]).sum()
             error = abs((q2 - q1) - expected)
             if error > TOLERANCE * (1.0 + size + size1 + size2):
                 return NotApplicable(
-                    f"the {update.family} update of {names} disagrees with the model's log density "
-                    f"by {error:.3g} at a random point{_HINT}",
+                    f"the {update.family_name} update of {names} disagrees with the model's log "
+                    f"density by {error:.3g} at a random point{_HINT}",
                     _culprit(data, update, series, changed) or update.where,
                 )
             compared += 1
         if compared >= NEEDED:
             return None
     return NotApplicable(
-        f"the {update.family} update of {names} could not be checked: the density is finite at "
-        f"{compared} of {_ATTEMPTS * POINTS} random points",
+        f"the {update.family_name} update of {names} could not be checked: the density is finite "
+        f"at {compared} of {_ATTEMPTS * POINTS} random points",
         update.where,
     )
 
@@ -87,28 +87,32 @@ def verify(data: CompleteData, update: Update, seed: int = 1) -> NotApplicable |
 def joint(data: CompleteData, update: Update, series: list[Point]) -> np.ndarray:
     """Summands of the log joint that hold the block, (terms, points), as they were written."""
     rows = [
-        np.broadcast_to(evaluate(factor.density, values), POINTS)
-        for factor in _checked(data, update)
+        np.broadcast_to(evaluate(term.density, values), POINTS)
+        for term in _checked(data, update)
         for t, values in enumerate(series)
-        if _counts(factor.role, t)
+        if _counts(term.role, t)
     ]
     return np.array(rows).reshape(-1, POINTS)
 
 
-def _checked(data: CompleteData, update: Update) -> list[Factor]:
-    """The factors that hold the block, but for those that the update leaves to the log joint."""
-    return [f for f in data.holding(update.components) if not any(f is g for g in update.left)]
+def _checked(data: CompleteData, update: Update) -> list[JointTerm]:
+    """The terms that hold the block, but for those that the update leaves to the log joint."""
+    return [
+        f
+        for f in data.holding(update.components)
+        if not any(f is g for g in update.inseparable_terms)
+    ]
 
 
 def _culprit(
     data: CompleteData, update: Update, series: list[Point], changed: Point
 ) -> Location | None:
-    """Where the first factor stands that differs from its own separated form."""
-    for factor in _checked(data, update):
-        form = separate(factor.density, update.components)
+    """Where the first term stands that differs from its own separated form."""
+    for term in _checked(data, update):
+        form = separate(term.density, update.components)
         if not isinstance(form, Separation):
-            return factor.where
-        pair = [factor.density, form.assemble()]
+            return term.where
+        pair = [term.density, form.assemble()]
         for values in series[1:]:
             (a, b), (c, d) = evaluate(pair, values), evaluate(pair, {**values, **changed})
             with np.errstate(invalid="ignore"):  # an infinite density at both tells nothing
@@ -116,12 +120,12 @@ def _culprit(
                 wrong = np.abs(one - two) > TOLERANCE * (1.0 + np.abs(a) + np.abs(c))
             missing = np.isfinite(one) & ~np.isfinite(two)
             if np.any(wrong | missing):
-                return factor.where
+                return term.where
     return None
 
 
 def _counts(role: str, t: int) -> bool:
-    """Whether a factor of this role enters at step t (from 0)."""
+    """Whether a term of this role enters at step t (from 0)."""
     return t == 0 if role in ("prior", "initial") else role == "observation" or t > 0
 
 
@@ -142,10 +146,10 @@ def log_q(update: Update, totals: np.ndarray, value: np.ndarray) -> tuple[float,
     values = dict(zip(update.components, value, strict=True))
     c = [*totals.tolist(), 0.0]
     terms = np.array([float(evaluate(f, values)) for f in update.functions]) * totals
-    family = update.conditional
+    family = update.family
     if family is None:
         return float(terms.sum()), float(np.abs(terms).sum())
-    out = sum(terms[j] for j in update.correction)
+    out = sum(terms[j] for j in update.outside_family)
     with np.errstate(all="ignore"):
         try:
             out += family.log_q(c, value)

@@ -13,20 +13,20 @@ from types import ModuleType
 
 import numpy as np
 
-from ssmppl.analysis.conjugacy.conjugacy import derive_updates
+from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
-from ssmppl.codegen.modules.trajectories import compile_updates, statistics_name
+from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
+from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import Problem
-from ssmppl.inference.run.ranges import without_density
-from ssmppl.inference.updates.conjugate_draw import draw
+from ssmppl.inference.updates.draw_update import draw
 
 
 @dataclass(frozen=True)
-class ParameterSteps:
+class GibbsUpdates:
     """A problem with the updates of its parameters, in the order in which they are made."""
 
     problem: Problem
@@ -41,8 +41,8 @@ class ParameterSteps:
         return {s: i for i, s in enumerate(self.problem.trace.parameter_symbols)}
 
     @cached_property
-    def where(self) -> list[np.ndarray]:
-        """Positions in theta of each update's components."""
+    def positions(self) -> list[np.ndarray]:
+        """Of each update's components in theta."""
         return [np.array([self.index[c] for c in u.components]) for u in self.updates]
 
     @cached_property
@@ -84,7 +84,7 @@ class ThetaValues(Mapping[Expr, float]):
 
 
 def draw_parameters(
-    steps: ParameterSteps,
+    steps: GibbsUpdates,
     theta: np.ndarray,
     paths: list[np.ndarray],
     generator: np.random.Generator,
@@ -98,19 +98,19 @@ def draw_parameters(
     """
     infos = []
     for k, update in enumerate(steps.updates):
-        where = steps.where[k]
+        positions = steps.positions[k]
         rest = ThetaValues(steps.index, theta)
         totals = _totals(steps, k, theta, paths)
-        exact = update.needs_log_joint or update.left
-        density = partial(_with, steps, theta, where, paths=paths) if exact else None
+        exact = update.needs_log_joint or update.inseparable_terms
+        density = partial(_with, steps, theta, positions, paths=paths) if exact else None
         try:
-            values, info = draw(update, totals, theta[where], rest, generator, density)
+            values, info = draw(update, totals, theta[positions], rest, generator, density)
         except SamplingError as error:
-            none = without_density(steps.problem.trace, theta)
+            none = law_without_density_at(steps.problem.trace, theta)
             if none is None:
                 raise
             raise SamplingError(f"{error.found}; {none[0]}", fix=none[1], where=none[2]) from None
-        theta[where] = values
+        theta[positions] = values
         if update.needs_log_joint:
             log_joint(steps, theta, paths)  # sets what is deterministic in the trajectories
         infos.append(info.accepted)
@@ -118,17 +118,15 @@ def draw_parameters(
 
 
 def _with(
-    steps: ParameterSteps, theta: np.ndarray, where: np.ndarray, values: np.ndarray,
+    steps: GibbsUpdates, theta: np.ndarray, positions: np.ndarray, values: np.ndarray,
     paths: list[np.ndarray],
 ) -> float:  # fmt: skip
     trial = theta.copy()
-    trial[where] = values
+    trial[positions] = values
     return log_joint(steps, trial, paths)
 
 
-def _totals(
-    steps: ParameterSteps, k: int, theta: np.ndarray, paths: list[np.ndarray]
-) -> np.ndarray:
+def _totals(steps: GibbsUpdates, k: int, theta: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
     """The statistics C_i of update k: the prior once, the rest summed over experiments."""
     update = steps.updates[k]
     if update.needs_log_joint or not update.functions:
@@ -145,7 +143,7 @@ def _totals(
     return total + prior
 
 
-def log_joint(steps: ParameterSteps, theta: np.ndarray, paths: list[np.ndarray]) -> float:
+def log_joint(steps: GibbsUpdates, theta: np.ndarray, paths: list[np.ndarray]) -> float:
     """log p(theta, x, y), deterministic components of x set on the way; -inf for nan.
 
     +inf where a density is infinite, which is no point to go to (`inference/updates/slices.py`).

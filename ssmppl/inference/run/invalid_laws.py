@@ -19,7 +19,7 @@ from ssmppl.language.distributions import (
     Truncated,
 )
 from ssmppl.language.distributions.nested import SUM_ROUNDING
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 _SHARES = (
     "that are shares of 1 whatever the state, such as [1 - p, p] with "
@@ -42,7 +42,7 @@ def out_of_range(law: Distribution, values: Mapping[Expr, float]) -> tuple[str, 
     return might[0] if might else None
 
 
-def without_density(trace: Trace, theta: np.ndarray) -> tuple[str, str, Location] | None:
+def law_without_density_at(trace: Trace, theta: np.ndarray) -> tuple[str, str, Location] | None:
     """Which law has no density at theta (P,) whatever the states are, a spread being none there:
     what was found, the fix, and the user's line. None where every law has one, as far as the
     parameters alone tell.

@@ -4,7 +4,7 @@
 table of families (`families.py`). What lies outside a family's span, if it comes from the prior or
 the initial law only (a bounded number of terms, however long the series), becomes a correction of
 the draw; if it grows with the series, the block is sampled by slices on its exact conditional.
-Every update is compared with the model's own density when it is derived (`check.py`).
+Every update is compared with the model's own density when it is derived (`numerical_check.py`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from dataclasses import replace
 from functools import partial
 
 from ssmppl.analysis.conjugacy import describe
-from ssmppl.analysis.conjugacy.check import verify
 from ssmppl.analysis.conjugacy.describe import Explanation, MatrixWording, Wording, joined, named
 from ssmppl.analysis.conjugacy.family import Family
-from ssmppl.analysis.conjugacy.search import Found, Search, kind_of
-from ssmppl.analysis.conjugacy.sufficient import (
+from ssmppl.analysis.conjugacy.numerical_check import verify
+from ssmppl.analysis.conjugacy.search import Found, Search, block_kind
+from ssmppl.analysis.conjugacy.separation import (
     BOUNDED_ROLES,
     NOTHING_MISSING,
     ROLES,
@@ -32,7 +32,7 @@ from ssmppl.analysis.conjugacy.update import Update, correction_ranges, natural_
 from ssmppl.analysis.density import Missing
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.expr import Expr, to_text
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 def derive_updates(
@@ -78,34 +78,34 @@ def conjugate_update(search: Search, found: Found) -> Update:
     form, family = found.form, found.family
     site = search.site(found.components[0])
     where, reason = site.distribution.location, ""
-    if found.correction:
-        sources = [f for j in found.correction for f in form.origins[form.monomials[j]]]
+    if found.outside_family:
+        sources = [f for j in found.outside_family for f in form.origins[form.monomials[j]]]
         laws = sorted({f"{f.role} law of {f.site}" for f in sources})
-        left = ", ".join(to_text(form.functions[j]) for j in found.correction)
+        left = ", ".join(to_text(form.functions[j]) for j in found.outside_family)
         where = sources[0].where
         reason = (
             f"the {' and the '.join(laws)} {'is' if len(laws) == 1 else 'are'} not conjugate "
             f"(outside the {family.name} family: {left})"
         )
-    if form.left:
-        where, reason = form.left[0][1].where or where, form.left[0][1].reason
+    if form.inseparable:
+        where, reason = form.inseparable[0][1].where or where, form.inseparable[0][1].reason
     update = Update(
         block=tuple(dict.fromkeys(c.data[1] for c in found.components)),
         components=found.components,
-        family=family.name,
+        family_name=family.name,
         functions=form.functions,
         coefficients=form.coefficients,
-        correction=found.correction,
+        outside_family=found.outside_family,
         bounds=tuple(search.bound[c] for c in found.components),
         explanation=Explanation(joined(found.components), ""),
         reason=reason,
         where=where,
-        kind=kind_of(site),
-        conditional=family,
-        left=tuple(factor for factor, _ in form.left),
+        kind=block_kind(site),
+        family=family,
+        inseparable_terms=tuple(term for term, _ in form.inseparable),
     )
     hyperparameters = search.unread(found.components)
-    if hyperparameters is not None and not found.correction and not form.left:
+    if hyperparameters is not None and not found.outside_family and not form.inseparable:
         explanation = describe.prior_alone(
             found.components, hyperparameters, "from which it is drawn"
         )
@@ -139,16 +139,18 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
-    if update.left:
-        laws = " and the ".join(dict.fromkeys(f"{f.role} law of {f.site}" for f in update.left))
+    if update.inseparable_terms:
+        laws = " and the ".join(
+            dict.fromkeys(f"{f.role} law of {f.site}" for f in update.inseparable_terms)
+        )
         notes.append(
             f"Metropolis-Hastings with the {update.family} law, which leaves out the {laws}, as "
             f"independence proposal, followed by univariate slice sampling: {update.reason}"
         )
         if update.where is not None:
             notes.append(update.where.short)
-    elif update.correction:
-        text = describe.correction_text(form, update.correction)
+    elif update.outside_family:
+        text = describe.correction_text(form, update.outside_family)
         if _may_be_bounded(update):
             notes.append(
                 f"rejection sampling from the {update.family} law with acceptance probability "
@@ -174,7 +176,7 @@ def _known(update: Update, i: int) -> float | None:
 
 def _may_be_bounded(update: Update) -> bool:
     """Whether the correction has a known bound, for whatever sign its coefficients can have."""
-    for (low, high), j in zip(correction_ranges(update), update.correction, strict=True):
+    for (low, high), j in zip(correction_ranges(update), update.outside_family, strict=True):
         total = _known(update, j)
         if (total is None or total > 0.0) and high == math.inf:
             return False
@@ -187,7 +189,7 @@ def _slice(
     search: Search, unit: tuple[Expr, ...], why: NotApplicable, use_statistics: bool
 ) -> Update:
     """Slice steps on the exact conditional; through the statistics where it separates."""
-    kind = kind_of(search.site(unit[0]))
+    kind = block_kind(search.site(unit[0]))
     separated = separate_block(search.data, unit) if use_statistics else why
     form = separated if isinstance(separated, BlockForm) else None
     how = {
@@ -207,10 +209,10 @@ def _slice(
     return Update(
         block=(unit[0].data[1],),
         components=unit,
-        family="slice",
+        family_name="slice",
         functions=form.functions if form else (),
         coefficients=form.coefficients if form else dict.fromkeys(ROLES, ()),
-        correction=(),
+        outside_family=(),
         bounds=tuple(search.bound[c] for c in unit),
         explanation=explanation,
         reason=why.reason,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ssmppl as ssm
-from ssmppl.inference.run.mixing import bulk_ess, mixing_attributes, rank_r_hat
+from ssmppl.inference.run.convergence import bulk_ess, mixing_attributes, rank_r_hat
 from ssmppl.inference.verbs.sample import METHODS
 
 

@@ -22,7 +22,7 @@ from ssmppl.codegen.text.specialise import specialise
 from ssmppl.codegen.text.sums import time_sum
 from ssmppl.compiling import one_at_a_time
 from ssmppl.expressions.calculus import NotDifferentiable
-from ssmppl.language.model.traced import Trace
+from ssmppl.language.model.trace import Trace
 
 
 @dataclass(frozen=True)
