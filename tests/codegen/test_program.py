@@ -29,7 +29,7 @@ def test_text(name):
     again = compile_trace(trace(build(name))).source()  # traced from another line: no difference
     same = text == program.path.read_text() == again
     assert same  # not compared in the assert itself: pytest would take minutes over the difference
-    lines = {int(n) for n in re.findall(r"# models\.py:(\d+)$", text, re.MULTILINE)}
+    lines = {int(n) for n in re.findall(r"# statements\.py:(\d+)$", text, re.MULTILINE)}
     source = (ROOT / "tests/models/statements.py").read_text().splitlines()
     start = MODELS[name].__code__.co_firstlineno
     assert lines, "no line of the user's is named"
@@ -37,7 +37,7 @@ def test_text(name):
     assert all(source[n - 1].strip() for n in lines)
     for role in ("initial", "transition"):
         (place,) = traced.functions[role]
-        assert f"models.py:{place.line} {role}" in text  # the header
+        assert f"statements.py:{place.line} {role}" in text  # the header
 
 
 def test_names_are_the_users():
