@@ -277,7 +277,7 @@ def exact_rows() -> tuple[ssm.Model, np.ndarray]:
     return model, np.where(z, 2.0 + 0.3 * rng.standard_normal(40), 0.0)
 
 
-TOLD = r"no maximum: the data of y are told exactly by a value of the states in \d+ rows"
+TOLD = r"no maximum: the data of y determine the states exactly in \d+ rows"
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_too_few_sets_is_said(monkeypatch):
 
     monkeypatch.setattr(Simulator, "sets", fails)
     theta = check_parameters(problem.trace, THETA)
-    with pytest.raises(ArgumentError, match="0 of 60 data sets") as error:
+    with pytest.raises(ArgumentError, match="0 of 60 parametric-bootstrap data sets") as error:
         run_screen(design, problem.experiments, theta, 60, seed_sequence(1), Checkpoint(None, {}))
     assert "particles" in str(error.value)
 
