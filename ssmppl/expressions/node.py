@@ -246,9 +246,10 @@ class Expr:
         return behaviour["text"](self)
 
 
-# np.exp(np.array([x, y])): on its plain arrays of objects NumPy calls the elements' methods.
+# np.exp(np.array([x, y])): on its plain arrays of objects NumPy calls the elements' methods. Not so
+# of np.sign, and x.sign() is no method of a number either.
 for _name, _operation in OPERATIONS.items():
-    _unary = _operation.operands == 1 and hasattr(np, _name)
+    _unary = _operation.operands == 1 and hasattr(np, _name) and _name != "sign"
     if _unary and not hasattr(Expr, f"__{_name}__"):
         setattr(Expr, _name, _method(_name))
 

@@ -127,7 +127,7 @@ def conjugate_update(search: Search, found: Found) -> Update:
 
 
 def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
-    """Truncation, correction, and what is done where the family is improper."""
+    """Truncation, what is done where the family is improper, and correction."""
     notes = []
     cut = [
         f"{to_text(c)} to ({to_text(low)}, {to_text(high)})"
@@ -139,13 +139,16 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
     ]
     if cut:
         notes.append(f"truncated: {', '.join(cut)}")
+    improper = family.when_improper(partial(_known, update))
+    if improper:
+        notes.append(improper)
     if update.inseparable_terms:
         laws = " and the ".join(
             dict.fromkeys(f"{f.role} law of {f.site}" for f in update.inseparable_terms)
         )
         notes.append(
-            f"Metropolis-Hastings with the {update.family} law, which leaves out the {laws}, as "
-            f"independence proposal, followed by univariate slice sampling: {update.reason}"
+            f"Metropolis-Hastings with the {update.family_name} law, which leaves out the {laws}, "
+            f"as independence proposal, followed by univariate slice sampling: {update.reason}"
         )
         if update.where is not None:
             notes.append(update.where.short)
@@ -153,19 +156,18 @@ def _notes(update: Update, family: Family, form: BlockForm) -> list[str]:
         text = describe.correction_text(form, update.outside_family)
         if _may_be_bounded(update):
             notes.append(
-                f"rejection sampling from the {update.family} law with acceptance probability "
+                f"rejection sampling from the {update.family_name} law with acceptance probability "
                 f"proportional to {text}: {update.reason}"
             )
         else:
             notes.append(
-                f"Metropolis-Hastings with the {update.family} law as independence proposal "
+                f"Metropolis-Hastings with the {update.family_name} law as independence proposal "
                 f"(density ratio {text} not known to be bounded), followed by univariate slice "
                 f"sampling: {update.reason}"
             )
         if update.where is not None:
             notes.append(update.where.short)
-    improper = family.when_improper(partial(_known, update))
-    return [*notes, improper] if improper else notes
+    return notes
 
 
 def _known(update: Update, i: int) -> float | None:

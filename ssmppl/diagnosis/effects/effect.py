@@ -20,9 +20,10 @@ kind           bound to           what the function returns
                                   further states
 =============  =================  ================================================================
 
-Increments act on the mean on the scale that the law's class says (`mean_link`): on itself of laws
-on the whole line, on the mean of the log of LogNormal, on the log of a positive mean, on the logit
-of a probability; of the law inside Truncated and ZeroInflated.
+Increments act on the mean of Normal, MvNormal, StudentT, Laplace, Cauchy and Dirac laws, on the
+mean of the log of LogNormal, on the log of the mean of Poisson, NegativeBinomial, Gamma,
+Exponential and Weibull and on the logit of that of Bernoulli and Binomial laws; of the law inside
+Truncated and ZeroInflated. Other laws have no mean that an effect could move.
 
 ==================  ===========================================================================
 `on`                which equations it is offered for

@@ -348,7 +348,7 @@ def smooth(
     setup = SmoothingSetup(
         problem, theta, particles, trajectories, levels, root, method is not None
     )
-    found = METHODS[type(chosen)](setup, chosen)
+    found = METHODS[_kind(chosen) or type(chosen)](setup, chosen)
     attrs = {
         "model": problem.trace.name, "method": type(chosen).__name__, "method_chosen": why,
         "settings": asdict(chosen), "seed": str(root.entropy),
@@ -358,6 +358,11 @@ def smooth(
         _dataset(setup, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
     ]
     return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _kind(method: Any) -> type | None:
+    """The method that these settings are of, also where they are of a class derived from it."""
+    return next((t for t in type(method).__mro__ if t in METHODS), None)
 
 
 def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[SmoothingMethod, str]:
@@ -371,13 +376,14 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
                 fix=written_as(method, METHODS) or f"use one of: {listing(method, NAMES)}",
             )
         method = NAMES[method]
-    if type(method) not in METHODS:
+    kind = _kind(method)
+    if kind is None:
         names = ", ".join(f"ssm.{t.__name__}(...)" for t in METHODS)
         raise ArgumentError(
             f"method={method!r} is no method of smoothing",
             fix=written_as(method, METHODS) or f"use {names}, a name, or None",
         )
-    what, find = NEEDED.get(type(method), ("", None))
+    what, find = NEEDED.get(kind, ("", None))
     if find is not None and isinstance(model := find(problem.trace), NotApplicable):
         raise ArgumentError(
             f"{type(method).__name__} needs {what}: {model.reason}",

@@ -1,5 +1,6 @@
 """The updates derived for a corpus of models: families, blocks, corrections."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,10 @@ def test_explanations_have_every_part(name):
         assert update.needs_log_joint or explanation.statistics
         assert update.where is not None
         assert all(len(line) < 700 for line in str(explanation).splitlines())
+        named = re.findall(
+            r"(?:sampling from|Hastings with) the (.+?) law ", " ".join(str(explanation).split())
+        )
+        assert all(n == update.family_name for n in named), named
 
 
 @pytest.mark.parametrize(("name", "improper"), [("half_cauchy_sd", True), ("two_variances", False)])

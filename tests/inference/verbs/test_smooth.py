@@ -172,6 +172,18 @@ def test_refusals(args, more, words):
         assert word in str(caught.value)
 
 
+def test_settings_of_a_class_of_ones_own():
+    class Mine(ssm.FFBSi):
+        """Settings derived from a method's are that method's."""
+
+    y = np.zeros(5)
+    for method in (ssm.FFBSi(), Mine()):
+        found = ssm.smooth(models.varves, {"y": y + 1.0}, {"phi": 0.9, "tau": 9.0}, method,
+                           particles=20, trajectories=5, seed=1)  # fmt: skip
+        assert found.attrs["method"] == type(method).__name__
+        assert np.all(np.isfinite(found["x"]))
+
+
 def test_kalman_on_a_nonlinear_model():
     with pytest.raises(ArgumentError, match=r"(?s)varves_observation.*y is Gamma.*ssm.FFBSi"):
         ssm.smooth(models.varves, {"y": [1.0, 2.0]}, {"phi": 0.9, "tau": 20}, "kalman")
