@@ -34,6 +34,7 @@ from ssmppl.codegen.kernels.particle.simulation import (
     simulate_on,
 )
 from ssmppl.codegen.modules.device import DeviceFilter, compile_device
+from ssmppl.codegen.modules.gaussian import GaussianApproximation, compile_gaussian
 from ssmppl.codegen.modules.marginal import NAMES as MARGINAL
 from ssmppl.codegen.modules.marginal import MarginalFilter, compile_marginal
 from ssmppl.codegen.modules.tempered import TemperedFilter, compile_tempered
@@ -82,6 +83,11 @@ class Program:
 
     def __reduce__(self):  # another process generates the module again, or finds it in its cache
         return compile_trace, (self.trace, self.missing)
+
+    @once_property
+    def gaussian(self) -> GaussianApproximation | NotApplicable:
+        """The Gaussian approximation, in a module of its own; generated when first asked for."""
+        return compile_gaussian(self.trace, self.missing)
 
     @once_property
     def twisted(self) -> TwistedFilter | NotApplicable:

@@ -27,8 +27,10 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Maximization
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
+from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
 from ssmppl.inference.preparation.exact_score import exact_score
@@ -57,6 +59,10 @@ def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
     ArgumentError : the model is neither linear Gaussian nor one of a single scalar state.
     """
     if isinstance(setup.exact, NotApplicable):
+        found = laplace_approximation(setup.problem)
+        if method.laplace and not isinstance(found, NotApplicable):
+            with announced("DirectOptimization", "climbing the likelihood", shown=setup.progress):
+                return GaussianClimb(setup, method, found).run()
         reason = smooth_filter_applies(setup.problem.trace)
         if reason is not None:
             raise ArgumentError(

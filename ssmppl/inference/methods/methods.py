@@ -200,22 +200,28 @@ class DirectOptimization:
     section on direct optimisation).
 
     With the exact likelihood and score on linear Gaussian models, on those of finitely many states
-    and where states have no noise; else, for one scalar state, over a particle filter with common
-    random numbers that is continuous in the parameters (Malik and Pitt 2011).
+    and where states have no noise. Else, where the states are driven by Gaussian noise and the
+    observations' density is twice differentiable, by way of Laplace's approximation of the
+    likelihood (Kristensen, Nielsen, Berg, Skaug and Bell 2016), whose top is then moved to that of
+    the likelihood by twisted particle filters with common random numbers. Else, for one scalar
+    state, over a particle filter with common random numbers that is continuous in the parameters
+    (Malik and Pitt 2011).
 
     Parameters
     ----------
-    particles : N of the continuous filter.
-    averages : number of its random seeds that the likelihood is averaged over.
+    particles : N of the continuous filter; the most that the twisted ones take.
+    averages : number of random seeds that the likelihood is averaged over.
     restarts : further starts, dispersed round the first, of which the best is kept; None: 2 where
-        the likelihood is exact, else 0.
-    steps : most iterations of a climb.
+        the likelihood is exact, and where a climb of Laplace's comes to no top, else 0.
+    steps : most iterations of a climb of an exact likelihood or of the continuous filter's.
+    laplace : whether to go by way of Laplace's approximation where there is one.
     """
 
     particles: int = setting(1000, count(2))
     averages: int = setting(8, count(2))
     restarts: int | None = setting(None, optional(count(0)))
     steps: int = setting(200, count(1))
+    laplace: bool = setting(True, flag)
 
 
 @dataclass(frozen=True)

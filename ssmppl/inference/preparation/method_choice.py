@@ -147,16 +147,24 @@ def start_as_parameter(trace: Trace) -> str:
 
 
 def choose_maximiser(
-    kind: str | NotApplicable, trace: Trace
+    kind: str | NotApplicable, trace: Trace, laplace: NotApplicable | None
 ) -> tuple[DirectOptimization | ScoreAscent | IF2, str]:
-    """The method of `maximize` for a model of this kind, and the reason."""
+    """The method of `maximize` for a model of this kind, and the reason.
+
+    laplace : why it cannot go by way of Laplace's approximation, None where it can.
+    """
     if not isinstance(kind, NotApplicable):
         return DirectOptimization(), (
             f"the model is {kind}, so that its likelihood and score are exact"
         )
+    if laplace is None:
+        return DirectOptimization(), (
+            "the states have a Gaussian approximation, whose likelihood is climbed and then "
+            "corrected by particle filters"
+        )
     obstacle = smooth_filter_applies(trace)
     if obstacle is None:
-        return DirectOptimization(), (
+        return DirectOptimization(laplace=False), (
             "for one scalar state a particle filter's likelihood can be made continuous in the "
             "parameters"
         )

@@ -14,6 +14,7 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.elimination.conditional import ConditionallyLinear, conditionally_linear
 from ssmppl.analysis.elimination.eliminable import Eliminable, eliminable
 from ssmppl.analysis.finite import FiniteStates, finite_states
+from ssmppl.analysis.proposals.curvature import laplace_obstacle
 from ssmppl.analysis.proposals.noises import Noises, noises
 from ssmppl.analysis.proposals.proposals import Proposal
 from ssmppl.analysis.proposals.tempered import tempered
@@ -67,6 +68,7 @@ class Plan:
     deterministic_memory : for how many steps a deterministic state remembers; None where it never
         forgets.
     noises : what drives the states, or why it is not known.
+    laplace : why the likelihood has no Laplace approximation; None where it has.
     eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
     """
@@ -79,6 +81,7 @@ class Plan:
     updates: tuple[Update, ...]
     deterministic_memory: int | None
     noises: Noises | NotApplicable
+    laplace: NotApplicable | None
     eliminable: Eliminable
     data: str = ""
     rows: int | None = None
@@ -132,11 +135,18 @@ class Plan:
                      "exact, by running them once")]  # fmt: skip
         if isinstance(self.structure, NotApplicable):
             found = [("nonlinear", f"not linear Gaussian: {reason_and_line(self.structure)}")]
+            found.append(("Laplace approximation", self._laplace()))
             if isinstance(self.conditional, ConditionallyLinear):
                 found.append(("conditionally linear Gaussian", _integrated(self.conditional)))
             return found
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
                  "used only where they are asked for")]  # fmt: skip
+
+    def _laplace(self) -> str:
+        if self.laplace is not None:
+            return f"none: {reason_and_line(self.laplace)}"
+        return ("an approximation to the likelihood at the mode of the states, where maximize "
+                "begins; log_likelihood gives it by proposal=\"laplace\"")  # fmt: skip
 
     def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
         if isinstance(proposal, NotApplicable):
@@ -155,7 +165,7 @@ class Plan:
             )
         }
         if self.trace.parameters:
-            choices["maximize"] = choose_maximiser(kind, self.trace)
+            choices["maximize"] = choose_maximiser(kind, self.trace, self.laplace)
         choices["smooth"] = choose_smoother(kind, self.trace)
         return [(verb, f"{type(m).__name__}: {why}") for verb, (m, why) in choices.items()]
 
@@ -266,6 +276,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         tuple(derive_updates(traced, (), missing)),
         deterministic_memory(traced),
         noises(traced, missing),
+        laplace_obstacle(traced, missing),
         eliminable(traced, (), missing),
         bound,
         rows,

@@ -10,6 +10,11 @@ import numpy as np
 
 from ssmppl.counts import check_count
 from ssmppl.data import check_parameters
+from ssmppl.inference.gaussian.likelihood import (
+    APPROXIMATE,
+    approximate_log_likelihood,
+    approximation_of,
+)
 from ssmppl.inference.particles.filtering import estimates_task
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood
 from ssmppl.inference.preparation.proposal_choice import resolve_settings
@@ -47,11 +52,12 @@ def log_likelihood(
     particles : number N of particles.
     repeats : number of independent estimates.
     proposal : "auto", "kalman", "forward", "deterministic", "bootstrap", "guided", "auxiliary",
-        "twisted", "tempered", or "user" where the model has a @proposal. "auto" is exact on linear
-        Gaussian models, on those of finitely many states ("forward", the forward algorithm) and on
-        those without noise in their states ("deterministic"), else the proposal with
-        the least variance for its cost in a pilot; "twisted", which looks ahead to the end of the
-        data, is tried where the others tell log Z to no better than 1.2 at 100 particles.
+        "twisted", "tempered", "laplace", "extended", or "user" where the model has a @proposal.
+        "auto" is exact on linear Gaussian models, on those of finitely many states ("forward", the
+        forward algorithm) and on those without noise in their states ("deterministic"), else the
+        proposal with the least variance for its cost in a pilot; "twisted", which looks ahead to
+        the end of the data, is tried where the others tell log Z to no better than 1.2 at 100
+        particles.
         "marginal", "marginal_guided" and "marginal_auxiliary" are Rao-Blackwellised: states that
         are linear and Gaussian given the others are integrated out by a Kalman filter per particle
         (Schön, Gustafsson and Nordlund 2005), and the others move by the transition or the two
@@ -62,6 +68,10 @@ def log_likelihood(
         no derivative is known of; a pilot of its own random numbers fixes powers and steps for each
         estimate. It costs tens of times what "bootstrap" does, and "auto" tries it where no
         guided proposal is derived and others tell log Z to no better than 1.2.
+        "laplace" and "extended" are approximations without particles or random numbers, for models
+        whose states are driven by Gaussian noise: Laplace's, at the mode of all states together
+        (Tierney and Kadane 1986), and an extended Kalman filter, whose update is the mode of each
+        row. They are exact where the model is linear and Gaussian, and never taken by "auto".
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     rescue : where all N particles have weight zero, go on drawing, up to `rescue` times N at a row,
@@ -81,7 +91,8 @@ def log_likelihood(
     -------
     float64 array (repeats,)
         The exp of each is an unbiased estimate of the likelihood (Del Moral 2004; Schön et al.
-        2015, section 5). -inf at parameters at which nothing is finite.
+        2015, section 5), except of the two approximations. -inf at parameters at which nothing is
+        finite.
 
     Raises
     ------
@@ -92,6 +103,11 @@ def log_likelihood(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters, support=False)
     check_count("repeats", repeats, 1)
+    if proposal in APPROXIMATE:
+        value = approximate_log_likelihood(
+            problem, theta, approximation_of(problem, proposal), proposal
+        )
+        return np.full(repeats, value)
     settings = resolve_settings(
         problem, theta, particles, proposal, resampling, ess_threshold, rescue, whole=True,
         integrate=True, device=device,

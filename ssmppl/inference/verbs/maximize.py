@@ -6,13 +6,14 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.proposals.curvature import laplace_obstacle
 from ssmppl.analysis.structure import noisy_start
-from ssmppl.data import check_values
+from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
 from ssmppl.inference.maximum import (
     direct_optimization,
@@ -130,6 +131,9 @@ def maximize(
     else:
         chosen, reason = (method, "by the user") if method is not None else choose_method(setup)
         ascent = METHODS[type(chosen)](setup, chosen)
+        if method is None and ascent.report.get("approximate") and not ascent.interrupted:
+            setup, chosen, reason = _without_laplace(setup, ascent)
+            ascent = METHODS[type(chosen)](setup, chosen)
     attrs: dict[str, Any] = {
         "model": problem.trace.name,
         "method": type(chosen).__name__ if chosen is not None else NO_METHOD,
@@ -161,7 +165,9 @@ def maximize(
 def choose_method(setup: Maximization) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
     trace = setup.problem.trace
-    chosen, reason = choose_maximiser(exact_kind(setup.exact), trace)
+    chosen, reason = choose_maximiser(
+        exact_kind(setup.exact), trace, laplace_obstacle(trace, setup.problem.program.missing)
+    )
     if isinstance(chosen, ScoreAscent) and noisy_start(trace):
         warnings.warn(
             f"{type(chosen).__name__} may take minutes for each hundred rows here: "
@@ -169,6 +175,18 @@ def choose_method(setup: Maximization) -> tuple[Any, str]:
             stacklevel=3,
         )
     return chosen, f"automatically: {reason}"
+
+
+def _without_laplace(setup: Maximization, ascent: Ascent) -> tuple[Maximization, Any, str]:
+    """The next method, from where Laplace's approximation has its top, and why."""
+    problem = setup.problem
+    none = NotApplicable("it could not be corrected")
+    chosen, reason = choose_maximiser(exact_kind(setup.exact), problem.trace, none)
+    near = unpack_parameters(problem.trace, ascent.theta)
+    near = {n: v for n, v in near.items() if n not in setup.fixed}
+    why = f"{reason}; started from {ascent.report['likelihood']}"
+    space = space_of(problem, setup.fixed, near)
+    return replace(setup, space=space, near=near), chosen, f"automatically: {why}"
 
 
 def _log_likelihood(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> float:

@@ -80,7 +80,7 @@ def exact_top(y):
 def test_the_top_of_a_short_series(problem):
     y = datasets.ice_varves()[:ROWS]
     top, information = exact_top(y)
-    method = ssm.DirectOptimization(particles=300, averages=8)
+    method = ssm.DirectOptimization(particles=300, averages=8, laplace=False)
     estimate = ssm.maximize(models.varves, {"y": y}, method, seed=seed_of("short"), progress=False)
     assert estimate.attrs["converged"]
     errors = estimate.attrs["monte_carlo_errors"]

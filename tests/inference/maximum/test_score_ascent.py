@@ -124,20 +124,30 @@ def chosen(transition):
 
 def test_it_is_chosen_for_several_nonlinear_states():
     method, reason = chosen(
-        lambda x, v, a: {"x": ssm.Normal(a * np.sin(v), sd=1), "v": ssm.Normal(x, sd=1)}
+        lambda x, v, a: {"x": ssm.StudentT(4, a * np.sin(v), scale=1), "v": ssm.Normal(x, sd=1)}
     )
     assert isinstance(method, ssm.ScoreAscent)
     assert "2 components" in reason
 
 
+def test_it_is_not_where_the_noise_is_gaussian():
+    method, reason = chosen(
+        lambda x, v, a: {"x": ssm.Normal(a * np.sin(v), sd=1), "v": ssm.Normal(x, sd=1)}
+    )
+    assert isinstance(method, ssm.DirectOptimization)
+    assert "Gaussian approximation" in reason
+
+
 def test_it_is_not_where_a_position_never_forgets():
     """Each index of a backward pass would change all later positions."""
     method, reason = chosen(
-        lambda x, v, a: {"x": ssm.Dirac(x + v), "v": ssm.Normal(v - a * np.sin(x), sd=1)}
+        lambda x, v, a: {"x": ssm.Dirac(x + v), "v": ssm.StudentT(4, v - a * np.sin(x), scale=1)}
     )
     assert isinstance(method, ssm.IF2)
     assert "infinite memory" in reason
-    method, _ = chosen(lambda x, v, a: {"x": ssm.Dirac(np.sin(v)), "v": ssm.Normal(a * x, sd=1)})
+    method, _ = chosen(
+        lambda x, v, a: {"x": ssm.Dirac(np.sin(v)), "v": ssm.StudentT(4, a * x, scale=1)}
+    )
     assert isinstance(method, ssm.ScoreAscent)  # x forgets all but the last v
 
 

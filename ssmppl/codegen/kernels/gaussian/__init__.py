@@ -1,0 +1,1 @@
+"""Kernels of the Gaussian approximation to the smoothing problem."""

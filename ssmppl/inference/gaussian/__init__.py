@@ -1,0 +1,1 @@
+"""The Gaussian approximation of the states, over all experiments of a problem."""

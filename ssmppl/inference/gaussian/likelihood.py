@@ -1,0 +1,67 @@
+"""Approximate log-likelihoods of a problem: Laplace's, and the extended Kalman filter's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssmppl.codegen.modules.gaussian import GaussianApproximation
+from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.run.problem import Problem
+
+APPROXIMATE = ("laplace", "extended")  # the names under which verbs know them
+
+
+class LaplaceLikelihood:
+    """Laplace's log p(y | theta), summed over the experiments.
+
+    The modes at the last theta are where the search for the next ones begins, so that a climb costs
+    a few passes a point. From elsewhere the search ends at the same mode, within its tolerance,
+    unless there are several.
+    """
+
+    def __init__(self, problem: Problem, approximation: GaussianApproximation):
+        self.problem, self.approximation = problem, approximation
+        self.noise: list[np.ndarray | None] = [None] * len(problem.experiments)
+
+    def __call__(self, theta: np.ndarray) -> float:
+        """At theta (P,); -inf where there is no mode."""
+        total = 0.0
+        for i, e in enumerate(self.problem.experiments):
+            found = self.approximation.laplace(theta, e.y, e.seen, e.u, self.noise[i])
+            if found is None:
+                return -np.inf
+            self.noise[i] = found.e
+            total += found.log_likelihood
+        return total
+
+
+def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplicable:
+    """What gives Laplace's, or why the model has none."""
+    found = problem.program.gaussian
+    if isinstance(found, GaussianApproximation) and isinstance(found.bent, NotApplicable):
+        return found.bent
+    return found
+
+
+def approximation_of(problem: Problem, kind: str) -> GaussianApproximation:
+    """What gives "laplace" or "extended".
+
+    Raises
+    ------
+    ArgumentError : the model has no such approximation; says why.
+    """
+    found = laplace_approximation(problem) if kind == "laplace" else problem.program.gaussian
+    if isinstance(found, NotApplicable):
+        raise ArgumentError(
+            f"proposal={kind!r} does not apply: {found}", fix='use proposal="auto" or "bootstrap"'
+        )
+    return found
+
+
+def approximate_log_likelihood(
+    problem: Problem, theta: np.ndarray, found: GaussianApproximation, kind: str
+) -> float:
+    """log p(y | theta) by "laplace" or "extended"; -inf where it comes to no number."""
+    if kind == "laplace":
+        return LaplaceLikelihood(problem, found)(theta)
+    return sum(found.extended_log_likelihood(theta, e.y, e.seen, e.u) for e in problem.experiments)

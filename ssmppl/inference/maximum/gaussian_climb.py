@@ -1,0 +1,309 @@
+"""Maximum likelihood by way of the Gaussian approximation, corrected by the twisted filter.
+
+First Newton's ascent of Laplace's log-likelihood L (Kristensen, Nielsen, Berg, Skaug and Bell 2016,
+"TMB: automatic differentiation and Laplace approximation"), which is smooth and takes a
+millisecond. What it lacks, log Z - L, is estimated by twisted particle filters with common random
+numbers, seed by seed, at the ends of the ellipsoid of one standard deviation round its top: there
+it is small and nearly straight. Its slopes move the top and its curvature the information, until
+the top rests. The slopes' scatter over the seeds gives the estimate's Monte Carlo error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, OK
+from ssmppl.codegen.modules.gaussian import GaussianApproximation
+from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood
+from ssmppl.inference.maximum.ascent import Ascent, Maximization
+from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.newton import GOOD, Top, climb, information_at
+from ssmppl.inference.particles.filtering import failure, log_of_mean
+from ssmppl.inference.preparation.pilot import finite_point
+from ssmppl.inference.run.invalid_laws import total_of
+from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.seeds import random_state
+from ssmppl.inference.run.tasks import run_tasks
+
+REACH = 1.0  # standard deviations by which the points lie off the top
+FINE = 0.02  # and those of the differences that give the slope of L
+ROUNDS = 8
+FAR = 0.5  # standard deviations of a step after which the information is looked at again
+LEAST_CURVATURE = 0.25  # of the likelihood, in that of L
+HALVINGS, TOLERANCE = 8, 1e-6  # of a step that leads downhill; nats that do not count
+RESTS = 0.1  # steps, in Monte Carlo errors and in standard deviations, with which the top rests
+LEAST = 0.01
+PRECISE = 0.2  # sd of log Z that is aimed at, by more particles
+HOPELESS = 1.5  # and from which there is no correction
+FEWEST = 50  # particles
+KNOWN = 1e-4  # information in z from which a direction is looked into: a standard error of 100
+FURTHER = 2  # starts more, where a climb has not come to a top
+
+
+class GaussianClimb:
+    """Ascent of Laplace's log-likelihood, and its correction.
+
+    Raises
+    ------
+    ArgumentError : the approximation comes to no number at every point tried for a start.
+    """
+
+    def __init__(
+        self, setup: Maximization, method: DirectOptimization, found: GaussianApproximation
+    ):
+        self.setup, self.method = setup, method
+        self.laplace = LaplaceLikelihood(setup.problem, found)
+        self.evaluations = 0
+        self.iterates: list[np.ndarray] = []
+
+    def run(self) -> Ascent:
+        """Both."""
+        top, started = self._climbed()
+        information = information_at(self.objective, top.z)
+        self.iterates.append(self._theta(top.z))
+        report = {
+            "converged": top.distance < GOOD, "evaluations": self.evaluations,
+            "likelihood": "Laplace's approximation", "restarts": started - 1,
+        }  # fmt: skip
+        if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] <= 0.0:
+            return self._uncorrected(top.z, None, report, "its top is at an edge, or flat")
+        twisted = self.setup.problem.program.twisted
+        if not isinstance(twisted, TwistedFilter):
+            return self._uncorrected(top.z, information, report, twisted.reason)
+        try:
+            found = _Correction(self, top.z, information).run()
+        except KeyboardInterrupt:
+            out = self._uncorrected(top.z, information, report, "interrupted")
+            return Ascent(**{**vars(out), "interrupted": True})
+        if isinstance(found, str):
+            return self._uncorrected(top.z, information, report, found)
+        report |= {
+            "converged": report["converged"] and found.rests, "evaluations": self.evaluations,
+            "likelihood": "Laplace's approximation, corrected by twisted particle filters with "
+            f"common random numbers ({found.particles} particles, {self.method.averages} seeds)",
+            "log_likelihood_error": found.value_error,
+            "laplace_log_likelihood": found.laplace,
+        }  # fmt: skip
+        self.iterates.append(self._theta(found.z))
+        return Ascent(
+            self._theta(found.z), found.value, np.array(self.iterates), report,
+            self.setup.natural(found.z, found.information),
+            self.setup.natural_error(found.z, found.error),
+        )  # fmt: skip
+
+    def objective(self, z: np.ndarray) -> float:
+        """Laplace's log-likelihood at z (F,), with the prior where it counts."""
+        value = self.log_likelihood(z)
+        return value + self.setup.log_prior(z) if value > -np.inf else value
+
+    def log_likelihood(self, z: np.ndarray) -> float:
+        """Laplace's; -inf off the support."""
+        self.evaluations += 1
+        theta, log_prior = self.setup.space.parameters(z)
+        return self.laplace(theta) if log_prior > -np.inf else -np.inf
+
+    def _theta(self, z: np.ndarray) -> np.ndarray:
+        return self.setup.space.parameters(z)[0].copy()
+
+    def _climbed(self) -> tuple[Top, int]:
+        """The highest top of the starts, and how many there were."""
+        given = self.setup.space.z[self.setup.space.positions]
+        rng = np.random.default_rng(self.setup.seed(0))
+        start = finite_point(given, self.objective, rng)
+        most = FURTHER if self.method.restarts is None else self.method.restarts
+        best, k = climb(self.objective, start), 1
+        while k <= most:
+            arrived = best is not None and best.distance < GOOD
+            if arrived and self.method.restarts is None:
+                break
+            centre = start if best is None else best.z
+            self.laplace.noise = [None] * len(self.laplace.noise)
+            there = finite_point(centre + rng.standard_normal(len(start)), self.objective, rng)
+            found = climb(self.objective, there)
+            if found is not None and (best is None or found.value > best.value):
+                best = found
+            k += 1
+        if best is None:
+            raise ArgumentError(
+                "Laplace's approximation comes to no number at every point that was tried",
+                fix="give start={name: value} near plausible values",
+            )
+        return best, k
+
+    def _uncorrected(
+        self, z: np.ndarray, information: np.ndarray | None, report: dict, why: str
+    ) -> Ascent:
+        """The top of the approximation, called one."""
+        report |= {
+            "likelihood": f"Laplace's approximation, not corrected: {why}",
+            "approximate": True,
+        }
+        natural = None if information is None else self.setup.natural(z, information)
+        return Ascent(self._theta(z), None, np.array(self.iterates), report, natural)
+
+
+@dataclass(frozen=True)
+class _Corrected:
+    """z (F,), information and Monte Carlo covariance (F, F) there; log-likelihood with its error,
+    and Laplace's; particles of the filters; whether the top rests."""
+
+    z: np.ndarray
+    information: np.ndarray
+    error: np.ndarray
+    value: float
+    value_error: float
+    laplace: float
+    particles: int
+    rests: bool
+
+
+class _Correction:
+    """From the top of L to that of the likelihood.
+
+    z : (F,) where L has its top, information (F, F) minus its second derivatives there.
+    """
+
+    def __init__(self, climb: GaussianClimb, z: np.ndarray, information: np.ndarray):
+        self.climb, self.z, self.information = climb, z, information
+        self.axes = axes_of(information)
+        self.particles = FEWEST
+        self.root = climb.setup.seed(9)
+
+    def run(self) -> _Corrected | str:
+        """The corrected top; why there is none, where there is none."""
+        middle = self._enough_particles()
+        if isinstance(middle, str):
+            return middle
+        rests = False
+        for _ in range(ROUNDS):
+            smooth, lacking, spread, bend = self._slopes(middle)
+            slope = smooth + lacking
+            if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(bend))):
+                return "the particle filter comes to no number one standard deviation off its top"
+            curvature = np.maximum(1.0 - bend, LEAST_CURVATURE)
+            step = slope / curvature
+            step *= self._share(step, lacking, bend)
+            self.z = self.z + self.axes @ step
+            (middle,) = self._log_z(self.z)
+            errors = np.sqrt(np.diagonal(spread)) / curvature
+            if np.all(np.abs(step) < np.maximum(RESTS * errors, LEAST)):
+                rests = bool(np.all(np.abs(slope / curvature) < np.maximum(RESTS * errors, LEAST)))
+                break
+            if np.linalg.norm(step) > FAR:  # the ellipsoid is another one there
+                information = information_at(self.climb.objective, self.z)
+                if not np.all(np.isfinite(information)):
+                    return "its second derivatives are no numbers on the way"
+                self.information, self.axes = information, axes_of(information)
+        value, value_error = log_of_mean(middle)
+        inverse = np.linalg.pinv(self.axes)
+        information = self.information - inverse.T @ np.diag(bend) @ inverse
+        scaled = self.axes / curvature
+        error = scaled @ (spread + np.outer(step, step)) @ scaled.T
+        return _Corrected(
+            self.z, information, error, value, value_error,
+            self.climb.log_likelihood(self.z), self.particles, rests,
+        )  # fmt: skip
+
+    def _share(self, step: np.ndarray, lacking: np.ndarray, bend: np.ndarray) -> float:
+        """How much of a step is taken: no further than one standard deviation, and not downhill,
+        with L itself and what it lacks as it was measured. 0 where all of it leads down."""
+        share = min(1.0, REACH / max(float(np.linalg.norm(step)), REACH))
+        here = self.climb.objective(self.z)
+        for _ in range(HALVINGS):
+            s = share * step
+            there = self.climb.objective(self.z + self.axes @ s)
+            if there + lacking @ s + 0.5 * bend @ s**2 > here - TOLERANCE:
+                return share
+            share *= 0.5
+        return 0.0
+
+    def _enough_particles(self) -> np.ndarray | str:
+        """(K,) log Z at the top by so many particles that their scatter is small."""
+        while True:
+            try:
+                (found,) = self._log_z(self.z)
+            except SamplingError as error:
+                return error.found
+            scatter = float(np.std(found, ddof=1)) if np.all(np.isfinite(found)) else np.inf
+            if scatter < PRECISE or self.particles >= self.climb.method.particles:
+                break
+            self.particles = min(4 * self.particles, self.climb.method.particles)
+        if scatter > HOPELESS:
+            return (
+                f"twisted particle filters of {self.particles} particles tell log Z to no better "
+                f"than {scatter:.2g}"
+            )
+        return found
+
+    def _log_z(self, *points: np.ndarray) -> np.ndarray:
+        """(points, K) log Z of the seeds at each z."""
+        setup = self.climb.setup
+        inside = [setup.space.parameters(z) for z in points]
+        seeds = [
+            [random_state(self.root, k, i) for i in range(len(setup.problem.experiments))]
+            for k in range(self.climb.method.averages)
+        ]
+        task = partial(twisted_log_z, setup.problem, self.particles, seeds)
+        out = np.full((len(points), len(seeds)), -np.inf)
+        there = [i for i, (_, log_prior) in enumerate(inside) if log_prior > -np.inf]
+        found = run_tasks(task, [inside[i][0].copy() for i in there], executor=setup.executor)
+        for i, log_z in zip(there, found, strict=True):
+            out[i] = log_z
+        return out
+
+    def _slopes(self, middle: np.ndarray) -> tuple[np.ndarray, ...]:
+        """In units of the axes, (N,): the slope of L with the prior; that of log Z - L, with its
+        covariance (N, N) over the seeds; and the second derivatives of log Z - L."""
+        climb, k, n = self.climb, len(middle), self.axes.shape[1]
+        weight = np.exp(middle - middle.max())
+        weight /= weight.sum()
+        here = middle - climb.log_likelihood(self.z)
+        steps = REACH * self.axes.T
+        points = [*(self.z + steps), *(self.z - steps)]
+        lacking = self._log_z(*points) - np.array([[climb.log_likelihood(z)] for z in points])
+        up, down = lacking[:n], lacking[n:]
+        slopes, bends = (up - down) / (2.0 * REACH), (up + down - 2.0 * here) / REACH**2
+        fine = FINE * self.axes.T
+        smooth = [(climb.objective(self.z + s) - climb.objective(self.z - s)) / (2.0 * FINE)
+                  for s in fine]  # fmt: skip
+        mean = slopes @ weight
+        off = weight * (slopes - mean[:, None])
+        return np.array(smooth), mean, off @ off.T * k / (k - 1), bends @ weight
+
+
+def axes_of(information: np.ndarray) -> np.ndarray:
+    """(F, N) one standard deviation along each eigenvector of which something is known."""
+    values, vectors = np.linalg.eigh(information)
+    known = values > KNOWN
+    return vectors[:, known] / np.sqrt(values[known])
+
+
+def twisted_log_z(
+    problem: Problem, particles: int, seeds: Sequence[Sequence[np.ndarray]], theta: np.ndarray
+) -> np.ndarray:
+    """(K,) log Z at theta (P,) by the twisted filter, for each seed's streams."""
+    twisted = problem.program.twisted
+    assert isinstance(twisted, TwistedFilter)
+    run = twisted.module.filter_twisted
+    out = np.zeros(len(seeds))
+    for i, e in enumerate(problem.experiments):
+        guided = twisted.guide(theta, e.y, e.seen, e.u)  # the same for all
+        increments, ess = np.empty(e.steps), np.empty(e.steps)
+        for k, streams in enumerate(seeds):
+            status, t = run(
+                theta, e.y, e.seen, guided, particles, None, 1.0, streams[i].copy(), increments,
+                ess, None, None,
+            )  # fmt: skip
+            if status == ALL_ZERO:
+                out[k] = -np.inf
+            elif status != OK:
+                raise failure(problem, theta, status, t, e)
+            else:
+                out[k] += total_of(increments)
+    return out

@@ -1,0 +1,129 @@
+"""Maximum likelihood by way of Laplace's approximation: the corrected top against exact ones."""
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+import ssmppl as ssm
+from ssmppl import datasets
+from ssmppl.inference.gaussian.likelihood import laplace_approximation
+from ssmppl.inference.maximum import gaussian_climb
+from ssmppl.inference.maximum.ascent import Maximization
+from ssmppl.inference.maximum.direct_optimization import ExactClimb
+from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
+from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.run.problem import pose
+from ssmppl.inference.run.seeds import seed_sequence
+from tests.models import standard as models
+from tests.statistics.checks import seed_of
+
+SEEDS = 12
+
+
+def scores(estimates, exact):
+    """(SEEDS, P) how many Monte Carlo errors the estimates are off."""
+    return np.array([
+        [(e.parameters[n] - v) / e.attrs["monte_carlo_errors"][n] for n, v in exact.items()]
+        for e in estimates
+    ])  # fmt: skip
+
+
+def assert_fair(z):
+    """The errors that are stated are about those that are made. Of one seed the error is itself
+    estimated, from eight: a t of seven degrees of freedom, whose square has the mean 7 / 5."""
+    assert np.all(np.abs(z) < 8.0)
+    for column in z.T:
+        p = stats.ttest_1samp(column, 0.0).pvalue
+        assert p > 1e-4, column
+        assert np.mean(column**2) < 7.0 / 5.0 * 4.0
+
+
+def test_the_top_of_the_varves(exact_values):
+    exact = exact_values["ice_varves"]
+    found = [
+        ssm.maximize(models.varves, {"y": datasets.ice_varves()}, seed=s, progress=False)
+        for s in range(SEEDS)
+    ]
+    errors = np.sqrt(np.diag(exact["inverse_observed_information_at_mle"]))
+    assert_fair(scores(found, exact["mle"]))
+    for one in found:
+        assert one.attrs["method"] == "DirectOptimization"
+        assert "corrected by twisted particle filters" in one.attrs["likelihood"]
+        off = [abs(one.parameters[n] - v) for n, v in exact["mle"].items()]
+        assert np.all(off < 0.1 * errors)
+        assert np.sqrt(np.diag(one.covariance)) == pytest.approx(errors, rel=0.03)
+
+
+def counts():
+    """A short series of small counts, where Laplace's approximation is not that good."""
+    model = ssm.Model("small counts")
+    model.prior(lambda: {"a": ssm.Uniform(0, 1), "s": ssm.HalfNormal(sd=2)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1.0)})
+    model.transition(lambda x, a, s: {"x": ssm.Normal(a * x, sd=s)})
+    model.observation(lambda x: {"y": ssm.Poisson(0.15 * np.exp(x))})
+    drawn = ssm.simulate(model, {"a": 0.7, "s": 1.6}, steps=80, seed=seed_of("small counts"))
+    return model, drawn["y"].values[0]
+
+
+def point_mass(y, a, s, points=600):
+    """log p(y | a, s) on a grid of x."""
+    x = np.linspace(-14.0, 14.0, points)
+    move = stats.norm.pdf(x[:, None], a * x, s) * (x[1] - x[0])
+    p, total = stats.norm.pdf(x) * (x[1] - x[0]), 0.0
+    for t, seen in enumerate(y):
+        p = (move @ p if t else p) * stats.poisson.pmf(seen, 0.15 * np.exp(x))
+        total += np.log(p.sum())
+        p /= p.sum()
+    return total
+
+
+def test_small_counts():
+    model, y = counts()
+
+    def value(v):
+        return -point_mass(y, 1.0 / (1.0 + np.exp(-v[0])), np.exp(v[1]))
+
+    top = optimize.minimize(value, [1.0, -0.5], method="Nelder-Mead",
+                            options={"xatol": 1e-5, "fatol": 1e-8})  # fmt: skip
+    exact = {"a": 1.0 / (1.0 + np.exp(-top.x[0])), "s": np.exp(top.x[1])}
+    found = [ssm.maximize(model, {"y": y}, seed=s, progress=False) for s in range(SEEDS)]
+    assert_fair(scores(found, exact))
+    laplace = ssm.log_likelihood(model, {"y": y}, exact, proposal="laplace")[0]
+    assert abs(laplace + top.fun) > 0.02, "an approximation without an error shows nothing"
+    for one in found:
+        off = one.log_likelihood + top.fun
+        assert abs(off) < 5.0 * one.attrs["log_likelihood_error"] + 0.01
+
+
+def climbs(objective):
+    """Of a linear Gaussian model: this climb, and the exact one."""
+    data = {"y": datasets.lgss_main_text()}
+    problem = pose(models.lgss, data)
+    fixed = {"c": np.array(0.5)}
+    space = space_of(problem, fixed, {})
+    setup = Maximization(problem, space, objective, fixed, {}, seed_sequence(1))
+    approximation = laplace_approximation(problem)
+    mine = GaussianClimb(setup, DirectOptimization(), approximation).run()
+    return setup, mine, ExactClimb(setup, setup.exact, DirectOptimization()).run()
+
+
+@pytest.mark.parametrize("objective", ["likelihood", "posterior"])
+def test_a_linear_gaussian_model_needs_no_correction(objective):
+    setup, mine, exact = climbs(objective)
+    assert mine.report["converged"]
+    error = np.sqrt(np.diag(mine.error))
+    assert np.all(np.abs(mine.theta - exact.theta) < 6.0 * error + 1e-4 * np.abs(exact.theta))
+    value = setup.exact.log_likelihood(setup.problem.experiments, exact.theta)
+    assert mine.report["laplace_log_likelihood"] == pytest.approx(value, abs=1e-2)
+
+
+def test_where_it_cannot_be_corrected_the_next_method_takes_over(monkeypatch):
+    monkeypatch.setattr(gaussian_climb, "HOPELESS", 0.0)
+    model, y = counts()
+    found = ssm.maximize(model, {"y": y[:15]}, seed=1, progress=False)
+    assert "twisted particle filters of" in found.attrs["method_chosen"]
+    assert "continuous in the parameters" in found.attrs["likelihood"]
+    asked = ssm.maximize(model, {"y": y[:15]}, ssm.DirectOptimization(), seed=1, progress=False)
+    assert asked.attrs["likelihood"].startswith("Laplace's approximation, not corrected: twisted")
+    assert asked.attrs["approximate"]
