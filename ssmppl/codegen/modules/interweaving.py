@@ -7,7 +7,7 @@ from typing import Any
 
 from ssmppl.analysis.proposals.noises import Noises
 from ssmppl.codegen.kernels.twisted import interweaving, lookahead
-from ssmppl.codegen.modules.twisted import linear_passes
+from ssmppl.codegen.modules.gaussian import linear_passes, look_pass
 from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.module import Layout, ModuleText, Section, Target
 from ssmppl.codegen.text.render import identifier
@@ -28,6 +28,7 @@ def compile_noises(trace: Trace, found: Noises, steered: bool) -> Loaded:
     if steered:
         assert not isinstance(found.lookahead, NotApplicable)
         linear_passes(section, trace, found.lookahead)
+        look_pass(section, found.lookahead)
     what = "of a Gaussian approximation to their posterior" if steered else "of their laws"
     out.add(f"the states by the noises {what}", section)
     if steered:

@@ -92,7 +92,7 @@ class Program:
     @once_property
     def twisted(self) -> TwistedFilter | NotApplicable:
         """The twisted filter, in a module of its own; generated when it is first asked for."""
-        return compile_twisted(self.trace, self.missing)
+        return compile_twisted(self.trace, self.missing, self.gaussian)
 
     @once_property
     def marginal(self) -> MarginalFilter | NotApplicable:

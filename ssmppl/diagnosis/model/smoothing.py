@@ -28,8 +28,8 @@ from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import flat_start
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform
 from ssmppl.codegen.modules.filter_variants import compile_row_scores
+from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.program import Program, compile_trace
-from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
@@ -194,15 +194,15 @@ class Smoother:
         """
         if self.settings.proposal != "twisted":
             return system.particles, system.weights
-        moments = self._twisted.filtered(theta, e.y, e.seen, e.u)
+        moments = self._gaussian.filtered(theta, e.y, e.seen, e.u)
         if moments is None:
             return system.particles, system.weights
         return _drawn(*moments, stream)
 
     @property
-    def _twisted(self) -> TwistedFilter:
-        found = self.program.twisted
-        assert isinstance(found, TwistedFilter)
+    def _gaussian(self) -> GaussianApproximation:
+        found = self.program.gaussian
+        assert isinstance(found, GaussianApproximation)
         return found
 
 

@@ -28,7 +28,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.data import Experiment, unpack_parameters
 from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialLaw
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
@@ -316,16 +316,15 @@ class Fitter:
         """theta (P,) -> log p(y | theta) by the extended Kalman filter, -inf where it has no
         number; None where the model has no such filter. Of a linear Gaussian model by the exact
         filter where rounding leaves that one without a number, as next to a vague initial law."""
-        twisted = problem.program.twisted if self.settings.proposal == "twisted" else None
-        if not isinstance(twisted, TwistedFilter):
+        found = problem.program.gaussian if self.settings.proposal == "twisted" else None
+        if not isinstance(found, GaussianApproximation):
             return None
 
         def value(theta: np.ndarray) -> float:
             total = 0.0
             for e in problem.experiments:
-                total += (
-                    twisted.extended_log_likelihood(theta, e.y, e.seen, e.u) + self.log_correction
-                )
+                total += found.extended_log_likelihood(theta, e.y, e.seen, e.u)
+                total += self.log_correction
             if isinstance(self.kalman, KalmanModel) and not np.isfinite(total):
                 shift = len(problem.experiments) * self.log_correction
                 total = self.kalman.log_likelihood(problem.experiments, theta) + shift
@@ -390,10 +389,10 @@ class Fitter:
     @cached_property
     def _process_noise_scales(self) -> set[str]:
         """Positive parameters that the noise of the transition is made of."""
-        twisted, trace = self.problem.program.twisted, self.problem.trace
-        if not isinstance(twisted, TwistedFilter):
+        gaussian, trace = self.problem.program.gaussian, self.problem.trace
+        if not isinstance(gaussian, GaussianApproximation):
             return set()
-        inside = {s.data[1] for s in symbols_of(list(twisted.found.transition.spread().ravel()))
+        inside = {s.data[1] for s in symbols_of(list(gaussian.found.transition.spread().ravel()))
                   if s.data[0] == "parameter"}  # fmt: skip
         out = set()
         for name in inside:

@@ -44,8 +44,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.proposals.noises import Noises, noises
+from ssmppl.codegen.modules.gaussian import GaussianApproximation, backward_passes
 from ssmppl.codegen.modules.interweaving import compile_noises
-from ssmppl.codegen.modules.twisted import TwistedFilter, backward_passes
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment, unpack_parameters
@@ -114,10 +114,13 @@ class NoiseMove:
     def references(self) -> tuple[np.ndarray | None, ...]:
         """For each experiment the trajectory (T, D) to linearise along; None where there is none.
         It depends on no chain, and never changes: see the kernel."""
-        filter_ = self.problem.program.twisted if self.steered else None
-        if not isinstance(filter_, TwistedFilter):
+        gaussian = self.problem.program.gaussian if self.steered else None
+        if not isinstance(gaussian, GaussianApproximation):
             return (None,) * len(self.problem.experiments)
-        return tuple(filter_.mode(self.near, e.y, e.seen, e.u) for e in self.problem.experiments)
+        return tuple(
+            gaussian.likely_trajectory(self.near, e.y, e.seen, e.u)
+            for e in self.problem.experiments
+        )
 
     def stands_near(self) -> bool:
         """Whether every experiment has a guide at `near`; elsewhere it hardly has, if not there."""

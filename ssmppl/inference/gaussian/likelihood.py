@@ -38,8 +38,8 @@ class LaplaceLikelihood:
 def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplicable:
     """What gives Laplace's, or why the model has none."""
     found = problem.program.gaussian
-    if isinstance(found, GaussianApproximation) and isinstance(found.bent, NotApplicable):
-        return found.bent
+    if isinstance(found, GaussianApproximation) and isinstance(found.by_mode, NotApplicable):
+        return found.by_mode
     return found
 
 

@@ -13,7 +13,8 @@ from scipy import optimize
 
 import ssmppl as ssm
 from ssmppl.codegen.kernels.twisted.lookahead import lift, update
-from ssmppl.codegen.modules import twisted
+from ssmppl.codegen.modules import gaussian
+from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.data import check_parameters
 from ssmppl.inference.exact.kalman import kalman_filter
@@ -74,7 +75,9 @@ GAPS = {  # rows and components that are missing; last rows too, whose guide say
 def plainly(problem):
     """The twisted filter with its generated functions in plain Python."""
     made = problem.program.twisted
-    return TwistedFilter(made.trace, made.found, made.proposals, plain_module(made.module))
+    of = made.gaussian
+    plain = GaussianApproximation(of.trace, of.found, plain_module(of.module))
+    return TwistedFilter(made.trace, plain, made.proposals, plain_module(made.module))
 
 
 @cache
@@ -103,7 +106,7 @@ class Guide:
         known, inputs = made.order, given[3].shape[1]
         np.testing.assert_array_equal(rows[:, :inputs], given[3])
         assert rows.shape == (len(given[1]), inputs + len(known))
-        d, r = len(made.trace.state_symbols), len(made.found.initial.noise)
+        d, r = len(made.trace.state_symbols), len(made.gaussian.found.initial.noise)
         steps = len(rows)
         self.precision, self.factor = np.zeros((steps, d, d)), np.zeros((r, r))
         self.pull, self.centre, self.start = np.zeros((steps, d)), np.zeros((steps, d)), np.zeros(r)
@@ -167,7 +170,7 @@ def test_start_and_centre_of_a_linear_gaussian_model(name):
 @pytest.mark.parametrize("name", CASES)
 def test_extended_kalman_filter_of_a_linear_gaussian_model(name):
     made, given, _, _, problem = case(name)
-    mean, covariance = made.filtered(*given)
+    mean, covariance = made.gaussian.filtered(*given)
     exact = kalman_filter(problem.trace, problem.experiments[0], given[0])
     np.testing.assert_allclose(mean, exact.mean, atol=1e-9)
     np.testing.assert_allclose(covariance, exact.covariance, atol=1e-9)
@@ -178,7 +181,7 @@ def test_extended_kalman_filter_of_a_linear_gaussian_model(name):
 def test_compiled_functions_agree(name):
     made, given, _, _, problem = case(name)
     for found, expected in zip(
-        problem.program.twisted.filtered(*given), made.filtered(*given), strict=True
+        problem.program.gaussian.filtered(*given), made.gaussian.filtered(*given), strict=True
     ):
         np.testing.assert_allclose(found, expected, atol=1e-12)
     found = problem.program.twisted.guide(*given)
@@ -232,24 +235,24 @@ def test_reference_is_the_mode_of_the_noise(swinging):
     np.testing.assert_allclose(twisted_models.pendulum_path(e), guide.centre, atol=1e-9)
     short = max(largest, climbed(e, y)) - pendulum_density(e, y)
     print(f"short of the mode by {short:.2g} nats")
-    assert 0.0 <= short < twisted.CLOSE
+    assert 0.0 <= short < gaussian.CLOSE
 
 
 def test_the_climb_is_what_finds_it(swinging, monkeypatch):
     made, given, y, largest = swinging
-    mean, _ = made.filtered(*given)
+    mean, _ = made.gaussian.filtered(*given)
     follows = twisted_models.pendulum_path(pendulum_noise(mean))
     assert np.max(np.abs(follows - mean)) > 0.1  # the filter's means are no trajectory
-    monkeypatch.setattr(twisted, "MOST_STEPS", 1)
+    monkeypatch.setattr(gaussian, "MOST_STEPS", 1)
     short = largest - pendulum_density(pendulum_noise(Guide(made, given).centre), y)
     print(f"after one pass short of the mode by {short:.2g} nats")
-    assert short > twisted.CLOSE
+    assert short > gaussian.CLOSE
 
 
 def test_pull_of_a_nonlinear_model(swinging, monkeypatch):
     """At the mode, the slope of the largest log density that is left, in the state at each row;
     which is that with all later noise held where it is."""
-    monkeypatch.setattr(twisted, "CLOSE", 1e-13)
+    monkeypatch.setattr(gaussian, "CLOSE", 1e-13)
     made, given, y, _ = swinging
     guide = Guide(made, given)
     e = pendulum_noise(guide.centre)
@@ -288,7 +291,7 @@ def test_flat_where_the_start_is_hopeless(hole, sigma):
     e = problem.experiments[0]
     made, given = plainly(problem), (np.array([hole, sigma]), e.y, e.seen, e.u)
     with np.errstate(all="ignore"):
-        assert made.filtered(*given) is None
+        assert made.gaussian.filtered(*given) is None
         guide = Guide(made, given)
     for part in (guide.precision, guide.pull, guide.centre, guide.start):
         np.testing.assert_array_equal(part, 0.0)

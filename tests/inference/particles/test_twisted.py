@@ -393,7 +393,7 @@ def test_moves_in_loops(case, in_loops):
     log_z = estimates(model, {"y": y}, parameters, combination, 100, 1000, seed_of("loops", case))
     table.cell(f"loops {case}", log_z, exact, 100, len(y))
     table.judge()
-    assert not pose(model, {"y": y}).program.twisted.found.written_out
+    assert not pose(model, {"y": y}).program.gaussian.found.written_out
 
 
 RING = 20
