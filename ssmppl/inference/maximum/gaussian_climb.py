@@ -16,15 +16,15 @@ from functools import partial
 
 import numpy as np
 
-from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, OK
+from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.twisted import TwistedFilter
-from ssmppl.errors import ArgumentError, SamplingError
+from ssmppl.errors import ArgumentError
 from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.newton import GOOD, Top, climb, information_at
-from ssmppl.inference.particles.filtering import failure, log_of_mean
+from ssmppl.inference.particles.filtering import log_of_mean
 from ssmppl.inference.preparation.pilot import finite_point
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
@@ -226,14 +226,13 @@ class _Correction:
     def _enough_particles(self) -> np.ndarray | str:
         """(K,) log Z at the top by so many particles that their scatter is small."""
         while True:
-            try:
-                (found,) = self._log_z(self.z)
-            except SamplingError as error:
-                return error.found
+            (found,) = self._log_z(self.z)
             scatter = float(np.std(found, ddof=1)) if np.all(np.isfinite(found)) else np.inf
             if scatter < PRECISE or self.particles >= self.climb.method.particles:
                 break
             self.particles = min(4 * self.particles, self.climb.method.particles)
+        if not np.isfinite(scatter):
+            return "the particle filter comes to no number at its top"
         if scatter > HOPELESS:
             return (
                 f"twisted particle filters of {self.particles} particles tell log Z to no better "
@@ -296,14 +295,10 @@ def twisted_log_z(
         guided = twisted.guide(theta, e.y, e.seen, e.u)  # the same for all
         increments, ess = np.empty(e.steps), np.empty(e.steps)
         for k, streams in enumerate(seeds):
-            status, t = run(
+            status, _ = run(
                 theta, e.y, e.seen, guided, particles, None, 1.0, streams[i].copy(), increments,
                 ess, None, None,
             )  # fmt: skip
-            if status == ALL_ZERO:
-                out[k] = -np.inf
-            elif status != OK:
-                raise failure(problem, theta, status, t, e)
-            else:
-                out[k] += total_of(increments)
+            # A weight that is infinite or no number, too, makes the point none.
+            out[k] = out[k] + total_of(increments) if status == OK else -np.inf
     return out
