@@ -11,8 +11,9 @@ the top rests. The slopes' scatter over the seeds gives the estimate's Monte Car
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -60,18 +61,26 @@ class GaussianClimb:
         self.setup, self.method = setup, method
         self.laplace = LaplaceLikelihood(setup.problem, found)
         self.evaluations = 0
+        self.best, self.best_value = np.empty(0), -np.inf  # of all points looked at
         self.iterates: list[np.ndarray] = []
 
     def run(self) -> Ascent:
-        """Both."""
-        top, started = self._climbed()
-        information = information_at(self.objective, top.z)
+        """Both. Ctrl-C ends it early, with the best so far."""
+        try:
+            top, started = self._climbed()
+            information = information_at(self.objective, top.z)
+        except KeyboardInterrupt:
+            if not len(self.best):
+                raise
+            self.iterates.append(self._theta(self.best))
+            report: dict[str, Any] = {"converged": False, "evaluations": self.evaluations}
+            return self._interrupted(self.best, None, report)
         self.iterates.append(self._theta(top.z))
         report = {
             "converged": top.distance < GOOD, "evaluations": self.evaluations,
             "likelihood": "Laplace's approximation", "restarts": started - 1,
         }  # fmt: skip
-        if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] <= 0.0:
+        if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] < KNOWN:
             return self._uncorrected(top.z, None, report, "its top is at an edge, or flat")
         twisted = self.setup.problem.program.twisted
         if not isinstance(twisted, TwistedFilter):
@@ -79,8 +88,7 @@ class GaussianClimb:
         try:
             found = _Correction(self, top.z, information).run()
         except KeyboardInterrupt:
-            out = self._uncorrected(top.z, information, report, "interrupted")
-            return Ascent(**{**vars(out), "interrupted": True})
+            return self._interrupted(top.z, information, report)
         if isinstance(found, str):
             return self._uncorrected(top.z, information, report, found)
         report |= {
@@ -93,14 +101,18 @@ class GaussianClimb:
         self.iterates.append(self._theta(found.z))
         return Ascent(
             self._theta(found.z), found.value, np.array(self.iterates), report,
-            self.setup.natural(found.z, found.information),
+            self._natural(found.z, found.information),
             self.setup.natural_error(found.z, found.error),
         )  # fmt: skip
 
     def objective(self, z: np.ndarray) -> float:
         """Laplace's log-likelihood at z (F,), with the prior where it counts."""
         value = self.log_likelihood(z)
-        return value + self.setup.log_prior(z) if value > -np.inf else value
+        if value > -np.inf:
+            value += self.setup.log_prior(z)
+        if value > self.best_value:
+            self.best, self.best_value = np.array(z), value
+        return value
 
     def log_likelihood(self, z: np.ndarray) -> float:
         """Laplace's; -inf off the support."""
@@ -137,15 +149,27 @@ class GaussianClimb:
         return best, k
 
     def _uncorrected(
-        self, z: np.ndarray, information: np.ndarray | None, report: dict, why: str
+        self, z: np.ndarray, information: np.ndarray | None, report: dict[str, Any], why: str
     ) -> Ascent:
         """The top of the approximation, called one."""
         report |= {
             "likelihood": f"Laplace's approximation, not corrected: {why}",
             "approximate": True,
         }
-        natural = None if information is None else self.setup.natural(z, information)
+        natural = None if information is None else self._natural(z, information)
         return Ascent(self._theta(z), None, np.array(self.iterates), report, natural)
+
+    def _interrupted(
+        self, z: np.ndarray, information: np.ndarray | None, report: dict[str, Any]
+    ) -> Ascent:
+        return replace(self._uncorrected(z, information, report, "interrupted"), interrupted=True)
+
+    def _natural(self, z: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """(P, P) information of the likelihood alone in theta, from that of the objective in z."""
+        if self.setup.with_prior:
+            nothing = np.zeros(len(self.setup.space.theta))
+            information = information + self.setup.transform.curvature(z, nothing).log_prior
+        return self.setup.natural(z, information)
 
 
 @dataclass(frozen=True)
@@ -180,8 +204,13 @@ class _Correction:
         middle = self._enough_particles()
         if isinstance(middle, str):
             return middle
-        rests = False
+        rests, far = False, False
         for _ in range(ROUNDS):
+            if far:  # the ellipsoid is another one there
+                self.information = information_at(self.climb.objective, self.z)
+                if not np.all(np.isfinite(self.information)):
+                    return "its second derivatives are no numbers on the way"
+                self.axes = axes_of(self.information)
             smooth, lacking, spread, bend = self._slopes(middle)
             slope = smooth + lacking
             if not (np.all(np.isfinite(slope)) and np.all(np.isfinite(bend))):
@@ -195,11 +224,7 @@ class _Correction:
             if np.all(np.abs(step) < np.maximum(RESTS * errors, LEAST)):
                 rests = bool(np.all(np.abs(slope / curvature) < np.maximum(RESTS * errors, LEAST)))
                 break
-            if np.linalg.norm(step) > FAR:  # the ellipsoid is another one there
-                information = information_at(self.climb.objective, self.z)
-                if not np.all(np.isfinite(information)):
-                    return "its second derivatives are no numbers on the way"
-                self.information, self.axes = information, axes_of(information)
+            far = bool(np.linalg.norm(step) > FAR)
         value, value_error = log_of_mean(middle)
         inverse = np.linalg.pinv(self.axes)
         information = self.information - inverse.T @ np.diag(bend) @ inverse

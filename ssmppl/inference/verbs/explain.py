@@ -68,7 +68,7 @@ class Plan:
     deterministic_memory : for how many steps a deterministic state remembers; None where it never
         forgets.
     noises : what drives the states, or why it is not known.
-    laplace : why the likelihood has no Laplace approximation; None where it has.
+    laplace : why the likelihood has no Laplace approximation; None where it has, or is exact.
     eliminable : the parameters that PGAS can integrate out, and why not the others.
     rows : of the longest data set, where there are data.
     """
@@ -267,6 +267,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         bound += f", {gaps} missing" if gaps else ", none missing"
         labels = _labels(experiments) + _unread(unread(traced, data), experiments)
     program = compile_trace(traced, missing)
+    nonlinear = isinstance(exact_model(traced), NotApplicable)
     return Plan(
         traced,
         linear_gaussian(traced),
@@ -276,7 +277,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         tuple(derive_updates(traced, (), missing)),
         deterministic_memory(traced),
         noises(traced, missing),
-        laplace_obstacle(traced, missing),
+        laplace_obstacle(traced, missing) if nonlinear else None,
         eliminable(traced, (), missing),
         bound,
         rows,

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.analysis.proposals.curvature import laplace_obstacle
 from ssmppl.analysis.structure import noisy_start
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
+from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum import (
     direct_optimization,
     em,
@@ -164,10 +164,11 @@ def maximize(
 
 def choose_method(setup: Maximization) -> tuple[Any, str]:
     """The method for a model's structure, and why."""
-    trace = setup.problem.trace
-    chosen, reason = choose_maximiser(
-        exact_kind(setup.exact), trace, laplace_obstacle(trace, setup.problem.program.missing)
-    )
+    trace, laplace = setup.problem.trace, None
+    if isinstance(setup.exact, NotApplicable):
+        found = laplace_approximation(setup.problem)
+        laplace = found if isinstance(found, NotApplicable) else None
+    chosen, reason = choose_maximiser(exact_kind(setup.exact), trace, laplace)
     if isinstance(chosen, ScoreAscent) and noisy_start(trace):
         warnings.warn(
             f"{type(chosen).__name__} may take minutes for each hundred rows here: "

@@ -6,15 +6,17 @@ from scipy import optimize, stats
 
 import ssmppl as ssm
 from ssmppl import datasets
-from ssmppl.inference.gaussian.likelihood import laplace_approximation
+from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood, laplace_approximation
 from ssmppl.inference.maximum import gaussian_climb
 from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.direct_optimization import ExactClimb
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.preparation.space import space_of
+from ssmppl.inference.preparation.exact_score import exact_score
+from ssmppl.inference.preparation.space import free_components, space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.inference.verbs.maximize import natural_covariance
 from tests.models import standard as models
 from tests.statistics.checks import seed_of
 
@@ -116,6 +118,47 @@ def test_a_linear_gaussian_model_needs_no_correction(objective):
     assert np.all(np.abs(mine.theta - exact.theta) < 6.0 * error + 1e-4 * np.abs(exact.theta))
     value = setup.exact.log_likelihood(setup.problem.experiments, exact.theta)
     assert mine.report["laplace_log_likelihood"] == pytest.approx(value, abs=1e-2)
+    known = natural_covariance(setup, exact.theta, setup_information(setup, exact.theta))
+    found = natural_covariance(setup, mine.theta, mine.information)
+    assert found[0, 0] == pytest.approx(known[0, 0], rel=0.03)
+
+
+def setup_information(setup, theta):
+    """(P, P) of the exact likelihood alone."""
+    free = free_components(setup.problem.trace, setup.fixed)
+    return exact_score(setup.exact, setup.problem.experiments, free, theta).information(theta)
+
+
+@pytest.mark.parametrize("after", [5, 300])
+def test_an_interrupted_climb_gives_the_best_so_far(monkeypatch, after):
+    """Ctrl-C on the way up, and in the correction."""
+    model, y = counts()
+    plain, seen = LaplaceLikelihood.__call__, []
+
+    def interrupted(self, theta):
+        if len(seen) == after:
+            raise KeyboardInterrupt
+        seen.append((plain(self, theta), theta.tolist()))
+        return seen[-1][0]
+
+    monkeypatch.setattr(LaplaceLikelihood, "__call__", interrupted)
+    monkeypatch.setattr(gaussian_climb, "RESTS", 0.0)
+    monkeypatch.setattr(gaussian_climb, "LEAST", 0.0)
+    monkeypatch.setattr(gaussian_climb, "ROUNDS", 10**6)
+    found = ssm.maximize(model, {"y": y}, seed=1, progress=False)
+    assert found.attrs["interrupted"]
+    assert "interrupted" in found.attrs["likelihood"]
+    best = max(seen[:after])[1]
+    if after == 5:
+        assert list(found.parameters.values()) == pytest.approx(best)
+    else:
+        value = ssm.log_likelihood  # the top of Laplace's, about
+        monkeypatch.undo()
+        got, top = (
+            value(model, {"y": y}, dict(zip(("a", "s"), p, strict=True)), proposal="laplace")[0]
+            for p in (list(found.parameters.values()), best)
+        )
+        assert got == pytest.approx(top, abs=0.01)
 
 
 def test_where_it_cannot_be_corrected_the_next_method_takes_over(monkeypatch):
