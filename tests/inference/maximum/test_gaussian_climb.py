@@ -99,12 +99,16 @@ def test_small_counts():
 
 
 def climbs(objective):
-    """Of a linear Gaussian model: this climb, and the exact one."""
-    data = {"y": datasets.lgss_main_text()}
-    problem = pose(models.lgss, data)
-    fixed = {"c": np.array(0.5)}
-    space = space_of(problem, fixed, {})
-    setup = Maximization(problem, space, objective, fixed, {}, seed_sequence(1))
+    """Of a linear Gaussian model whose prior counts: this climb, and the exact one."""
+    model = ssm.Model("level")
+    model.prior(lambda: {"q": ssm.Gamma(40, rate=40)})
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, q: {"x": ssm.Normal(0.8 * x, precision=q)})
+    model.observation(lambda x: {"y": ssm.Normal(x, sd=0.5)})
+    data = {"y": np.random.default_rng(seed_of("level")).standard_normal(60)}
+    problem = pose(model, data)
+    space = space_of(problem, {}, {})
+    setup = Maximization(problem, space, objective, {}, {}, seed_sequence(1))
     approximation = laplace_approximation(problem)
     mine = GaussianClimb(setup, DirectOptimization(), approximation).run()
     return setup, mine, ExactClimb(setup, setup.exact, DirectOptimization()).run()
