@@ -7,6 +7,7 @@ import pytest
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals.channels import channel_draws, observation_draws
+from ssmppl.analysis.proposals.curvature import bends
 from ssmppl.analysis.proposals.proposals import bootstrap
 from ssmppl.analysis.proposals.twisted import jacobian, lookahead_model
 from ssmppl.codegen.modules.program import compile_trace
@@ -53,12 +54,17 @@ def close(found, expected, what):
 class Generated:
     """The functions of one section at one time step.
 
-    Those of the twisted filter stand in a module of their own, and read a guide behind the inputs.
+    Those of the twisted filter and of the Gaussian approximation stand in modules of their own;
+    the former read a guide behind the inputs.
     """
 
     def __init__(self, program, numbers, suffix, t):
         self.module, self.suffix = program.module, suffix
-        if suffix in ("twisted", "guide"):
+        if suffix == "gaussian":
+            self.module = program.gaussian.module
+        elif suffix == "mode":
+            self.module = program.gaussian.by_mode
+        elif suffix == "twisted":
             self.module = program.twisted.module
             numbers = numbers.guided(program.twisted.order, np.random.default_rng([8, t]))
         self.numbers = numbers
@@ -172,18 +178,19 @@ def test_joining_a_reference(case):
             close(joined[k], expected, f"{name} connect {s!r}")
 
 
-def test_guide_of_the_twisted_filter(case):
+def test_gaussian_approximation(case):
     """The model by its noise, with its derivatives, of one particle at a time."""
     program, numbers = case
     found = lookahead_model(program.trace, program.missing)
     if isinstance(found, NotApplicable):
+        assert isinstance(program.gaussian, NotApplicable)
         assert isinstance(program.twisted, NotApplicable)
         return
     rng, d = np.random.default_rng(9), len(program.trace.state_symbols)
     lower = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
     seen = [found.observed, *found.slope, *lower]
     for t in range(STEPS):
-        generated = Generated(program, numbers, "guide", t)
+        generated = Generated(program, numbers, "gaussian", t)
         form, suffix = (found.transition, "") if t else (found.initial, "_initial")
         e = rng.normal(size=len(form.noise))
         noise = dict(zip(form.noise, e, strict=True))
@@ -200,6 +207,27 @@ def test_guide_of_the_twisted_filter(case):
         out = np.zeros((len(seen), PARTICLES))  # entries that are always 0 are not written
         generated.pass_("look", numbers.states[t], out)
         check_rows(generated, out, seen, t, "look")
+
+
+def test_second_derivatives_of_the_gaussian_approximation(case):
+    """Those of the transition by the noise, weighted by the costate, of one particle at a time."""
+    program, numbers = case
+    if isinstance(program.gaussian, NotApplicable):
+        return
+    bent = bends(program.gaussian.found, program.trace)
+    if isinstance(bent, NotApplicable):
+        assert isinstance(program.gaussian.by_mode, NotApplicable)
+        return
+    rng = np.random.default_rng(11)
+    for t in range(STEPS):
+        generated = Generated(program, numbers, "mode", t)
+        bend = bent[1 if t else 0]
+        given = dict(zip(bend.given, rng.normal(size=len(bend.given)), strict=True))
+        before = [numbers.states[t - 1]] if t else []
+        out = np.zeros((len(bend.values), PARTICLES))
+        role = "bend" if t else "bend_initial"
+        generated.pass_(role, *before, np.array(list(given.values())), numbers.states[t], out)
+        check_rows(generated, out, bend.values, t, role, given)
 
 
 def test_moves_in_loops(case):
