@@ -265,14 +265,15 @@ def eliminate_all(
 
 @exact
 def gaussian_mode(
-    prepare, step, begin, follow, bend_initial, bend, look, sizes, theta, y, seen, u, r,
+    prepare, step, follow_step, eliminate_all, sizes, theta, y, seen, u, r,
     x, e, aim, gain, root, jacobian, spread, information, costate,
 ):  # fmt: skip
     """(Laplace's log-likelihood less its constant, nats left to gain), by Newton's method from e.
 
-    r : numbers (R_1, R) of noises. e (T, R') : where it starts, and then the mode; x (T, D), aim
-    (T, R'), gain (T, R', D), root (T, R', R'), jacobian (T, D, D), spread (T, D, R'), information
-    (T, D, D) and costate (T, D) : there, written. -inf where the model or its curvature comes to no number; nan where the last trajectory
+    follow_step, eliminate_all : those above, of the model. r : numbers (R_1, R) of noises. e (T,
+    R') : where it starts, and then the mode; x (T, D), aim (T, R'), gain (T, R', D), root (T, R',
+    R'), jacobian (T, D, D), spread (T, D, R'), information (T, D, D) and costate (T, D) : there,
+    written. -inf where the model or its curvature comes to no number; nan where the last trajectory
     is no maximum. The constant is none: g and the law of e are whole densities, and what e's lacks
     is what the integral gives.
     """
@@ -286,9 +287,7 @@ def gaussian_mode(
         step(theta, c, y, seen, u, t, s[t])
     aim[:] = 0.0
     gain[:] = 0.0
-    value = follow_step(
-        begin, follow, look, theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes
-    )
+    value = follow_step(theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes)
     if not value > -np.inf:
         return -np.inf, np.nan
     x[:] = x_new
@@ -296,14 +295,14 @@ def gaussian_mode(
     for _ in range(PASSES):
         curved = True
         log_det, left = eliminate_all(
-            bend_initial, bend, theta, c, s, True, r, x, e, slopes, aim, gain, root, jacobian,
-            spread, information, costate,
+            theta, c, s, True, r, x, e, slopes, aim, gain, root, jacobian, spread, information,
+            costate,
         )  # fmt: skip
         if not left >= 0.0:
             curved = False
             log_det, left = eliminate_all(
-                bend_initial, bend, theta, c, s, False, r, x, e, slopes, aim, gain, root, jacobian,
-                spread, information, costate,
+                theta, c, s, False, r, x, e, slopes, aim, gain, root, jacobian, spread,
+                information, costate,
             )  # fmt: skip
         if not left >= 0.0:
             return -np.inf, np.nan
@@ -313,8 +312,7 @@ def gaussian_mode(
         share, moved = 1.0, False
         for _ in range(HALVINGS):
             new = follow_step(
-                begin, follow, look, theta, c, s, share, x, e, aim, gain, r, x_new, e_new,
-                slopes_new,
+                theta, c, s, share, x, e, aim, gain, r, x_new, e_new, slopes_new
             )  # fmt: skip
             if new >= value + ENOUGH * share * left - ROUNDING * abs(value):
                 moved = True

@@ -1,9 +1,9 @@
 """The gradient in theta of Laplace's log-likelihood at a mode, exact, by the adjoint method.
 
-At the mode e* of J, L = J(e*) - log det(-J'')/ 2. The determinant depends on theta directly, and by
-way of e*, x and the costate l, all of which the mode ties together: x_t = F(x_{t-1}, e_t), l_t = g_t
-+ J_{t+1}' l_{t+1}, e_t = L_t' l_t. With a multiplier for each of these three (Griewank and Walther
-2008, chapter 15; Skaug and Fournier 2006 for the gradient of Laplace's approximation),
+At the mode e* of J, L = J(e*) - log det(-J'') / 2. The determinant depends on theta directly, and
+by way of e*, x and the costate l, all of which the mode ties together: x_t = F(x_{t-1}, e_t), l_t =
+g_t + J_{t+1}' l_{t+1}, e_t = L_t' l_t. With a multiplier for each of these three (Griewank and
+Walther 2008, chapter 15; Skaug and Fournier 2006 for the gradient of Laplace's approximation),
 
 - the derivative of -log det / 2 in the entries of -J'' is minus half the covariance of the noise:
   one pass forward gives Xi_t, that of (x_{t-1}, e_t), and the weights of first and second
@@ -133,6 +133,8 @@ def mode_gradient(
         if t == 0:
             third_initial(theta, c, s[t], given[t], now, values)
         else:
+            if t == 1:  # entries that are always 0 are not written
+                values[:] = 0.0
             third(theta, c, s[t], before, given[t], now, values)
         third_seen(theta, c, s[t], given_seen[t], now, values_seen)
         for k in range(at + n + d):
@@ -203,6 +205,8 @@ def mode_gradient(
         if t == 0:
             fixed_initial(theta, c, s[t], given[t], now, answer)
         else:
+            if t == 1:
+                answer[:] = 0.0
             fixed(theta, c, s[t], before, given[t], now, answer)
         fixed_seen(theta, c, s[t], given_seen[t], now, answer_seen)
         for k in range(n_parameters):
