@@ -1,4 +1,6 @@
-"""Approximate log-likelihoods of a problem: Laplace's, and the extended Kalman filter's."""
+"""Approximate log-likelihoods of a problem: Laplace's, and the extended and unscented Kalman
+filters'.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from ssmppl.codegen.native.loading import Loaded
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.run.problem import Problem
 
-APPROXIMATE = ("laplace", "extended")  # the names under which verbs know them
+APPROXIMATE = ("laplace", "extended", "unscented")  # the names under which verbs know them
 
 
 class LaplaceLikelihood:
@@ -70,17 +72,22 @@ def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplic
     return found
 
 
-def approximation_of(problem: Problem, kind: str) -> GaussianApproximation:
-    """What gives "laplace" or "extended".
+def approximation_of(
+    problem: Problem, kind: str, instead: str = 'use proposal="auto" or "bootstrap"'
+) -> GaussianApproximation:
+    """What gives "laplace", "extended" or "unscented"; instead : what to do where nothing does.
 
     Raises
     ------
     ArgumentError : the model has no such approximation; says why.
     """
     found = laplace_approximation(problem) if kind == "laplace" else problem.program.gaussian
+    if kind == "unscented" and isinstance(found, GaussianApproximation):
+        points = found.by_points
+        found = points if isinstance(points, NotApplicable) else found
     if isinstance(found, NotApplicable):
         raise ArgumentError(
-            f"proposal={kind!r} does not apply: {found}", fix='use proposal="auto" or "bootstrap"'
+            f"proposal={kind!r} does not apply: {found.reason}", fix=instead, where=found.where
         )
     return found
 
@@ -88,7 +95,15 @@ def approximation_of(problem: Problem, kind: str) -> GaussianApproximation:
 def approximate_log_likelihood(
     problem: Problem, theta: np.ndarray, found: GaussianApproximation, kind: str
 ) -> float:
-    """log p(y | theta) by "laplace" or "extended"; -inf where it comes to no number."""
+    """log p(y | theta) by one of `APPROXIMATE`; -inf where it comes to no number."""
     if kind == "laplace":
         return LaplaceLikelihood(problem, found)(theta)
-    return sum(found.extended_log_likelihood(theta, e.y, e.seen, e.u) for e in problem.experiments)
+    total = 0.0
+    for e in problem.experiments:
+        given = theta, e.y, e.seen, e.u
+        if kind == "extended":
+            total += found.extended_log_likelihood(*given)
+        else:
+            told = found.unscented(*given)
+            total += -np.inf if told is None else float(np.sum(told[0].increments))
+    return total

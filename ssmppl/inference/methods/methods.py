@@ -432,8 +432,17 @@ Method = MetropolisHastings | Gibbs | PMMH | PGAS | SMC2
 
 @dataclass(frozen=True)
 class KalmanSmoother:
-    """Exact smoothing of linear Gaussian models: moments (Rauch, Tung and Striebel 1965), or
-    independent draws by backward sampling."""
+    """Smoothing by Kalman passes: moments (Rauch, Tung and Striebel 1965), or independent draws by
+    backward sampling. Exact on linear Gaussian models.
+
+    Parameters
+    ----------
+    proposal : "kalman", exact; or an approximation for states driven by Gaussian noise: "laplace",
+        the Gaussian law round the mode of all states together (Tierney and Kadane 1986),
+        "extended", or "unscented" (Julier and Uhlmann 1997; Särkkä 2008).
+    """
+
+    proposal: str = setting("kalman", one_of(("kalman", "laplace", "extended", "unscented")))
 
 
 @dataclass(frozen=True)
