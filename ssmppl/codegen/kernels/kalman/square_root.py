@@ -13,12 +13,18 @@ make an array lower triangular (Kailath, Sayed and Hassibi 2000, "Linear estimat
 so no covariance is ever subtracted from another and none loses its positive semidefiniteness;
 Q and P may be singular. A missing component drops its row from C and from R^1/2.
 
+Arrays stand transposed, a column in a row of memory, so that a transformation works on whole rows;
+zeros are passed over: those of A and C (the shift registers of seasons and lags), the columns that
+a Q of low rank does not have, and in the update the half of L that is zero, for which rotations
+take a column of L after the other into that of a measurement.
+
 Where A, Q, C and R do not depend on time, covariances settle (Anderson and Moore 1979, "Optimal
 filtering", chapter 4). From the step on at which the root moves by rounding errors only, the arrays
 are kept and the means go on alone, until a row misses other components than the one before.
 
 Notation: D states, K observed components, T steps; a matrix that does not depend on time is given
-with a first axis of length 1 instead of T.
+with a first axis of length 1 instead of T. Nonzero entries of a matrix (n, m) are listed as `where`
+(n m, 2), of which the first `count` rows are in use.
 """
 
 from __future__ import annotations
@@ -100,12 +106,6 @@ def product(x, y):
 
 
 @exact
-def triangularise(a):
-    """Make a (n, m), m >= n, lower triangular in place, a a' kept: Householder reflections."""
-    reflect(a, a.shape[0])
-
-
-@exact
 def reflect(a, pivots):
     """Make the first rows of a (n, m), m >= pivots, lower triangular; a a' of all rows is kept.
 
@@ -156,13 +156,32 @@ def square(root, out):
 
 
 @exact
-def affine_map(a, x, b, out):
-    """out = a x + b."""
-    for i in range(a.shape[0]):
-        total = b[i]
-        for k in range(a.shape[1]):
-            total += a[i, k] * x[k]
-        out[i] = total
+def square_columns(root, out):
+    """out = root' root: the covariance of a transposed root."""
+    for i in range(root.shape[1]):
+        for j in range(root.shape[1]):
+            out[i, j] = 0.0
+    for c in range(root.shape[0]):
+        column = root[c]
+        for i in range(column.size):
+            factor, row = column[i], out[i]
+            if factor != 0.0:
+                for j in range(column.size):
+                    row[j] += factor * column[j]
+
+
+@exact
+def add_spread(c, root, out):
+    """out += c root' root c'."""
+    told = np.zeros((root.shape[0], c.shape[0]))
+    for l in range(root.shape[0]):
+        for i in range(c.shape[0]):
+            for j in range(root.shape[1]):
+                told[l, i] += c[i, j] * root[l, j]
+    for l in range(root.shape[0]):
+        for i in range(c.shape[0]):
+            for j in range(c.shape[0]):
+                out[i, j] += told[l, i] * told[l, j]
 
 
 @exact
@@ -172,40 +191,173 @@ def at(t, n):
 
 
 @exact
-def predict(a, q_root, root, array):
-    """root <- that of a x + N(0, q_root q_root'); array (D, 2 D) is scratch."""
-    n = root.shape[0]
-    multiply(a, root, array[:, :n])
-    array[:, n:] = q_root
-    triangularise(array)
-    root[:] = array[:, :n]
+def nonzeros(a, where):
+    """Write (row, column) of the entries of a that are not zero into where; returns how many."""
+    count = 0
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            if a[i, j] != 0.0:
+                where[count, 0] = i
+                where[count, 1] = j
+                count += 1
+    return count
 
 
 @exact
-def join(seen, r_root, c_root, root, array):
-    """Fill and transform the array of an update; returns k, how many components were measured.
+def affine_known(a, where, count, x, b, out):
+    """out = a x + b, from the nonzero entries of a."""
+    for i in range(b.size):
+        out[i] = b[i]
+    for e in range(count):
+        i, k = where[e, 0], where[e, 1]
+        out[i] += a[i, k] * x[k]
 
-    array (K + D, K + D): rows 0 to k hold S^1/2, rows k to k + D the gain's K and the new root,
-    in columns 0 to k and k to k + D.
+
+@exact
+def turn(a, out):
+    """out <- a'."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[j, i] = a[i, j]
+
+
+@exact
+def reflect_columns(a, width, pivots, dots):
+    """Make a' lower triangular, its columns being rows 0 to width of a: Householder reflections.
+
+    Only pivots rows of a' are looked at, and those below carried along. dots : scratch.
     """
-    n, k_all = root.shape[0], r_root.shape[0]
-    array[:] = 0.0
-    k = 0
-    for j in range(k_all):
-        if seen[j] != 0.0:
-            array[k, :k_all] = r_root[j]
-            array[k, k_all:] = c_root[j]
+    n = a.shape[1]
+    for i in range(min(pivots, width)):
+        others = 0.0
+        for c in range(i + 1, width):
+            others += a[c, i] * a[c, i]
+        if others == 0.0:
+            continue
+        norm = math.sqrt(a[i, i] * a[i, i] + others)
+        diagonal = -norm if a[i, i] > 0.0 else norm
+        a[i, i] -= diagonal  # column i now holds the vector v of the reflection 1 - 2 v v' / v'v
+        scale = -1.0 / (diagonal * a[i, i])
+        for j in range(i + 1, n):
+            dots[j] = 0.0
+        for c in range(i, width):
+            factor, column = a[c, i], a[c]
+            if factor != 0.0:
+                for j in range(i + 1, n):
+                    dots[j] += factor * column[j]
+        for c in range(i, width):
+            factor, column = scale * a[c, i], a[c]
+            if factor != 0.0:
+                for j in range(i + 1, n):
+                    column[j] -= factor * dots[j]
+            a[c, i] = 0.0
+        a[i, i] = diagonal
+
+
+@exact
+def columns_of(root, out):
+    """out <- root'; returns how many columns there are before those that are zero, as of
+    `square_root`."""
+    turn(root, out)
+    for c in range(out.shape[0]):
+        empty = True
+        for i in range(out.shape[1]):
+            empty = empty and out[c, i] == 0.0
+        if empty:
+            return c
+    return out.shape[0]
+
+
+@exact
+def predict_root(a, where, count, noise, rank, root, array, dots):
+    """root <- the transposed root of A L L' A' + Q; array (2 D, D), dots (D,): scratch.
+
+    noise : the transposed root of Q, of which rank rows are not zero.
+    """
+    n = root.shape[0]
+    for c in range(n):
+        column, into = root[c], array[c]
+        for i in range(n):
+            into[i] = 0.0
+        for e in range(count):
+            into[where[e, 0]] += a[where[e, 0], where[e, 1]] * column[where[e, 1]]
+    for c in range(rank):
+        for i in range(n):
+            array[n + c, i] = noise[c, i]
+    reflect_columns(array, n + rank, n, dots)
+    for c in range(n):
+        for i in range(n):
+            root[c, i] = array[c, i]
+
+
+@exact
+def noise_columns(r_root, seen, place, noise, dots):
+    """Write the transposed lower triangular root of the measured part of R; returns its size k.
+
+    r_root (K, K): a root of R. noise (K, K): its first k columns are written. place (K,) integers:
+    where each component of y is among those that were measured, -1 where it was not.
+    """
+    k, k_all = 0, r_root.shape[0]
+    for p in range(k_all):
+        place[p] = -1
+        if seen[p] != 0.0:
+            for q in range(k_all):
+                noise[q, k] = r_root[p, q]
+            place[p] = k
             k += 1
-    array[k : k + n, k_all:] = root
-    triangularise(array[: k + n])
+    reflect_columns(noise, k_all, k, dots)
     return k
+
+
+@exact
+def update_root(c, where, count, place, noise, k, root, array):
+    """Fill and transform the array of an update.
+
+    root : transposed root of the predicted covariance, lower triangular before it was transposed.
+    noise, place, k : of `noise_columns`. array (K + D, K + D): its first k rows then hold S^1/2 and
+    the gain's K, transposed, in columns 0 to k and k to k + D; the next D rows the transposed root
+    of the filtered covariance, in the latter.
+    """
+    n = root.shape[0]
+    for i in range(k + n):
+        for j in range(k + n):
+            array[i, j] = 0.0
+    for q in range(k):
+        for i in range(q, k):
+            array[q, i] = noise[q, i]
+    for l in range(n):
+        column, into = root[l], array[k + l]
+        for j in range(n):
+            into[k + j] = column[j]
+        for e in range(count):
+            row = place[where[e, 0]]
+            if row >= 0:
+                into[row] += c[where[e, 0], where[e, 1]] * column[where[e, 1]]
+    for i in range(k):
+        pivot = array[i]
+        for l in range(n - 1, -1, -1):
+            column = array[k + l]
+            entry = column[i]
+            if entry == 0.0:
+                continue
+            radius = math.sqrt(pivot[i] * pivot[i] + entry * entry)
+            cosine, sine = pivot[i] / radius, entry / radius
+            for j in range(i, k):
+                above, here = pivot[j], column[j]
+                pivot[j] = cosine * above + sine * here
+                column[j] = cosine * here - sine * above
+            for j in range(k + l, k + n):
+                above, here = pivot[j], column[j]
+                pivot[j] = cosine * above + sine * here
+                column[j] = cosine * here - sine * above
+            column[i] = 0.0
 
 
 @exact
 def learn(array, k, residual, seen, mean, z):
     """mean <- that given the seen components of y; (log density, smallest |S^1/2_ii|).
 
-    array, k : of `join`. residual : (K,) y less its prediction. z : (K,) scratch.
+    array, k : of `update_root`. residual : (K,) y less its prediction. z : (K,) scratch.
     """
     log_density, least = -0.5 * k * LOG_2PI, np.inf
     i = 0
@@ -213,20 +365,21 @@ def learn(array, k, residual, seen, mean, z):
         if seen[row] != 0.0:
             z[i] = residual[row]
             for j in range(i):
-                z[i] -= array[i, j] * z[j]
+                z[i] -= array[j, i] * z[j]
             z[i] /= array[i, i]
             least = min(least, abs(array[i, i]))
             log_density -= math.log(abs(array[i, i])) + 0.5 * z[i] * z[i]
             i += 1
-    for i in range(mean.size):
-        for j in range(k):
-            mean[i] += array[k + i, j] * z[j]
+    for j in range(k):
+        column = array[j]
+        for i in range(mean.size):
+            mean[i] += column[k + i] * z[j]
     return log_density, least
 
 
 @exact
 def rests(root, last):
-    """Whether a triangular root is the last one but for rounding; last <- root.
+    """Whether a triangular root, transposed, is the last one but for rounding; last <- root.
 
     What rounding moves is small in units of the rows. That alone does not tell: beside a part that
     no data tell of, what is being learned may be as small, and shrink as slowly as 1 / t. It is
@@ -238,18 +391,24 @@ def rests(root, last):
     for i in range(n):
         squares, change = 0.0, 0.0
         for j in range(i + 1):
-            entry = root[i, j] if root[j, j] >= 0.0 else -root[i, j]
+            entry = root[j, i] if root[j, j] >= 0.0 else -root[j, i]
             squares += entry * entry
-            change = max(change, abs(entry - last[i, j]))
-        still = still and change <= SETTLED * math.sqrt(squares)
+            change = max(change, abs(entry - last[j, i]))
+        if not change <= SETTLED * math.sqrt(squares):
+            still = False
+            break
     for j in range(n):
+        column, kept = root[j], last[j]
+        sign = 1.0 if column[j] >= 0.0 else -1.0
         size, change, noise = 0.0, 0.0, 0.0
+        if still:
+            for i in range(j, n):
+                size = max(size, abs(column[i]))
+                change = max(change, abs(sign * column[i] - kept[i]))
+                for k in range(i + 1):
+                    noise = max(noise, SETTLED * abs(root[k, i]))
         for i in range(j, n):
-            entry = root[i, j] if root[j, j] >= 0.0 else -root[i, j]
-            size, change = max(size, abs(entry)), max(change, abs(entry - last[i, j]))
-            for k in range(i + 1 if still else 0):
-                noise = max(noise, SETTLED * abs(root[i, k]))
-            last[i, j] = entry
+            kept[i] = sign * column[i]
         still = still and (change <= LEARNT * size or size <= noise)
     return still
 
@@ -280,46 +439,56 @@ def kalman_filter(
     n_steps, n, k_all = y.shape[0], m.size, y.shape[1]
     moments = mean.shape[0] > 0
     constant = A.shape[0] == 1 and Q.shape[0] == 1 and C.shape[0] == 1 and R.shape[0] == 1
-    settled, k = False, 0
-    x, root, q_root, r_root = m.copy(), np.empty((n, n)), np.empty((n, n)), np.empty((k_all, k_all))
-    c_root, both, array = (
-        np.empty((k_all, n)),
-        np.empty((n, 2 * n)),
-        np.empty((k_all + n, k_all + n)),
-    )
+    settled, k, rank, count_a, count_c = False, 0, 0, 0, 0
+    x, root, full_root = m.copy(), np.empty((n, n)), np.empty((n, n))
+    r_root, noise, q_noise = np.empty((k_all, k_all)), np.empty((k_all, k_all)), np.empty((n, n))
+    both, array = np.empty((2 * n, n)), np.empty((k_all + n, k_all + n))
     last, before, predicted = np.zeros((n, n)), np.empty(n), np.empty(k_all)
-    residual, z = np.empty(k_all), np.empty(k_all)
+    residual, z, dots = np.empty(k_all), np.empty(k_all), np.empty(max(n, k_all))
+    where_a, where_c = np.empty((n * n, 2), np.int64), np.empty((k_all * n, 2), np.int64)
+    place = np.empty(k_all, np.int64)
     log_increment[:] = -np.inf
-    if not square_root(P, root):
+    if not square_root(P, full_root):
         return NOT_COVARIANCE, 0
+    turn(full_root, root)
+    reflect_columns(root, n, n, dots)
     for t in range(n_steps):
-        alike = constant and t > 1 and same(seen[t], seen[t - 1])
+        a, c = A[at(t, A.shape[0])], C[at(t, C.shape[0])]
+        alike = t > 0 and same(seen[t], seen[t - 1])
         settled = settled and alike
         if t > 0:
+            if t == 1 or A.shape[0] > 1:
+                count_a = nonzeros(a, where_a)
             before[:] = x
-            affine_map(A[at(t, A.shape[0])], before, b[at(t, b.shape[0])], x)
+            affine_known(a, where_a, count_a, before, b[at(t, b.shape[0])], x)
         if not settled:
             if t > 0:
-                if (t == 1 or Q.shape[0] > 1) and not square_root(Q[at(t, Q.shape[0])], q_root):
+                if t == 1 or Q.shape[0] > 1:
+                    if not square_root(Q[at(t, Q.shape[0])], full_root):
+                        return NOT_COVARIANCE, t
+                    rank = columns_of(full_root, q_noise)
+                predict_root(a, where_a, count_a, q_noise, rank, root, both, dots)
+            if t == 0 or R.shape[0] > 1:
+                if not square_root(R[at(t, R.shape[0])], r_root):
                     return NOT_COVARIANCE, t
-                predict(A[at(t, A.shape[0])], q_root, root, both)
-            if (t == 0 or R.shape[0] > 1) and not square_root(R[at(t, R.shape[0])], r_root):
-                return NOT_COVARIANCE, t
-            multiply(C[at(t, C.shape[0])], root, c_root)
-        affine_map(C[at(t, C.shape[0])], x, d[at(t, d.shape[0])], predicted)
+            if not alike or R.shape[0] > 1:
+                k = noise_columns(r_root, seen[t], place, noise, dots)
+            if t == 0 or C.shape[0] > 1:
+                count_c = nonzeros(c, where_c)
+        affine_known(c, where_c, count_c, x, d[at(t, d.shape[0])], predicted)
         if moments:
             mean_predicted[t], observation_mean[t] = x, predicted
             if settled:
                 covariance_predicted[t] = covariance_predicted[t - 1]
                 observation_covariance[t] = observation_covariance[t - 1]
             else:
-                square(root, covariance_predicted[t])
-                square(c_root, observation_covariance[t])
-                observation_covariance[t] += R[at(t, R.shape[0])]
+                square_columns(root, covariance_predicted[t])
+                observation_covariance[t] = R[at(t, R.shape[0])]
+                add_spread(c, root, observation_covariance[t])
         for j in range(k_all):
             residual[j] = y[t, j] - predicted[j]
         if not settled:
-            k = join(seen[t], r_root, c_root, root, array)
+            update_root(c, where_c, count_c, place, noise, k, root, array)
         increment, least = learn(array, k, residual, seen[t], x, z)
         if least == 0.0:
             return SINGULAR, t
@@ -332,9 +501,11 @@ def kalman_filter(
             if moments:
                 covariance[t] = covariance[t - 1]
             continue
-        root[:] = array[k : k + n, k : k + n]
+        for i in range(n):
+            for j in range(n):
+                root[i, j] = array[k + i, k + j]
         if moments:
-            square(root, covariance[t])
+            square_columns(root, covariance[t])
         if constant:
             settled = rests(root, last) and alike
     return OK, n_steps
