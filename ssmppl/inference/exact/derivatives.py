@@ -183,8 +183,8 @@ class Scored(ABC):
     ) -> np.ndarray:
         """The observed information -d^2 log p(y | theta), (P, P), by differences of the score.
 
-        Extrapolated to zero step: errors of about 1e-8 of
-        sqrt(I_ii I_jj), mostly far less. free : as in `score`; rows and columns of the others are zero.
+        Extrapolated to zero step: errors of about 1e-8 of sqrt(I_ii I_jj), mostly far less. free :
+        as in `score`; rows and columns of the others are zero.
 
         Raises
         ------

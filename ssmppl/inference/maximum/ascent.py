@@ -30,6 +30,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.preparation.exact_models import ExactModel, exact_model
+from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.pilot import Pilot, explained, find_mode, finite_point
 from ssmppl.inference.preparation.space import Space, at
 from ssmppl.inference.run.problem import Problem
@@ -228,6 +229,19 @@ class Maximization:
     def exact(self) -> ExactModel | NotApplicable:
         """The exact filter, or why there is none."""
         return exact_model(self.problem.trace)
+
+    def exact_score(self, free: np.ndarray) -> ExactScore:
+        """Score and information of the exact likelihood in these components, free (P,) bool."""
+        assert not isinstance(self.exact, NotApplicable), self.exact
+        key = free.tobytes()
+        if key not in self._scores:
+            data, theta = self.problem.experiments, self.space.theta
+            self._scores[key] = exact_score(self.exact, data, free, theta)
+        return self._scores[key]
+
+    @cached_property
+    def _scores(self) -> dict[bytes, ExactScore]:
+        return {}
 
     @cached_property
     def kalman(self) -> KalmanModel | NotApplicable:
