@@ -19,7 +19,6 @@ from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.module import STEP, Layout, ModuleText, Section, level_of
 from ssmppl.codegen.text.render import depends, identifier
 from ssmppl.compiling import one_at_a_time
-from ssmppl.data import Experiment
 from ssmppl.expressions.evaluate import numbers
 from ssmppl.expressions.expr import Expr
 from ssmppl.language.model.trace import Trace
@@ -52,13 +51,14 @@ class MatrixProgram:
     entries: np.ndarray
     _placed: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
 
-    def matrices(self, experiment: Experiment, theta: np.ndarray) -> Matrices:
-        """The matrices at theta (P,), for the rows of one experiment."""
-        flat, out = self.room(experiment.steps)
+    def matrices(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray
+    ) -> Matrices:
+        """The matrices at theta (P,), for these rows: y, seen (T, K), u (T, U)."""
+        flat, out = self.room(len(y))
         if len(self.entries):
-            e = experiment
-            _, entries = self._places(e.steps)
-            self.module.assemble(np.ascontiguousarray(theta), e.y, e.seen, e.u, entries, flat)
+            _, entries = self._places(len(y))
+            self.module.assemble(np.ascontiguousarray(theta), y, seen, u, entries, flat)
         return out
 
     def room(self, steps: int, filled: bool = True) -> tuple[np.ndarray, Matrices]:
@@ -115,20 +115,19 @@ class SlopeProgram:
     wanted: np.ndarray
     _placed: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
 
-    def gradient(
-        self, experiment: Experiment, theta: np.ndarray, adjoint: np.ndarray, out: np.ndarray
-    ) -> None:
-        """Add the gradient (P,) to out; adjoint : as of `MatrixProgram.room`."""
-        e = experiment
-        key = e.steps if self.program.varying else 1
+    def add_gradient(
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray,
+        adjoint: np.ndarray, out: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Add the gradient (P,) to out; adjoint : as of `MatrixProgram.room`, of as many rows."""
+        key = len(y) if self.program.varying else 1
         if key not in self._placed:
             if len(self._placed) >= KEPT:
                 self._placed.clear()
-            self._placed[key] = self.program.placed(self.entries, e.steps)
+            self._placed[key] = self.program.placed(self.entries, len(y))
         self.module.contract(
-            np.ascontiguousarray(theta), e.y, e.seen, e.u, self._placed[key], self.values,
-            adjoint, out,
-        )  # fmt: skip
+            np.ascontiguousarray(theta), y, seen, u, self._placed[key], self.values, adjoint, out
+        )
 
 
 @one_at_a_time

@@ -227,7 +227,7 @@ def score(
     )
     if status != OK:
         raise Stopped(status, t)
-    slope.gradient(experiment, theta, flat, gradient)
+    slope.add_gradient(theta, experiment.y, experiment.seen, experiment.u, flat, gradient)
     return total_of(increments)
 
 
@@ -262,7 +262,8 @@ class KalmanModel(Scored):
 
     def matrices(self, experiment: Experiment, theta: np.ndarray) -> Matrices:
         """The matrices at theta (P,), for the rows of one experiment."""
-        return _program(self.trace).matrices(experiment, theta)
+        e = experiment
+        return _program(self.trace).matrices(theta, e.y, e.seen, e.u)
 
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
         """log p(y | theta), summed over experiments; -inf where it does not exist at theta.
