@@ -5,7 +5,7 @@ import pytest
 
 from ssmppl.codegen.kernels.kalman.steps import Matrices
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.inference.exact.kalman import LAWS, _program, _slopes, kalman_model
+from ssmppl.inference.exact.kalman import LAWS, _ordered, _slopes, kalman_model
 from ssmppl.inference.exact.kalman_matrices import values_of
 from tests.inference.exact.test_kalman_score import matrix_valued, singular
 from tests.models.kalman import MODELS, posed
@@ -50,7 +50,7 @@ def test_gradient_by_adjoints(build, steps):
     if not len(theta):
         return
     known, slope = _slopes(traced)
-    program, values = _program(traced), values_of(traced, e, theta)
+    (_, program), values = _ordered(traced), values_of(traced, e, theta)
     flat, adjoint = program.room(steps, filled=False)
     rng = np.random.default_rng(seed_of("contract", build.__name__, steps))
     flat[:] = rng.normal(size=flat.size)

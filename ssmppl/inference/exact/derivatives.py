@@ -89,7 +89,7 @@ def observed_information(
     scale = np.sqrt(abs(np.diagonal(slope)))
     wild = np.flatnonzero(~(error <= CURVED * np.outer(scale, scale)).all(axis=0))
     error = error**2 / np.where(error > 0.0, np.outer(scale, scale), 1.0)
-    for j in wild:
+    for j in wild.tolist():
         column, spread = _derivative(inner, x, j, _step(inner, x, j))
         slope[:, j], error[:, j] = column, spread
     error = np.maximum(error, abs(slope - slope.T) / 2.0)

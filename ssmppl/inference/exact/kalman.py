@@ -8,6 +8,9 @@ Flat components of x_1 (`codegen/kernels/kalman/diffuse.py`): given the flat par
 ordinary one, and given the data the flat part is Gaussian; so everything but the filter runs on the
 ordinary model from the mean of that Gaussian, with its root in further columns.
 
+The likelihood and the score run with the states in the order in which the filter passes over the
+most zeros (`filter_order`); moments and draws in that of the trace.
+
 The score: the matrices are differentiated as expressions, once for each model; their derivatives
 are computed as the matrices themselves are, and meet what one backward pass of the filter says
 about their entries (`codegen/kernels/kalman/adjoint.py`). No parameter costs another pass.
@@ -36,6 +39,7 @@ from ssmppl.codegen.modules.linear_gaussian import (
 from ssmppl.codegen.modules.program import Program
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, Location, NotApplicable, SamplingError
+from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact import kalman_matrices
@@ -279,9 +283,9 @@ class KalmanModel(Scored):
             np.empty((0, d)), np.empty((0, d, d)), np.empty((0, d)), np.empty((0, d, d)),
             np.empty((0, k)), np.empty((0, k, k)),
         )  # fmt: skip
-        total = 0.0
+        total, (_, program) = 0.0, _ordered(self.trace)
         for e in experiments:
-            model, increments = self.matrices(e, theta), np.empty(e.steps)
+            model, increments = program.matrices(theta, e.y, e.seen, e.u), np.empty(e.steps)
             if self.form.flat:
                 try:
                     total += start_of(self.trace, self.form.flat, model, e).log_density(np.nan)
@@ -377,9 +381,9 @@ class KalmanModel(Scored):
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
         found, slope = _slopes(self.trace)
         check_free(self.trace, found, wanted)
-        program, total, gradient = _program(self.trace), 0.0, np.zeros(len(theta))
+        (_, program), total, gradient = _ordered(self.trace), 0.0, np.zeros(len(theta))
         for e in experiments:
-            model = self.matrices(e, theta)
+            model = program.matrices(theta, e.y, e.seen, e.u)
             try:
                 start = start_of(self.trace, self.form.flat, model, e)
                 log_given = score(program, slope, model, start.columns, e, theta, gradient)
@@ -412,6 +416,42 @@ def kalman_model(source: Trace | Program) -> KalmanModel | NotApplicable:
     return form if isinstance(form, NotApplicable) else KalmanModel(trace, form)
 
 
+def filter_order(form: LinearGaussian) -> list[int]:
+    """The order of the states for a filter's likelihood: that of the trace, or its reverse.
+
+    The reflections of a prediction take the rows of A L one after the other, with L lower
+    triangular. In a chain of lags or seasons each state is the one before it, so that from its end
+    on a row has one entry right of the diagonal, and the dense row of its head comes last. Models
+    with a flat start keep the order, by which they name what the data do not tell.
+    """
+    n = len(form.m)
+    forth, back = list(range(n)), list(range(n))[::-1]
+    if form.flat:
+        return forth
+    return back if _work(form.reordered(back)) < 0.8 * _work(form) else forth
+
+
+def _work(form: LinearGaussian) -> int:
+    """About the multiplications of a prediction's reflections, whose zeros fill up on the way."""
+    a, q = (~_zeros(f) for f in (form.A, form.Q))
+    n = len(a)
+    noise = np.eye(n, dtype=bool)[:, q.any(axis=0)]
+    array, total = np.hstack([(a.astype(int) @ np.tri(n, dtype=int)) > 0, noise]), 0
+    for i in range(n):
+        taken = np.flatnonzero(array[i, i:]) + i
+        if len(taken) > 1:
+            total += len(taken) * (n - i)
+            touched = np.flatnonzero(array[i + 1 :, taken].any(axis=1)) + i + 1
+            array[np.ix_(touched, taken)] = True
+    return total
+
+
+def _zeros(field: ExprArray) -> np.ndarray:
+    """Which entries are the number zero."""
+    flat = [e.op == "const" and e.data == 0.0 for e in field.ravel()]
+    return np.array(flat, dtype=bool).reshape(field.shape)
+
+
 @once_per_trace
 def _program(trace: Trace) -> MatrixProgram:
     """The compiled matrices of a linear Gaussian model."""
@@ -421,13 +461,24 @@ def _program(trace: Trace) -> MatrixProgram:
 
 
 @once_per_trace
-def _slopes(trace: Trace) -> tuple[Slopes, SlopeProgram]:
-    """The derivatives of a linear Gaussian model's matrices, and these compiled."""
+def _ordered(trace: Trace) -> tuple[LinearGaussian, MatrixProgram]:
+    """The form with the states as the likelihood has them, and its compiled matrices."""
     form = _form(trace)
     assert not isinstance(form, NotApplicable)
+    order = filter_order(form)
+    if order == sorted(order):
+        return form, _program(trace)
+    ordered = form.reordered(order)
+    return ordered, compile_matrices(trace, ordered)
+
+
+@once_per_trace
+def _slopes(trace: Trace) -> tuple[Slopes, SlopeProgram]:
+    """The derivatives of the matrices of `_ordered`, and these compiled."""
+    form, program = _ordered(trace)
     found = slopes(trace, form)
     later = [field for field, law in LAWS.items() if law == "transition"]
-    return found, compile_slopes(trace, _program(trace), found.known, later)
+    return found, compile_slopes(trace, program, found.known, later)
 
 
 def _applicable(source: Trace | Program) -> KalmanModel:

@@ -180,6 +180,21 @@ def _differences(function: Callable[[np.ndarray], float | np.ndarray], z: np.nda
 
 
 @dataclass(frozen=True)
+class Edges:
+    """Which parameters are at an edge of their support.
+
+    z : (F,) an estimate inside the support. kept : (F,) bool, the numbers that are not held there.
+    components : index of each component of theta at an edge -> the value of that edge.
+    moving : those of them whose edge is where other free parameters put it.
+    """
+
+    z: np.ndarray
+    kept: np.ndarray
+    components: dict[int, float]
+    moving: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
 class Ascent:
     """Where a climb came to (P components of theta, K iterates).
 
@@ -189,7 +204,7 @@ class Ascent:
     in theta, where the method has them. error : (P, P), the Monte Carlo covariance of theta itself.
     Of several starts the iterates are (starts, K, P); figures : what else is known of each iterate,
     (K,) or (starts, K), by name. no_information : why no information is to be looked for, where
-    that is so.
+    that is so. held : what the climb found to be at an edge; None: nothing, or it did not look.
     """
 
     theta: np.ndarray
@@ -201,6 +216,7 @@ class Ascent:
     interrupted: bool = False
     figures: dict[str, np.ndarray] = field(default_factory=dict)
     no_information: str = ""
+    held: Edges | None = None
 
 
 @dataclass(frozen=True)

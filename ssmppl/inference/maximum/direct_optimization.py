@@ -27,8 +27,8 @@ from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
-from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Maximization
-from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
+from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximization
+from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
@@ -259,6 +259,7 @@ class ExactClimb:
         self.iterates: list[np.ndarray] = []
         self.values: list[float] = []
         self.evaluations = 0
+        self.held: Edges | None = None
         self.known: dict[bytes, float] = {}  # objective at the points since the last iterate
 
     def run(self) -> Ascent:
@@ -309,6 +310,7 @@ class ExactClimb:
             point.theta, self.model.log_likelihood(self.experiments, point.theta),
             np.array(self.iterates), report, interrupted=interrupted,
             figures={"objective": np.array(self.values)},
+            held=held_at(self.setup, self.held, point.theta),
         )  # fmt: skip
 
     def value(self, z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -369,7 +371,7 @@ class ExactClimb:
         """
         gap = np.inf
         theta = self.setup.transform.at(self.best).theta
-        found = edges(self.setup, theta, self.exact.information(theta))
+        found = self.held = edges(self.setup, theta, self.exact.information(theta))
         kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
         free = self.exact.free.copy()
         free[list(found.components) if found is not None else []] = False

@@ -23,8 +23,8 @@ from ssmppl.inference.maximum import (
     psaem,
     score_ascent,
 )
-from ssmppl.inference.maximum.ascent import Ascent, Maximization
-from ssmppl.inference.maximum.edges import Edges, edges
+from ssmppl.inference.maximum.ascent import Ascent, Edges, Maximization
+from ssmppl.inference.maximum.edges import edges
 from ssmppl.inference.maximum.estimate import NO_METHOD, Estimate, make_estimate
 from ssmppl.inference.methods.methods import (
     EM,
@@ -226,10 +226,10 @@ def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> n
     if ascent.no_information:
         attrs["covariance"] = f"none: {ascent.no_information}"
         return nothing
-    if information is None:
+    found, score = ascent.held, None
+    if information is None and found is None:
         information = _information(setup, ascent.theta, None)
-    found = score = None
-    if information is not None and not isinstance(setup.exact, NotApplicable):
+    if found is None and information is not None and not isinstance(setup.exact, NotApplicable):
         found = edges(setup, ascent.theta, information)
     if found is not None:
         labels = [repr(s) for s in setup.problem.trace.parameter_symbols]

@@ -272,7 +272,8 @@ def columns_of(root, out):
 def predict_root(a, where, count, noise, rank, root, array, dots):
     """root <- the transposed root of A L L' A' + Q; array (2 D, D), dots (D,): scratch.
 
-    noise : the transposed root of Q, of which rank rows are not zero.
+    root : of L lower triangular, as it is after. noise : the transposed root of Q, of which rank
+    rows are not zero.
     """
     n = root.shape[0]
     for c in range(n):
@@ -280,7 +281,9 @@ def predict_root(a, where, count, noise, rank, root, array, dots):
         for i in range(n):
             into[i] = 0.0
         for e in range(count):
-            into[where[e, 0]] += a[where[e, 0], where[e, 1]] * column[where[e, 1]]
+            k = where[e, 1]
+            if k >= c:  # the column is zero before
+                into[where[e, 0]] += a[where[e, 0], k] * column[k]
     for c in range(rank):
         for i in range(n):
             array[n + c, i] = noise[c, i]
