@@ -30,30 +30,25 @@ sums over the columns (see `steps.py`).
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from ssmppl.codegen.kernels.kalman.square_root import (
-    LOG_2PI,
     NOT_COVARIANCE,
     NOT_FINITE,
     OK,
     SINGULAR,
     at,
-    columns_of,
-    noise_columns,
+    begin_roots,
+    measure_step,
     nonzeros,
-    predict_root,
-    reflect_columns,
+    predict_step,
     rests,
+    roots_of,
     same,
     square_columns,
-    square_root,
-    turn,
-    update_root,
+    update_step,
 )
-from ssmppl.codegen.kernels.kalman.steps import copy, fill
+from ssmppl.codegen.kernels.kalman.steps import add_known, copy, fill, innovate, log_density
 from ssmppl.codegen.kernels.math.flags import exact
 
 # Which adjoints are asked for, in the order of `Matrices`.
@@ -87,103 +82,41 @@ def filter_forward(model, start, y, seen, x, kept, z, roots, log_increment):
         and model.C.shape[0] == 1
         and model.R.shape[0] == 1
     )
-    settled, k, rank, count_a, count_c = False, 0, 0, 0, 0
-    root, full_root, last = np.empty((n, n)), np.empty((n, n)), np.zeros((n, n))
-    r_root, noise, q_noise = np.empty((k_all, k_all)), np.empty((k_all, k_all)), np.empty((n, n))
-    both, array = np.empty((2 * n, n)), np.empty((k_all + n, k_all + n))
-    before, dots, place = np.empty((n, columns)), np.empty(max(n, k_all)), np.empty(k_all, np.int64)
-    where_a, where_c = np.empty((n * n, 2), np.int64), np.empty((k_all * n, 2), np.int64)
+    settled, s = False, roots_of(n, k_all)
+    before, last = np.empty((n, columns)), np.zeros((n, n))
     log_increment[:] = -np.inf
-    if not square_root(model.P, full_root):
+    if not begin_roots(model.P, s):
         return NOT_COVARIANCE, 0
-    turn(full_root, root)
-    reflect_columns(root, n, n, dots)
     copy(start, before)
     for t in range(n_steps):
-        a, c = model.A[at(t, model.A.shape[0])], model.C[at(t, model.C.shape[0])]
+        c, d = model.C[at(t, model.C.shape[0])], model.d[at(t, model.d.shape[0])]
         alike = t > 0 and same(seen[t], seen[t - 1])
         settled = settled and alike
-        if t > 0:
-            if t == 1 or model.A.shape[0] > 1:
-                count_a = nonzeros(a, where_a)
-            add_known(a, where_a, count_a, x[t - 1], model.b[at(t, model.b.shape[0])], before)
         if not settled:
-            if t > 0:
-                if t == 1 or model.Q.shape[0] > 1:
-                    if not square_root(model.Q[at(t, model.Q.shape[0])], full_root):
-                        return NOT_COVARIANCE, t
-                    rank = columns_of(full_root, q_noise)
-                predict_root(a, where_a, count_a, q_noise, rank, root, both, dots)
-            if t == 0 or model.R.shape[0] > 1:
-                if not square_root(model.R[at(t, model.R.shape[0])], r_root):
-                    return NOT_COVARIANCE, t
-            if not alike or model.R.shape[0] > 1:
-                k = noise_columns(r_root, seen[t], place, noise, dots)
-            if t == 0 or model.C.shape[0] > 1:
-                count_c = nonzeros(c, where_c)
-            update_root(c, where_c, count_c, place, noise, k, root, array)
-            for i in range(n):
-                for j in range(n):
-                    root[i, j] = array[k + i, k + j]
+            if t > 0 and not predict_step(model.A, model.Q, t, s):
+                return NOT_COVARIANCE, t
+            if not measure_step(model.C, model.R, t, seen[t], alike, s):
+                return NOT_COVARIANCE, t
+            update_step(c, s)
             if constant:
-                settled = rests(root, last) and alike
+                settled = rests(s.root, last) and alike
+        if t > 0:
+            a, b = model.A[at(t, model.A.shape[0])], model.b[at(t, model.b.shape[0])]
+            add_known(a, s.a, s.counts[0], x[t - 1], b, before)
+        k = s.counts[3]
         for i in range(k):
             for j in range(k + n):
-                kept[t, i, j] = array[i, j]
+                kept[t, i, j] = s.array[i, j]
         if roots.shape[0] > 0:
-            copy(root, roots[t])
-        d = model.d[at(t, model.d.shape[0])]
-        increment = innovate(c, where_c, count_c, d, y[t], place, k, before, kept[t], z[t], x[t])
+            copy(s.root, roots[t])
+        innovate(c, s.c, s.counts[1], d, y[t], s.place, k, before, s.array, z[t], x[t])
+        increment = log_density(s.array, z[t], k)
         if increment == np.inf:
             return SINGULAR, t
         if not abs(increment) < np.inf:
             return NOT_FINITE, t
         log_increment[t] = increment
     return OK, n_steps
-
-
-@exact
-def add_known(a, where, count, x, b, out):
-    """out (n, F) <- a x, and b more in column 0, from the nonzero entries of a."""
-    fill(out, 0.0)
-    for i in range(b.size):
-        out[i, 0] = b[i]
-    for e in range(count):
-        factor, row, into = a[where[e, 0], where[e, 1]], x[where[e, 1]], out[where[e, 0]]
-        for f in range(row.size):
-            into[f] += factor * row[f]
-
-
-@exact
-def innovate(c, where, count, d, y, place, k, x, array, z, filtered):
-    """z (K, F), first k rows <- S^-1/2 (y - C x - d), -S^-1/2 C x in the further columns; filtered
-    <- the mean given these. Returns the log density of column 0, inf where S is singular."""
-    columns = x.shape[1]
-    for p in range(y.size):
-        if place[p] >= 0:
-            z[place[p], 0] = y[p] - d[p]
-            for f in range(1, columns):
-                z[place[p], f] = 0.0
-    for e in range(count):
-        row = place[where[e, 0]]
-        if row >= 0:
-            factor = c[where[e, 0], where[e, 1]]
-            for f in range(columns):
-                z[row, f] -= factor * x[where[e, 1], f]
-    copy(x, filtered)
-    total = -0.5 * k * LOG_2PI
-    for i in range(k):
-        if array[i, i] == 0.0:
-            return np.inf
-        for f in range(columns):
-            for j in range(i):
-                z[i, f] -= array[j, i] * z[j, f]
-            z[i, f] /= array[i, i]
-        for a in range(filtered.shape[0]):
-            for f in range(columns):
-                filtered[a, f] += array[i, k + a] * z[i, f]
-        total -= math.log(abs(array[i, i])) + 0.5 * z[i, 0] * z[i, 0]
-    return total
 
 
 @exact

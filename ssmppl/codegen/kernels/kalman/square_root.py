@@ -30,6 +30,7 @@ with a first axis of length 1 instead of T. Nonzero entries of a matrix (n, m) a
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -356,6 +357,91 @@ def update_root(c, where, count, place, noise, k, root, array):
             column[i] = 0.0
 
 
+class Roots(NamedTuple):
+    """What the roots of a filter go on by, D states and K components of y.
+
+    root (D, D): transposed root of what is known of x. array (K + D, K + D): of `update_root`.
+    a, c : `where` of A and C. state_noise (D, D): transposed root of Q; noise (K, K) and place
+    (K,): of `noise_columns`. counts : of a, of c, rank of Q, how many components were measured.
+    full, r_root, both, dots : scratch, but that r_root keeps a root of R.
+    """
+
+    root: np.ndarray
+    array: np.ndarray
+    a: np.ndarray
+    c: np.ndarray
+    state_noise: np.ndarray
+    noise: np.ndarray
+    place: np.ndarray
+    counts: np.ndarray
+    full: np.ndarray
+    r_root: np.ndarray
+    both: np.ndarray
+    dots: np.ndarray
+
+
+@exact
+def roots_of(n, k_all):
+    """Room for them."""
+    return Roots(
+        np.empty((n, n)), np.empty((k_all + n, k_all + n)), np.empty((n * n, 2), np.int64),
+        np.empty((k_all * n, 2), np.int64), np.empty((n, n)), np.empty((k_all, k_all)),
+        np.empty(k_all, np.int64), np.zeros(4, np.int64), np.empty((n, n)),
+        np.empty((k_all, k_all)), np.empty((2 * n, n)), np.empty(max(n, k_all)),
+    )  # fmt: skip
+
+
+@exact
+def begin_roots(P, s):
+    """The root of x_1; False where P is no covariance."""
+    if not square_root(P, s.full):
+        return False
+    turn(s.full, s.root)
+    reflect_columns(s.root, s.root.shape[0], s.root.shape[0], s.dots)
+    return True
+
+
+@exact
+def predict_step(A, Q, t, s):
+    """The root of x_t from that of x_{t-1}; False where Q is no covariance. A and Q are looked at
+    anew where they change; t > 0."""
+    if t == 1 or A.shape[0] > 1:
+        s.counts[0] = nonzeros(A[at(t, A.shape[0])], s.a)
+    if t == 1 or Q.shape[0] > 1:
+        if not square_root(Q[at(t, Q.shape[0])], s.full):
+            return False
+        s.counts[2] = columns_of(s.full, s.state_noise)
+    a = A[at(t, A.shape[0])]
+    predict_root(a, s.a, s.counts[0], s.state_noise, s.counts[2], s.root, s.both, s.dots)
+    return True
+
+
+@exact
+def measure_step(C, R, t, seen, alike, s):
+    """What of C and R the update of step t takes; False where R is no covariance.
+
+    alike : whether the same components were measured as in the step before.
+    """
+    if t == 0 or C.shape[0] > 1:
+        s.counts[1] = nonzeros(C[at(t, C.shape[0])], s.c)
+    if t == 0 or R.shape[0] > 1:
+        if not square_root(R[at(t, R.shape[0])], s.r_root):
+            return False
+    if not alike or R.shape[0] > 1:
+        s.counts[3] = noise_columns(s.r_root, seen, s.place, s.noise, s.dots)
+    return True
+
+
+@exact
+def update_step(c, s):
+    """The root of x_t given y_t, and the array; after `measure_step`."""
+    k = s.counts[3]
+    update_root(c, s.c, s.counts[1], s.place, s.noise, k, s.root, s.array)
+    for i in range(s.root.shape[0]):
+        for j in range(s.root.shape[0]):
+            s.root[i, j] = s.array[k + i, k + j]
+
+
 @exact
 def learn(array, k, residual, seen, mean, z):
     """mean <- that given the seen components of y; (log density, smallest |S^1/2_ii|).
@@ -442,57 +528,40 @@ def kalman_filter(
     n_steps, n, k_all = y.shape[0], m.size, y.shape[1]
     moments = mean.shape[0] > 0
     constant = A.shape[0] == 1 and Q.shape[0] == 1 and C.shape[0] == 1 and R.shape[0] == 1
-    settled, k, rank, count_a, count_c = False, 0, 0, 0, 0
-    x, root, full_root = m.copy(), np.empty((n, n)), np.empty((n, n))
-    r_root, noise, q_noise = np.empty((k_all, k_all)), np.empty((k_all, k_all)), np.empty((n, n))
-    both, array = np.empty((2 * n, n)), np.empty((k_all + n, k_all + n))
-    last, before, predicted = np.zeros((n, n)), np.empty(n), np.empty(k_all)
-    residual, z, dots = np.empty(k_all), np.empty(k_all), np.empty(max(n, k_all))
-    where_a, where_c = np.empty((n * n, 2), np.int64), np.empty((k_all * n, 2), np.int64)
-    place = np.empty(k_all, np.int64)
+    settled, s = False, roots_of(n, k_all)
+    x, before, last = m.copy(), np.empty(n), np.zeros((n, n))
+    predicted, residual, z = np.empty(k_all), np.empty(k_all), np.empty(k_all)
     log_increment[:] = -np.inf
-    if not square_root(P, full_root):
+    if not begin_roots(P, s):
         return NOT_COVARIANCE, 0
-    turn(full_root, root)
-    reflect_columns(root, n, n, dots)
     for t in range(n_steps):
-        a, c = A[at(t, A.shape[0])], C[at(t, C.shape[0])]
+        c = C[at(t, C.shape[0])]
         alike = t > 0 and same(seen[t], seen[t - 1])
         settled = settled and alike
-        if t > 0:
-            if t == 1 or A.shape[0] > 1:
-                count_a = nonzeros(a, where_a)
-            before[:] = x
-            affine_known(a, where_a, count_a, before, b[at(t, b.shape[0])], x)
         if not settled:
-            if t > 0:
-                if t == 1 or Q.shape[0] > 1:
-                    if not square_root(Q[at(t, Q.shape[0])], full_root):
-                        return NOT_COVARIANCE, t
-                    rank = columns_of(full_root, q_noise)
-                predict_root(a, where_a, count_a, q_noise, rank, root, both, dots)
-            if t == 0 or R.shape[0] > 1:
-                if not square_root(R[at(t, R.shape[0])], r_root):
-                    return NOT_COVARIANCE, t
-            if not alike or R.shape[0] > 1:
-                k = noise_columns(r_root, seen[t], place, noise, dots)
-            if t == 0 or C.shape[0] > 1:
-                count_c = nonzeros(c, where_c)
-        affine_known(c, where_c, count_c, x, d[at(t, d.shape[0])], predicted)
+            if t > 0 and not predict_step(A, Q, t, s):
+                return NOT_COVARIANCE, t
+            if not measure_step(C, R, t, seen[t], alike, s):
+                return NOT_COVARIANCE, t
+        if t > 0:
+            before[:] = x
+            b_t = b[at(t, b.shape[0])]
+            affine_known(A[at(t, A.shape[0])], s.a, s.counts[0], before, b_t, x)
+        affine_known(c, s.c, s.counts[1], x, d[at(t, d.shape[0])], predicted)
         if moments:
             mean_predicted[t], observation_mean[t] = x, predicted
             if settled:
                 covariance_predicted[t] = covariance_predicted[t - 1]
                 observation_covariance[t] = observation_covariance[t - 1]
             else:
-                square_columns(root, covariance_predicted[t])
+                square_columns(s.root, covariance_predicted[t])
                 observation_covariance[t] = R[at(t, R.shape[0])]
-                add_spread(c, root, observation_covariance[t])
+                add_spread(c, s.root, observation_covariance[t])
         for j in range(k_all):
             residual[j] = y[t, j] - predicted[j]
         if not settled:
-            update_root(c, where_c, count_c, place, noise, k, root, array)
-        increment, least = learn(array, k, residual, seen[t], x, z)
+            update_step(c, s)
+        increment, least = learn(s.array, s.counts[3], residual, seen[t], x, z)
         if least == 0.0:
             return SINGULAR, t
         if not abs(increment) < np.inf:
@@ -500,15 +569,10 @@ def kalman_filter(
         log_increment[t] = increment
         if moments:
             mean[t] = x
-        if settled:
-            if moments:
+            if settled:
                 covariance[t] = covariance[t - 1]
-            continue
-        for i in range(n):
-            for j in range(n):
-                root[i, j] = array[k + i, k + j]
-        if moments:
-            square_columns(root, covariance[t])
-        if constant:
-            settled = rests(root, last) and alike
+            else:
+                square_columns(s.root, covariance[t])
+        if constant and not settled:
+            settled = rests(s.root, last) and alike
     return OK, n_steps
