@@ -15,6 +15,7 @@ import numpy as np
 
 from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
@@ -23,6 +24,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.updates.draw_update import draw
+from ssmppl.language.model.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,17 @@ class GibbsUpdates:
 
 
 def plan_updates(problem: Problem, fixed: Mapping[str, np.ndarray]) -> tuple[Update, ...]:
-    """The updates of the parameters that are not fixed."""
-    return tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
+    """The updates of the parameters that are not fixed; derived once."""
+    kept, key = _plans(problem.trace), (frozenset(fixed), problem.program.missing)
+    if key not in kept:
+        kept[key] = tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
+    return kept[key]
+
+
+@once_per_trace
+def _plans(trace: Trace) -> dict[tuple[frozenset[str], Missing], tuple[Update, ...]]:
+    """The updates of a model that were derived, by what is fixed and what may be missing."""
+    return {}
 
 
 class ThetaValues(Mapping[Expr, float]):
