@@ -92,6 +92,7 @@ def _compiled(name):
 
 
 STATEMENTS = [
+    "for i in range(3): a += 1.0",
     "while a < 1.0: a = 2.0", "x = [a]", "states[0, 0], b = 1.0, 2.0", "b = a ** 2.0", "b = c.real",
     "for i in range(1, 3): a = 1.0", "b = unknown", "b = a < 1.0 < 2.0", "other(states)",
 ]  # fmt: skip

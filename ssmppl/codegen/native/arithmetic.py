@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from ssmppl.errors import SSMError
 
 FLOAT, BOOLEAN, INTEGER, ROW, PLANE, STREAM = "float", "boolean", "integer", "row", "plane", "rng"
+FLAG_ROW = "row of flags"
 COMPARISONS = {ast.Lt: "olt", ast.LtE: "ole", ast.Gt: "ogt", ast.GtE: "oge", ast.Eq: "oeq",
                ast.NotEq: "une"}  # fmt: skip
 ARITHMETIC = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
@@ -32,7 +33,8 @@ class Arithmetic:
     """A function while it is written: its lines, its names, the values of its expressions.
 
     name : of the function. flags : of its floating-point operations. calls : (name, arity, draws)
-    of the scalar functions that it calls. in_loop : whether the line is one of a particle's.
+    of the scalar functions that it calls. in_loop : whether the line is one of a particle's, or of
+    a step's where over_steps.
     """
 
     def __init__(self, name: str, flags: str):
@@ -41,7 +43,7 @@ class Arithmetic:
         self.names: dict[str, Value] = {"inf": number(float("inf")), "nan": number(float("nan"))}
         self.count = 0
         self.calls: set[tuple[str, int, bool]] = set()
-        self.in_loop = False
+        self.in_loop = self.over_steps = False
 
     def value(self, node: ast.expr) -> Value:
         """The value of an expression, after the lines that compute it."""
@@ -138,6 +140,9 @@ class Arithmetic:
             offset = self.let(f"mul i64 {first.text}, {array.length}")
             at = self.let(f"getelementptr double, ptr {array.text}, i64 {offset}")
             return Value(ROW, at, array.length)
+        if array.kind == FLAG_ROW:
+            at = self.let(f"getelementptr i8, ptr {array.text}, i64 {self.value(node.slice).text}")
+            return Value(BOOLEAN, self.let(f"icmp ne i8 {self.let(f'load i8, ptr {at}')}, 0"))
         return Value(FLOAT, self.load(self.element(node)))
 
     def element(self, node: ast.expr) -> str:
@@ -205,7 +210,7 @@ class Arithmetic:
 
     @property
     def _group(self) -> str:
-        return ", !llvm.access.group !GROUP" if self.in_loop else ""
+        return ", !llvm.access.group !GROUP" if self.in_loop and not self.over_steps else ""
 
     def let(self, text: str) -> str:
         """A new name for what an instruction gives."""

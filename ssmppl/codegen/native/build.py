@@ -39,8 +39,11 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
 def _load(key: str, text: str) -> Mapping[str, int]:
     names, code = None, folder.kept_bytes(key, ".o")
     if code is None:
-        code, names = _compiled(text)
-        folder.keep_bytes(key, ".o", code)
+        with folder.one_process(key):
+            code = folder.kept_bytes(key, ".o")
+            if code is None:
+                code, names = _compiled(text)
+                folder.keep_bytes(key, ".o", code)
     if names is None:
         names = [line[4 : line.index("(")] for line in text.splitlines() if line.startswith("def ")]
     module = llvm.parse_assembly(f'target triple = "{llvm.get_process_triple()}"\n')

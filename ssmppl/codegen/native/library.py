@@ -35,8 +35,9 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
     file = f"lib_{name}_{arity}"
     text = folder.kept(file, ".ll")
     if text is None:
-        text = _made(name, arity, draws)
-        folder.keep(file, ".ll", text)
+        with folder.one_process(file):
+            text = folder.kept(file, ".ll") or _made(name, arity, draws)
+            folder.keep(file, ".ll", text)
     return text
 
 
