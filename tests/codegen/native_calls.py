@@ -1,7 +1,6 @@
 """Functions of a random or given model, called as native code and as plain Python."""
 
 import ctypes
-import re
 from functools import partial
 
 import numpy as np
@@ -12,8 +11,6 @@ from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.translate import PLANES
 from tests.codegen.harness import PARTICLES, ROOM, STEPS, plain_module
-
-MATRIX = re.compile(r"\b(cholesky|inverse|logdet|det)\(\(")  # what is left to Numba
 
 
 def called(address, names, values):

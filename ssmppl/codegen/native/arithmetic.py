@@ -6,10 +6,12 @@ import ast
 import struct
 from dataclasses import dataclass
 
+from ssmppl.codegen.native import matrices
 from ssmppl.errors import SSMError
+from ssmppl.expressions.operations import MATRIX_OPS
 
 FLOAT, BOOLEAN, INTEGER, ROW, PLANE, STREAM = "float", "boolean", "integer", "row", "plane", "rng"
-FLAG_ROW = "row of flags"
+FLAG_ROW, MATRIX = "row of flags", "matrix"
 COMPARISONS = {ast.Lt: "olt", ast.LtE: "ole", ast.Gt: "ogt", ast.GtE: "oge", ast.Eq: "oeq",
                ast.NotEq: "une"}  # fmt: skip
 ARITHMETIC = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
@@ -22,11 +24,13 @@ class Untranslatable(SSMError):
 
 @dataclass(frozen=True)
 class Value:
-    """A typed value: its kind and the text of the operand; the length where it is an array."""
+    """A typed value: its kind and the text of the operand; the length where it is an array, the
+    entries where it is a matrix."""
 
     kind: str
     text: str
     length: str = ""
+    entries: tuple[tuple[str, ...], ...] = ()
 
 
 class Arithmetic:
@@ -135,6 +139,9 @@ class Arithmetic:
             first = self.value(node.slice.lower)
             at = self.let(f"getelementptr double, ptr {array.text}, i64 {first.text}")
             return Value(ROW, at)
+        if array.kind == MATRIX:
+            i, j = ast.literal_eval(node.slice)
+            return Value(FLOAT, array.entries[i][j])
         if array.kind == PLANE and not isinstance(node.slice, ast.Tuple):
             first = self.value(node.slice)
             offset = self.let(f"mul i64 {first.text}, {array.length}")
@@ -164,6 +171,8 @@ class Arithmetic:
         if not isinstance(node.func, ast.Name) or node.keywords:
             raise self.unknown(node)
         name = node.func.id
+        if name in MATRIX_OPS:
+            return self._matrix(name, node)
         values = [self.value(a) for a in node.args]
         if name in ("max", "min") and all(v.kind == INTEGER for v in values):
             a, b = values
@@ -179,6 +188,27 @@ class Arithmetic:
         if stream:
             numbers = [f"ptr {values[0].text}", f"i64 {values[0].length}", *numbers]
         return Value(FLOAT, self.let(f"call double @lib_{name}({', '.join(numbers)})"))
+
+    def _matrix(self, name: str, node: ast.Call) -> Value:
+        """An operation on a matrix, whose entries stand in a tuple, row by row."""
+        given, size = node.args
+        if not isinstance(given, ast.Tuple) or not isinstance(size, ast.Constant):
+            raise self.unknown(node)
+        n = int(str(size.value))
+        if n > matrices.LARGEST[name]:
+            raise self.unknown(node)
+        numbers = [self.float(self.value(e)) for e in given.elts]
+        rows = [numbers[n * i : n * (i + 1)] for i in range(n)]
+        if name == "logdet":
+            return Value(FLOAT, matrices.logdet(self.let, rows, self._log))
+        if name == "det":
+            return Value(FLOAT, matrices.det(self.let, rows))
+        made = {"cholesky": matrices.cholesky, "inverse": matrices.inverse}[name](self.let, rows)
+        return Value(MATRIX, "", entries=tuple(map(tuple, made)))
+
+    def _log(self, number: str) -> str:
+        self.calls.add(("log", 1, False))
+        return self.let(f"call double @lib_log(double {number})")
 
     # -- small things
     def float(self, v: Value) -> str:
