@@ -1,6 +1,7 @@
 """Native code does what the text says: every function of the corpus, and the small language."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -305,6 +306,44 @@ def test_operations_on_matrices(operation, n):
         else:
             found = values["c"][: np.size(expected)].reshape(np.shape(expected))
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14, err_msg=str(a))
+
+
+TABLE = np.linspace(0.0, 1.0, 5)
+
+
+@ssm.primitive
+def bent(v, strength):
+    return TABLE[2] * v if v > 1.0 else strength * math.tanh(v) + v**2.5
+
+
+@ssm.primitive
+def raising(v):
+    if v > 10.0:
+        raise ValueError("too large")
+    return v
+
+
+@ssm.primitive
+def with_room(v):
+    room = np.zeros(int(abs(v)) + 3)
+    room[1] = v
+    return room.sum()
+
+
+def test_primitives_are_taken_in():
+    """With the constants that they read, and what they call of the mathematical library."""
+    text = f"@exact\ndef run(theta, c):\n    c[0] = {bent.name}(theta[0], theta[1])\n"
+    address = addresses("primitive", text)["run"]
+    for v in (-0.5, 0.7, 3.0):
+        values = {"theta": np.array([v, 2.0]), "c": np.zeros(1)}
+        called(address, ["theta", "c"], values)
+        np.testing.assert_allclose(values["c"][0], bent.compiled(v, 2.0), rtol=1e-15)
+
+
+@pytest.mark.parametrize("primitive", [raising, with_room], ids=["raises", "allocates"])
+def test_primitives_that_need_python_are_left_to_numba(primitive):
+    with pytest.raises(Untranslatable, match=primitive.name):
+        addresses("primitive", f"@exact\ndef run(c):\n    c[0] = {primitive.name}(c[0])\n")
 
 
 def test_large_matrices_are_left_to_numba():
