@@ -67,9 +67,9 @@ def _compiled(dispatcher: Any, name: str, arity: int, draws: bool = False) -> An
 
 def _of_primitive(name: str, arity: int) -> str:
     made: Any = REGISTRY[name]
-    options = {k: v for k, v in made.targetoptions.items() if k != "nopython"}
-    bare = numba.njit(**options, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-    compiled = _compiled(bare(made.py_func), name, arity)
+    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {k: v for k, v in made.targetoptions.items() if k != "nopython"}
+    compiled = _compiled(numba.njit(**options)(made.py_func), name, arity)
     text: str = compiled.library.get_llvm_str()
     inner = re.escape(_quoted(compiled.fndesc.llvm_func_name))
     (body,) = re.findall(rf"^define [^\n]*@{inner}\(.+?^}}", text, re.MULTILINE | re.DOTALL)
