@@ -6,6 +6,8 @@ import re
 import stat
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -201,6 +203,35 @@ def test_two_processes_at_once_then_a_third(tmp_path):
         assert finish(start(tmp_path))[2:] == both[0][2:]
         restored = path.read_text() == text
         assert restored
+
+
+def test_what_another_makes_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("SSMPPL_CACHE", str(tmp_path))
+    order, begun = [], threading.Event()
+
+    def first():
+        with folder.one_process("thing"):
+            begun.set()
+            time.sleep(0.2)
+            order.append("made")
+
+    other = threading.Thread(target=first)
+    other.start()
+    begun.wait()
+    with folder.one_process("thing"):
+        order.append("looked for")
+    other.join()
+    assert order == ["made", "looked for"]
+    assert not list(folder.cache_folder().iterdir())
+
+
+def test_it_is_not_waited_for_for_ever(tmp_path, monkeypatch):
+    monkeypatch.setenv("SSMPPL_CACHE", str(tmp_path))
+    monkeypatch.setattr(folder, "PATIENCE", 0.1)
+    with folder.one_process("thing"):
+        begun = time.monotonic()
+        with folder.one_process("thing"):
+            assert 0.1 <= time.monotonic() - begun < 30.0
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")

@@ -33,6 +33,7 @@ from typing import Any, cast
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.compiler import CompileResult
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
@@ -147,17 +148,23 @@ def one_process(name: str) -> Iterator[None]:
 
 
 def _wait_for(handle: int) -> None:
+    if _locked(handle):
+        return
     until = time.monotonic() + PATIENCE
-    while True:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            if time.monotonic() > until:
-                return
+    with event.trigger_event("numba:compile"):  # a notice is due as if we compiled ourselves
+        while not _locked(handle) and time.monotonic() < until:
             time.sleep(0.02)
-        except OSError:
-            return
+
+
+def _locked(handle: int) -> bool:
+    """Whether we have the lock, or nobody can have it."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def written(file: str, text: str) -> Path | None:
