@@ -211,11 +211,11 @@ class Maximiser:
         self, theta: np.ndarray, paths: Sequence[np.ndarray], weights: Sequence[np.ndarray]
     ) -> np.ndarray:
         """The C_i averaged over weighted paths, (M, T, D) and (M,) of each experiment."""
-        total = self.q.prior(theta)
+        total, theta = self.q.prior(theta), np.ascontiguousarray(theta, dtype=float)
         part = np.empty(len(total))
         run = self.module.weighted_statistics
         for e, some, w in zip(self.problem.experiments, paths, weights, strict=True):
-            run(theta, e.y, e.seen, e.u, some, w, None, part, total)
+            run(theta, e.y, e.seen, e.u, np.ascontiguousarray(some), w, None, part, total)
         return total
 
     def from_paths(
