@@ -131,6 +131,7 @@ class Section:
     fits : what is computed once per particle and kept in the rows of `fits`.
     roles : the functions, and the arguments of each.
     further : numbers that its kernel reads behind those that all have, see `ModuleText.algorithm`.
+    per_step : whether it has `prepare` and `step`, which fill `c` and `s`.
     """
 
     layout: Layout
@@ -139,10 +140,15 @@ class Section:
     s: dict[Expr, int] = field(default_factory=dict)
     fits: dict[Expr, int] = field(default_factory=dict)
     functions: list[str] = field(default_factory=list)
-    roles: dict[str, str] = field(default_factory=lambda: dict(OUTER))
+    roles: dict[str, str] = field(default_factory=dict)
     normals: int = 0
     uniforms: int = 0
     further: tuple[int, ...] = ()
+    per_step: bool = True
+
+    def __post_init__(self) -> None:
+        if self.per_step:
+            self.roles = OUTER | self.roles
 
     def name(self, role: str) -> str:
         """Name of the function of this role."""
@@ -268,6 +274,8 @@ class Section:
 
     def finish(self) -> str:
         """The functions with `prepare` and `step`, which compute `c` and `s`."""
+        if not self.per_step:
+            return "\n\n".join(self.functions)
         step = self._straight("step", OUTER["step"], "What depends on theta and time.", self.s, "s")
         prepare = self._straight(
             "prepare", OUTER["prepare"], "What depends on theta alone.", self.c, "c"
@@ -338,7 +346,7 @@ class ModuleText:
     """
 
     def __init__(self, layout: Layout):
-        self.n_states = len(layout.trace.state_symbols)
+        self.layout, self.n_states = layout, len(layout.trace.state_symbols)
         self.parts: list[str] = []
         self.algorithms: dict[str, Algorithm] = {}
         self.texts: dict[int, str] = {}
@@ -348,10 +356,6 @@ class ModuleText:
         """A section's own functions, under a title."""
         self.texts[id(section)] = section.finish()
         self.parts += [heading(title), self.texts[id(section)]]
-
-    def add_function(self, title: str, text: str) -> None:
-        """A single entry point."""
-        self.parts += [heading(title), text.replace("@exact", "@entry", 1)]
 
     def algorithm(
         self, function: Callable[..., Any], name: str, section: Section, decorator: str,

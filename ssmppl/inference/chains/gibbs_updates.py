@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from types import ModuleType
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
 from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
@@ -35,7 +35,7 @@ class GibbsUpdates:
     updates: tuple[Update, ...]
 
     @once_property
-    def module(self) -> ModuleType:
+    def module(self) -> Loaded:
         return compile_updates(self.problem.trace, self.updates)
 
     @cached_property

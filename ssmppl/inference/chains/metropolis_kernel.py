@@ -101,7 +101,7 @@ class Coordinates:
                 theta[i] = 1.0 / value
                 log_jacobian -= 2.0 * np.log(abs(value))
         program = space.problem.program
-        log_jacobian += program.entry("constrain")(z, self.by_z, theta)
+        log_jacobian += program.entry("constrain")(theta, z, self.by_z)
         log_density = program.entry("log_prior")(theta) + log_jacobian
         if not np.all(np.isfinite(theta)) or not log_density < np.inf:
             return theta, -np.inf
