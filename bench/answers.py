@@ -5,7 +5,8 @@
 Each question is asked in a process of its own. There every program answers once, which compiles or
 loads what is compiled; then K times in turns, each time with another seed, and medians are told:
 seconds on the clock and, in brackets, of the processor, which tell more where the machine does
-other work. A first answer of more than a minute of the processor counts, and is the only one.
+other work. A first answer of more than a minute of the processor counts, and is the only one; of
+`--repeats 0` all first ones count.
 Beside the times stand the last answers, the goal, and what is wrong with ssmppl's: each answer is
 held against an exact one or another program's (`bench/questions/`), and warnings count.
 
@@ -218,7 +219,10 @@ def kept() -> dict[str, list[dict[str, str]]]:
     found: dict[str, list[dict[str, str]]] = {}
     if TABLE.exists():
         with TABLE.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != HEADER:
+                return {}  # of another version
+            for row in reader:
                 found.setdefault(row["key"], []).append(row)
     return found
 
@@ -240,32 +244,44 @@ def packages() -> list[str]:
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.answers")
     parser.add_argument("question", nargs="*", help=f"of: {', '.join(QUESTIONS)}; all unless given")
-    parser.add_argument("--repeats", type=int, default=3, help="answers that count (3)")
+    parser.add_argument(
+        "--repeats",
+        type=int,
+        default=3,
+        help="answers that count (3); of 0 the first one of the process does",
+    )
     parser.add_argument("--limit", type=float, default=1200.0, help="seconds for a question (1200)")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
     unknown = [key for key in given.question if key not in QUESTIONS]
-    if unknown or given.repeats < 1:
-        parser.error(f"no such question: {', '.join(unknown)}" if unknown else "--repeats below 1")
+    if unknown or given.repeats < 0:
+        parser.error(f"no such question: {', '.join(unknown)}" if unknown else "--repeats below 0")
     chosen = [QUESTIONS[key] for key in given.question or QUESTIONS]
     if given.here:
         for question in chosen:
             ask(question, given.repeats)
         return
-    rows = kept()
+    rows = {}
     for question in chosen:
         print(f"== {question.key}", file=sys.stderr, flush=True)
         rows[question.key] = rows_of(question, asked(question, given.repeats, given.limit))
+        keep(kept() | {question.key: rows[question.key]})
+    print(_about(), markdown([row for found in rows.values() for row in found]), sep="\n\n")
+
+
+def keep(rows: Mapping[str, list[dict[str, str]]]) -> None:
+    """Write the figures and the page, in the order of the questions."""
     ordered = [row for key in QUESTIONS for row in rows.get(key, ())]
     with TABLE.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, HEADER, lineterminator="\n")
         writer.writeheader()
         writer.writerows(ordered)
     title = "# Time to an answer\n\nWritten by `python -m bench.answers`."
-    about = f"{machine()}. {versions(*packages())}."
-    page = "\n\n".join([title, about, markdown(ordered)]) + "\n"
-    PAGE.write_text(page, encoding="utf-8")
-    print(about, markdown([row for q in chosen for row in rows[q.key]]), sep="\n\n")
+    PAGE.write_text("\n\n".join([title, _about(), markdown(ordered)]) + "\n", encoding="utf-8")
+
+
+def _about() -> str:
+    return f"{machine()}. {versions(*packages())}."
 
 
 if __name__ == "__main__":
