@@ -177,8 +177,8 @@ def diagnosis() -> Run:
     def run(seed: int) -> Answer:
         report = ssm.diagnose(made, data, seed=seed, progress=False)
         remarks = {"verdict": report.verdict, "chosen": ", ".join(report.chosen) or "none"}
-        if report.left_out:
-            remarks["left out"] = ", ".join(map(str, report.left_out))
+        if len(report.left_out):
+            remarks["left out"] = ", ".join(map(str, report.left_out.iloc[:, 0]))
         return Answer({}, remarks)
 
     return run
