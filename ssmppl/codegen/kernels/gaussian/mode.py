@@ -261,7 +261,7 @@ def eliminate_all(
 
 @exact
 def gaussian_mode(
-    prepare, step, begin, follow, bend_initial, bend, look, sizes, theta, y, seen, u, r,
+    prepare, step, follow_step, eliminate_all, sizes, theta, y, seen, u, r,
     x, e, aim, gain, root, jacobian, spread,
 ):  # fmt: skip
     """(Laplace's log-likelihood less its constant, nats left to gain), by Newton's method from e.
@@ -282,9 +282,7 @@ def gaussian_mode(
         step(theta, c, y, seen, u, t, s[t])
     aim[:] = 0.0
     gain[:] = 0.0
-    value = follow_step(
-        begin, follow, look, theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes
-    )
+    value = follow_step(theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes)
     if not value > -np.inf:
         return -np.inf, np.nan
     x[:] = x_new
@@ -292,15 +290,13 @@ def gaussian_mode(
     for _ in range(PASSES):
         curved = True
         log_det, left = eliminate_all(
-            bend_initial, bend, theta, c, s, True, r, x, e, slopes, aim, gain, root, jacobian,
-            spread,
-        )  # fmt: skip
+            theta, c, s, True, r, x, e, slopes, aim, gain, root, jacobian, spread
+        )
         if not left >= 0.0:
             curved = False
             log_det, left = eliminate_all(
-                bend_initial, bend, theta, c, s, False, r, x, e, slopes, aim, gain, root, jacobian,
-                spread,
-            )  # fmt: skip
+                theta, c, s, False, r, x, e, slopes, aim, gain, root, jacobian, spread
+            )
         if not left >= 0.0:
             return -np.inf, np.nan
         if last and curved:
@@ -309,9 +305,8 @@ def gaussian_mode(
         share, moved = 1.0, False
         for _ in range(HALVINGS):
             new = follow_step(
-                begin, follow, look, theta, c, s, share, x, e, aim, gain, r, x_new, e_new,
-                slopes_new,
-            )  # fmt: skip
+                theta, c, s, share, x, e, aim, gain, r, x_new, e_new, slopes_new
+            )
             if new >= value + ENOUGH * share * left - ROUNDING * abs(value):
                 moved = True
                 break

@@ -1,0 +1,157 @@
+"""The pilot by the Gaussian approximation: the mode of an approximate posterior, the covariance
+there, and how well the twisted filter knows the likelihood at it.
+
+The log posterior with Laplace's likelihood in place of the exact one (with the extended Kalman
+filter's, where Laplace's does not apply) has no noise, so that Newton's method climbs it in a few
+dozen evaluations. Its inverse Hessian at the mode is the covariance that random walks and
+independence proposals begin with. The result only starts and scales chains; nothing depends on its
+accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssmppl.codegen.modules.twisted import TwistedFilter
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.inference.gaussian.likelihood import (
+    APPROXIMATE,
+    ApproximateLikelihood,
+    laplace_approximation,
+)
+from ssmppl.inference.optimisation.newton import GOOD, climb, information_at
+from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
+from ssmppl.inference.preparation.pilot import Pilot, TunedParticles, finite_point, scale_of
+from ssmppl.inference.preparation.space import Space
+from ssmppl.inference.run.problem import Problem
+
+# Of the twisted filter: whole vectors of a processor, as N = 8 costs no more than 5.
+NUMBERS = (8, 16, 32, 64, 128, 256)
+# sd of log Z beyond which more particles pay: a run costs about the same from 8 to 32 of them, as
+# most of it is the guide, and at 0.4 the noise costs about a fifth of the draws.
+PRECISE = 0.4
+REPEATS = 40
+LEAST_EIGENVALUE = 1e-3  # of the information as correlations
+STARTS = 3  # climbs at most, until one comes to a top
+
+
+@dataclass(frozen=True)
+class GaussianPilot:
+    """kind : "laplace" or "extended". z (F,) : the mode. covariance (F, F) : inverse information
+    there. log_density : there, approximate. noise : (T, R') of each experiment's likeliest
+    trajectory there; None of the extended filter."""
+
+    kind: str
+    z: np.ndarray
+    covariance: np.ndarray
+    log_density: float
+    noise: tuple[np.ndarray, ...] | None
+
+    @property
+    def pilot(self) -> Pilot:
+        """As the starts of chains know it."""
+        return Pilot(self.z, np.sqrt(np.diagonal(self.covariance)), self.log_density)
+
+    def likelihood(self, problem: Problem) -> ApproximateLikelihood:
+        """The approximation, as a function of the parameters."""
+        return ApproximateLikelihood(problem, self.kind, self.noise)
+
+
+def approximation_kind(problem: Problem, asked: str = "auto") -> str | NotApplicable:
+    """ "laplace" where it applies, else "extended"; or why there is neither.
+
+    asked : the only one that will do.
+    """
+    laplace = laplace_approximation(problem)
+    if asked in APPROXIMATE:
+        found = laplace if asked == "laplace" else problem.program.gaussian
+        return found if isinstance(found, NotApplicable) else asked
+    if not isinstance(laplace, NotApplicable):
+        return "laplace"
+    found = problem.program.gaussian
+    return found if isinstance(found, NotApplicable) else "extended"
+
+
+def gaussian_pilot(space: Space, kind: str, seed: np.random.SeedSequence) -> GaussianPilot | None:
+    """The mode of the approximate posterior; None where the approximation comes to no number, or
+    its posterior to no mode."""
+    problem = space.problem
+    start = ApproximateLikelihood(problem, kind)
+    noise: list[tuple[np.ndarray, ...] | None] = [None]  # of the last point: where to begin
+
+    def log_density(z: np.ndarray) -> float:
+        theta, log_prior = space.parameters(z)
+        if log_prior == -np.inf:
+            return -np.inf
+        found = ApproximateLikelihood(problem, kind, noise[0]).at(theta)
+        if found.noise is not None:
+            noise[0] = found.noise
+        return found.log_likelihood + log_prior
+
+    z = space.z[space.positions]
+    rng = np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(8, 1)))
+    best = None
+    for _ in range(STARTS if len(z) else 1):
+        try:
+            top = climb(log_density, finite_point(z, log_density, rng))
+        except ArgumentError:
+            return None
+        if top is not None and (best is None or top.value > best.value):
+            best = top
+        if best is not None and best.distance < GOOD:
+            break
+        z, noise[0] = z + rng.standard_normal(len(z)), None
+    if best is None:
+        return None
+    covariance = _covariance(space, log_density, best.z)
+    if covariance is None:
+        return None
+    theta, log_prior = space.parameters(best.z)
+    found = start.at(theta)
+    return GaussianPilot(
+        kind, best.z, covariance, found.log_likelihood + log_prior, found.noise
+    )
+
+
+def _covariance(space: Space, log_density, z: np.ndarray) -> np.ndarray | None:  # type: ignore[no-untyped-def]
+    """(F, F) the inverse information at z, positive definite whatever the differences are."""
+    if not len(z):
+        return np.zeros((0, 0))
+    information = information_at(log_density, z)
+    diagonal = np.diagonal(information)
+    if not np.all(diagonal > 0.0):  # no mode, or one at an edge: the scale at least
+        scale = scale_of(z, log_density, space.on_the_line)
+        return np.diag(scale**2) if np.all(scale > 0.0) else None
+    scale = 1.0 / np.sqrt(diagonal)
+    if not np.all(np.isfinite(information)):
+        return np.diag(scale**2)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    root = scale[:, None] * vectors / np.sqrt(np.maximum(values, LEAST_EIGENVALUE))
+    return root @ root.T
+
+
+def tune_twisted(
+    problem: Problem, theta: np.ndarray, target: float, most: int = NUMBERS[-1]
+) -> TunedParticles | None:
+    """The fewest particles of the twisted filter by which log Z has at most the target's standard
+    deviation at theta; the best of those tried where none has; None where there is no filter, or
+    it comes to no number."""
+    if not isinstance(problem.program.twisted, TwistedFilter):
+        return None
+    best, seed = None, np.random.SeedSequence(20150)
+    for particles in (n for n in NUMBERS if n <= most):
+        settings = FilterSettings(particles, "twisted")
+        try:
+            log_z = repeated_estimates(problem, theta, settings, seed, range(REPEATS))
+        except SamplingError:
+            continue
+        if not np.all(np.isfinite(log_z)):
+            continue
+        sd = float(np.std(log_z, ddof=1))
+        if best is None or sd < best.sd:
+            best = TunedParticles(particles, sd)
+        if sd <= target:
+            break
+    return best
