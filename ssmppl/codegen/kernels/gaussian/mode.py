@@ -304,9 +304,7 @@ def gaussian_mode(
         last = left < ARRIVED
         share, moved = 1.0, False
         for _ in range(HALVINGS):
-            new = follow_step(
-                theta, c, s, share, x, e, aim, gain, r, x_new, e_new, slopes_new
-            )
+            new = follow_step(theta, c, s, share, x, e, aim, gain, r, x_new, e_new, slopes_new)
             if new >= value + ENOUGH * share * left - ROUNDING * abs(value):
                 moved = True
                 break
