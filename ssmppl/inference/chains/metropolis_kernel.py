@@ -373,7 +373,11 @@ def _positive_run(
         run = _run(kernel, theta, None, found, stream)
         if run is not None:
             return run
-    problem = kernel.coordinates.problem
+    return no_run(kernel.coordinates.problem)
+
+
+def no_run(problem: Problem) -> LikelihoodRun:
+    """In place of a run where every one has likelihood zero."""
     d = len(problem.trace.state_symbols)
     return LikelihoodRun(
         -np.inf,
@@ -408,6 +412,31 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
         stats["log_likelihood"].append(float(point.run.log_likelihood))
         stats["lp"].append(float(point.run.log_likelihood + point.log_density))
         stats["acceptance_rate"].append(accepted)
+    return state, Block.of(draws, stats)
+
+
+LONGEST_HELD = 1000  # thinned steps, after which a draw counts as another one at the same place
+
+
+def jump_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[WalkState, Block]:
+    """n distinct draws of the chain thinned to every `thin`-th step, with their holding times in
+    such steps; in the warmup n steps, as `metropolis_block`."""
+    if state.iteration < kernel.warmup:
+        return metropolis_block(kernel, state, n)
+    state = replace(state, generator=copy.deepcopy(state.generator), stream=state.stream.copy())
+    draws: dict[str, list[np.ndarray]] = {"theta": []}
+    stats: dict[str, list[float]] = {"lp": [], "holding": [], "acceptance_rate": []}
+    for _ in range(n):
+        point, held, accepted = state.point, 0, 0.0
+        while state.point is point and held < LONGEST_HELD:
+            for _ in range(kernel.thin):
+                state, rate = _iterate(kernel, state)
+                accepted += rate
+            held += 1
+        draws["theta"].append(point.theta)
+        stats["lp"].append(float(point.run.log_likelihood + point.log_density))
+        stats["holding"].append(float(held))
+        stats["acceptance_rate"].append(accepted / (held * kernel.thin))
     return state, Block.of(draws, stats)
 
 

@@ -49,6 +49,7 @@ from ssmppl.inference.chains.metropolis_kernel import (
     Proposal,
     RandomWalk,
     WalkAndIndependence,
+    WalkState,
     coordinates,
     local_derivatives,
     metropolis_block,
@@ -93,9 +94,9 @@ from ssmppl.inference.run.seeds import random_state
 GUIDE, TWISTED_COST = 2500.0, 15.0
 BEST_SD, FEWEST = 1.2, 10.0
 USUAL_EXACT = {1: 0.44, 2: 0.35}  # rates of acceptance by the first stage, which has no noise
-# Share of independence proposals, by how many of them are accepted: one is worth several steps of a
-# walk where they are, and a walk loses little by the others where they are not.
-GOOD_ACCEPTANCE, MOSTLY, SELDOM = 0.3, 0.9, 0.2
+# Share of independence proposals where many of them are accepted, each worth several steps of a
+# walk, and where few are.
+MOSTLY, SELDOM = 0.9, 0.2
 APPROXIMATE_SHARE = 0.8  # of the warmup, by the first stage alone
 NAMED = {
     "laplace": "Laplace's approximation of the likelihood",
@@ -548,12 +549,18 @@ def _draws_lost(sd: float) -> float:
     return 1.0 / math.erfc(0.5 * sd)
 
 
-def prepared_walk(
+def prepared_walk(*args: Any, **options: Any) -> PreparedChains:
+    """The chains of `walk`, made ready."""
+    kernel, states, report = walk(*args, **options)
+    return PreparedChains(partial(metropolis_block, kernel), states, report)
+
+
+def walk(
     setup: SamplingSetup, method: PMMH | MetropolisHastings, likelihood: Likelihood,
     where: Coordinates, pilot: Pilot, proposal: str, order: int, usual: float, *,
     gaussian: GaussianPilot | None = None, first: ApproximateLikelihood | None = None,
-) -> PreparedChains:  # fmt: skip
-    """Chains in the coordinates, started round the pilot's mode, and what to report of both.
+) -> tuple[Metropolis, list[WalkState], dict[str, Any]]:  # fmt: skip
+    """The kernel of chains in the coordinates, the chains themselves, started round the pilot's mode, and what to report of both.
 
     proposal : of the filter that looks at the starts. order : of the steps, as in `PMMH`. usual :
     rate of acceptance to adapt to, unless the method names one. gaussian : the approximation, whose
@@ -564,7 +571,7 @@ def prepared_walk(
     move: Proposal = RandomWalk()
     d = len(where)
     if gaussian is not None and method.covariance is None and d:
-        share = MOSTLY if gaussian.acceptance > GOOD_ACCEPTANCE else SELDOM
+        share = MOSTLY if gaussian.well_proposed else SELDOM
         move = WalkAndIndependence(where.at(pilot.z), factor * np.sqrt(d) / STRETCH, share)
     if order:
         if method.covariance is None:
@@ -591,7 +598,7 @@ def prepared_walk(
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
         "walk_covariance": (factor @ factor.T).tolist(),
     }
-    return PreparedChains(partial(metropolis_block, kernel), states, report)
+    return kernel, states, report
 
 
 def _likelihood(setup: SamplingSetup, method: PMMH, settings: FilterSettings) -> Likelihood:

@@ -105,9 +105,9 @@ class SamplingMethod:
     """What `sample` and `explain` know of a method, whose settings are of the class it is
     registered under.
 
-    prepare : (setup, settings) -> its Markov chains, made ready; None where it has none.
-    independent : of a method without Markov chains, (setup, settings, draws, executor, progress) ->
-    independent draws of parameters alone, as chains, and what to report.
+    prepare : (setup, settings) -> its Markov chains, made ready; None where draws come otherwise.
+    independent : (setup, settings, draws, executor, progress) -> such draws, as chains, and what to
+    report. trajectories : whether they begin with a warmup, are thinned and hold the states, too.
     state_classes : the dataclasses that its checkpoints are made of.
     complete : (settings, draws) -> settings, with what depends on the number of draws.
     by_row : settings -> whether draws come with a log-likelihood of each row.
@@ -124,11 +124,12 @@ class SamplingMethod:
     attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = lambda problem, chains: {}
     where_slow: str = ""
     explain: Callable[[Derived], Mapping[str, PlanRows]] = lambda plan: {}
+    trajectories: bool = False
 
     @property
     def markov(self) -> bool:
-        """Whether its draws are Markov chains, which need warmup and draw the states too."""
-        return self.prepare is not None
+        """Whether its draws stem from Markov chains, which need warmup, and hold the states too."""
+        return self.prepare is not None or self.trajectories
 
     def draw(
         self, setup: SamplingSetup, settings: Any, draws: int, executor: Executor | None,

@@ -36,6 +36,7 @@ PRECISE = 0.3
 REPEATS = 40
 LEAST_EIGENVALUE = 1e-3  # of the information as correlations
 DEGREES = 5.0  # of freedom of independence proposals: heavier tails than most posteriors have
+GOOD_ACCEPTANCE = 0.3  # of them
 TRIED = 100  # of them, to know how many are accepted
 STARTS = 3  # climbs at most, until one comes to a top
 
@@ -58,6 +59,11 @@ class GaussianPilot:
     def pilot(self) -> Pilot:
         """As the starts of chains know it."""
         return Pilot(self.z, np.sqrt(np.diagonal(self.covariance)), self.log_density)
+
+    @property
+    def well_proposed(self) -> bool:
+        """Whether independence proposals are worth more than steps of a walk."""
+        return self.acceptance > GOOD_ACCEPTANCE
 
     def likelihood(self, problem: Problem) -> ApproximateLikelihood:
         """The approximation, as a function of the parameters."""

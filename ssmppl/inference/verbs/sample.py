@@ -15,13 +15,21 @@ from ssmppl.analysis.structure import singular_covariance
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
-from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
+from ssmppl.inference.chains import gibbs, ismcmc, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.gibbs_updates import plan_updates
 from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
 from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
-from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.methods.methods import (
+    ISMCMC,
+    PGAS,
+    PMMH,
+    SMC2,
+    Gibbs,
+    Method,
+    MetropolisHastings,
+)
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
@@ -41,6 +49,7 @@ METHODS: dict[type, SamplingMethod] = {
     MetropolisHastings: metropolis.METHOD,
     Gibbs: gibbs.METHOD,
     PMMH: pmmh.METHOD,
+    ISMCMC: ismcmc.METHOD,
     PGAS: pgas.METHOD,
     SMC2: smc2.METHOD,
 }
@@ -179,7 +188,8 @@ def sample(
         "seconds": checkpoint_file.seconds if checkpoint_file else time.perf_counter() - began,
     }  # fmt: skip
     attrs |= sampling_method.attributes(problem, result)
-    whole = stack(result) if checkpoint_file is None else checkpoint_file.stack(result)
+    as_drawn = checkpoint_file is None or sampling_method.independent is not None
+    whole = stack(result) if as_drawn or checkpoint_file is None else checkpoint_file.stack(result)
     if sampling_method.markov:
         free = free_components(problem.trace, fixed_values)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
