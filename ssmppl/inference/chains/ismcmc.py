@@ -10,9 +10,9 @@ h_k Z_k / L_a(theta_k). Weighted averages converge to those of the exact posteri
 and trajectories together, whatever the number of particles.
 
 The draws of phase 2 know nothing of each other. They go to an executor in lanes, every lane the
-draws i, i + `LANES`, i + 2 `LANES`, ... of a chain, and each has random numbers of its own place, so
-that the result is the same whatever ran where. After an interrupt the first draws of each chain are
-there.
+draws i, i + `LANES`, i + 2 `LANES`, ... of a chain, and each has random numbers of its own place,
+so that the result is the same whatever ran where. After an interrupt the first draws of each chain
+are there.
 
 The posterior that is returned has as many draws as were corrected, resampled systematically by
 their weights in the order of the chain. Copies of a draw stand side by side, so that estimates of

@@ -560,7 +560,8 @@ def walk(
     where: Coordinates, pilot: Pilot, proposal: str, order: int, usual: float, *,
     gaussian: GaussianPilot | None = None, first: ApproximateLikelihood | None = None,
 ) -> tuple[Metropolis, list[WalkState], dict[str, Any]]:  # fmt: skip
-    """The kernel of chains in the coordinates, the chains themselves, started round the pilot's mode, and what to report of both.
+    """The kernel of chains in the coordinates, these chains, started round the pilot's mode, and
+    what to report of both.
 
     proposal : of the filter that looks at the starts. order : of the steps, as in `PMMH`. usual :
     rate of acceptance to adapt to, unless the method names one. gaussian : the approximation, whose

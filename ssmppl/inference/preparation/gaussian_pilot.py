@@ -198,3 +198,25 @@ def tune_twisted(
         if sd <= target:
             break
     return best
+
+
+MOST_PARTICLES = 64  # of the twisted filter, where PMMH over it is the default
+MOST_NUMBERS = 12  # free ones, that independence proposals move at once
+FEW_NUMBERS = 6  # and a walk
+
+
+def precise_twisted(space: Space) -> TunedParticles | None:
+    """How well the twisted filter knows the likelihood at the mode of the approximate posterior,
+    where it knows it well enough for Metropolis-Hastings over it to be the best of all methods;
+    else None. The pilot has random numbers of its own, the same for every call."""
+    problem = space.problem
+    if "user" in problem.program.proposals or not 0 < len(space.positions) <= MOST_NUMBERS:
+        return None
+    if approximation_kind(problem) != "laplace":
+        return None
+    found = gaussian_pilot(space, "laplace", np.random.SeedSequence(20150))
+    if found is None or (len(found.z) > FEW_NUMBERS and not found.well_proposed):
+        return None
+    theta, _ = space.parameters(found.z)
+    tuned = tune_twisted(problem, theta, PRECISE, MOST_PARTICLES)
+    return tuned if tuned is not None and tuned.sd <= PRECISE else None
