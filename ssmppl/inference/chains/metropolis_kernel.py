@@ -415,7 +415,7 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
     return state, Block.of(draws, stats)
 
 
-LONGEST_HELD = 1000  # thinned steps, after which a draw counts as another one at the same place
+LONGEST_HELD = 50  # thinned steps, after which a draw counts as another one at the same place
 
 
 def jump_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[WalkState, Block]:

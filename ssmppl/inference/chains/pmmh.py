@@ -93,6 +93,7 @@ from ssmppl.inference.run.seeds import random_state
 # it; the spread of log Z that other filters are tuned to, and the fewest particles they take.
 GUIDE, TWISTED_COST = 2500.0, 15.0
 BEST_SD, FEWEST = 1.2, 10.0
+LEAST_ACCEPTANCE = 0.05  # of independence proposals, below which their mode is not to be trusted
 USUAL_EXACT = {1: 0.44, 2: 0.35}  # rates of acceptance by the first stage, which has no noise
 # Share of independence proposals where many of them are accepted, each worth several steps of a
 # walk, and where few are.
@@ -475,14 +476,15 @@ def _planned(setup: SamplingSetup, method: PMMH) -> _Plan:
             f"delayed_acceptance=True does not apply: {why}",
             fix="use ssm.PMMH(delayed_acceptance=False)",
         )
-    twisted = None
+    twisted, target = None, min(method.target_sd, PRECISE)
     if gaussian is not None:
         mode, _ = space.parameters(gaussian.z)
-        if method.proposal in ("auto", "twisted") and method.particles is None:
-            target = min(method.target_sd, PRECISE)
-            twisted = setup.once("twisted", lambda: tune_twisted(problem, mode, target))
-            if twisted is not None and twisted.sd > target:
-                twisted = None  # by the ways of other filters, then
+        twisted = setup.once("twisted", lambda: tune_twisted(problem, mode, target))
+        if asked is not True and not _trusted(gaussian, twisted):
+            gaussian = None
+        usable = method.proposal in ("auto", "twisted") and method.particles is None
+        if gaussian is None or not usable or twisted is None or twisted.sd > target:
+            twisted = None  # by the ways of other filters, then
     found = gaussian
     pilot = gaussian.pilot if gaussian is not None else setup.once(
         "pilot", lambda: find_mode(space, setup.root, rescue=method.rescue)
@@ -529,6 +531,12 @@ def _gaussian(setup: SamplingSetup, method: PMMH) -> GaussianPilot | None:
     if isinstance(kind, NotApplicable):
         return None
     return gaussian_pilot(setup.space, kind, setup.root)
+
+
+def _trusted(gaussian: GaussianPilot, twisted: TunedParticles | None) -> bool:
+    """Whether the approximate posterior is near enough to the exact one to begin from: t round its
+    mode fits it, and the filter that it guides knows the likelihood there."""
+    return gaussian.acceptance > LEAST_ACCEPTANCE and twisted is not None and twisted.sd < BEST_SD
 
 
 def _pays(choice: Choice, twisted: TunedParticles) -> bool:

@@ -202,7 +202,6 @@ def tune_twisted(
 
 MOST_PARTICLES = 64  # of the twisted filter, where PMMH over it is the default
 MOST_NUMBERS = 12  # free ones, that independence proposals move at once
-FEW_NUMBERS = 6  # and a walk
 
 
 def precise_twisted(space: Space) -> TunedParticles | None:
@@ -215,7 +214,7 @@ def precise_twisted(space: Space) -> TunedParticles | None:
     if approximation_kind(problem) != "laplace":
         return None
     found = gaussian_pilot(space, "laplace", np.random.SeedSequence(20150))
-    if found is None or (len(found.z) > FEW_NUMBERS and not found.well_proposed):
+    if found is None or not found.well_proposed:
         return None
     theta, _ = space.parameters(found.z)
     tuned = tune_twisted(problem, theta, PRECISE, MOST_PARTICLES)
