@@ -4,6 +4,8 @@ filters'.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ssmppl.codegen.modules.gaussian import GaussianApproximation, Mode
@@ -62,6 +64,44 @@ class LaplaceLikelihood:
                 return value, gradient
             total += one
         return value, total
+
+
+@dataclass(frozen=True)
+class Approximated:
+    """An approximate log p(y | theta), -inf where it comes to no number; with the noise (T, R') of
+    each experiment's likeliest trajectory, where Laplace's gave it."""
+
+    log_likelihood: float
+    noise: tuple[np.ndarray, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ApproximateLikelihood:
+    """An approximate log p(y | theta) that is a function of theta alone, as chains need it.
+
+    kind : of `APPROXIMATE`. noise : (T, R') of each experiment, from where every search for
+    Laplace's modes begins; None: from the extended Kalman filter. Where Laplace's comes to no
+    number, the extended filter's stands in for it.
+    """
+
+    problem: Problem
+    kind: str
+    noise: tuple[np.ndarray, ...] | None = None
+
+    def at(self, theta: np.ndarray) -> Approximated:
+        """At theta (P,)."""
+        found = approximation_of(self.problem, self.kind)
+        total, noise = 0.0, []
+        for i, e in enumerate(self.problem.experiments if self.kind == "laplace" else ()):
+            begin = None if self.noise is None else self.noise[i]
+            mode = found.laplace(theta, e.y, e.seen, e.u, begin)
+            if mode is None:
+                break
+            noise.append(mode.e)
+            total += mode.log_likelihood
+        if len(noise) == len(self.problem.experiments):
+            return Approximated(total, tuple(noise))
+        return Approximated(approximate_log_likelihood(self.problem, theta, found, "extended"))
 
 
 def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplicable:
