@@ -312,7 +312,8 @@ class _Correction:
             [random_state(self.root, k, i) for i in range(len(setup.problem.experiments))]
             for k in range(self.climb.method.averages)
         ]
-        task = partial(twisted_log_z, setup.problem, self.particles, seeds)
+        near = [None if mode is None else mode.e for mode in self.climb.laplace.modes]
+        task = partial(twisted_log_z, setup.problem, self.particles, seeds, near)
         out = np.full((len(points), len(seeds)), -np.inf)
         there = [i for i, (_, log_prior) in enumerate(inside) if log_prior > -np.inf]
         found = run_tasks(task, [inside[i][0].copy() for i in there], executor=setup.executor)
@@ -357,15 +358,22 @@ def axes_of(information: np.ndarray) -> np.ndarray:
 
 
 def twisted_log_z(
-    problem: Problem, particles: int, seeds: Sequence[Sequence[np.ndarray]], theta: np.ndarray
-) -> np.ndarray:
-    """(K,) log Z at theta (P,) by the twisted filter, for each seed's streams."""
+    problem: Problem, particles: int, seeds: Sequence[Sequence[np.ndarray]],
+    near: Sequence[np.ndarray | None], theta: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """(K,) log Z at theta (P,) by the twisted filter, for each seed's streams.
+
+    near : by experiment the noise (T, R') of a mode at another theta, from which that of this one
+        is looked for, which the guide goes by.
+    """
     twisted = problem.program.twisted
     assert isinstance(twisted, TwistedFilter)
     run = twisted.module.filter_twisted
     out = np.zeros(len(seeds))
     for i, e in enumerate(problem.experiments):
-        guided = twisted.guide(theta, e.y, e.seen, e.u)  # the same for all
+        given = theta, e.y, e.seen, e.u
+        mode = None if near[i] is None else twisted.gaussian.laplace(*given, near[i])
+        guided = twisted.guide(*given, e=None if mode is None else mode.e)  # the same for all
         increments, ess = np.empty(e.steps), np.empty(e.steps)
         for k, streams in enumerate(seeds):
             status, _ = run(

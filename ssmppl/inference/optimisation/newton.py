@@ -1,11 +1,11 @@
 """Newton's ascent of a smooth function: by its gradient, or where it has none by its differences.
 
-With a gradient, L-BFGS goes near the top (Zhu, Byrd, Lu and Nocedal 1997), and Newton's steps with
-differences of the gradient end there. Without one, coordinates are measured in widths, over which
-the function changes by about one, so that parameters of any unit are alike. Where the function is
-not concave, eigenvalues count by their size, so that a step climbs (Nocedal and Wright 2006,
-sections 3.4 and 8.1; Dauphin et al. 2014). For functions that take a millisecond and few
-coordinates, as a Kalman filter's log-likelihood: F^2 + F calls a step.
+With a gradient, BFGS goes near the top (`quasi_newton`), and Newton's steps with differences of the
+gradient end there. Without one, coordinates are measured in widths, over which the function changes
+by about one, so that parameters of any unit are alike. Where the function is not concave,
+eigenvalues count by their size, so that a step climbs (Nocedal and Wright 2006, sections 3.4 and
+8.1; Dauphin et al. 2014). For functions that take a millisecond and few coordinates, as a Kalman
+filter's log-likelihood: F^2 + F calls a step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
+
+from ssmppl.inference.optimisation.quasi_newton import quasi_newton
 
 FINE = 0.05  # of a width: differences at the end of a climb, far above rounding
 CHANGE = (0.05, 5.0)  # of the function over one width, between which that is a width
@@ -30,9 +31,9 @@ CONVEX = 0.05  # minus an eigenvalue, in widths, beyond which the place is no to
 LEAST = 1e-3  # of the eigenvalues of the second derivatives as correlations
 FLAT = 1e-10  # second derivative in widths that is rounding
 
-FAR = 1e300  # minus a function where it has no value
 QUASI_NEWTON_STEPS = 200
-LAST_STEPS = 8  # of Newton's, behind L-BFGS
+GAIN = 1e-7  # of one of them, relative, from where on Newton's are quicker
+LAST_STEPS = 8  # of Newton's, behind BFGS
 ARRIVED = 1e-7  # that the quadratic still expects to gain, from where on there is none
 NEAR = 1e-4  # a first step in z for the differences of a gradient
 LONGEST = 0.1  # of these at most
@@ -124,18 +125,16 @@ def climb_by_slope(function: Slope, z: np.ndarray) -> Top | None:
     if not len(z):
         return Top(z, value, np.zeros((0, 0)), 0.0)
 
-    def downhill(z: np.ndarray) -> tuple[float, np.ndarray]:
+    iterates: list[np.ndarray] = []
+
+    def climbed(z: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = function(z)
         there = np.isfinite(value) and bool(np.all(np.isfinite(slope)))
-        return (-value, -slope) if there else (FAR, np.zeros(len(z)))
+        return (value, slope) if there else (-np.inf, np.zeros(len(z)))
 
-    found = optimize.minimize(
-        downhill, z, jac=True, method="L-BFGS-B",
-        options={"maxiter": QUASI_NEWTON_STEPS, "ftol": 1e-10, "gtol": 1e-3},
-    )  # fmt: skip
-    if -found.fun >= value:
-        z = np.array(found.x)
-        value, slope = function(z)
+    quasi_newton(climbed, z, QUASI_NEWTON_STEPS, iterates.append, GAIN)
+    z = iterates[-1]
+    value, slope = function(z)
     information, distance = np.full((len(z), len(z)), np.nan), np.inf
     for _ in range(LAST_STEPS):
         information = information_by_slope(function, z)

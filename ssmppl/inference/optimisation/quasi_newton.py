@@ -25,12 +25,13 @@ GRADIENT = 1e-7  # largest entry: likewise
 
 
 def quasi_newton(
-    function: Function, start: np.ndarray, steps: int, visit: Callable[[np.ndarray], None]
-) -> str:
+    function: Function, start: np.ndarray, steps: int, visit: Callable[[np.ndarray], None],
+    gain: float = GAIN,
+) -> str:  # fmt: skip
     """Climb from start (d,), at most so many steps; returns why it ended.
 
     function : z (d,) -> (value, gradient (d,)), -inf where there is none. visit : told of every
-    iterate, the start too.
+    iterate, the start too. gain : of a step, relative to 1 or the value, with which it ends.
     """
     z = np.array(start, dtype=float)
     value, slope = function(z)
@@ -60,7 +61,7 @@ def quasi_newton(
         gained = value_new - value
         z, value, slope = new, value_new, slope_new
         visit(z)
-        if gained <= GAIN * max(abs(value), 1.0):
+        if gained <= gain * max(abs(value), 1.0):
             return "the value does not increase any more"
     return "the steps are used up"
 
