@@ -64,18 +64,21 @@ def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.nd
     return out
 
 
-def edges(setup: Maximization, theta: np.ndarray, information: np.ndarray) -> Edges | None:
+def edges(
+    setup: Maximization, theta: np.ndarray, information: np.ndarray,
+    objective: Callable[[np.ndarray], float] | None = None,
+) -> Edges | None:  # fmt: skip
     """Which components of theta (P,) are at an edge; None where none is.
 
     information : (P, P), NaN where it does not exist; where it is plain in all of z, nothing is
-    asked of the likelihood.
+    asked of the likelihood. objective : of z (F,), what is maximised; None: the exact one.
     """
     z = _inside(setup, theta)
     jacobian = setup.transform.at(z).jacobian
     with np.errstate(all="ignore"):
         if np.all(np.einsum("pf,pq,qf->f", jacobian, information, jacobian) > FLAT):
             return None
-    found = directions(setup.exact_objective, z)
+    found = directions(objective or setup.exact_objective, z)
     if not found.any():
         return None
     place = {s: i for i, s in enumerate(setup.problem.trace.parameter_symbols)}

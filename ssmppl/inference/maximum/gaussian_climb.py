@@ -23,6 +23,7 @@ from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
+from ssmppl.inference.maximum.edges import Edges, edges
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.newton import (
     GOOD,
@@ -87,8 +88,15 @@ class GaussianClimb:
             "converged": top.distance < GOOD, "evaluations": self.evaluations,
             "likelihood": "Laplace's approximation", "restarts": started - 1,
         }  # fmt: skip
-        if not np.all(np.isfinite(information)) or np.linalg.eigvalsh(information)[0] < KNOWN:
-            return self._uncorrected(top.z, None, report, "its top is at an edge, or flat")
+        if not np.all(np.isfinite(information)):
+            return self._uncorrected(top.z, None, report, "it has no second derivatives at its top")
+        held = None
+        if np.linalg.eigvalsh(information)[0] < KNOWN:
+            held = self._edges(top.z, information)
+            if held is None:
+                return self._uncorrected(top.z, None, report, "its top is flat")
+            information[~held.kept, :] = information[:, ~held.kept] = 0.0
+            report["converged"] = self._rests(top.z, information)
         twisted = self.setup.problem.program.twisted
         if not isinstance(twisted, TwistedFilter):
             return self._uncorrected(top.z, information, report, twisted.reason)
@@ -109,8 +117,23 @@ class GaussianClimb:
         return Ascent(
             self._theta(found.z), found.value, np.array(self.iterates), report,
             self._natural(found.z, found.information),
-            self.setup.natural_error(found.z, found.error),
+            self.setup.natural_error(found.z, found.error), held=held,
         )  # fmt: skip
+
+    def _edges(self, z: np.ndarray, information: np.ndarray) -> Edges | None:
+        """Which parameters are at an edge of their support, with information about all others;
+        None where there is nothing known of some that is not."""
+        held = edges(self.setup, self._theta(z), self._natural(z, information), self.objective)
+        if held is None or not held.kept.any() or held.moving:
+            return None
+        rest = information[np.ix_(held.kept, held.kept)]
+        return held if np.linalg.eigvalsh(rest)[0] > KNOWN else None
+
+    def _rests(self, z: np.ndarray, information: np.ndarray) -> bool:
+        """Whether the quadratic expects next to nothing in the directions of which it knows."""
+        slope = self.slope(z)[1] if self.laplace.differentiable else np.full(len(z), np.nan)
+        along = slope @ axes_of(information)
+        return bool(0.5 * along @ along < GOOD)
 
     def objective(self, z: np.ndarray) -> float:
         """Laplace's log-likelihood at z (F,), with the prior where it counts."""

@@ -237,8 +237,9 @@ def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> n
         if not found.kept.any():
             attrs["covariance"] = "every parameter is at an edge of what it can be"
             return nothing
-        information = _information(setup, ascent.theta, found)
-        if found.moving:
+        if ascent.information is None:
+            information = _information(setup, ascent.theta, found)
+        if found.moving and not isinstance(setup.exact, NotApplicable):
             score = _score_of(setup, found).score(ascent.theta)[1]
     if information is None:
         attrs["covariance"] = "none: no second derivatives of the log-likelihood"

@@ -174,3 +174,41 @@ def test_where_it_cannot_be_corrected_the_next_method_takes_over(monkeypatch):
     asked = ssm.maximize(model, {"y": y[:15]}, ssm.DirectOptimization(), seed=1, progress=False)
     assert asked.attrs["likelihood"].startswith("Laplace's approximation, not corrected: twisted")
     assert asked.attrs["approximate"]
+
+
+def test_a_scale_whose_maximum_is_at_zero_is_held_there():
+    """A population without noise of its own: the rest by quadrature over its start."""
+    model = ssm.Model("voles")
+    model.prior(lambda: {
+        "r": ssm.Normal(0, sd=1), "b": ssm.HalfNormal(sd=1), "s": ssm.HalfNormal(sd=1)
+    })  # fmt: skip
+    model.initial(lambda: {"n": ssm.Normal(3, sd=1)})
+    model.transition(lambda n, r, b, s: {"n": ssm.Normal(n + r - b * np.exp(n) / 100, sd=s)})
+    model.observation(lambda n: {"y": ssm.Poisson(np.exp(n))})
+    n = [3.0]
+    for _ in range(24):
+        n.append(n[-1] + 0.5 - 0.5 * np.exp(n[-1]) / 50)
+    # between the expected counts' whole numbers: less scatter than Poisson's, so that no noise of
+    # the state makes the data likelier
+    y = np.round(np.exp(n))
+    y[[4, 5, 12]] = np.nan
+    start = np.linspace(1.0, 5.0, 2001)
+    weight = stats.norm.pdf(start, 3.0, 1.0)
+
+    def value(v):
+        r, b = v
+        n, total = start, np.zeros(len(start))
+        for t, seen in enumerate(y):
+            n = n + r - b * np.exp(n) / 100 if t else n
+            total += stats.poisson.logpmf(seen, np.exp(n)) if np.isfinite(seen) else 0.0
+        return -np.log(weight @ np.exp(total - total.max())) - total.max()
+
+    top = optimize.minimize(value, [0.5, 1.0], method="Nelder-Mead",
+                            options={"xatol": 1e-6, "fatol": 1e-10})  # fmt: skip
+    found = ssm.maximize(model, {"y": y}, seed=1, progress=False)
+    assert found.attrs["held_at_edge"] == {"s": 0.0}
+    assert found.attrs["converged"]
+    assert np.isnan(found.standard_errors["s"])
+    for name, exact in zip(("r", "b"), top.x, strict=True):
+        assert 0.0 < found.standard_errors[name] < 1.0
+        assert abs(found.parameters[name] - exact) < 0.05 * found.standard_errors[name]
