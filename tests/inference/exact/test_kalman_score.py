@@ -10,9 +10,10 @@ from ssmppl import datasets
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, SamplingError
 from ssmppl.inference.exact.derivatives import jacobian
-from ssmppl.inference.exact.kalman import kalman_model
+from ssmppl.inference.exact.kalman import filter_order, kalman_model
 from ssmppl.language.model.model import Model
 from ssmppl.language.tracing import trace
+from tests.codegen.kernels.test_kalman_adjoint import textbook
 from tests.inference.exact.test_kalman import lgss
 from tests.models.kalman import MODELS, posed, scalar, time_varying
 from tests.statistics.checks import seed_of
@@ -203,3 +204,48 @@ def test_what_has_no_derivative_is_named():
         theta[1:], np.array([0.05]),
     )  # fmt: skip
     assert gradient[1] == pytest.approx(slope[0, 0], rel=1e-8)
+
+
+def seasonal():
+    """A level and a season of four rows, kept in a shift register."""
+    model = Model("seasonal")
+
+    @model.prior
+    def prior():
+        return {"q": D.Gamma(np.full(2, 2.0), rate=4.0), "r": D.Gamma(2, rate=4.0)}
+
+    @model.initial
+    def initial():
+        return {n: D.Normal(0.5 * i, sd=1.0) for i, n in enumerate(("level", "s0", "s1", "s2"))}
+
+    @model.transition
+    def transition(level, s0, s1, s2, q):
+        return {"level": D.Normal(level, variance=q[0]),
+                "s0": D.Normal(-s0 - s1 - s2, variance=q[1]),
+                "s1": D.Dirac(s0), "s2": D.Dirac(s1)}  # fmt: skip
+
+    @model.observation
+    def observation(level, s0, r):
+        return {"y": D.Normal(level + s0, variance=r)}
+
+    return model
+
+
+def test_a_shift_register_is_filtered_from_its_end():
+    """In another order than the trace's, to the same likelihood and score."""
+    traced = trace(seasonal())
+    model, theta = kalman_model(traced), np.array([0.3, 0.2, 0.4])
+    assert filter_order(model.form) == [3, 2, 1, 0]
+    y = np.random.default_rng(4).normal(size=30)
+    y[[5, 6, 20]] = np.nan
+    (experiment,) = bind(traced, {"y": y})
+
+    def by_hand(v):
+        given = model.matrices(experiment, v)
+        return np.array([textbook(given, experiment.y, experiment.seen)])
+
+    value, gradient = model.score([experiment], theta)
+    assert value == pytest.approx(by_hand(theta)[0], abs=1e-11)
+    assert model.log_likelihood([experiment], theta) == pytest.approx(value, abs=1e-11)
+    slope, _ = jacobian(by_hand, theta, 0.1 * theta)
+    np.testing.assert_allclose(gradient, slope[0], rtol=1e-9, atol=1e-9)
