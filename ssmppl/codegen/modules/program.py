@@ -247,6 +247,7 @@ def _write(
     if trace.observations:
         _backward(out, trace, layout, plain)
     out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
+    out.add_each("log_joint")
     if trace.parameters:
         out.add_function("parameters", parameter_functions(trace, layout))
     return out, _introduction(trace, proposals)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
+from ssmppl.codegen.kernels.particle.experiments import sums_of_each
 from ssmppl.codegen.text.render import (
     Names,
     Writer,
@@ -352,6 +353,12 @@ class ModuleText:
     def add_function(self, title: str, text: str) -> None:
         """A single entry point."""
         self.parts += [heading(title), text.replace("@exact", "@entry", 1)]
+
+    def add_each(self, sums: str) -> None:
+        """`<sums>_of_each`, an entry point that takes these sums over each data set."""
+        made = specialise(sums_of_each, f"{sums}_of_each", {"sums": sums})
+        self.parts.append(made.text.replace("@exact", "@entry", 1))
+        self.imports |= {n: home for n, home in made.imports.items() if n != sums}
 
     def algorithm(
         self, function: Callable[..., Any], name: str, section: Section, decorator: str,
