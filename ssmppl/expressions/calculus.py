@@ -140,7 +140,7 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
         an incomplete gamma or beta function, an opaque primitive, a random draw's parameters).
     """
     involved = dependent(expressions, [symbol])
-    tangent: dict[Expr, _Slope] = {symbol: _Slope(constant(1.0))}
+    tangent: dict[Expr, Slope] = {symbol: Slope(constant(1.0))}
     matrix_tangent: dict[Expr, ExprArray] = {}
     for node in topological(expressions, involved):
         if node is symbol:
@@ -148,13 +148,13 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
         if node.op in ("cholesky", "inverse"):
             matrix_tangent[node] = _matrix_tangent(node, tangent)
         elif node.op == "item":
-            tangent[node] = _Slope(matrix_tangent[node.args[0]][node.data])
+            tangent[node] = Slope(matrix_tangent[node.args[0]][node.data])
         else:
             tangent[node] = _chain(node, tangent)
     return [tangent.get(e, _NONE).whole() for e in expressions]
 
 
-class _Slope(NamedTuple):
+class Slope(NamedTuple):
     """A slope, and the condition outside of which it is zero, whatever `value` is there."""
 
     value: Expr
@@ -164,27 +164,27 @@ class _Slope(NamedTuple):
         """The slope as one expression."""
         return self.value if self.moves is None else apply("where", self.moves, self.value, 0.0)
 
-    def only(self, condition: Expr) -> _Slope:
+    def only(self, condition: Expr) -> Slope:
         """This slope where the condition holds, else zero."""
         if self.moves is None or self.moves is condition:
-            return _Slope(self.value, condition)
-        return _Slope(self.value, apply("and", condition, self.moves))
+            return Slope(self.value, condition)
+        return Slope(self.value, apply("and", condition, self.moves))
 
-    def plus(self, other: _Slope) -> _Slope:
+    def plus(self, other: Slope) -> Slope:
         if _is_zero(self.value) or _is_zero(other.value):
             return self if _is_zero(other.value) else other
         if self.moves is other.moves:
-            return _Slope(self.value + other.value, self.moves)
+            return Slope(self.value + other.value, self.moves)
         total = self.whole() + other.whole()
         if self.moves is None or other.moves is None:
-            return _Slope(total)
-        return _Slope(total, apply("or", self.moves, other.moves))
+            return Slope(total)
+        return Slope(total, apply("or", self.moves, other.moves))
 
 
-_NONE = _Slope(constant(0.0))
+_NONE = Slope(constant(0.0))
 
 
-def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
+def _chain(node: Expr, tangent: dict[Expr, Slope]) -> Slope:
     if node.op in FLAT:
         return _NONE
     if node.op == "where":
@@ -193,20 +193,20 @@ def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
         return _either(CHOICES[node.op](*node.args), *(tangent.get(a, _NONE) for a in node.args))
     if node.op in ("logdet", "det"):
         slope = np.sum(_inverse_of(node).T * _entries(node, tangent))
-        return _Slope(slope * node if node.op == "det" else slope)
+        return Slope(slope * node if node.op == "det" else slope)
     if node.op not in PARTIALS:
-        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
+        raise NotDifferentiable(f"{as_told(node)} has no derivative in closed form")
     total = _NONE
     partials = PARTIALS[node.op](node, *node.args)
     for place, (argument, partial) in enumerate(zip(node.args, partials, strict=True)):
         if argument in tangent and not _is_zero(tangent[argument].value):
             if partial is None:
-                raise NotDifferentiable(f"{_told(node)} has no derivative in {_told(argument)}")
+                raise NotDifferentiable(f"{as_told(node)} has no derivative in {as_told(argument)}")
             total = total.plus(_summand(node, place, partial, tangent))
     return total
 
 
-def _told(node: Expr) -> str:
+def as_told(node: Expr) -> str:
     """The expression in a message, of which nobody reads more than a line."""
     text = repr(node)
     if node.op == "call":  # a primitive, by the name that its user gave it
@@ -214,7 +214,7 @@ def _told(node: Expr) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
-def _either(condition: Expr, first: _Slope, second: _Slope) -> _Slope:
+def _either(condition: Expr, first: Slope, second: Slope) -> Slope:
     """The slope of where(condition, a, b), from those of a and b."""
     if _is_zero(second.value):
         return first if _is_zero(first.value) else first.only(condition)
@@ -222,27 +222,27 @@ def _either(condition: Expr, first: _Slope, second: _Slope) -> _Slope:
         return second.only(apply("not", condition))
     whole = apply("where", condition, first.whole(), second.whole())
     if first.moves is None and second.moves is None:
-        return _Slope(whole)
+        return Slope(whole)
     ways = [
         case if slope.moves is None else apply("and", case, slope.moves)
         for case, slope in ((condition, first), (apply("not", condition), second))
     ]
-    return _Slope(whole, apply("or", *ways))
+    return Slope(whole, apply("or", *ways))
 
 
-def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, _Slope]) -> _Slope:
+def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, Slope]) -> Slope:
     """Partial times slope for one of the node's arguments."""
     argument, op = node.args[place], node.op
     value, moves = slope = tangent[argument]
     if op in _VANISHING:
         (down, falls), (up, grows) = map(without_exponentials, (as_expr(partial), value))
         if falls is not None and grows is not None:
-            return _Slope(down * up * apply("exp", falls + grows), moves)
+            return Slope(down * up * apply("exp", falls + grows), moves)
     if (op, place) == ("div", 1) or ((op, place) == ("pow", 0) and never_negative(argument)):
         relative = _relative(argument, tangent)
         if relative is not None:
             by = -1.0 if op == "div" else node.args[1]
-            return _Slope(by * node * relative, moves)
+            return Slope(by * node * relative, moves)
     zeros = []  # where any of these is 0, so is the slope
     if (op, place) == ("pow", 1):
         zeros = [node.args[0]]  # 0 ** b is 0 for every b above 0
@@ -254,10 +254,10 @@ def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, 
     for zero in zeros:
         if not _never_zero(zero):
             slope = slope.only(apply("ne", zero, 0.0))
-    return _Slope(partial * value, slope.moves)
+    return Slope(partial * value, slope.moves)
 
 
-def _relative(node: Expr, tangent: dict[Expr, _Slope]) -> Expr | None:
+def _relative(node: Expr, tangent: dict[Expr, Slope]) -> Expr | None:
     """The slope of a growing exponential relative to it, which is finite also where it is not."""
     if node.op == "exp":
         return tangent[node.args[0]].value
@@ -279,7 +279,7 @@ def _relative(node: Expr, tangent: dict[Expr, _Slope]) -> Expr | None:
     return relative / (1.0 + share if node.op == "add" else 1.0 - share)
 
 
-def _fixed_factors(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
+def _fixed_factors(node: Expr, tangent: dict[Expr, Slope]) -> list[Expr]:
     """Of a product those factors that do not move."""
     if node not in tangent:
         return [node]
@@ -309,7 +309,7 @@ def _is_zero(node: Expr) -> bool:
     return node.op == "const" and node.data == 0.0
 
 
-def _entries(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
+def _entries(node: Expr, tangent: dict[Expr, Slope]) -> ExprArray:
     flat = array([tangent.get(a, _NONE).whole() for a in node.args])
     return array(flat.reshape(node.data, node.data))
 
@@ -318,7 +318,7 @@ def _inverse_of(node: Expr) -> ExprArray:
     return inverse(array(node.args).reshape(node.data, node.data))
 
 
-def _matrix_tangent(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
+def _matrix_tangent(node: Expr, tangent: dict[Expr, Slope]) -> ExprArray:
     n, d = node.data, _entries(node, tangent)
     item = np.array([[Expr("item", (node,), (i, j)) for j in range(n)] for i in range(n)])
     if node.op == "inverse":  # d(A^-1) = -A^-1 dA A^-1

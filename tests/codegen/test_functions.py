@@ -7,7 +7,7 @@ import pytest
 
 from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.proposals.channels import channel_draws, observation_draws
-from ssmppl.analysis.proposals.curvature import bends
+from ssmppl.analysis.proposals.curvature import adjoint_of, bends, seen_adjoint
 from ssmppl.analysis.proposals.proposals import bootstrap
 from ssmppl.analysis.proposals.twisted import jacobian, lookahead_model
 from ssmppl.codegen.modules.program import compile_trace
@@ -64,6 +64,8 @@ class Generated:
             self.module = program.gaussian.module
         elif suffix == "mode":
             self.module = program.gaussian.by_mode
+        elif suffix == "adjoint":
+            self.module = program.gaussian.by_adjoint
         elif suffix == "twisted":
             self.module = program.twisted.module
             numbers = numbers.guided(program.twisted.order, np.random.default_rng([8, t]))
@@ -228,6 +230,36 @@ def test_second_derivatives_of_the_gaussian_approximation(case):
         role = "bend" if t else "bend_initial"
         generated.pass_(role, *before, np.array(list(given.values())), numbers.states[t], out)
         check_rows(generated, out, bend.values, t, role, given)
+
+
+def test_gradients_at_the_mode(case):
+    """What the adjoint of Laplace's approximation adds up, of one particle at a time."""
+    program, numbers = case
+    traced = program.trace
+    if isinstance(program.gaussian, NotApplicable):
+        return
+    if isinstance(program.gaussian.by_adjoint, NotApplicable):
+        return
+    found, theta, before = program.gaussian.found, traced.parameter_symbols, []
+    rng, bent = np.random.default_rng(12), program.gaussian.bends
+    laws = {
+        "": adjoint_of(found.transition, bent[1], traced.state_prev_symbols, theta),
+        "_initial": adjoint_of(found.initial, bent[0], [], theta),
+        "_seen": seen_adjoint(found, traced.state_symbols, theta),
+    }
+    for t, suffix in [
+        (0, "_initial"),
+        (0, "_seen"),
+        *((t, s) for t in (1, 2) for s in ("", "_seen")),
+    ]:
+        generated, law = Generated(program, numbers, "adjoint", t), laws[suffix]
+        given = dict(zip(law.given, rng.normal(size=len(law.given)), strict=True))
+        before = [] if suffix else [numbers.states[t - 1]]
+        for role, values in (("third", law.moving), ("fixed", law.fixed)):
+            out = np.zeros((len(values), PARTICLES))
+            noise = np.array(list(given.values()))
+            generated.pass_(f"{role}{suffix}", *before, noise, numbers.states[t], out)
+            check_rows(generated, out, values, t, f"{role}{suffix}", given)
 
 
 def test_moves_in_loops(case):

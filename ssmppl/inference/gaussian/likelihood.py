@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.codegen.modules.gaussian import GaussianApproximation
+from ssmppl.codegen.modules.gaussian import GaussianApproximation, Mode
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.run.problem import Problem
 
@@ -21,18 +22,44 @@ class LaplaceLikelihood:
 
     def __init__(self, problem: Problem, approximation: GaussianApproximation):
         self.problem, self.approximation = problem, approximation
-        self.noise: list[np.ndarray | None] = [None] * len(problem.experiments)
+        self.modes: list[Mode | None] = []
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin the next search from nothing."""
+        self.modes = [None] * len(self.problem.experiments)
 
     def __call__(self, theta: np.ndarray) -> float:
         """At theta (P,); -inf where there is no mode."""
         total = 0.0
-        for i, e in enumerate(self.problem.experiments):
-            found = self.approximation.laplace(theta, e.y, e.seen, e.u, self.noise[i])
+        for i, (e, mode) in enumerate(zip(self.problem.experiments, self.modes, strict=True)):
+            found = self.approximation.laplace(
+                theta, e.y, e.seen, e.u, None if mode is None else mode.e
+            )
             if found is None:
                 return -np.inf
-            self.noise[i] = found.e
+            self.modes[i] = found
             total += found.log_likelihood
         return total
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether there is an exact gradient."""
+        return isinstance(self.approximation.by_adjoint, Loaded)
+
+    def score(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
+        """(value, its gradient in theta (P,)); NaN where there is none of it."""
+        value, gradient = self(theta), np.full(len(theta), np.nan)
+        if value == -np.inf:
+            return value, gradient
+        total = np.zeros(len(theta))
+        for e, mode in zip(self.problem.experiments, self.modes, strict=True):
+            assert mode is not None
+            one = self.approximation.laplace_gradient(theta, e.y, e.seen, e.u, mode)
+            if one is None:
+                return value, gradient
+            total += one
+        return value, total
 
 
 def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplicable:

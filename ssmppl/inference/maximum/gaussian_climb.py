@@ -24,7 +24,14 @@ from ssmppl.errors import ArgumentError
 from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood
 from ssmppl.inference.maximum.ascent import Ascent, Maximization
 from ssmppl.inference.methods.methods import DirectOptimization
-from ssmppl.inference.optimisation.newton import GOOD, Top, climb, information_at
+from ssmppl.inference.optimisation.newton import (
+    GOOD,
+    Top,
+    climb,
+    climb_by_slope,
+    information_at,
+    information_by_slope,
+)
 from ssmppl.inference.particles.filtering import log_of_mean
 from ssmppl.inference.preparation.pilot import finite_point
 from ssmppl.inference.run.invalid_laws import total_of
@@ -68,7 +75,7 @@ class GaussianClimb:
         """Both. Ctrl-C ends it early, with the best so far."""
         try:
             top, started = self._climbed()
-            information = information_at(self.objective, top.z)
+            information = self.information(top.z)
         except KeyboardInterrupt:
             if not len(self.best):
                 raise
@@ -114,6 +121,29 @@ class GaussianClimb:
             self.best, self.best_value = np.array(z), value
         return value
 
+    def slope(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """The objective and its gradient (F,) at z; NaN where that is none."""
+        self.evaluations += 1
+        point = self.setup.transform.at(z)
+        if point.log_prior == -np.inf:
+            return -np.inf, np.full(len(z), np.nan)
+        value, gradient = self.laplace.score(point.theta)
+        slope = point.pull(gradient)
+        if self.setup.with_prior:
+            value, slope = value + point.log_prior, slope + point.d_log_prior
+        if value > self.best_value:
+            self.best, self.best_value = np.array(z), value
+        return value, slope
+
+    def information(self, z: np.ndarray) -> np.ndarray:
+        """(F, F) minus the second derivatives of the objective at z (F,); NaN where there are
+        none."""
+        if self.laplace.differentiable:
+            found = information_by_slope(self.slope, z)
+            if np.all(np.isfinite(found)):
+                return found
+        return information_at(self.objective, z)
+
     def log_likelihood(self, z: np.ndarray) -> float:
         """Laplace's; -inf off the support."""
         self.evaluations += 1
@@ -123,21 +153,30 @@ class GaussianClimb:
     def _theta(self, z: np.ndarray) -> np.ndarray:
         return self.setup.space.parameters(z)[0].copy()
 
+    def _climb(self, z: np.ndarray) -> Top | None:
+        """The top near z (F,): by the gradient, where that gets there."""
+        found = None
+        if self.laplace.differentiable:
+            found = climb_by_slope(self.slope, z)
+            if found is not None and found.distance < GOOD and found.is_top:
+                return found
+        return climb(self.objective, z if found is None else found.z)
+
     def _climbed(self) -> tuple[Top, int]:
         """The highest top of the starts, and how many there were."""
         given = self.setup.space.z[self.setup.space.positions]
         rng = np.random.default_rng(self.setup.seed(0))
         start = finite_point(given, self.objective, rng)
         most = FURTHER if self.method.restarts is None else self.method.restarts
-        best, k = climb(self.objective, start), 1
+        best, k = self._climb(start), 1
         while k <= most:
             arrived = best is not None and best.distance < GOOD
             if arrived and self.method.restarts is None:
                 break
             centre = start if best is None else best.z
-            self.laplace.noise = [None] * len(self.laplace.noise)
+            self.laplace.forget()
             there = finite_point(centre + rng.standard_normal(len(start)), self.objective, rng)
-            found = climb(self.objective, there)
+            found = self._climb(there)
             if found is not None and (best is None or found.value > best.value):
                 best = found
             k += 1
@@ -207,7 +246,7 @@ class _Correction:
         rests, far = False, False
         for _ in range(ROUNDS):
             if far:  # the ellipsoid is another one there
-                self.information = information_at(self.climb.objective, self.z)
+                self.information = self.climb.information(self.z)
                 if not np.all(np.isfinite(self.information)):
                     return "its second derivatives are no numbers on the way"
                 self.axes = axes_of(self.information)
@@ -293,12 +332,21 @@ class _Correction:
         lacking = self._log_z(*points) - np.array([[climb.log_likelihood(z)] for z in points])
         up, down = lacking[:n], lacking[n:]
         slopes, bends = (up - down) / (2.0 * REACH), (up + down - 2.0 * here) / REACH**2
-        fine = FINE * self.axes.T
-        smooth = [(climb.objective(self.z + s) - climb.objective(self.z - s)) / (2.0 * FINE)
-                  for s in fine]  # fmt: skip
+        smooth = self._smooth_slope()
         mean = slopes @ weight
         off = weight * (slopes - mean[:, None])
-        return np.array(smooth), mean, off @ off.T * k / (k - 1), bends @ weight
+        return smooth, mean, off @ off.T * k / (k - 1), bends @ weight
+
+    def _smooth_slope(self) -> np.ndarray:
+        """(N,) the slope of L with the prior, in units of the axes."""
+        climb = self.climb
+        if climb.laplace.differentiable:
+            _, slope = climb.slope(self.z)
+            if np.all(np.isfinite(slope)):
+                return slope @ self.axes
+        fine = FINE * self.axes.T
+        values = [[climb.objective(self.z + sign * s) for sign in (1.0, -1.0)] for s in fine]
+        return np.array([(up - down) / (2.0 * FINE) for up, down in values])
 
 
 def axes_of(information: np.ndarray) -> np.ndarray:

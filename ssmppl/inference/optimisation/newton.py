@@ -1,9 +1,11 @@
-"""Newton's ascent of a smooth function that has no derivatives of its own, by its differences.
+"""Newton's ascent of a smooth function: by its gradient, or where it has none by its differences.
 
-Coordinates are measured in widths, over which the function changes by about one, so that parameters
-of any unit are alike. Where the function is not concave, eigenvalues count by their size, so that a
-step climbs (Nocedal and Wright 2006, sections 3.4 and 8.1; Dauphin et al. 2014). For functions that
-take a millisecond and few coordinates, as a Kalman filter's log-likelihood: F^2 + F calls a step.
+With a gradient, L-BFGS goes near the top (Zhu, Byrd, Lu and Nocedal 1997), and Newton's steps with
+differences of the gradient end there. Without one, coordinates are measured in widths, over which
+the function changes by about one, so that parameters of any unit are alike. Where the function is
+not concave, eigenvalues count by their size, so that a step climbs (Nocedal and Wright 2006,
+sections 3.4 and 8.1; Dauphin et al. 2014). For functions that take a millisecond and few
+coordinates, as a Kalman filter's log-likelihood: F^2 + F calls a step.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import optimize
 
 FINE = 0.05  # of a width: differences at the end of a climb, far above rounding
 CHANGE = (0.05, 5.0)  # of the function over one width, between which that is a width
@@ -27,7 +30,16 @@ CONVEX = 0.05  # minus an eigenvalue, in widths, beyond which the place is no to
 LEAST = 1e-3  # of the eigenvalues of the second derivatives as correlations
 FLAT = 1e-10  # second derivative in widths that is rounding
 
+FAR = 1e300  # minus a function where it has no value
+QUASI_NEWTON_STEPS = 200
+LAST_STEPS = 8  # of Newton's, behind L-BFGS
+ARRIVED = 1e-7  # that the quadratic still expects to gain, from where on there is none
+NEAR = 1e-4  # a first step in z for the differences of a gradient
+LONGEST = 0.1  # of these at most
+WIDTH_TRIES, NEARER = 4, 30.0  # of their sizes; by how much they may be off
+
 Function = Callable[[np.ndarray], float]
+Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient (F,)
 
 
 @dataclass(frozen=True)
@@ -42,6 +54,14 @@ class Top:
     value: float
     information: np.ndarray
     distance: float
+
+    @property
+    def is_top(self) -> bool:
+        """Whether the function falls on all sides, as far as its second derivatives tell."""
+        return bool(
+            np.all(np.isfinite(self.information))
+            and (not len(self.z) or np.linalg.eigvalsh(self.information)[0] > 0.0)
+        )
 
 
 def climb(function: Function, z: np.ndarray) -> Top | None:
@@ -90,6 +110,69 @@ def climb(function: Function, z: np.ndarray) -> Top | None:
         if max(before, gained) < LITTLE:
             break
     return Top(z, value, information, distance)
+
+
+def climb_by_slope(function: Slope, z: np.ndarray) -> Top | None:
+    """The top near z (F,) of a function with its gradient; None where it has no value there.
+
+    -inf is no value, and a gradient that is not finite is none: the climb ends there.
+    """
+    z = np.array(z, dtype=float)
+    value, slope = function(z)
+    if not np.isfinite(value):
+        return None
+    if not len(z):
+        return Top(z, value, np.zeros((0, 0)), 0.0)
+
+    def downhill(z: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = function(z)
+        there = np.isfinite(value) and bool(np.all(np.isfinite(slope)))
+        return (-value, -slope) if there else (FAR, np.zeros(len(z)))
+
+    found = optimize.minimize(
+        downhill, z, jac=True, method="L-BFGS-B",
+        options={"maxiter": QUASI_NEWTON_STEPS, "ftol": 1e-10, "gtol": 1e-3},
+    )  # fmt: skip
+    if -found.fun >= value:
+        z = np.array(found.x)
+        value, slope = function(z)
+    information, distance = np.full((len(z), len(z)), np.nan), np.inf
+    for _ in range(LAST_STEPS):
+        information = information_by_slope(function, z)
+        if not (np.all(np.isfinite(information)) and np.all(np.isfinite(slope))):
+            return Top(z, value, information, np.inf)
+        step = newton_step(slope, information)
+        distance = 0.5 * float(slope @ step)
+        if distance < ARRIVED:
+            break
+        step *= min(1.0, FARTHEST / float(np.max(np.abs(step) / np.maximum(1.0, np.abs(z)))))
+        higher = _further(lambda z: function(z)[0], z, value, step)
+        if higher is None:
+            break
+        z, value = higher[0], higher[1]
+        slope = function(z)[1]
+    return Top(z, value, information, distance)
+
+
+def information_by_slope(function: Slope, z: np.ndarray) -> np.ndarray:
+    """(F, F) minus the second derivatives at z (F,), by central differences of the gradient over a
+    small share of each width; NaN where there is none."""
+    n = len(z)
+    out = np.full((n, n), np.nan)
+    longest = LONGEST * np.maximum(1.0, np.abs(z))
+    size = NEAR * np.maximum(1.0, np.abs(z))
+    for _ in range(WIDTH_TRIES):
+        for i in range(n):
+            up, down = (function(_moved(z, i, s * size[i]))[1] for s in (1.0, -1.0))
+            out[i] = (down - up) / (2.0 * size[i])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            wanted = FINE / np.sqrt(np.abs(np.diagonal(out)))
+        # Where the gradient is none so far out, nearer.
+        wanted = np.where(np.isfinite(wanted), np.minimum(wanted, longest), size / NEARER)
+        if np.all(np.isfinite(out)) and np.all(np.abs(np.log(wanted / size)) < np.log(NEARER)):
+            break
+        size = wanted
+    return 0.5 * (out + out.T)
 
 
 def information_at(function: Function, z: np.ndarray) -> np.ndarray:

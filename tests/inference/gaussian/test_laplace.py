@@ -1,16 +1,29 @@
 """Laplace's approximation: exact where the model is linear and Gaussian, and elsewhere what NumPy
 makes of a log density written by hand, maximised by SciPy and differenced twice."""
 
+import sys
+
 import numpy as np
 import pytest
+from numba.core.registry import CPUDispatcher
 from scipy import optimize, stats
 
 import ssmppl as ssm
+from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.codegen.native.loading import Loaded
+from ssmppl.codegen.store.folder import cache_folder
 from ssmppl.data import check_parameters
+from ssmppl.errors import NotApplicable
+from ssmppl.inference.exact.kalman import kalman_model
 from ssmppl.inference.gaussian.likelihood import LaplaceLikelihood
 from ssmppl.inference.gaussian.likelihood import approximate_log_likelihood as by
 from ssmppl.inference.preparation.exact_models import exact_log_likelihood
+from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.run.problem import pose
+from ssmppl.language.tracing import trace
+from tests.codegen.harness import Numbers
+from tests.codegen.test_functions import missing_of
+from tests.models.statements import MODELS, build
 from tests.statistics.checks import seed_of
 
 
@@ -197,3 +210,103 @@ def test_where_nothing_can_be_it_is_minus_infinity():
     problem, theta = posed(model, data, {"a": 1e308})
     for kind in ("laplace", "extended"):
         assert approximate_log_likelihood(problem, theta, kind) == -np.inf
+
+
+def differences_of(likelihood, theta):
+    """(P,) of a function of theta by differences, and their error."""
+    value = likelihood(theta)
+
+    def along(k, h):
+        out = []
+        for sign in (1.0, -1.0):
+            there = theta.copy()
+            there[k] += sign * h
+            out.append(likelihood(there))
+        return (out[0] - out[1]) / (2.0 * h)
+
+    differences, bound = [], []
+    for k, size in enumerate(theta):
+        h = 1e-3 * max(abs(size), 1e-2)
+        wide, narrow = along(k, h), along(k, h / 2.0)
+        differences.append((4.0 * narrow - wide) / 3.0)
+        # Rounding, and what extrapolation leaves: less than the difference of the two.
+        bound.append(0.1 * abs(wide - narrow) + 1e-12 * (1.0 + abs(value)) / h)
+    return np.array(differences), np.array(bound)
+
+
+@pytest.mark.parametrize("make", [curved_noise, pendulum, product])
+def test_the_gradient_is_exact(make):
+    model, data, parameters, *_ = make()
+    problem, theta = posed(model, data, parameters)
+    likelihood = LaplaceLikelihood(problem, problem.program.gaussian)
+    assert likelihood.differentiable
+
+    def settled(theta):  # from the mode itself once more: what is left there is rounding
+        likelihood(theta)
+        return likelihood(theta)
+
+    settled(theta)
+    value, found = likelihood.score(theta)
+    assert value == pytest.approx(likelihood(theta), rel=1e-12)
+    differences, bound = differences_of(settled, theta)
+    assert np.all(np.abs(found - differences) < bound + 1e-7 * np.abs(found))
+
+
+@pytest.mark.parametrize("gaps", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_the_gradient_of_every_statement(name, gaps):
+    """Of all that the language has words for."""
+    traced = trace(build(name))
+    program = compile_trace(traced, missing_of(traced, gaps))
+    found = program.gaussian
+    if isinstance(found, NotApplicable) or not isinstance(found.by_adjoint, Loaded):
+        return
+    n = Numbers(traced, np.random.default_rng(5), gaps)
+    given = n.y, n.seen, n.u
+    mode = found.laplace(n.theta, *given)
+    if mode is None or not len(n.theta):
+        return
+
+    def value(theta):
+        return found.laplace(theta, *given, found.laplace(theta, *given, mode.e).e).log_likelihood
+
+    gradient = found.laplace_gradient(n.theta, *given, found.laplace(n.theta, *given, mode.e))
+    differences, bound = differences_of(value, n.theta)
+    assert np.all(np.abs(gradient - differences) < bound + 1e-6 * np.abs(gradient)), (
+        gradient, differences, bound
+    )  # fmt: skip
+
+
+def test_the_gradient_of_a_linear_model():
+    """With a joint law, gaps, an input, two experiments, and a state without noise."""
+    rng = np.random.default_rng(seed_of("gradient"))
+    data = []
+    for steps in (30, 7):
+        y, w, u = rng.standard_normal((3, steps))
+        y[2:5] = w[4] = np.nan
+        data.append({"y": y, "w": w, "u": u})
+    problem, theta = posed(linear(), data, {"a": 0.9, "r": 0.4})
+    found = LaplaceLikelihood(problem, problem.program.gaussian).score(theta)
+    model = kalman_model(problem.trace)
+    free = np.ones(len(theta), dtype=bool)
+    exact = exact_score(model, problem.experiments, free, theta).score(theta)
+    assert found[0] == pytest.approx(exact[0], rel=1e-12)
+    np.testing.assert_allclose(found[1], exact[1], rtol=1e-9)
+
+
+def test_what_is_compiled_is_kept_for_the_next_process():
+    model, data, parameters, *_ = curved_noise()
+    problem, theta = posed(model, data, parameters)
+    LaplaceLikelihood(problem, problem.program.gaussian).score(theta)
+    approximate_log_likelihood(problem, theta, "extended")
+    assert isinstance(problem.program.gaussian.by_mode, Loaded)
+    compiled = [
+        name.rpartition(".")[2] for name, module in list(sys.modules.items())
+        if "_by_address_" in name and any(
+            isinstance(v, CPUDispatcher) and v.signatures and v.py_func.__module__ == name
+            and v.targetoptions.get("nogil") for v in vars(module).values()
+        )
+    ]  # fmt: skip
+    assert any(name.startswith("gaussian_mode") for name in compiled)
+    for name in compiled:
+        assert list(cache_folder().glob(f"{name}.*.nbc")), name

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from ssmppl.inference.optimisation.newton import GOOD, LITTLE, climb, information_at, widths
+from ssmppl.inference.optimisation.newton import (
+    GOOD,
+    LITTLE,
+    climb,
+    climb_by_slope,
+    information_at,
+    information_by_slope,
+    widths,
+)
 from tests.statistics.checks import seed_of
 
 
@@ -85,3 +93,49 @@ def test_a_width_is_what_changes_the_function_by_about_one():
     change = 0.5 * (found / scale) ** 2
     assert np.all((change[:2] >= 0.05) & (change <= 5.0)[:2])
     assert found[2] == 4.0  # as far as any
+
+
+def gamma_beside_normal(units):
+    """With its gradient: a gamma law's logarithm beside a normal one that leans on it."""
+
+    def function(z):
+        a, b = z[0] / units, z[1]
+        off = b - 0.4 * a
+        if a > 700.0:
+            return -np.inf, np.full(2, np.nan)
+        value = 7.0 * a - 7.0 * np.exp(a) - 15.0 * off**2
+        return value, np.array([(7.0 - 7.0 * np.exp(a) + 12.0 * off) / units, -30.0 * off])
+
+    return function
+
+
+@pytest.mark.parametrize("units", [1e-6, 1.0, 1e4])
+def test_by_the_gradient(units):
+    function, exact = gamma_beside_normal(units), np.array([[11.8, -12.0], [-12.0, 30.0]])
+    scale = np.diag([1.0 / units, 1.0])
+    exact = scale @ exact @ scale
+    np.testing.assert_allclose(information_by_slope(function, np.zeros(2)), exact, rtol=2e-3)
+    found = climb_by_slope(function, np.array([3.0 * units, -2.0]))
+    assert found.value > function(np.array([3.0 * units, -2.0]))[0]
+    if units == 1.0:  # far from it the other climb takes over, which measures in widths
+        assert found.is_top
+        assert found.distance < 1e-7
+        assert found.value == pytest.approx(-7.0, abs=1e-6)
+
+
+def test_by_the_gradient_of_a_quadratic():
+    rng = np.random.default_rng(seed_of("by the gradient"))
+    root = rng.standard_normal((5, 5))
+    h, top = root @ root.T + 0.1 * np.eye(5), rng.standard_normal(5)
+    found = climb_by_slope(
+        lambda z: (3.0 - 0.5 * (z - top) @ h @ (z - top), -h @ (z - top)), top + 20.0
+    )
+    np.testing.assert_allclose(found.z, top, atol=1e-3)
+    np.testing.assert_allclose(found.information, h, rtol=1e-6, atol=1e-7)
+
+
+def test_by_the_gradient_where_there_is_none():
+    assert climb_by_slope(lambda z: (-np.inf, np.full(2, np.nan)), np.zeros(2)) is None
+    found = climb_by_slope(lambda z: (-0.5 * z @ z, np.full(2, np.nan)), np.ones(2))
+    assert not found.is_top
+    assert found.distance == np.inf

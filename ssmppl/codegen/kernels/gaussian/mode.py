@@ -186,12 +186,14 @@ def follow_step(begin, follow, look, theta, c, s, share, x_old, e_old, aim, gain
 
 @exact
 def eliminate_all(
-    bend_initial, bend, theta, c, s, curved, r, x, e, slopes, aim, gain, root, jacobian, spread
+    bend_initial, bend, theta, c, s, curved, r, x, e, slopes, aim, gain, root, jacobian, spread,
+    information, costate,
 ):  # fmt: skip
     """The backward pass along a trajectory that follows the model: (log det, nats that the step
     gains), inf and nan where it comes to no number.
 
-    curved : with all second derivatives; else those of Gauss and Newton's method.
+    curved : with all second derivatives; else those of Gauss and Newton's method. information (T,
+    D, D), costate (T, D) : minus curvature and slope in x_t of row t and all that follows, written.
     """
     n_steps, d = x.shape
     widest = e.shape[1]
@@ -218,9 +220,11 @@ def eliminate_all(
             lift(h)
         for i in range(d):
             g[i] = g_before[i] + slopes[t, 1 + i]
+            costate[t, i] = g[i]
             now[i, 0] = x[t, i]
             for j in range(d):
                 a[i, j] = a_before[i, j] + h[i, j]
+                information[t, i, j] = a[i, j]
         n = r[0] if t == 0 else r[1]
         for k in range(n):
             both[k] = e[t, k]
@@ -261,13 +265,14 @@ def eliminate_all(
 
 @exact
 def gaussian_mode(
-    prepare, step, begin, follow, bend_initial, bend, look, sizes, theta, y, seen, u, r,
-    x, e, aim, gain, root, jacobian, spread,
+    prepare, step, follow_step, eliminate_all, sizes, theta, y, seen, u, r,
+    x, e, aim, gain, root, jacobian, spread, information, costate,
 ):  # fmt: skip
     """(Laplace's log-likelihood less its constant, nats left to gain), by Newton's method from e.
 
-    r : numbers (R_1, R) of noises. e (T, R') : where it starts, and then the mode; x (T, D), aim
-    (T, R'), gain (T, R', D), root (T, R', R'), jacobian (T, D, D) and spread (T, D, R') : there,
+    follow_step, eliminate_all : those above, of the model. r : numbers (R_1, R) of noises. e (T,
+    R') : where it starts, and then the mode; x (T, D), aim (T, R'), gain (T, R', D), root (T, R',
+    R'), jacobian (T, D, D), spread (T, D, R'), information (T, D, D) and costate (T, D) : there,
     written. -inf where the model or its curvature comes to no number; nan where the last trajectory
     is no maximum. The constant is none: g and the law of e are whole densities, and what e's lacks
     is what the integral gives.
@@ -282,9 +287,7 @@ def gaussian_mode(
         step(theta, c, y, seen, u, t, s[t])
     aim[:] = 0.0
     gain[:] = 0.0
-    value = follow_step(
-        begin, follow, look, theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes
-    )
+    value = follow_step(theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes)
     if not value > -np.inf:
         return -np.inf, np.nan
     x[:] = x_new
@@ -292,14 +295,14 @@ def gaussian_mode(
     for _ in range(PASSES):
         curved = True
         log_det, left = eliminate_all(
-            bend_initial, bend, theta, c, s, True, r, x, e, slopes, aim, gain, root, jacobian,
-            spread,
+            theta, c, s, True, r, x, e, slopes, aim, gain, root, jacobian, spread, information,
+            costate,
         )  # fmt: skip
         if not left >= 0.0:
             curved = False
             log_det, left = eliminate_all(
-                bend_initial, bend, theta, c, s, False, r, x, e, slopes, aim, gain, root, jacobian,
-                spread,
+                theta, c, s, False, r, x, e, slopes, aim, gain, root, jacobian, spread,
+                information, costate,
             )  # fmt: skip
         if not left >= 0.0:
             return -np.inf, np.nan
@@ -309,8 +312,7 @@ def gaussian_mode(
         share, moved = 1.0, False
         for _ in range(HALVINGS):
             new = follow_step(
-                begin, follow, look, theta, c, s, share, x, e, aim, gain, r, x_new, e_new,
-                slopes_new,
+                theta, c, s, share, x, e, aim, gain, r, x_new, e_new, slopes_new
             )  # fmt: skip
             if new >= value + ENOUGH * share * left - ROUNDING * abs(value):
                 moved = True
