@@ -35,6 +35,7 @@ from ssmppl.inference.preparation.method_choice import (
     choose_maximiser,
     choose_sampler,
     choose_smoother,
+    only_counts,
     why_stuck,
 )
 from ssmppl.inference.run.problem import missing_of
@@ -162,6 +163,7 @@ class Plan:
                 self._numbers(),
                 why_stuck(self.trace, self.rows),
                 singular_covariance(self.trace),
+                only_counts(self.trace),
             )
         }
         if self.trace.parameters:

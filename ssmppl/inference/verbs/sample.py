@@ -24,7 +24,7 @@ from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_diges
 from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
-from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
+from ssmppl.inference.preparation.method_choice import choose_sampler, only_counts, why_stuck
 from ssmppl.inference.preparation.space import free_components, space_of
 from ssmppl.inference.run.convergence import mixing_attributes
 from ssmppl.inference.run.draws import stack
@@ -231,7 +231,8 @@ def _chosen(problem: Problem, fixed_values: dict[str, np.ndarray]) -> tuple[Meth
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
     drawn = not isinstance(exact, NotApplicable) and singular is None
     updates = plan_updates(problem, fixed_values) if drawn else ()
-    return choose_sampler(exact_kind(exact), updates, numbers, stuck, singular)
+    counted = only_counts(problem.trace)
+    return choose_sampler(exact_kind(exact), updates, numbers, stuck, singular, counted)
 
 
 def _to_arviz(
