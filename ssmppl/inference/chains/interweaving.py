@@ -424,7 +424,7 @@ def prepare_interweaving(
                 return None, f"none: {reason}"
     if model is None and found.parameters:
         moves.append(NoiseMove(setup.problem, found, False, near))
-    names = found.tied if steered or model is not None else found.parameters
+    names = found.tied
     owner = [t.site.name for t in transforms(setup.problem.trace) for _ in t.free]
     movable = np.array([k for k, i in enumerate(space.positions) if owner[i] in names], dtype=int)
     if not len(movable):
