@@ -27,6 +27,8 @@ BIN     := $(VENV)/bin
 PIP     := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 export MPLBACKEND ?= Agg
+# With as many workers as cores a second thread of linear algebra in each only waits for a core.
+test slow exhaustive tables gap examples docs: export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow exhaustive tables gap examples check docs linkcheck bench package audit

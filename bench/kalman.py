@@ -46,7 +46,9 @@ def runs(d, k):
     draw = exact_entry("draw")
     return {
         "log-likelihood": lambda: exact_entry("kalman_filter")(*made, y, seen, out, *none),
-        "score": lambda: exact_entry("adjoints")(made, start, y, seen, out, zeros_like(made)),
+        "score": lambda: exact_entry("adjoints")(
+            made, start, y, seen, np.ones(8, np.int64), out, zeros_like(made)
+        ),
         "smoother": lambda: exact_entry("smooth")(
             made, start, y, seen, out, *moments, None, None, None, None
         ),

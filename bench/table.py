@@ -13,12 +13,17 @@ WIDEST = (("avx512f", "AVX-512"), ("avx2", "AVX2"))
 
 def show(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table in Markdown, the columns aligned."""
+    print(text(header, rows), flush=True)
+
+
+def text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """The table in Markdown, the columns aligned."""
     cells = [[str(c) for c in row] for row in (header, *rows)]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
     lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |"
              for row in cells]  # fmt: skip
     lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
-    print("\n".join(lines), flush=True)
+    return "\n".join(lines)
 
 
 def machine() -> str:

@@ -19,6 +19,7 @@ from ssmppl.errors import (
 from ssmppl.inference.methods.methods import (
     EM,
     IF2,
+    ISMCMC,
     PGAS,
     PMMH,
     PSAEM,
@@ -120,6 +121,7 @@ _LATER = {
 __all__ = [
     "EM",
     "IF2",
+    "ISMCMC",
     "PGAS",
     "PMMH",
     "PSAEM",

@@ -146,6 +146,22 @@ class LinearGaussian:
     R: ExprArray
     flat: tuple[int, ...] = ()
 
+    def reordered(self, order: Sequence[int]) -> LinearGaussian:
+        """The same model with the states in this order, order[i] the old place of the new i-th."""
+        index = list(order)
+
+        def square(matrix: ExprArray) -> ExprArray:
+            return array(matrix.view(np.ndarray)[np.ix_(index, index)])
+
+        def vector(values: ExprArray) -> ExprArray:
+            return array(values.view(np.ndarray)[index])
+
+        return LinearGaussian(
+            vector(self.m), square(self.P), square(self.A), vector(self.b), square(self.Q),
+            array(self.C.view(np.ndarray)[:, index]), self.d, self.R,
+            tuple(sorted(index.index(i) for i in self.flat)),
+        )  # fmt: skip
+
 
 def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
     """The whole model as a linear Gaussian one, or the first reason why it is not."""

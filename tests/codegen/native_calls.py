@@ -1,7 +1,6 @@
 """Functions of a random or given model, called as native code and as plain Python."""
 
 import ctypes
-import re
 from functools import partial
 
 import numpy as np
@@ -12,8 +11,6 @@ from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.translate import PLANES
 from tests.codegen.harness import PARTICLES, ROOM, STEPS, plain_module
-
-MATRIX = re.compile(r"\b(cholesky|inverse|logdet|det)\(\(")  # what is left to Numba
 
 
 def called(address, names, values):
@@ -41,7 +38,9 @@ def arguments(numbers, t, rng):
         "out": rng.normal(size=(ROOM, PARTICLES)), "noise": rng.normal(size=ROOM),
         "reference": np.ascontiguousarray(numbers.states[t, :, 2]) if d else np.zeros(0),
         "normals": rng.normal(size=ROOM * PARTICLES), "uniforms": rng.uniform(size=ROOM),
-        "rng": new_state(np.random.SeedSequence(3)),
+        "rng": new_state(np.random.SeedSequence(3)), "steps": STEPS,
+        "trajectory": np.ascontiguousarray(numbers.states[:, :, 2]), "total": rng.normal(size=ROOM),
+        "z": rng.normal(size=ROOM), "free": np.arange(ROOM) % 3 > 0,
     }  # fmt: skip
 
 
@@ -80,8 +79,7 @@ def both_ways(plain, name, section, text, numbers, rng):
     found = addresses(name, text)
     for t in (0, STEPS - 1):
         values = arguments(numbers, t, rng)
-        order = ["prepare", "step", *(r for r in section.roles if r not in ("prepare", "step"))]
-        for role in order:
+        for role in sorted(section.roles, key=lambda r: (r != "prepare", r != "step")):
             names = section.roles[role].split(", ")
             if t == 0 and "states_prev" in names:
                 continue
@@ -89,6 +87,6 @@ def both_ways(plain, name, section, text, numbers, rng):
             called(found[section.name(role)], names, values)
             with np.errstate(all="ignore"):
                 getattr(plain, section.name(role))(*(twin[n] for n in names))
-            for n in set(names) - {"t"}:
+            for n in set(names) - {"t", "steps"}:
                 near = partial(rounded, getattr(plain, section.name(role)), names, before, n)
                 yield f"{section.name(role)}, {n}, t={t}", values[n], twin[n], near

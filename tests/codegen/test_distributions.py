@@ -4,9 +4,11 @@ One generated module for each distribution and spelling of its parameters: the s
 distribution with symbols for parameters, whose values come in theta.
 """
 
+import contextlib
 import functools
 import math
 import zlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ import scipy.stats as st
 import ssmppl.language.distributions as D
 from ssmppl.codegen.kernels.math.random import fill_normal, fill_uniform, new_state
 from ssmppl.codegen.modules.program import compile_trace
+from ssmppl.codegen.native.build import addresses
+from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.store import folder
 from ssmppl.codegen.text.kernel_functions import DRAW_INITIAL, WEIGH_INITIAL
 from ssmppl.codegen.text.module import Layout, ModuleText, Section, Target
@@ -24,6 +28,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.language.distributions.draws import Draws
 from ssmppl.language.model.trace import Site, Trace, symbols
 from ssmppl.language.tracing import trace
+from tests.codegen.native_calls import called
 from tests.language.distributions.distribution_table import CASES, JOINT_CASES, TRUNCATED_CASES
 from tests.language.distributions.test_truncated import COUNTS, check_counts
 from tests.models.statements import declare
@@ -31,6 +36,12 @@ from tests.models.statements import declare
 N = 20_000
 LEVEL = 1e-6 / (len(CASES) + 6 * len(JOINT_CASES) + len(TRUNCATED_CASES))  # Bonferroni
 NOWHERE = Location("<test>", 1)
+
+
+def by_address(address, arguments, *values):
+    """Call a native function, given its arguments' names in a row."""
+    names = arguments.split(", ")
+    called(address, names, dict(zip(names, values, strict=True)))
 
 
 class Compiled:
@@ -56,14 +67,21 @@ class Compiled:
         section.particle_pass("weigh", "Log density.", WEIGH_INITIAL, [density])
         text = ModuleText(section.layout)
         text.add("law", section)
-        self.module = folder.load("law", text.finish(["A law."]))
+        module = folder.load("law", text.finish(["A law."]))
+        self.functions = {role: getattr(module, section.name(role)) for role in section.roles}
+        with contextlib.suppress(Untranslatable):  # matrices are left to Numba
+            found = addresses("law", text.texts[id(section)])
+            self.functions = {
+                role: partial(by_address, found[section.name(role)], arguments)
+                for role, arguments in section.roles.items()
+            }
         self.section, self.states = section, len(place)
         self.index = [place[s] for s in value.ravel()]  # flat value -> row of states
         self.noise = section.normals, section.uniforms
 
     def constants(self, theta):
         c = np.empty(len(self.section.c))
-        self.module.prepare_law(theta, c)
+        self.functions["prepare"](theta, c)
         return c
 
     def sample(self, theta, seed, n=N):
@@ -73,7 +91,8 @@ class Compiled:
         fill_normal(rng, normals)
         fill_uniform(rng, uniforms)
         out = np.empty((self.states, n))
-        self.module.draw_law(theta, self.constants(theta), np.empty(0), out, normals, uniforms, rng)
+        c = self.constants(theta)
+        self.functions["draw"](theta, c, np.empty(0), out, normals, uniforms, rng)
         return out[self.index]
 
     def log_density(self, theta, values):
@@ -81,7 +100,7 @@ class Compiled:
         states = np.empty((self.states, values.shape[1]))
         states[self.index] = values
         log_w = np.empty(values.shape[1])
-        self.module.weigh_law(theta, self.constants(theta), np.empty(0), states, log_w)
+        self.functions["weigh"](theta, self.constants(theta), np.empty(0), states, log_w)
         return log_w
 
 

@@ -6,6 +6,8 @@ import re
 import stat
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -88,19 +90,33 @@ def test_the_digest_knows_text_kernels_and_versions(monkeypatch):
 
 # -- cache on disk, always in processes of their own
 SCRIPT = """
-import numpy as np, sys
+import numpy as np
+from ssmppl.analysis.conjugacy.derive import derive_updates
+from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
+from ssmppl.language.tracing import trace
+from tests.models.statements import build
+traced = trace(build("linear_scalar"))
+updates = derive_updates(traced)
+module = compile_updates(traced, updates).module
+run = getattr(module, statistics_name(updates[0]))  # the variant that Numba compiles and keeps
+y, total = np.ones((3, 1)), np.empty(len(updates[0].functions))
+run(np.array([0.5, 1.0, 1.0]), y, y, np.zeros((3, 0)), y + 0.3, total)
+hits, misses = run.stats.cache_hits, run.stats.cache_misses
+print(sum(hits.values()), sum(misses.values()), sum(total), module.__file__)
+"""
+SIMULATION = """
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.codegen.kernels.math.random import new_state
 from ssmppl.language.tracing import trace
 from tests.models.statements import build
+import numpy as np
 program = compile_trace(trace(build("linear_scalar")))
-run = program.module.simulate  # the variant that Numba compiles and keeps
-y = np.zeros((3, 1))
-out = np.empty((3, 1, 2)), np.empty((3, 1, 2))
-run(np.array([0.5, 1.0, 1.0]), y, y + 1, np.zeros((3, 0)), new_state(np.random.SeedSequence(1)),
-    *out, False)
-stats = run.stats
-print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()), out[1].sum(), program.path)
+y, out = np.zeros((3, 1)), (np.empty((3, 1, 1)), np.empty((3, 1, 1)))
+program.entry("simulate")(
+    np.array([0.5, 1.0, 1.0]), y, y + 1, np.zeros((3, 0)), new_state(np.random.SeedSequence(1)),
+    *out, False,
+)
+print(0, 0, out[1].sum(), program.path)
 """
 
 
@@ -114,7 +130,7 @@ def start(folder, script=SCRIPT, **more):
 
 
 def finish(process):
-    """(cache hits, cache misses, sum of what was simulated, path of the module)."""
+    """(cache hits, cache misses, the number that was computed, path of the module)."""
     out, error = process.communicate(timeout=200)
     assert process.returncode == 0, error
     hits, misses, total, path = out.split()
@@ -175,10 +191,11 @@ def test_what_is_damaged_is_made_anew(tmp_path, damage):
 
 def test_two_processes_at_once_then_a_third(tmp_path):
     both = [finish(p) for p in [start(tmp_path), start(tmp_path)]]
+    assert sorted(found[:2] for found in both) == [(0, 1), (1, 0)]  # one waits for the other
     assert both[0][2:] == both[1][2:]
     path = both[0][3]
     assert path.parent == tmp_path / "ssmppl"
-    assert not list(path.parent.glob("*.tmp"))
+    assert not [*path.parent.glob("*.tmp"), *path.parent.glob("*.lock")]
     assert finish(start(tmp_path)) == (1, 0, *both[0][2:])  # nothing is compiled again
     text = path.read_text()
     for spoilt in ("raise SystemExit('edited')\n", "", text + "\nentry = None\n"):
@@ -186,6 +203,35 @@ def test_two_processes_at_once_then_a_third(tmp_path):
         assert finish(start(tmp_path))[2:] == both[0][2:]
         restored = path.read_text() == text
         assert restored
+
+
+def test_what_another_makes_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("SSMPPL_CACHE", str(tmp_path))
+    order, begun = [], threading.Event()
+
+    def first():
+        with folder.one_process("thing"):
+            begun.set()
+            time.sleep(0.2)
+            order.append("made")
+
+    other = threading.Thread(target=first)
+    other.start()
+    begun.wait()
+    with folder.one_process("thing"):
+        order.append("looked for")
+    other.join()
+    assert order == ["made", "looked for"]
+    assert not list(folder.cache_folder().iterdir())
+
+
+def test_it_is_not_waited_for_for_ever(tmp_path, monkeypatch):
+    monkeypatch.setenv("SSMPPL_CACHE", str(tmp_path))
+    monkeypatch.setattr(folder, "PATIENCE", 0.1)
+    with folder.one_process("thing"):
+        begun = time.monotonic()
+        with folder.one_process("thing"):
+            assert 0.1 <= time.monotonic() - begun < 30.0
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
@@ -242,8 +288,6 @@ def test_a_folder_that_others_write_to_is_not_used(tmp_path, monkeypatch, change
 
 def test_runs_without_compiling(tmp_path):
     """NUMBA_DISABLE_JIT=1 gives the same numbers, for debugging."""
-    script = SCRIPT.replace("stats = run.stats", "class stats: cache_hits = cache_misses = {}")
-    script = script.replace("3, 1, 2", "3, 1, 1")
-    compiled = finish(start(tmp_path, SCRIPT.replace("3, 1, 2", "3, 1, 1")))
-    debugged = finish(start(tmp_path, script, NUMBA_DISABLE_JIT="1"))
+    compiled = finish(start(folder.cache_folder().parent, SIMULATION))
+    debugged = finish(start(tmp_path, SIMULATION, NUMBA_DISABLE_JIT="1"))
     assert debugged[2] == pytest.approx(compiled[2], rel=1e-12)

@@ -12,7 +12,7 @@ import ssmppl as ssm
 from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
 from tests.codegen.harness import Numbers
-from tests.codegen.native_calls import MATRIX, both_ways, sections
+from tests.codegen.native_calls import both_ways, sections
 from tests.fuzz.calls import Case, LeftOut, Outcome, Wrong, judged, random_call
 from tests.fuzz.later import LATER, LaterCase
 from tests.fuzz.models import Recipe, random_model
@@ -65,8 +65,6 @@ def agree(model: ssm.Model, rng: np.random.Generator) -> None:
         raise LeftOut(str(error)) from error
     plain, parts = sections(traced, gaps)
     for name, section, text in parts:
-        if MATRIX.search(text):
-            continue
         try:
             found = both_ways(plain, name, section, text, numbers, rng)
             for what, native, interpreted, near in found:

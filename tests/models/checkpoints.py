@@ -65,6 +65,8 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
     "PMMH": (ssm.PMMH(target_sd=2.0, proposal="bootstrap"), {"fixed": {"r": 0.2}}),
     "PMMH, gradient": (ssm.PMMH(particles=20, order=2, lag=3, proposal="bootstrap"), {}),
     "PMMH, correlated": (ssm.PMMH(particles=20, correlation=0.9, proposal="bootstrap"), {}),
+    "PMMH, delayed": (ssm.PMMH(particles=8, proposal="twisted"), {}),
+    "ISMCMC": (ssm.ISMCMC(), {"chains": 2, "draws": 40}),
     "PGAS": (ssm.PGAS(particles=10, log_likelihood=True, proposal="bootstrap"), {"thin": 2}),
     "PGAS, interweaved": (ssm.PGAS(particles=10, interweave=True, proposal="bootstrap"), {}),
     "PGAS, auto": (

@@ -1,5 +1,6 @@
 """Models of finitely many values, and their answers by enumerating every path."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -104,22 +105,26 @@ def enumerated(traced, e, theta):
     assert not isinstance(form, NotApplicable)
     values, missing = form.values, Missing(partial=e.partial)
     given = values_of(traced, e, theta)
+
+    @functools.cache
+    def log_density(t, before, now):
+        """Of x_t, the value of this number, and y_t, given that of x_{t-1}."""
+        env = {s: (v[t] if np.ndim(v) else v) for s, v in given.items()}
+        env |= dict(zip(traced.observation_symbols, e.y[t], strict=True))
+        env |= {seen(s): m for s, m in zip(traced.observation_symbols, e.seen[t], strict=True)}
+        env |= dict(zip(traced.state_symbols, values[now], strict=True))
+        if t:
+            earlier = [previous(s) for s in traced.state_symbols]
+            env |= dict(zip(earlier, values[before], strict=True))
+        roles = ("transition" if t else "initial", "observation")
+        found = [term for role in roles for term in terms(traced, role, missing)]
+        return sum(float(evaluate(term.guarded(), env)) for term in found)
+
     paths, total = [], []
     for index in itertools.product(range(len(values)), repeat=e.steps):
-        path, log_p = values[list(index)], 0.0
-        for t in range(e.steps):
-            env = {s: (v[t] if np.ndim(v) else v) for s, v in given.items()}
-            env |= dict(zip(traced.observation_symbols, e.y[t], strict=True))
-            env |= {seen(s): m for s, m in zip(traced.observation_symbols, e.seen[t], strict=True)}
-            env |= dict(zip(traced.state_symbols, path[t], strict=True))
-            if t:
-                before = [previous(s) for s in traced.state_symbols]
-                env |= dict(zip(before, path[t - 1], strict=True))
-            for role in ("transition" if t else "initial", "observation"):
-                for term in terms(traced, role, missing):
-                    log_p += float(evaluate(term.guarded(), env))
-        paths.append(path)
-        total.append(log_p)
+        pairs = zip((None, *index), index, strict=False)
+        paths.append(values[list(index)])
+        total.append(sum(log_density(t, *pair) for t, pair in enumerate(pairs)))
     return np.array(paths), np.array(total)
 
 

@@ -62,7 +62,7 @@ def test_a_state_that_leads_there_is_told(proposal):
 )
 def test_a_prior_that_reaches_below_zero(method):
     model = level("transition", ssm.Normal(0.2, sd=0.3))
-    q = np.linspace(0, 2, 2001)[1:]
+    q = np.linspace(0, 2, 401)[1:]
     log_p = -0.5 * ((q - 0.2) / 0.3) ** 2
     log_p += [ssm.log_likelihood(model, DATA, {"q": v}, proposal="kalman")[0] for v in q]
     p = np.exp(log_p - log_p.max())

@@ -10,8 +10,9 @@ from scipy import stats
 
 import ssmppl as ssm
 from ssmppl.codegen.kernels.math.flags import interpreted
+from ssmppl.codegen.kernels.math.sums import weighted_statistics
 from ssmppl.codegen.kernels.particle.conditional_smc import JOINING
-from ssmppl.codegen.kernels.particle.weights import NAN, weighted_statistics
+from ssmppl.codegen.kernels.particle.weights import NAN
 from ssmppl.inference.particles.backward import sweep_failure
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
@@ -235,13 +236,13 @@ def test_filter_means_after_paths_left_the_numbers():
 
 
 def test_a_path_without_weight_adds_nothing():
-    def statistics(theta, y, seen, u, path, part):
+    def statistics(theta, y, seen, u, steps, path, part):
         part[0] = path[0, 0]
 
     paths, weights = np.array([[[2.0]], [[np.nan]]]), np.array([1.0, 0.0])
     each, part, total = np.empty((2, 1)), np.empty(1), np.zeros(1)
     plain = interpreted(weighted_statistics.py_func)
-    plain(statistics, None, None, None, None, paths, weights, each, part, total)
+    plain(statistics, None, np.zeros(1), None, None, paths, weights, each, part, total)
     assert total.tolist() == [2.0]
     assert np.isnan(each[1, 0])
 

@@ -113,15 +113,20 @@ def studies() -> dict[str, Study]:
         "PMMH order 2": ssm.PMMH(particles=60, proposal="bootstrap", order=2),
         "PMMH auxiliary": ssm.PMMH(particles=40, proposal="auxiliary"),
         "PMMH twisted": ssm.PMMH(particles=20, proposal="twisted"),
+        "PMMH twisted at once": ssm.PMMH(
+            particles=20, proposal="twisted", delayed_acceptance=False
+        ),
+        "PMMH delayed": ssm.PMMH(particles=60, proposal="bootstrap", delayed_acceptance=True),
         "PMMH natural scale": ssm.PMMH(particles=60, proposal="bootstrap", scale="natural"),
         "PMMH rescue": ssm.PMMH(particles=60, proposal="bootstrap", rescue=50),
     }
+    twisted = {"PMMH twisted": variants["PMMH twisted"]}
     table: dict[str, dict] = {
-        "proper_varves": pgas | guided | pmmh | pmmh_guided,
+        "proper_varves": pgas | guided | pmmh | pmmh_guided | twisted,
         "regression": pgas | look_ahead | pmmh,
         "two_states": pgas | pmmh,
         "counts": pgas | guided | pmmh | variants,
-        "stationary": exact | plain | pmmh,
+        "stationary": exact | plain | pmmh | twisted,
         "vector_ar": exact | plain,
         "vector_ar_apart": exact | plain,
         "three_regimes": finite | plain | pmmh,
@@ -129,7 +134,7 @@ def studies() -> dict[str, Study]:
         "ricker": pgas | guided | pmmh,
         "growth": pgas | pmmh,
         "bounded": without_elimination | guided | pmmh,
-        "delay": exact | pgas | pmmh,
+        "delay": exact | pgas | pmmh | twisted,
     }
     found = [
         Study(model, method, label, 0 if label in ("PGAS", "Gibbs") else 300)

@@ -110,7 +110,10 @@ class Transitions:
         exact = not hasattr(kernel.likelihood, "settings")
         run = None
         for _ in range(1 if exact else RUNS):
-            new = kernel.likelihood.run(theta, None, state.stream)
+            if kernel.first is None:
+                new = kernel.likelihood.run(theta, None, state.stream)
+            else:
+                new = kernel.likelihood.run_given(theta, kernel.first.at(theta), state.stream)
             if new is None:
                 continue
             change = -np.inf if run is None else run.log_likelihood - new.log_likelihood

@@ -28,6 +28,7 @@ from tests.models import wider as wider_models
 
 from .checks import seed_of
 
+APART = 8  # draws of ISMCMC between those that are ranked
 KEPT = 63  # L: ranks from 0 to 63
 BINS = 16
 STEPS = 50
@@ -43,7 +44,7 @@ class Study:
     """
 
     model: str
-    method: ssm.PMMH | ssm.PGAS | ssm.Gibbs | ssm.MetropolisHastings | ssm.SMC2
+    method: ssm.PMMH | ssm.ISMCMC | ssm.PGAS | ssm.Gibbs | ssm.MetropolisHastings | ssm.SMC2
     parameters: tuple[str, ...]
     state: str
 
@@ -53,11 +54,12 @@ class Study:
 
     @property
     def label(self) -> str:
-        """The method; those interweaved in every sweep, or with parameters eliminated, are studied
-        beside the plain ones."""
+        """The method; those interweaved in every sweep, with parameters eliminated, or over the
+        twisted filter, are studied beside the plain ones."""
         woven = getattr(self.method, "interweave", False) is True
         without = getattr(self.method, "eliminate", False) is not False
-        name = type(self.method).__name__
+        twisted = getattr(self.method, "proposal", "") == "twisted"
+        name = type(self.method).__name__ + " twisted" * twisted
         return name + " interweaved" * woven + " eliminated" * without
 
     @property
@@ -100,6 +102,8 @@ METHODS = (
     ssm.PMMH(particles=100),
     ssm.SMC2(parameters=4 * KEPT, particles=50),
 )
+APPROXIMATED = (ssm.ISMCMC(particles=8), ssm.PMMH(particles=8, proposal="twisted"))
+GAUSSIAN = {name: MODELS[name] for name in ("proper_varves", "counts")}
 EXACT = (ssm.Gibbs(interweave=False), ssm.Gibbs(interweave=True), ssm.MetropolisHastings())
 PLAIN = (METHODS[0], METHODS[3])
 MISSING = {"vector_ar", "vector_ar_apart", "bounded"}  # of their data, some steps and entries
@@ -107,6 +111,7 @@ STUDIES = {
     study.name: study
     for models_, methods in (
         (MODELS, METHODS),
+        (GAUSSIAN | LINEAR, APPROXIMATED),
         (LINEAR, EXACT),
         (BLOCKS, EXACT[:1]),
         (WIDER, PLAIN),
@@ -134,7 +139,9 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
     seeds = np.random.SeedSequence(seed_of("sbc", label, study.name, replication)).spawn(2)
     first, second = (int(s.generate_state(1)[0]) for s in seeds)
     u = inputs_of(model)
-    walks = isinstance(study.method, (ssm.PMMH, ssm.MetropolisHastings))
+    walks = isinstance(study.method, (ssm.PMMH, ssm.ISMCMC, ssm.MetropolisHastings))
+    # of draws that are resampled out of as many, some are copies: those far apart are none
+    apart = APART if isinstance(study.method, ssm.ISMCMC) else 1
     warmup = 600 if walks else 200  # random walks adapt during it
     truth = ssm.simulate(model, steps=STEPS, inputs=u or None, seed=first)
     y = truth["y"].values[0].copy()
@@ -144,10 +151,10 @@ def draws_of(study: Study, replication: int, draws: int, thin: int, label: str):
             y[20:25, 0] = y[40, 1] = np.nan
     data = {"y": y} | u
     idata = ssm.sample(
-        model, data, study.method, draws=draws, warmup=warmup, chains=1, thin=thin, progress=False,
-        seed=second,
+        model, data, study.method, draws=apart * draws, warmup=warmup, chains=1, thin=thin,
+        progress=False, seed=second,
     )  # fmt: skip
-    posterior = idata["posterior"]
+    posterior = idata["posterior"].isel(draw=slice(None, None, apart))
     middle = STEPS // 2
     known = [entry(truth, p)[0] for p in study.parameters]
     drawn = [entry(posterior, p) for p in study.parameters]

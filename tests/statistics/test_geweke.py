@@ -87,7 +87,7 @@ SLOW = (
     "proper_varves PGAS", "regression PGAS eliminated", "two_states PMMH", "counts PGAS guided",
     "stationary MetropolisHastings", "vector_ar_apart Gibbs", "three_regimes Gibbs",
     "leverage PGAS", "ricker PMMH", "growth PGAS interweaved", "bounded PGAS", "delay PGAS",
-    "delay Gibbs interweaved",
+    "delay Gibbs interweaved", "counts PMMH delayed", "proper_varves PMMH twisted",
 )  # fmt: skip
 NAMES = [pytest.param(n, marks=[pytest.mark.exhaustive] * (n not in SLOW)) for n in STUDIES]
 

@@ -43,13 +43,13 @@ from ssmppl.codegen.native.loading import Loaded, load
 from ssmppl.codegen.text.kernel_functions import (
     add_conditional_smc,
     add_filters,
+    add_log_joint,
+    add_parameters,
     add_predictions,
     backward_functions,
     conditional_passes,
     filter_functions,
     horizon,
-    log_joint_function,
-    parameter_functions,
     simulation_functions,
 )
 from ssmppl.codegen.text.module import Layout, ModuleText
@@ -246,10 +246,9 @@ def _write(
             out.algorithm(move_blocks, section.name("move_blocks"), section, "entry")
     if trace.observations:
         _backward(out, trace, layout, plain)
-    out.add_function("complete-data log density", log_joint_function(trace, layout, missing))
-    out.add_each("log_joint")
+    add_log_joint(out, trace, layout, missing)
     if trace.parameters:
-        out.add_function("parameters", parameter_functions(trace, layout))
+        add_parameters(out, trace, layout)
     return out, _introduction(trace, proposals)
 
 

@@ -127,9 +127,12 @@ class TwistedFilter:
         return call
 
     def guide(
-        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, horizon: int = 0
-    ) -> np.ndarray:
+        self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, horizon: int = 0,
+        e: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
         """The inputs (T, U), and behind them each row's guide: precision, slope, centre.
+
+        e : noise (T, R') of the likeliest trajectory where it is known, which saves the search.
 
         A guide that nothing can be computed of is flat: the particles move by the transition.
         """
@@ -137,7 +140,7 @@ class TwistedFilter:
         out[:, : u.shape[1]] = u
         ones = [k for k, s in enumerate(self.order) if _on_diagonal(s)]
         out[0, u.shape[1] + np.array(ones, dtype=int)] = 1.0
-        reference = self.gaussian.reference((theta, y, seen, u))
+        reference = self.gaussian.reference((theta, y, seen, u), e)
         if reference is None:
             return out
         back = Backward.like(reference)

@@ -2,6 +2,7 @@
 
     translate.py  the text of a generated function -> LLVM IR, a statement at a time
     arithmetic.py its expressions
+    matrices.py   operations on small matrices among them
     library.py    the scalar functions that such text calls, as Numba compiles them, once for all
     build.py      IR -> machine code, kept on disk -> addresses
     entries.py    Numba's kernels, compiled once for all models, that call functions by address

@@ -6,9 +6,12 @@ import ast
 import struct
 from dataclasses import dataclass
 
+from ssmppl.codegen.native import matrices
 from ssmppl.errors import SSMError
+from ssmppl.expressions.operations import MATRIX_OPS
 
 FLOAT, BOOLEAN, INTEGER, ROW, PLANE, STREAM = "float", "boolean", "integer", "row", "plane", "rng"
+FLAG_ROW, MATRIX = "row of flags", "matrix"
 COMPARISONS = {ast.Lt: "olt", ast.LtE: "ole", ast.Gt: "ogt", ast.GtE: "oge", ast.Eq: "oeq",
                ast.NotEq: "une"}  # fmt: skip
 ARITHMETIC = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
@@ -21,18 +24,21 @@ class Untranslatable(SSMError):
 
 @dataclass(frozen=True)
 class Value:
-    """A typed value: its kind and the text of the operand; the length where it is an array."""
+    """A typed value: its kind and the text of the operand; the length where it is an array, the
+    entries where it is a matrix."""
 
     kind: str
     text: str
     length: str = ""
+    entries: tuple[tuple[str, ...], ...] = ()
 
 
 class Arithmetic:
     """A function while it is written: its lines, its names, the values of its expressions.
 
     name : of the function. flags : of its floating-point operations. calls : (name, arity, draws)
-    of the scalar functions that it calls. in_loop : whether the line is one of a particle's.
+    of the scalar functions that it calls. in_loop : whether the line is one of a particle's, or of
+    a step's where over_steps.
     """
 
     def __init__(self, name: str, flags: str):
@@ -41,7 +47,7 @@ class Arithmetic:
         self.names: dict[str, Value] = {"inf": number(float("inf")), "nan": number(float("nan"))}
         self.count = 0
         self.calls: set[tuple[str, int, bool]] = set()
-        self.in_loop = False
+        self.in_loop = self.over_steps = False
 
     def value(self, node: ast.expr) -> Value:
         """The value of an expression, after the lines that compute it."""
@@ -133,11 +139,17 @@ class Arithmetic:
             first = self.value(node.slice.lower)
             at = self.let(f"getelementptr double, ptr {array.text}, i64 {first.text}")
             return Value(ROW, at)
+        if array.kind == MATRIX:
+            i, j = ast.literal_eval(node.slice)
+            return Value(FLOAT, array.entries[i][j])
         if array.kind == PLANE and not isinstance(node.slice, ast.Tuple):
             first = self.value(node.slice)
             offset = self.let(f"mul i64 {first.text}, {array.length}")
             at = self.let(f"getelementptr double, ptr {array.text}, i64 {offset}")
             return Value(ROW, at, array.length)
+        if array.kind == FLAG_ROW:
+            at = self.let(f"getelementptr i8, ptr {array.text}, i64 {self.value(node.slice).text}")
+            return Value(BOOLEAN, self.let(f"icmp ne i8 {self.let(f'load i8, ptr {at}')}, 0"))
         return Value(FLOAT, self.load(self.element(node)))
 
     def element(self, node: ast.expr) -> str:
@@ -159,6 +171,8 @@ class Arithmetic:
         if not isinstance(node.func, ast.Name) or node.keywords:
             raise self.unknown(node)
         name = node.func.id
+        if name in MATRIX_OPS:
+            return self._matrix(name, node)
         values = [self.value(a) for a in node.args]
         if name in ("max", "min") and all(v.kind == INTEGER for v in values):
             a, b = values
@@ -174,6 +188,27 @@ class Arithmetic:
         if stream:
             numbers = [f"ptr {values[0].text}", f"i64 {values[0].length}", *numbers]
         return Value(FLOAT, self.let(f"call double @lib_{name}({', '.join(numbers)})"))
+
+    def _matrix(self, name: str, node: ast.Call) -> Value:
+        """An operation on a matrix, whose entries stand in a tuple, row by row."""
+        given, size = node.args
+        if not isinstance(given, ast.Tuple) or not isinstance(size, ast.Constant):
+            raise self.unknown(node)
+        n = int(str(size.value))
+        if n > matrices.LARGEST[name]:
+            raise self.unknown(node)
+        numbers = [self.float(self.value(e)) for e in given.elts]
+        rows = [numbers[n * i : n * (i + 1)] for i in range(n)]
+        if name == "logdet":
+            return Value(FLOAT, matrices.logdet(self.let, rows, self._log))
+        if name == "det":
+            return Value(FLOAT, matrices.det(self.let, rows))
+        made = {"cholesky": matrices.cholesky, "inverse": matrices.inverse}[name](self.let, rows)
+        return Value(MATRIX, "", entries=tuple(map(tuple, made)))
+
+    def _log(self, number: str) -> str:
+        self.calls.add(("log", 1, False))
+        return self.let(f"call double @lib_log(double {number})")
 
     # -- small things
     def float(self, v: Value) -> str:
@@ -205,7 +240,7 @@ class Arithmetic:
 
     @property
     def _group(self) -> str:
-        return ", !llvm.access.group !GROUP" if self.in_loop else ""
+        return ", !llvm.access.group !GROUP" if self.in_loop and not self.over_steps else ""
 
     def let(self, text: str) -> str:
         """A new name for what an instruction gives."""

@@ -39,8 +39,11 @@ def addresses(name: str, text: str) -> Mapping[str, int]:
 def _load(key: str, text: str) -> Mapping[str, int]:
     names, code = None, folder.kept_bytes(key, ".o")
     if code is None:
-        code, names = _compiled(text)
-        folder.keep_bytes(key, ".o", code)
+        with folder.one_process(key):
+            code = folder.kept_bytes(key, ".o")
+            if code is None:
+                code, names = _compiled(text)
+                folder.keep_bytes(key, ".o", code)
     if names is None:
         names = [line[4 : line.index("(")] for line in text.splitlines() if line.startswith("def ")]
     module = llvm.parse_assembly(f'target triple = "{llvm.get_process_triple()}"\n')
@@ -66,14 +69,15 @@ def _compiled(text: str) -> tuple[bytes, list[str]]:
     metadata = (
         '!0 = distinct !{}\n!1 = distinct !{!1, !2}\n!2 = !{!"llvm.loop.parallel_accesses", !0}\n'
     )
-    fabs = "declare double @llvm.fabs.f64(double)"
-    module = llvm.parse_assembly("\n".join([head, fabs, *declared, body, metadata]))
+    own = [f"declare double @llvm.{n}.f64(double)" for n in ("fabs", "sqrt")]
+    own.append("declare double @llvm.copysign.f64(double, double)")
+    module = llvm.parse_assembly("\n".join([head, *own, *declared, body, metadata]))
     for ir in libraries:
         module.link_in(llvm.parse_assembly(ir))
     module.verify()
-    own = set(found.names)
+    public = set(found.names)
     for f in module.functions:
-        if f.name not in own and not f.is_declaration:
+        if f.name not in public and not f.is_declaration:
             f.linkage = llvm.Linkage.internal
     options = llvm.create_pipeline_tuning_options(speed_level=3)
     options.loop_vectorization = True

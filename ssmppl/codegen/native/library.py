@@ -1,7 +1,9 @@
-"""Scalar functions for translated code: the kernels' own, as LLVM IR that Numba made of them.
+"""Scalar functions for translated code: the kernels' own and primitives, as LLVM IR by Numba.
 
-Each is compiled by Numba once, and its IR kept on disk; translated code takes it in and inlines it,
-so that a loop that calls exp still vectorises.
+Each kernel is compiled by Numba once, and its IR kept on disk; translated code takes it in and
+inlines it, so that a loop that calls exp still vectorises. Of the user's primitives those are taken
+in that need nothing of Python at run time: no exception to be raised, no memory to be managed, no
+address of this process.
 """
 
 from __future__ import annotations
@@ -10,12 +12,15 @@ import importlib
 import re
 from typing import Any
 
+import llvmlite.binding as llvm
+import numba
 from numba import float64, types
 
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.store import folder
 from ssmppl.compiling import once
 from ssmppl.expressions.operations import KERNELS, MATRIX_OPS
+from ssmppl.language.user_defined.primitive import REGISTRY
 
 STREAM = types.Array(types.uint64, 1, "C")
 
@@ -30,13 +35,16 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
     ------
     Untranslatable : there is no such function of floats.
     """
+    if name in REGISTRY and not draws:
+        return _of_primitive(name, arity)
     if name not in KERNELS or name in MATRIX_OPS:  # these take tuples, and give arrays
         raise Untranslatable(f"{name} is not a function of numbers", fix="")
     file = f"lib_{name}_{arity}"
     text = folder.kept(file, ".ll")
     if text is None:
-        text = _made(name, arity, draws)
-        folder.keep(file, ".ll", text)
+        with folder.one_process(file):
+            text = folder.kept(file, ".ll") or _made(name, arity, draws)
+            folder.keep(file, ".ll", text)
     return text
 
 
@@ -45,11 +53,44 @@ def _made(name: str, arity: int, draws: bool) -> str:
     dispatcher: Any = getattr(getattr(module, name), "bare", None)
     if dispatcher is None:  # Numba is switched off
         raise Untranslatable(f"{name} is not compiled", fix="")
+    return _wrapped(_compiled(dispatcher, name, arity, draws), name, arity, draws)
+
+
+def _compiled(dispatcher: Any, name: str, arity: int, draws: bool = False) -> Any:
     signature = (*([STREAM] if draws else []), *[float64] * arity)
     dispatcher.compile(signature)
     compiled = dispatcher.overloads[signature]
     if compiled.signature.return_type != float64:
         raise Untranslatable(f"{name} gives {compiled.signature.return_type}", fix="")
+    return compiled
+
+
+def _of_primitive(name: str, arity: int) -> str:
+    made: Any = REGISTRY[name]
+    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {k: v for k, v in made.targetoptions.items() if k != "nopython"}
+    compiled = _compiled(numba.njit(**options)(made.py_func), name, arity)
+    text: str = compiled.library.get_llvm_str()
+    inner = re.escape(_quoted(compiled.fndesc.llvm_func_name))
+    (body,) = re.findall(rf"^define [^\n]*@{inner}\(.+?^}}", text, re.MULTILINE | re.DOTALL)
+    returned = re.findall(r"^ +ret i32 ([^,\n]+)", body, re.MULTILINE)
+    module = llvm.parse_assembly(text)
+    outside = [
+        x.name for x in (*module.functions, *module.global_variables)
+        if x.is_declaration and not x.name.startswith("llvm.")
+    ]  # fmt: skip
+    if set(returned) != {"0"}:
+        raise Untranslatable(f"{name} may raise an exception", fix="")
+    if compiled.library.has_dynamic_globals or not all(map(_of_libm, outside)):
+        raise Untranslatable(f"{name} needs {', '.join(outside) or 'addresses'}", fix="")
+    return _wrapped(compiled, name, arity, False)
+
+
+def _of_libm(name: str) -> bool:
+    return re.fullmatch("[a-z][a-z0-9]*", name) is not None and bool(llvm.address_of_symbol(name))
+
+
+def _wrapped(compiled: Any, name: str, arity: int, draws: bool) -> str:
     inner = compiled.fndesc.llvm_func_name
     numbers = [f"double %x{k}" for k in range(arity)]
     # An array goes to Numba's functions as (parent, owner, items, item size, data, shape, stride).

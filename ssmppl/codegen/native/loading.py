@@ -24,7 +24,7 @@ from numba import config
 from numba.core import event
 from tqdm import tqdm
 
-from ssmppl.codegen.kernels.gaussian import mode
+from ssmppl.codegen.kernels.gaussian import mode, unscented
 from ssmppl.codegen.kernels.particle import backward
 from ssmppl.codegen.kernels.twisted import lookahead, twisting
 from ssmppl.codegen.native.build import addresses
@@ -42,6 +42,7 @@ HELPERS: dict[str, Any] = {
     for home, names in (
         (lookahead, ("look_at", "most_likely")),
         (mode, ("follow_step", "eliminate_all")),
+        (unscented, ("predicted_row",)),
         (twisting, twisting.SPECIALISED),
         (backward, ("backward_weights", "continuation")),
     )

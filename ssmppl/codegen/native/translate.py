@@ -1,13 +1,13 @@
 """The text of a generated function -> LLVM IR.
 
 Generated functions are written in a small part of Python: straight-line arithmetic on floats, one
-loop over particles, rows of arrays. All that is here is what `module.py` writes; anything else is
-`Untranslatable`, and Numba gets the text instead.
+loop over particles or over steps, rows of arrays. All that is here is what `module.py` and
+`sums.py` write; anything else is `Untranslatable`, and Numba gets the text instead.
 
 Every function takes one pointer to 64-bit words, two for each of its parameters: an array's address
 and the length of its last axis, or a whole number and nothing. Iterations of a loop over particles
 touch their own particle only, and the loop says so to the vectoriser, which then needs no checks
-for overlapping rows.
+for overlapping rows; in a loop over steps one reads what another wrote.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 
 from ssmppl.codegen.kernels.math.flags import FAST
 from ssmppl.codegen.native.arithmetic import (
+    FLAG_ROW,
     INTEGER,
     PLANE,
     ROW,
@@ -29,10 +30,12 @@ from ssmppl.codegen.native.arithmetic import (
 from ssmppl.compiling import parse
 
 PLANES = frozenset(
-    ["y_data", "seen_data", "u_data", "states", "states_prev", "fits", "out"]
+    ["y_data", "seen_data", "u_data", "states", "states_prev", "fits", "out", "trajectory"]
 )  # two-dimensional arrays; all others have one axis
-WHOLE = frozenset(["t"])  # parameters that are whole numbers
+FLAGS = frozenset(["free"])  # of truth values
+WHOLE = frozenset(["t", "steps"])  # parameters that are whole numbers
 STREAMS = frozenset(["rng"])  # of unsigned words, for draws
+KINDS = {PLANE: PLANES, STREAM: STREAMS, FLAG_ROW: FLAGS}
 
 
 @dataclass
@@ -80,7 +83,7 @@ class _Function(Arithmetic):
                 self.names[name] = Value(INTEGER, words[0])
                 continue
             pointer = self.let(f"inttoptr i64 {words[0]} to ptr")
-            kind = PLANE if name in PLANES else STREAM if name in STREAMS else ROW
+            kind = next((k for k, names in KINDS.items() if name in names), ROW)
             self.names[name] = Value(kind, pointer, words[1])
         self._statements(self.node.body)
         body = "\n".join(f"  {line}" if not line.endswith(":") else line for line in self.lines)
@@ -144,14 +147,16 @@ class _Function(Arithmetic):
         if ast.unparse(call.func) != "range" or len(call.args) != 1 or node.orelse:
             raise self.unknown(node)
         length = self.value(call.args[0])
-        index = self._begin_loop(length.text)
+        index = self._begin_loop(length.text, over_steps=ast.unparse(call.args[0]) == "steps")
         outer = dict(self.names)
         self.names[target.id] = Value(INTEGER, index)
         self._statements(node.body)
+        if any(self.names[name] != before for name, before in outer.items()):
+            raise self.unknown(node)  # the next iteration would have to know
         self.names = outer
         self._end_loop()
 
-    def _begin_loop(self, length: str) -> str:
+    def _begin_loop(self, length: str, over_steps: bool = False) -> str:
         self.count += 1
         k = self.count
         self._head = (f"head{k}", f"body{k}", f"exit{k}")
@@ -163,7 +168,7 @@ class _Function(Arithmetic):
             f"br i1 %more{k}, label %{self._head[1]}, label %{self._head[2]}",
             f"{self._head[1]}:",
         ]  # fmt: skip
-        self.block, self.in_loop = self._head[1], True
+        self.block, self.in_loop, self.over_steps = self._head[1], True, over_steps
         self._loop_number = k
         return index
 
@@ -171,7 +176,8 @@ class _Function(Arithmetic):
         k = self._loop_number
         self.lines += [
             f"br label %last{k}", f"last{k}:", f"%next{k} = add nuw nsw i64 %i{k}, 1",
-            f"br label %{self._head[0]}, !llvm.loop !LOOP", f"{self._head[2]}:",
+            f"br label %{self._head[0]}{'' if self.over_steps else ', !llvm.loop !LOOP'}",
+            f"{self._head[2]}:",
         ]  # fmt: skip
         self.block, self.in_loop = self._head[2], False
 

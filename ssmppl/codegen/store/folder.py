@@ -8,6 +8,8 @@ What is compiled is not left to Numba's own files: they hold one index for all s
 function, which two processes that write at once can pair with each other's code, and a full disk or
 half a file ends the call. Here each signature has a file of its own with its digest behind it; what
 cannot be written is compiled again by the next process, and so is what cannot be read.
+
+Where several processes want the same new code at once, one compiles and the others wait for it.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ import platform
 import stat
 import sys
 import tempfile
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -30,11 +33,19 @@ from typing import Any, cast
 
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.compiler import CompileResult
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 
-from ssmppl.compiling import once, one_at_a_time
+from ssmppl.compiling import LOCK, once, one_at_a_time
+
+try:
+    import fcntl
+except ImportError:  # Windows: each process compiles for itself
+    fcntl = None  # type: ignore[assignment]
+
+PATIENCE = 120.0  # seconds that a process waits for another that compiles what it needs
 
 
 def cache_folder() -> Path:
@@ -115,6 +126,47 @@ def keep_bytes(name: str, suffix: str, content: bytes) -> None:
         _write_atomically(folder / f"{name}{suffix}", content + hashlib.sha256(content).digest())
 
 
+@contextlib.contextmanager
+def one_process(name: str) -> Iterator[None]:
+    """While a process makes what is kept under a name, others that are about to do the same wait.
+
+    Who waited looks again whether it is kept. The system takes the lock from a process that dies;
+    who cannot have it, after `PATIENCE` or in a folder without locks, makes the thing too.
+    """
+    handle = None
+    with contextlib.suppress(OSError):
+        handle = os.open(cache_folder() / f"{name}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        if handle is not None and fcntl is not None:
+            _wait_for(handle)
+        yield
+    finally:
+        if handle is not None:
+            with contextlib.suppress(OSError):  # another may hold it by now, and then loads
+                os.unlink(cache_folder() / f"{name}.lock")
+            os.close(handle)
+
+
+def _wait_for(handle: int) -> None:
+    if _locked(handle):
+        return
+    until = time.monotonic() + PATIENCE
+    with event.trigger_event("numba:compile"):  # a notice is due as if we compiled ourselves
+        while not _locked(handle) and time.monotonic() < until:
+            time.sleep(0.02)
+
+
+def _locked(handle: int) -> bool:
+    """Whether we have the lock, or nobody can have it."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
 def written(file: str, text: str) -> Path | None:
     """Where a text lies that is written if it is not there: in the folder, else in a temporary one;
     None where neither takes it."""
@@ -171,7 +223,9 @@ def load(name: str, text: str) -> ModuleType:
         raise
     for value in vars(module).values():
         if isinstance(value, CPUDispatcher) and value.py_func.__module__ == module_name:
-            cast(Any, value)._cache = Kept(value.py_func, stem)
+            keeps = Kept(value.py_func, stem)
+            cast(Any, value)._cache = keeps
+            cast(Any, value).compile = keeps.alone(value.compile)
     return module
 
 
@@ -184,11 +238,25 @@ class Kept:
     def __init__(self, function: Callable[..., Any], stem: str):
         self.cache_path = str(Path(function.__code__.co_filename).parent)
         self._stem = f"{stem}.{function.__qualname__}"
+        self._held = contextlib.ExitStack()
+
+    def alone(self, compile: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """Numba's `compile(signature)`, which asks here for what is kept, in one process a time."""
+
+        def compile_alone(signature: Any) -> Any:
+            with LOCK, contextlib.ExitStack() as self._held:
+                return compile(signature)
+
+        return compile_alone
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The compiled function of a signature; None where there is none."""
         target.refresh()
-        found = kept_bytes(self._name(signature, target.codegen()), ".nbc")
+        name = self._name(signature, target.codegen())
+        found = kept_bytes(name, ".nbc")
+        if found is None:
+            self._held.enter_context(one_process(name))
+            found = kept_bytes(name, ".nbc")
         return None if found is None else CompileResult._rebuild(target, *pickle.loads(found))
 
     def save_overload(self, signature: Any, compiled: Any) -> None:

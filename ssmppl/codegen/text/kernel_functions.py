@@ -10,13 +10,14 @@ from ssmppl.analysis.density import Missing, Term, terms
 from ssmppl.analysis.proposals.channels import channel_draws, observation_draws, of_components
 from ssmppl.analysis.proposals.proposals import Proposal, bootstrap
 from ssmppl.analysis.structure import deterministic, deterministic_memory
+from ssmppl.codegen.kernels.math.sums import constrain, log_prior, sum_of_path
 from ssmppl.codegen.kernels.particle.alive_filter import alive_filter
 from ssmppl.codegen.kernels.particle.conditional_smc import conditional_smc, filtered_path
 from ssmppl.codegen.kernels.particle.particle_filter import particle_filter
 from ssmppl.codegen.kernels.particle.simulation import predict_step
 from ssmppl.codegen.text.module import PARTICLE, Layout, ModuleText, Section, Target, level_of
 from ssmppl.codegen.text.render import Names, Writer, depends
-from ssmppl.codegen.text.sums import scalar_function, time_sum
+from ssmppl.codegen.text.sums import add_entry, add_sums, scalar_function, time_sum
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, constant
@@ -32,6 +33,8 @@ LOOK_AHEAD = "theta, c, s, states_prev, fits, log_w"
 FITTED_DRAW = "theta, c, s, states_prev, fits, states, normals, uniforms, rng"
 WEIGH = "theta, c, s, states_prev, fits, states, log_w"
 OBSERVE = "theta, c, s, states, out, normals, uniforms, rng"
+TRANSFORM = "theta, z, free, total"
+DENSITY = "theta, total"
 
 
 def add_predictions(out: ModuleText, trace: Trace, layout: Layout, missing: Missing) -> None:
@@ -236,7 +239,7 @@ def predictive(site: Site) -> list[tuple[Expr, Expr, Expr, Expr]]:
     return [tuple(f.ravel()[first[s]] for f in forms) for s in site.components]
 
 
-def log_joint_function(trace: Trace, layout: Layout, missing: Missing) -> str:
+def add_log_joint(out: ModuleText, trace: Trace, layout: Layout, missing: Missing) -> None:
     """`log_joint(theta, y, seen, u, trajectory, total)`: log p(x, y | theta) without the prior.
 
     Deterministic components are set to what follows from the noisy ones, so that this is the
@@ -254,17 +257,18 @@ def log_joint_function(trace: Trace, layout: Layout, missing: Missing) -> str:
         parts[role] = [total]
         fixed[role] = _values(known)
     doc = "log p(x, y | theta); deterministic components of x are set on the way."
-    return time_sum(layout, "log_joint", doc, parts, 1, fixed)
+    text = time_sum(layout, "log_joint", doc, parts, 1, fixed)
+    add_sums(out, "complete-data log density", "log_joint", sum_of_path, text)
 
 
-def parameter_functions(trace: Trace, layout: Layout) -> str:
-    """`constrain(z, free, theta)` and `log_prior(theta)`."""
-    names = Names(["z", "free", "log_jacobian", "total"])
+def add_parameters(out: ModuleText, trace: Trace, layout: Layout) -> None:
+    """`constrain(theta, z, free)` and `log_prior(theta)`."""
+    names = Names()
     known = {s: f"theta[{i}]" for i, s in enumerate(trace.parameter_symbols)}
     lines = [
-        "@entry\ndef constrain(z, free, theta):",
+        f"@exact\ndef transform_constrain({TRANSFORM}):",
         '    """Write the free parameters into theta from the unconstrained z; log Jacobian."""',
-        "    log_jacobian = 0.0",
+        "    total[0] = 0.0",
     ]
     at = 0
     for k, t in enumerate(transforms(trace)):
@@ -272,15 +276,16 @@ def parameter_functions(trace: Trace, layout: Layout) -> str:
         at += len(t.free)
         writer = Writer(own, names, trace.locations, " " * 8)
         targets = [(known[c], v) for c, v in zip(t.components, t.values, strict=True)]
-        writer.assign([("log_jacobian", t.log_jacobian)], "+=")
+        writer.assign([("total[0]", t.log_jacobian)], "+=")
         writer.assign(targets)
         lines += [f"    if free[{k}]:  # {t.site.name}", *writer.lines]
-    lines += ["    return log_jacobian", ""]
+    text = "\n".join([*lines, ""])
+    add_entry(out, "parameters", "constrain", constrain, {"transform": TRANSFORM}, text)
     total = constant(0.0)
     for term in terms(trace, "prior"):
         total = total + term.log_density
-    prior = scalar_function(
-        layout, "log_prior", "theta", "Log prior density; -inf outside the support.",
-        [("total", total)], returns="total",
+    text = scalar_function(
+        layout, "density_log_prior", DENSITY, "Log prior density; -inf outside the support.",
+        [("total[0]", total)],
     )  # fmt: skip
-    return "\n".join(lines) + "\n\n" + prior.replace("@exact", "@entry", 1)
+    add_entry(out, "prior", "log_prior", log_prior, {"density": DENSITY}, text)

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
-from ssmppl.codegen.kernels.particle.experiments import sums_of_each
 from ssmppl.codegen.text.render import (
     Names,
     Writer,
@@ -132,6 +131,7 @@ class Section:
     fits : what is computed once per particle and kept in the rows of `fits`.
     roles : the functions, and the arguments of each.
     further : numbers that its kernel reads behind those that all have, see `ModuleText.algorithm`.
+    per_step : whether it has `prepare` and `step`, which fill `c` and `s`.
     """
 
     layout: Layout
@@ -140,10 +140,15 @@ class Section:
     s: dict[Expr, int] = field(default_factory=dict)
     fits: dict[Expr, int] = field(default_factory=dict)
     functions: list[str] = field(default_factory=list)
-    roles: dict[str, str] = field(default_factory=lambda: dict(OUTER))
+    roles: dict[str, str] = field(default_factory=dict)
     normals: int = 0
     uniforms: int = 0
     further: tuple[int, ...] = ()
+    per_step: bool = True
+
+    def __post_init__(self) -> None:
+        if self.per_step:
+            self.roles = OUTER | self.roles
 
     def name(self, role: str) -> str:
         """Name of the function of this role."""
@@ -269,6 +274,8 @@ class Section:
 
     def finish(self) -> str:
         """The functions with `prepare` and `step`, which compute `c` and `s`."""
+        if not self.per_step:
+            return "\n\n".join(self.functions)
         step = self._straight("step", OUTER["step"], "What depends on theta and time.", self.s, "s")
         prepare = self._straight(
             "prepare", OUTER["prepare"], "What depends on theta alone.", self.c, "c"
@@ -339,7 +346,7 @@ class ModuleText:
     """
 
     def __init__(self, layout: Layout):
-        self.n_states = len(layout.trace.state_symbols)
+        self.layout, self.n_states = layout, len(layout.trace.state_symbols)
         self.parts: list[str] = []
         self.algorithms: dict[str, Algorithm] = {}
         self.texts: dict[int, str] = {}
@@ -349,16 +356,6 @@ class ModuleText:
         """A section's own functions, under a title."""
         self.texts[id(section)] = section.finish()
         self.parts += [heading(title), self.texts[id(section)]]
-
-    def add_function(self, title: str, text: str) -> None:
-        """A single entry point."""
-        self.parts += [heading(title), text.replace("@exact", "@entry", 1)]
-
-    def add_each(self, sums: str) -> None:
-        """`<sums>_of_each`, an entry point that takes these sums over each data set."""
-        made = specialise(sums_of_each, f"{sums}_of_each", {"sums": sums})
-        self.parts.append(made.text.replace("@exact", "@entry", 1))
-        self.imports |= {n: home for n, home in made.imports.items() if n != sums}
 
     def algorithm(
         self, function: Callable[..., Any], name: str, section: Section, decorator: str,

@@ -20,7 +20,8 @@ PHRASES = WRITTEN | {
     n: call(o.kernel.split(".")[-1], o.operands) for n, o in OPERATIONS.items() if o.kernel
 }
 _OWN_NAMES = """theta c s i n t y_data seen_data u_data states states_prev normals uniforms rng
-    log_w out inf nan reference look trajectory total entry kernel np prev noise kept"""
+    log_w out inf nan steps free z reference look trajectory total entry kernel np prev noise
+    kept"""
 RESERVED = frozenset([*KERNELS, *keyword.kwlist, *dir(builtins), *_OWN_NAMES.split()])
 MAX_INLINE = 60  # characters; a longer single-use subexpression gets a line of its own
 

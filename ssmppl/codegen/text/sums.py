@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
-from ssmppl.codegen.text.module import THETA, Layout, is_matrix, level_of
+from ssmppl.codegen.text.module import THETA, Layout, ModuleText, Section, is_matrix, level_of
 from ssmppl.codegen.text.render import Names, Writer, depends
 from ssmppl.expressions.expr import Expr, topological
+
+SUM = "theta, y_data, seen_data, u_data, steps, trajectory, total"
+
+
+def add_entry(
+    out: ModuleText, title: str, name: str, kernel: Callable[..., Any], roles: dict[str, str],
+    text: str,
+) -> None:  # fmt: skip
+    """A function without particles, and the entry point of that name by which Python calls it.
+
+    kernel : the way in. roles : its parameter for the function, and the function's arguments.
+    """
+    section = Section(out.layout, name, functions=[text], roles=roles, per_step=False)
+    out.add(title, section)
+    out.algorithm(kernel, name, section, "entry")
+
+
+def add_sums(out: ModuleText, title: str, name: str, kernel: Callable[..., Any], text: str) -> None:
+    """A function of `time_sum`, under a title, and the entry point by which Python calls it."""
+    add_entry(out, title, name, kernel, {"sums": SUM}, text)
 
 
 def scalar_function(
     layout: Layout, name: str, arguments: str, doc: str, outputs: list[tuple[str, Expr]],
-    sources: dict[Expr, str] | None = None, returns: str = "",
+    sources: dict[Expr, str] | None = None,
 ) -> str:  # fmt: skip
     """A function without a loop: statements `target = expression`."""
     reserved, names = Names(), dict[Expr, str]()
@@ -19,14 +40,14 @@ def scalar_function(
     writer = Writer(names, reserved, layout.trace.locations)
     writer.assign(outputs)
     lines = [f"@exact\ndef {name}({arguments}):", f'    """{doc}"""', *head, *writer.lines]
-    return "\n".join([*lines, *([f"    return {returns}"] if returns else [])]) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def time_sum(
     layout: Layout, name: str, doc: str, parts: Mapping[str, Sequence[Expr]], size: int,
     fixed: dict[str, list[tuple[Expr, Expr]]] | None = None,
 ) -> str:  # fmt: skip
-    """A function that adds expressions up over a trajectory.
+    """`sums_NAME`, a function that adds expressions up over a trajectory.
 
     parts : for "prior", "initial", "transition" and "observation" the summands of total[0], ...,
         total[size - 1]; rows 1..T count for the observation, 2..T for the transition.
@@ -34,7 +55,7 @@ def time_sum(
     """
     reserved = Names()
     lines = [
-        f"@exact\ndef {name}(theta, y_data, seen_data, u_data, trajectory, total):",
+        f"@exact\ndef sums_{name}({SUM}):",
         f'    """{doc}"""',
     ]
     names: dict[Expr, str] = {}
@@ -63,7 +84,7 @@ def time_sum(
         block += _block(layout, _added(parts.get(role, ())), names, reserved, indent, "+=")
         if block:
             body += [*([f"        if {condition}:"] if condition else []), *block]
-    loop = ["    for t in range(y_data.shape[0]):", *body] if body else []
+    loop = ["    for t in range(steps):", *body] if body else []
     return "\n".join([*lines, *head, *zero, *prior, *loop]) + "\n"
 
 

@@ -582,7 +582,7 @@ class Fitter:
             found[np.ix_(free, free)] = information_at(inside, fit.z[free])
             yield found
         setup = Maximization(fit.problem, fit.space, "posterior", self.fixed, {}, seed)
-        yield observed_information(setup, kalman, fit.z)
+        yield observed_information(setup, fit.z)
 
     def _unconstrained(
         self, space: Space, theta: np.ndarray, information: np.ndarray,

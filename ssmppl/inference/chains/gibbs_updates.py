@@ -9,14 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from types import ModuleType
 
 import numpy as np
 
 from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
+from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import deterministic
+from ssmppl.codegen.kernels.particle.experiments import sums_of_each
 from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
+from ssmppl.codegen.native.entries import for_each
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
@@ -24,6 +27,7 @@ from ssmppl.expressions.expr import Expr
 from ssmppl.inference.run.invalid_laws import law_without_density_at
 from ssmppl.inference.run.problem import Problem, joined
 from ssmppl.inference.updates.draw_update import draw
+from ssmppl.language.model.trace import Trace, once_per_trace
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class GibbsUpdates:
     updates: tuple[Update, ...]
 
     @once_property
-    def module(self) -> ModuleType:
+    def module(self) -> Loaded:
         return compile_updates(self.problem.trace, self.updates)
 
     @cached_property
@@ -64,8 +68,17 @@ class GibbsUpdates:
 
 
 def plan_updates(problem: Problem, fixed: Mapping[str, np.ndarray]) -> tuple[Update, ...]:
-    """The updates of the parameters that are not fixed."""
-    return tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
+    """The updates of the parameters that are not fixed; derived once."""
+    kept, key = _plans(problem.trace), (frozenset(fixed), problem.program.missing)
+    if key not in kept:
+        kept[key] = tuple(derive_updates(problem.trace, tuple(fixed), problem.program.missing))
+    return kept[key]
+
+
+@once_per_trace
+def _plans(trace: Trace) -> dict[tuple[frozenset[str], Missing], tuple[Update, ...]]:
+    """The updates of a model that were derived, by what is fixed and what may be missing."""
+    return {}
 
 
 class ThetaValues(Mapping[Expr, float]):
@@ -133,12 +146,8 @@ def _totals(steps: GibbsUpdates, k: int, theta: np.ndarray, paths: list[np.ndarr
     if update.needs_log_joint or not update.functions:
         return np.empty(0)
     each = np.empty((len(paths), len(update.functions)))
-    every, name = steps.problem.end_to_end, statistics_name(update)
-    if len(paths) > 1:
-        run = getattr(steps.module, f"{name}_of_each")
-        run(theta, *every.data, joined(paths), each)
-    else:
-        getattr(steps.module, name)(theta, every.y, every.seen, every.u, paths[0], each[0])
+    run = for_each(sums_of_each, getattr(steps.module, statistics_name(update)))
+    run(theta, *steps.problem.end_to_end.data, joined(paths), each)
     total = np.add.reduce(each)  # one after the other, as they stand
     prior = steps.prior_totals[k]
     if prior is None:
@@ -168,10 +177,7 @@ def log_joint(steps: GibbsUpdates, theta: np.ndarray, paths: list[np.ndarray]) -
 def log_joints(problem: Problem, theta: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """(E,) log p(x, y | theta) of each data set, of trajectories end to end (R, D); deterministic
     components of x are set on the way."""
-    every, each = problem.end_to_end, np.empty((len(problem.experiments), 1))
-    if len(each) == 1:
-        run = problem.program.entry("log_joint")
-        run(theta, every.y, every.seen, every.u, rows, each[0])
-    else:
-        problem.program.entry("log_joint_of_each")(theta, *every.data, rows, each)
+    each = np.empty((len(problem.experiments), 1))
+    run = for_each(sums_of_each, problem.program.entry("log_joint"))
+    run(theta, *problem.end_to_end.data, rows, each)
     return each[:, 0]

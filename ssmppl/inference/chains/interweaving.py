@@ -28,7 +28,12 @@ the marginal; elsewhere nearly so. (Compare Murray and Adams 2010, "Slice sampli
 hyperparameters of latent Gaussian models"; Tan 2023, "Efficient data augmentation techniques for
 some classes of state space models", *Statistical Science* 38, where the data choose location and
 scale of the states.) Where the states can be drawn exactly, the step is on p(theta | y) itself,
-before they are drawn (`Collapsed`).
+before they are drawn (`Collapsed`). There more numbers than a random walk can move at once are
+also proposed about a mode m of p(z | y): z' = m + sqrt(1 - s^2) (z - m) + s N(0, C), which keeps
+N(m, C), C from the information at m (Cotter, Roberts, Stuart and White 2013, "MCMC methods for
+functions: modifying old algorithms to make them faster", *Statistical Science* 28; here with the
+posterior's own Gaussian approximation in place of the prior). One step of a sweep remains a random
+walk, for tails that are not Gaussian.
 
 All choices are made in the warmup: which parameters move (those slow in the plain chain at its
 beginning), the walk's covariance, which of the maps; afterwards the kernel is fixed.
@@ -61,6 +66,7 @@ from ssmppl.inference.chains.gibbs_updates import log_joints
 from ssmppl.inference.chains.metropolis_kernel import RandomWalk
 from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
+from ssmppl.inference.optimisation.newton import climb
 from ssmppl.inference.preparation.exact_models import ExactModel
 from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
@@ -77,6 +83,10 @@ LONGEST_LOOK = 400  # sweeps
 FEW = 6  # numbers that a random walk moves at once without trouble
 SLOW = 0.5  # lag-1 autocorrelation from which a parameter moves
 WALK = RandomWalk()
+MOST = 60  # free numbers up to which the information at the mode is looked for: F^2 likelihoods
+SHARE = 0.5  # of a step about the mode that is drawn anew, at first
+ACCEPTED = 0.4  # of such steps, to which the share is adapted
+LEAST_SHARE = 1e-3
 
 
 class Move(Protocol):
@@ -215,11 +225,51 @@ class Collapsed:
     problem: Problem
     model: ExactModel
 
+    def about(self, space: Space, near: np.ndarray) -> Reference | None:
+        """A mode of the posterior near z (free,), and the curvature there; None where it has none
+        or there are too many numbers."""
+        experiments = self.problem.experiments
+
+        def log_density(z: np.ndarray) -> float:
+            theta, prior = space.parameters(z)
+            value = -np.inf if prior == -np.inf else self.model.log_likelihood(experiments, theta)
+            return value + prior if value > -np.inf else value
+
+        top = climb(log_density, near) if len(near) <= MOST else None
+        if top is None or not np.all(np.isfinite(top.information)):
+            return None
+        positive = np.linalg.eigvalsh(top.information)[0] > 0.0
+        return Reference(top.z, top.information) if positive else None
+
     def stand(self, theta: np.ndarray, paths: Paths) -> tuple[float, None]:
         return comparable(self.model.log_likelihood(self.problem.experiments, theta)), None
 
     def at(self, theta: np.ndarray, held: None, paths: Paths) -> tuple[float, Paths]:
         return self.stand(theta, paths)[0], paths
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A Gaussian of the free numbers z: mode (free,), precision (free, free)."""
+
+    mode: np.ndarray
+    precision: np.ndarray
+
+    def moved(
+        self, z: np.ndarray, where: np.ndarray, share: float, normals: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """z (free,) with those at `where` moved in detailed balance with the Gaussian, given the
+        others; and the log of its density before over that after."""
+        away = z - self.mode
+        own = self.precision[np.ix_(where, where)]
+        others = np.delete(np.arange(len(z)), where)
+        shift = np.linalg.solve(own, self.precision[np.ix_(where, others)] @ away[others])
+        root, before = np.linalg.cholesky(own), away[where] + shift
+        step = np.linalg.solve(root.T, normals)
+        after = np.sqrt(1.0 - share**2) * before + share * step
+        trial = z.copy()
+        trial[where] = self.mode[where] - shift + after
+        return trial, 0.5 * float(np.sum((root.T @ after) ** 2) - np.sum((root.T @ before) ** 2))
 
 
 @dataclass(frozen=True)
@@ -229,7 +279,7 @@ class Interweaving:
     moves : what can be held fixed. movable : positions, among the free numbers on the unconstrained
     scale, of those that may move. scale : (d,) of the first steps.
     adapting : sweeps of the warmup. looking : of these, the first, plain, by which "auto" decides.
-    bounds : of all components of theta, where they are numbers.
+    bounds : of all components of theta, where they are numbers. near : (free,) about the mode.
     """
 
     space: Space
@@ -239,6 +289,20 @@ class Interweaving:
     adapting: int
     looking: int
     bounds: list[tuple[float, float]] | None
+    near: np.ndarray | None = None
+
+    def __getstate__(self) -> dict:
+        return {f.name: self.__dict__[f.name] for f in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        self.__dict__.update(state)
+
+    @once_property
+    def reference(self) -> Reference | None:
+        """What the steps about the mode are made by; None where there are none."""
+        if self.near is None or not isinstance(self.moves[0], Collapsed):
+            return None
+        return self.moves[0].about(self.space, self.near)
 
     def begin(self) -> InterweavingTuning:
         """What a new chain begins with."""
@@ -269,10 +333,10 @@ class Interweaving:
                 tuning = replace(tuning, chosen=_farthest(tuning))
             for k in range(len(self.moves)):
                 if tuning.chosen is None or tuning.chosen == k:
-                    factor, won = self._propose(k, tuning, theta, paths, generator)
+                    factor, share, won = self._propose(k, tuning, theta, paths, generator)
                     accepted, made = accepted + won, made + PROPOSALS
                     factors = (*tuning.factors[:k], factor, *tuning.factors[k + 1 :])
-                    tuning = replace(tuning, factors=factors)
+                    tuning = replace(tuning, factors=factors, share=share)
                     if tuning.chosen is None:
                         wins = (*tuning.won[:k], tuning.won[k] + won, *tuning.won[k + 1 :])
                         tuning = replace(tuning, won=wins)
@@ -281,36 +345,45 @@ class Interweaving:
     def _propose(
         self, k: int, tuning: InterweavingTuning, theta: np.ndarray, paths: Paths,
         generator: np.random.Generator,
-    ) -> tuple[np.ndarray, int]:  # fmt: skip
-        """Metropolis steps with one thing held fixed; (adapted factor, number accepted)."""
-        move, where, factor = self.moves[k], tuning.where, tuning.factors[k]
+    ) -> tuple[np.ndarray, float, int]:  # fmt: skip
+        """Metropolis steps with one thing held fixed; (adapted factor, adapted share, number
+        accepted)."""
+        move, where, factor, share = self.moves[k], tuning.where, tuning.factors[k], tuning.share
         assert where is not None
+        reference = self.reference if len(where) > FEW else None
         value, held = move.stand(theta, paths)
         z = self._free(theta)
         _, prior = self.space.parameters(z)
         value += prior
         if not abs(value) < np.inf:
-            return factor, 0
+            return factor, share, 0
         d, won = len(where), 0
         target = 0.44 if d == 1 else 0.35 if d == 2 else 0.234
         for j in range(PROPOSALS):
             normals = generator.standard_normal(d)
-            trial = z.copy()
-            trial[where] += factor @ normals
+            trial, balance = z.copy(), 0.0
+            if about := reference is not None and j > 0:
+                trial, balance = reference.moved(z, where, share, normals)
+            else:
+                trial[where] += factor @ normals
             new, prior = self.space.parameters(trial)
             probability, moved = 0.0, paths
             if prior > -np.inf:
                 log_density, moved = move.at(new, held, paths)
                 change = log_density + prior - value
-                probability = min(1.0, float(np.exp(min(change, 0.0))))
+                probability = min(1.0, float(np.exp(min(change + balance, 0.0))))
             if generator.uniform() < probability:
                 theta[:], z, value = new, trial, value + change
                 paths[:] = moved
                 won += 1
             if tuning.sweep < self.adapting:
                 at = (tuning.sweep - self.looking) * PROPOSALS + j
-                factor = WALK.adapt(factor, normals, probability - target, at)
-        return factor, won
+                if about:
+                    size = share * np.exp((probability - ACCEPTED) / np.sqrt(at + 1.0))
+                    share = float(np.clip(size, LEAST_SHARE, 1.0))
+                else:
+                    factor = WALK.adapt(factor, normals, probability - target, at)
+        return factor, share, won
 
     def _free(self, theta: np.ndarray) -> np.ndarray:
         """The free numbers on the unconstrained scale."""
@@ -322,13 +395,13 @@ class Interweaving:
 
     def _slow(self, seen: Sequence[np.ndarray]) -> np.ndarray:
         """Which numbers move: those whose plain chain is slow, by the lag-1 autocorrelation of its
-        later half (a drift towards the posterior counts as slow); where some are and there are few,
-        all, as they may depend on each other."""
+        later half (a drift towards the posterior counts as slow); where some are, all, as they may
+        depend on each other, if they are few or move about the mode."""
         z = np.array(seen)[len(seen) // 2 :]
         z = z - z.mean(axis=0)
         lagged = (z[1:] * z[:-1]).sum(axis=0) / np.maximum((z**2).sum(axis=0), 1e-300)
         slow = lagged[self.movable] > SLOW
-        if slow.any() and len(slow) <= FEW:
+        if slow.any() and (len(slow) <= FEW or self.reference is not None):
             return self.movable
         return self.movable[slow]
 
@@ -340,7 +413,8 @@ class InterweavingTuning:
     sweep : how many it has made. where : positions of the numbers that move; None while it looks,
     empty where none does. factors : of each move's walk, (d, d). chosen : the move that is made;
     None while all are tried. seen : (d_free,) of each sweep while it looks. won : of each
-    move, steps that were accepted while all were tried.
+    move, steps that were accepted while all were tried. share : of a step about the mode that is
+    drawn anew.
     """
 
     sweep: int
@@ -349,6 +423,7 @@ class InterweavingTuning:
     chosen: int | None
     seen: tuple[np.ndarray, ...]
     won: tuple[int, ...] = ()
+    share: float = SHARE
 
 
 def _farthest(tuning: InterweavingTuning) -> int:
@@ -431,7 +506,10 @@ def prepare_interweaving(
         return None, "none: no free parameter is in the law of a state"
     looking = 0 if setting is True else min(int(LOOK * adapting), LONGEST_LOOK)
     bounds = parameter_bounds(setup.problem.trace)
-    steps = Interweaving(space, tuple(moves), movable, pilot.scale, adapting, looking, bounds)
+    steps = Interweaving(
+        space, tuple(moves), movable, pilot.scale, adapting, looking, bounds,
+        None if model is None else pilot.z,
+    )  # fmt: skip
     moved = ", ".join(dict.fromkeys(owner[space.positions[k]] for k in movable))
     who = f"those with high autocorrelation in the plain chain, of {moved}" if looking else moved
     return steps, f"{who}: moved with {describe_interweaving(found, model)}"

@@ -5,6 +5,12 @@ estimate in place of the likelihood it is kept with the point it was made for (A
 2009), and so is whatever else of that run the proposal goes by, so that the chain on point and run
 has the posterior for its marginal. The random walk adapts during warmup and is then held fixed.
 
+With a first stage acceptance is delayed (Christen and Fox 2005, "Markov chain Monte Carlo using an
+approximation"): a proposal is accepted or refused by an approximate likelihood, and only what that
+accepts is worth a run of the exact one, by which it is accepted with the probability that makes the
+whole exact. The first part of the warmup, whose draws count for nothing, goes by the approximation
+alone.
+
 A chain moves in coordinates: each parameter keeps to the unconstrained scale of
 `language/model/transforms.py`, or is moved itself, or its logarithm or reciprocal is. A proposal
 outside the support has density zero there.
@@ -15,7 +21,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 
@@ -23,6 +29,8 @@ from ssmppl.analysis.bounds import Interval, interval
 from ssmppl.errors import ArgumentError, listing
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr
+from ssmppl.inference.gaussian.likelihood import Approximated, ApproximateLikelihood
+from ssmppl.inference.preparation.gaussian_pilot import DEGREES
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.draws import Block
 from ssmppl.inference.run.problem import Problem
@@ -101,7 +109,7 @@ class Coordinates:
                 theta[i] = 1.0 / value
                 log_jacobian -= 2.0 * np.log(abs(value))
         program = space.problem.program
-        log_jacobian += program.entry("constrain")(z, self.by_z, theta)
+        log_jacobian += program.entry("constrain")(theta, z, self.by_z)
         log_density = program.entry("log_prior")(theta) + log_jacobian
         if not np.all(np.isfinite(theta)) or not log_density < np.inf:
             return theta, -np.inf
@@ -254,14 +262,15 @@ class LikelihoodRun:
 
 @dataclass(frozen=True)
 class ChainPoint:
-    """w (d,), theta (P,), log_density = log prior + log Jacobian, the run, and what the proposal
-    knows at this point."""
+    """w (d,), theta (P,), log_density = log prior + log Jacobian, the run, what the proposal knows
+    at this point, and the first stage's log-likelihood, where there is one and it is known."""
 
     w: np.ndarray
     theta: np.ndarray
     log_density: float
     run: LikelihoodRun
     local: Any = None
+    approximate: float | None = None
 
 
 class Likelihood(Protocol):
@@ -277,6 +286,15 @@ class Likelihood(Protocol):
         """What a kept draw has besides theta: path_<i>, increment_<i>."""
 
 
+class GuidedLikelihood(Likelihood, Protocol):
+    """One that can begin from what a first stage has found."""
+
+    def run_given(
+        self, theta: np.ndarray, found: Approximated | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
+        """As `run`."""
+
+
 class Proposal(Protocol):
     """How a point moves; `tuning` is what adaptation changes."""
 
@@ -285,11 +303,14 @@ class Proposal(Protocol):
 
     def propose(
         self, point: ChainPoint, tuning: Any, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """A new w, and the standard normals behind it."""
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """A new w, and the standard normals of the walk's step; None where it was no step of one,
+        and tells adaptation nothing."""
 
-    def log_ratio(self, old: ChainPoint, new: ChainPoint, tuning: Any) -> float:
-        """log q(old | new) - log q(new | old)."""
+    def log_ratio(
+        self, old: ChainPoint, new: ChainPoint, tuning: Any, normals: np.ndarray | None
+    ) -> float:
+        """log q(old | new) - log q(new | old), of the kind of step that `propose` made."""
 
     def adapt(self, tuning: Any, normals: np.ndarray, excess: float, iteration: int) -> Any:
         """The tuning after a step whose probability of acceptance was in excess of the target."""
@@ -298,7 +319,11 @@ class Proposal(Protocol):
 @dataclass(frozen=True)
 class Metropolis:
     """A Metropolis-Hastings kernel: adapts in its first `adapting` iterations; the first `warmup`
-    draws are not thinned."""
+    draws are not thinned.
+
+    first : of delayed acceptance; None: there is none. approximate : so many iterations go by it
+    alone.
+    """
 
     coordinates: Coordinates
     likelihood: Likelihood
@@ -307,6 +332,8 @@ class Metropolis:
     adapting: int
     target: float
     thin: int
+    first: ApproximateLikelihood | None = None
+    approximate: int = 0
 
 
 @dataclass(frozen=True)
@@ -326,21 +353,46 @@ def start_chain(
 ) -> WalkState:  # fmt: skip
     """A chain at w (d,); of log-likelihood -inf where no run of several has a positive one."""
     theta, log_density = kernel.coordinates.parameters(w)
-    stream, run = stream.copy(), None
-    for _ in range(STARTS):
-        run = kernel.likelihood.run(theta, None, stream)
-        if run is not None:
-            break
-    if run is None:
-        problem = kernel.coordinates.problem
-        d = len(problem.trace.state_symbols)
-        run = LikelihoodRun(
-            -np.inf,
-            tuple(np.zeros((e.steps, d)) for e in problem.experiments),
-            tuple(np.full(e.steps, -np.inf) for e in problem.experiments),
-        )
-    point = ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run))
+    stream, found = stream.copy(), None
+    if kernel.first is not None:
+        found = kernel.first.at(theta)
+    if found is not None and kernel.approximate:
+        run = LikelihoodRun(found.log_likelihood)
+    else:
+        run = _positive_run(kernel, theta, found, stream)
+    known = None if found is None else found.log_likelihood
+    point = ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run), known)
     return WalkState(point, tuning, 0, generator, stream)
+
+
+def _positive_run(
+    kernel: Metropolis, theta: np.ndarray, found: Approximated | None, stream: np.ndarray
+) -> LikelihoodRun:
+    """A run of positive likelihood out of several; of log-likelihood -inf where none has one."""
+    for _ in range(STARTS):
+        run = _run(kernel, theta, None, found, stream)
+        if run is not None:
+            return run
+    return no_run(kernel.coordinates.problem)
+
+
+def no_run(problem: Problem) -> LikelihoodRun:
+    """In place of a run where every one has likelihood zero."""
+    d = len(problem.trace.state_symbols)
+    return LikelihoodRun(
+        -np.inf,
+        tuple(np.zeros((e.steps, d)) for e in problem.experiments),
+        tuple(np.full(e.steps, -np.inf) for e in problem.experiments),
+    )
+
+
+def _run(
+    kernel: Metropolis, theta: np.ndarray, before: LikelihoodRun | None,
+    found: Approximated | None, stream: np.ndarray,
+) -> LikelihoodRun | None:  # fmt: skip
+    if kernel.first is None:
+        return kernel.likelihood.run(theta, before, stream)
+    return cast(GuidedLikelihood, kernel.likelihood).run_given(theta, found, stream)
 
 
 def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[WalkState, Block]:
@@ -363,25 +415,105 @@ def metropolis_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[Walk
     return state, Block.of(draws, stats)
 
 
+LONGEST_HELD = 50  # thinned steps, after which a draw counts as another one at the same place
+
+
+def jump_block(kernel: Metropolis, state: WalkState, n: int) -> tuple[WalkState, Block]:
+    """n distinct draws of the chain thinned to every `thin`-th step, with their holding times in
+    such steps; in the warmup n steps, as `metropolis_block`."""
+    if state.iteration < kernel.warmup:
+        return metropolis_block(kernel, state, n)
+    state = replace(state, generator=copy.deepcopy(state.generator), stream=state.stream.copy())
+    draws: dict[str, list[np.ndarray]] = {"theta": []}
+    stats: dict[str, list[float]] = {"lp": [], "holding": [], "acceptance_rate": []}
+    for _ in range(n):
+        point, held, accepted = state.point, 0, 0.0
+        while state.point is point and held < LONGEST_HELD:
+            for _ in range(kernel.thin):
+                state, rate = _iterate(kernel, state)
+                accepted += rate
+            held += 1
+        draws["theta"].append(point.theta)
+        stats["lp"].append(float(point.run.log_likelihood + point.log_density))
+        stats["holding"].append(float(held))
+        stats["acceptance_rate"].append(accepted / (held * kernel.thin))
+    return state, Block.of(draws, stats)
+
+
 def _iterate(kernel: Metropolis, state: WalkState) -> tuple[WalkState, float]:
+    if kernel.first is not None and state.iteration == kernel.approximate > 0:
+        found = kernel.first.at(state.point.theta)  # from here on by the exact likelihood
+        run = _positive_run(kernel, state.point.theta, found, state.stream)
+        state = replace(state, point=replace(state.point, run=run))
     old, generator = state.point, state.generator
     w, normals = kernel.proposal.propose(old, state.tuning, generator)
     theta, log_density = kernel.coordinates.parameters(w)
-    new, probability = None, 0.0
+    new, probability, promising = None, 0.0, 0.0
     if log_density > -np.inf:
-        run = kernel.likelihood.run(theta, old.run, state.stream)
-        if run is not None:
-            new = ChainPoint(w, theta, log_density, run, kernel.proposal.local(w, run))
-            change = run.log_likelihood + log_density - old.run.log_likelihood - old.log_density
-            change += kernel.proposal.log_ratio(old, new, state.tuning)
-            probability = 1.0 if not change < 0.0 else float(np.exp(change))
+        made = ChainPoint(w, theta, log_density, old.run)
+        if kernel.first is None:
+            new, probability = _decided(kernel, state, made, normals)
+            promising = probability
+        else:
+            new, promising, probability = _delayed(kernel, state, made, normals)
     accept = generator.uniform() < probability
     tuning = state.tuning
-    if state.iteration < kernel.adapting and len(w):
-        excess = probability - kernel.target
+    if state.iteration < kernel.adapting and len(w) and normals is not None:
+        excess = promising - kernel.target
         tuning = kernel.proposal.adapt(tuning, normals, excess, state.iteration)
     point = new if accept and new is not None else old
     return replace(state, point=point, tuning=tuning, iteration=state.iteration + 1), float(accept)
+
+
+def _decided(
+    kernel: Metropolis, state: WalkState, made: ChainPoint, normals: np.ndarray | None
+) -> tuple[ChainPoint | None, float]:
+    """The proposed point with its run, and its probability of acceptance."""
+    old = state.point
+    run = kernel.likelihood.run(made.theta, old.run, state.stream)
+    if run is None:
+        return None, 0.0
+    new = replace(made, run=run, local=kernel.proposal.local(made.w, run))
+    change = run.log_likelihood + new.log_density - old.run.log_likelihood - old.log_density
+    change += kernel.proposal.log_ratio(old, new, state.tuning, normals)
+    return new, 1.0 if not change < 0.0 else float(np.exp(change))
+
+
+def _delayed(
+    kernel: Metropolis, state: WalkState, made: ChainPoint, normals: np.ndarray | None
+) -> tuple[ChainPoint | None, float, float]:
+    """The proposed point, if the first stage accepts it; the probabilities of acceptance by the
+    first stage, and by the second once the first has.
+
+    Where the approximation is no number at either point the first stage accepts, and the second
+    decides by the whole ratio.
+    """
+    old, first = state.point, kernel.first
+    assert first is not None
+    before, found = old.approximate, first.at(made.theta)
+    if before is None:
+        before = first.at(old.theta).log_likelihood
+    ratio = kernel.proposal.log_ratio(old, made, state.tuning, normals)
+    ratio += made.log_density - old.log_density
+    alone = state.iteration < kernel.approximate
+    known = before > -np.inf and found.log_likelihood > -np.inf
+    change = found.log_likelihood - before if known else 0.0
+    if alone and not known:
+        change = 0.0 if found.log_likelihood > -np.inf else -np.inf
+    promising = 1.0
+    if (known or alone) and change + ratio < 0.0:
+        promising = float(np.exp(change + ratio))
+    if not state.generator.uniform() < promising:
+        return None, promising, 0.0
+    made = replace(made, approximate=found.log_likelihood)
+    if alone:
+        return replace(made, run=LikelihoodRun(found.log_likelihood)), promising, 1.0
+    run = _run(kernel, made.theta, None, found, state.stream)
+    if run is None:
+        return None, promising, 0.0
+    rest = run.log_likelihood - old.run.log_likelihood
+    rest += -change if known else ratio
+    return replace(made, run=run), promising, 1.0 if not rest < 0.0 else float(np.exp(rest))
 
 
 # What checkpoints of Metropolis chains are made of.
@@ -397,11 +529,13 @@ class RandomWalk:
 
     def propose(
         self, point: ChainPoint, tuning: np.ndarray, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         normals = generator.standard_normal(len(point.w))
         return point.w + tuning @ normals, normals
 
-    def log_ratio(self, old: ChainPoint, new: ChainPoint, tuning: np.ndarray) -> float:
+    def log_ratio(
+        self, old: ChainPoint, new: ChainPoint, tuning: np.ndarray, normals: np.ndarray | None
+    ) -> float:
         return 0.0
 
     def adapt(
@@ -413,3 +547,42 @@ class RandomWalk:
         unit = normals / np.linalg.norm(normals)
         middle = np.eye(d) + gain * excess * np.outer(unit, unit)
         return np.linalg.cholesky(tuning @ middle @ tuning.T)
+
+
+@dataclass(frozen=True)
+class WalkAndIndependence(RandomWalk):
+    """A random walk, and in a share of the steps w' ~ Student's t round the mode, whatever w is
+    (Tierney 1994, section 2.3.3, and 2.4 on mixtures of kernels).
+
+    Where the posterior is about Gaussian these forget where the chain is within a step or two; the
+    walk takes it to where they are not a good fit.
+
+    centre (d,), factor (d, d) : of t, of whose scale matrix the factor is a Cholesky factor.
+    share : of the steps.
+    """
+
+    centre: np.ndarray
+    factor: np.ndarray
+    share: float
+
+    def propose(
+        self, point: ChainPoint, tuning: np.ndarray, generator: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        if generator.uniform() >= self.share:
+            return super().propose(point, tuning, generator)
+        stretch = np.sqrt(DEGREES / generator.chisquare(DEGREES))
+        normals = generator.standard_normal(len(point.w))
+        return self.centre + stretch * (self.factor @ normals), None
+
+    def log_ratio(
+        self, old: ChainPoint, new: ChainPoint, tuning: np.ndarray, normals: np.ndarray | None
+    ) -> float:
+        if normals is not None:
+            return 0.0
+        return self._log_density(old.w) - self._log_density(new.w)
+
+    def _log_density(self, w: np.ndarray) -> float:
+        """Of t at w, up to a constant."""
+        white = np.linalg.solve(self.factor, w - self.centre)
+        d = len(w)
+        return -0.5 * (DEGREES + d) * float(np.log1p(white @ white / DEGREES))

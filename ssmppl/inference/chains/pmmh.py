@@ -17,6 +17,7 @@ that a wild estimate cannot throw the chain far.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -33,6 +34,7 @@ from ssmppl.codegen.modules.filter_variants import (
     numbered_filter,
     scored_filter,
 )
+from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.compiling import once_property
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -46,16 +48,27 @@ from ssmppl.inference.chains.metropolis_kernel import (
     Metropolis,
     Proposal,
     RandomWalk,
+    WalkAndIndependence,
+    WalkState,
     coordinates,
     local_derivatives,
     metropolis_block,
     start_chain,
 )
 from ssmppl.inference.chains.sampling import PreparedChains, SamplingMethod, SamplingSetup
+from ssmppl.inference.gaussian.likelihood import Approximated, ApproximateLikelihood
 from ssmppl.inference.methods.methods import PMMH, MetropolisHastings
 from ssmppl.inference.optimisation.quadratic import fitted_covariance
 from ssmppl.inference.particles.filtering import FilterSettings, failure, run_filter
 from ssmppl.inference.particles.marginal import draw_given, is_marginal
+from ssmppl.inference.preparation.gaussian_pilot import (
+    PRECISE,
+    GaussianPilot,
+    approximately,
+    approximation_kind,
+    gaussian_pilot,
+    tune_twisted,
+)
 from ssmppl.inference.preparation.pilot import (
     SCALE_REPEATS,
     TUNING_REPEATS,
@@ -67,11 +80,29 @@ from ssmppl.inference.preparation.pilot import (
     particles_for,
     tune_particles,
 )
-from ssmppl.inference.preparation.proposal_choice import Choice, choose_by_pilot
+from ssmppl.inference.preparation.proposal_choice import (
+    PILOT_PARTICLES,
+    Choice,
+    choose_by_pilot,
+)
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.seeds import random_state
 
+# Of counted costs, in nanoseconds a row: the guide with Laplace's mode, and a particle that follows
+# it; the spread of log Z that other filters are tuned to, and the fewest particles they take.
+GUIDE, TWISTED_COST = 2500.0, 15.0
+BEST_SD, FEWEST = 1.2, 10.0
+LEAST_ACCEPTANCE = 0.05  # of independence proposals, below which their mode is not to be trusted
+USUAL_EXACT = {1: 0.44, 2: 0.35}  # rates of acceptance by the first stage, which has no noise
+# Share of independence proposals where many of them are accepted, each worth several steps of a
+# walk, and where few are.
+MOSTLY, SELDOM = 0.9, 0.2
+APPROXIMATE_SHARE = 0.8  # of the warmup, by the first stage alone
+NAMED = {
+    "laplace": "Laplace's approximation of the likelihood",
+    "extended": "the extended Kalman filter's approximation of the likelihood",
+}
 LEAST_EIGENVALUE, MOST_EIGENVALUE = 0.2, 5.0  # of the information, in units of the pilot's
 LONGEST = 1.0  # of the drift, in standard deviations of the step
 STRETCH = 2.562  # of a random walk's steps, over sqrt(d): Sherlock et al. (2015)
@@ -125,8 +156,25 @@ class ParticleLikelihood(_KeepsPaths):
     def run(
         self, theta: np.ndarray, before: LikelihoodRun | None, stream: np.ndarray
     ) -> LikelihoodRun | None:
+        return self.run_given(theta, None, stream)
+
+    def run_given(
+        self, theta: np.ndarray, found: Approximated | None, stream: np.ndarray
+    ) -> LikelihoodRun | None:
+        """As `run`; the twisted filter takes its guide from the mode that a first stage found."""
         n, name = self.settings.particles, self.settings.proposal
         carried = len(self.problem.program.carried(name))
+        modes = found.noise if found is not None and name == "twisted" else None
+
+        def by_mode(
+            i: int, e: Experiment, path: np.ndarray, increment: np.ndarray
+        ) -> tuple[int, int, float]:
+            twisted = self.problem.program.twisted
+            assert isinstance(twisted, TwistedFilter)
+            assert modes is not None
+            guide = twisted.guide(theta, e.y, e.seen, e.u, e=modes[i])
+            run = twisted.module.filtered_path_twisted
+            return run(theta, e.y, e.seen, guide, n, stream, path, increment)
 
         def by_kernel(
             i: int, e: Experiment, path: np.ndarray, increment: np.ndarray
@@ -148,6 +196,8 @@ class ParticleLikelihood(_KeepsPaths):
 
         if self.settings.rescue:
             return run_each(self.problem, theta, carried, alive)
+        if modes is not None:
+            return run_each(self.problem, theta, carried, by_mode)
         entry = self.problem.program.entry(f"filtered_path_{name}")
         return run_each(self.problem, theta, carried, by_kernel)
 
@@ -324,7 +374,9 @@ class Langevin:
         move = point.local.root @ (_drift(point.local, step) + normals)
         return point.w + step * move, normals
 
-    def log_ratio(self, old: ChainPoint, new: ChainPoint, tuning: float) -> float:
+    def log_ratio(
+        self, old: ChainPoint, new: ChainPoint, tuning: float, normals: np.ndarray | None
+    ) -> float:
         step = np.exp(tuning)
         return _log_density(new, old, step) - _log_density(old, new, step)
 
@@ -365,70 +417,187 @@ def prepare(setup: SamplingSetup, method: PMMH) -> PreparedChains:
     ------
     ArgumentError : a setting does not apply to the model; gives the reason.
     """
-    problem, space = setup.problem, setup.space
-    where = coordinates(space, method.scale, method.transform)
+    problem = setup.problem
+    where = coordinates(setup.space, method.scale, method.transform)
     if method.covariance is not None:
         given_factor(method.covariance, len(where))  # refused now, not after the pilot
-    pilot = setup.once("pilot", lambda: find_mode(space, setup.root, rescue=method.rescue))
-    theta, _ = space.parameters(pilot.z)
+    plan = _planned(setup, method)
+    settings, gaussian = plan.settings, plan.gaussian
+    d, usual = len(where), 0.3 if method.correlation else 0.25
+    if plan.plain and d > 1:
+        usual = 0.2 if d == 2 else 0.15
+    first = None
+    if gaussian is not None and plan.delayed:
+        first, usual = gaussian.likelihood(problem), USUAL_EXACT.get(d, 0.234)
+    likelihood = _likelihood(setup, method, settings)
+    chains = prepared_walk(
+        setup, method, likelihood, where, plan.pilot, "bootstrap", method.order, usual,
+        gaussian=gaussian, first=first,
+    )  # fmt: skip
+    report = {
+        "particles": settings.particles,
+        "proposal": plan.chosen,
+        "settings": settings_of(method),
+        **chains.report,
+    }
+    if first is not None:
+        report["first_stage"] = NAMED[first.kind]
+    if plan.sd is not None:
+        report["pilot_sd_of_log_likelihood"] = plan.sd
+    return replace(chains, report=report)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the pilot has found: the mode; the filter, and in words how it was chosen; the standard
+    deviation of its log Z, where that was looked at; the Gaussian approximation at its mode, where
+    there is one; whether acceptance is delayed."""
+
+    pilot: Pilot
+    settings: FilterSettings
+    chosen: str
+    sd: float | None
+    gaussian: GaussianPilot | None
+    delayed: bool
+    plain: bool
+
+
+def _planned(setup: SamplingSetup, method: PMMH) -> _Plan:
+    problem, space = setup.problem, setup.space
     plain = method.order == 0 and not method.correlation  # others know no guide
+    asked = method.delayed_acceptance
+    gaussian = None
+    if plain and not method.rescue:
+        gaussian = setup.once("gaussian", lambda: _gaussian(setup, method))
+    if gaussian is None and asked is True:
+        kind = approximation_kind(problem)
+        why = kind if isinstance(kind, NotApplicable) else "it comes to no number, or to no mode"
+        raise ArgumentError(
+            f"delayed_acceptance=True does not apply: {why}",
+            fix="use ssm.PMMH(delayed_acceptance=False)",
+        )
+    twisted, target = None, min(method.target_sd, PRECISE)
+    if gaussian is not None:
+        mode, _ = space.parameters(gaussian.z)
+        twisted = setup.once("twisted", lambda: tune_twisted(problem, mode, target))
+        if asked is not True and not _trusted(gaussian, twisted):
+            gaussian = None
+        usable = method.proposal in ("auto", "twisted") and method.particles is None
+        if gaussian is None or not usable or twisted is None or twisted.sd > target:
+            twisted = None  # by the ways of other filters, then
+    found = gaussian
+    pilot = gaussian.pilot if gaussian is not None else setup.once(
+        "pilot", lambda: find_mode(space, setup.root, rescue=method.rescue)
+    )  # fmt: skip
+    theta, _ = space.parameters(pilot.z)
     choice = None
     if method.proposal == "auto":
         temper = plain and not method.rescue
         choice = setup.once(
             "proposal",
             lambda: choose_by_pilot(
-                problem, theta, exact=False, whole=plain, integrate=plain, temper=temper
+                problem, theta, exact=False, whole=plain and twisted is None, integrate=plain,
+                temper=temper and twisted is None,
             ),
-        )
+        )  # fmt: skip
+        if twisted is not None and _pays(choice, twisted):
+            choice = replace(choice, name="twisted")
+        else:
+            twisted = None
     proposal = choice.name if choice else method.proposal
     problem.proposal(proposal, integrate=plain)
-    particles, tuned = method.particles, None
-    if particles is None:
+    tuned = twisted
+    if method.particles is None and tuned is None:
         tuned = setup.once("tuning", lambda: _tuned(setup, method, theta, proposal))
-        particles = tuned.particles
+    particles = method.particles if tuned is None else tuned.particles
+    assert particles is not None
     settings = FilterSettings(int(particles), proposal, rescue=int(method.rescue))
-    d, usual = len(where), 0.3 if method.correlation else 0.25
-    if plain and d > 1:
-        usual = 0.2 if d == 2 else 0.15
-    likelihood = _likelihood(setup, method, settings)
-    chains = prepared_walk(
-        setup, method, likelihood, where, pilot, "bootstrap", method.order, usual
-    )
-    report = {
-        "particles": settings.particles,
-        "proposal": str(choice or proposal),
-        "settings": settings_of(method),
-        **chains.report,
-    }
-    if tuned is not None:
-        report["pilot_sd_of_log_likelihood"] = tuned.sd
-    return replace(chains, report=report)
+    cheap = proposal == "twisted" and found is not None and found.kind == "laplace"
+    delayed = cheap if asked == "auto" else bool(asked)
+    return _Plan(
+        pilot, settings, str(choice or proposal), None if tuned is None else tuned.sd, found,
+        delayed and len(pilot.z) > 0, plain,
+    )  # fmt: skip
 
 
-def prepared_walk(
+def _gaussian(setup: SamplingSetup, method: PMMH) -> GaussianPilot | None:
+    """The approximation at its mode, where it may be of use."""
+    problem = setup.problem
+    if method.proposal not in ("auto", "twisted") and method.delayed_acceptance is not True:
+        return None
+    if "user" in problem.program.proposals and method.delayed_acceptance is not True:
+        return None
+    kind = approximation_kind(problem)
+    if isinstance(kind, NotApplicable):
+        return None
+    return gaussian_pilot(setup.space, kind, setup.root)
+
+
+def _trusted(gaussian: GaussianPilot, twisted: TunedParticles | None) -> bool:
+    """Whether the approximate posterior is near enough to the exact one to begin from: t round its
+    mode fits it, and the filter that it guides knows the likelihood there."""
+    return gaussian.acceptance > LEAST_ACCEPTANCE and twisted is not None and twisted.sd < BEST_SD
+
+
+def _pays(choice: Choice, twisted: TunedParticles) -> bool:
+    """Whether the twisted filter costs less for an effective draw than the filter of the pilot's
+    choice, by counted costs: of N particles a row, and of the guide."""
+    sd, cost = choice.figures.get(choice.name, (np.inf, 0.0))
+    if not choice.figures:  # without a rival there was no pilot
+        return True
+    particles = max(sd**2 * PILOT_PARTICLES / BEST_SD**2, FEWEST)
+    other = particles * cost * _draws_lost(BEST_SD)
+    own = (GUIDE + twisted.particles * TWISTED_COST) * _draws_lost(twisted.sd)
+    return not other < own
+
+
+def _draws_lost(sd: float) -> float:
+    """Iterations for each that an exact likelihood would need, by the acceptance at equilibrium of
+    independent estimates of log Z with this standard deviation (Sherlock et al. 2015)."""
+    return 1.0 / math.erfc(0.5 * sd)
+
+
+def prepared_walk(*args: Any, **options: Any) -> PreparedChains:
+    """The chains of `walk`, made ready."""
+    kernel, states, report = walk(*args, **options)
+    return PreparedChains(partial(metropolis_block, kernel), states, report)
+
+
+def walk(
     setup: SamplingSetup, method: PMMH | MetropolisHastings, likelihood: Likelihood,
-    where: Coordinates, pilot: Pilot, proposal: str, order: int, usual: float,
-) -> PreparedChains:  # fmt: skip
-    """Chains in the coordinates, started round the pilot's mode, and what to report of both.
+    where: Coordinates, pilot: Pilot, proposal: str, order: int, usual: float, *,
+    gaussian: GaussianPilot | None = None, first: ApproximateLikelihood | None = None,
+) -> tuple[Metropolis, list[WalkState], dict[str, Any]]:  # fmt: skip
+    """The kernel of chains in the coordinates, these chains, started round the pilot's mode, and
+    what to report of both.
 
     proposal : of the filter that looks at the starts. order : of the steps, as in `PMMH`. usual :
-    rate of acceptance to adapt to, unless the method names one.
+    rate of acceptance to adapt to, unless the method names one. gaussian : the approximation, whose
+    covariance the walk begins with. first : of delayed acceptance.
     """
-    factor = walk_factor(setup, method, where, pilot, proposal)
+    factor = walk_factor(setup, method, where, pilot, proposal, gaussian)
     tuning: Any = factor
     move: Proposal = RandomWalk()
+    d = len(where)
+    if gaussian is not None and method.covariance is None and d:
+        share = MOSTLY if gaussian.well_proposed else SELDOM
+        move = WalkAndIndependence(where.at(pilot.z), factor * np.sqrt(d) / STRETCH, share)
     if order:
         if method.covariance is None:
-            factor = factor * np.sqrt(max(len(where), 1)) / STRETCH  # of one standard deviation
+            factor = factor * np.sqrt(max(d, 1)) / STRETCH  # of one standard deviation
         move, tuning = Langevin(where, factor, order == 2), 0.0
     target = usual if method.target_acceptance is None else method.target_acceptance
     adapts = method.covariance is None if method.adapt is None else method.adapt
     adapting = setup.warmup if adapts else 0
-    kernel = Metropolis(where, likelihood, move, setup.warmup, adapting, target, setup.thin)
+    approximate = int(APPROXIMATE_SHARE * setup.warmup) if first is not None else 0
+    kernel = Metropolis(
+        where, likelihood, move, setup.warmup, adapting, target, setup.thin, first, approximate
+    )
     space, rescue = setup.space, getattr(method, "rescue", 0)
+    finite = None if gaussian is None else approximately(gaussian.likelihood(setup.problem))
     starts = setup.once(
-        "starts", lambda: dispersed(space, pilot, setup.chains, setup.root, proposal, rescue)
+        "starts",
+        lambda: dispersed(space, pilot, setup.chains, setup.root, proposal, rescue, finite),
     )
     states = []
     for chain, z in enumerate(starts):
@@ -438,7 +607,7 @@ def prepared_walk(
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
         "walk_covariance": (factor @ factor.T).tolist(),
     }
-    return PreparedChains(partial(metropolis_block, kernel), states, report)
+    return kernel, states, report
 
 
 def _likelihood(setup: SamplingSetup, method: PMMH, settings: FilterSettings) -> Likelihood:
@@ -483,7 +652,7 @@ def _tuned(setup: SamplingSetup, method: PMMH, theta: np.ndarray, proposal: str)
 
 def walk_factor(
     setup: SamplingSetup, method: PMMH | MetropolisHastings, where: Coordinates, pilot: Pilot,
-    proposal: str,
+    proposal: str, gaussian: GaussianPilot | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Cholesky factor (d, d) of the walk's covariance, as given or from the pilot.
 
@@ -493,6 +662,10 @@ def walk_factor(
     """
     if method.covariance is not None:
         return given_factor(method.covariance, len(where))
+    if gaussian is not None:
+        change = scales(where, pilot) / pilot.scale if len(where) else pilot.scale
+        covariance = gaussian.covariance * np.outer(change, change)
+        return np.linalg.cholesky(covariance) * STRETCH / np.sqrt(max(len(where), 1))
     rescue = getattr(method, "rescue", 0)
     covariance = setup.once(
         "covariance", lambda: pilot_covariance(setup, where, pilot, proposal, rescue)
@@ -550,7 +723,7 @@ def settings_of(method: Any) -> dict[str, Any]:
 
 METHOD = SamplingMethod(
     prepare,
-    state_classes=(*WALK_STATES, LocalProposal, Pilot, TunedParticles, Choice),
+    state_classes=(*WALK_STATES, LocalProposal, Pilot, TunedParticles, Choice, GaussianPilot),
     by_row=lambda method: True,
     where_slow=', more particles, or another method, such as ssm.PGAS(interweave="auto")',
 )

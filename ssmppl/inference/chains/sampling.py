@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -30,6 +30,8 @@ Result = TypeVar("Result")
 DrawnChains = Sequence[ChainDraws[Any]]
 Drawn = tuple[list[ChainDraws[Any]], dict[str, Any]]  # the chains, and what to report of them
 PlanRows = list[tuple[str, str]]
+
+GO_ON = (2, 4)  # times the draws that were asked for, to which chains go on that have not mixed
 
 # Titles of what `explain` says of the methods.
 TRAJECTORIES = "Trajectories"
@@ -105,9 +107,9 @@ class SamplingMethod:
     """What `sample` and `explain` know of a method, whose settings are of the class it is
     registered under.
 
-    prepare : (setup, settings) -> its Markov chains, made ready; None where it has none.
-    independent : of a method without Markov chains, (setup, settings, draws, executor, progress) ->
-    independent draws of parameters alone, as chains, and what to report.
+    prepare : (setup, settings) -> its Markov chains, made ready; None where draws come otherwise.
+    independent : (setup, settings, draws, executor, progress) -> such draws, as chains, and what to
+    report. trajectories : whether they begin with a warmup, are thinned and hold the states, too.
     state_classes : the dataclasses that its checkpoints are made of.
     complete : (settings, draws) -> settings, with what depends on the number of draws.
     by_row : settings -> whether draws come with a log-likelihood of each row.
@@ -124,43 +126,76 @@ class SamplingMethod:
     attributes: Callable[[Problem, DrawnChains], dict[str, Any]] = lambda problem, chains: {}
     where_slow: str = ""
     explain: Callable[[Derived], Mapping[str, PlanRows]] = lambda plan: {}
+    trajectories: bool = False
 
     @property
     def markov(self) -> bool:
-        """Whether its draws are Markov chains, which need warmup and draw the states too."""
-        return self.prepare is not None
+        """Whether its draws stem from Markov chains, which need warmup, and hold the states too."""
+        return self.prepare is not None or self.trajectories
 
     def draw(
         self, setup: SamplingSetup, settings: Any, draws: int, executor: Executor | None,
-        progress: bool,
+        progress: bool, mixed: Callable[[DrawnChains], bool] | None = None,
     ) -> Drawn:  # fmt: skip
-        """The chains, and what to report of them."""
+        """The chains, and what to report of them.
+
+        mixed : whether they have; where they have not they go on, as `GO_ON` says. None: they are
+        left as they are.
+        """
         if self.prepare is None:
             assert self.independent is not None
             return self.independent(setup, settings, draws, executor, progress)
         title, checkpoint = type(settings).__name__, setup.checkpoint
-        if (
-            checkpoint is None
-            or checkpoint.report is None
-            or not checkpoint.finished(setup.warmup + draws)
-        ):
-            with announced(title, "preparing", shown=progress):
-                chains = self.prepare(setup, settings)
-            if checkpoint is not None:
-                checkpoint.report = chains.report
-        else:  # nothing is left to draw, and nothing needs to be compiled for it
-            chains = PreparedChains(_finished, [None] * setup.chains, checkpoint.report)
-        result = run_chains(
-            chains.step_block, chains.states, draws, setup.warmup, executor=executor,
-            progress=progress, title=title, checkpoint=checkpoint,
-        )  # fmt: skip
-        return result, chains.report
+        chains: PreparedChains | None = None
+        result: list[ChainDraws[Any]] = []
+        for times in (1, *GO_ON):
+            if times > 1 and (mixed is None or result[0].interrupted or mixed(result)):
+                break
+            done = len(result[0].draws["theta"]) if result else 0
+            if chains is None and not _on_file(checkpoint, setup.warmup + times * draws):
+                with announced(title, "preparing", shown=progress):
+                    chains = self.prepare(setup, settings)
+                if checkpoint is not None:
+                    checkpoint.report = chains.report
+            made = chains
+            if made is None:  # nothing is left to draw, and nothing needs to be compiled for it
+                assert checkpoint is not None
+                assert checkpoint.report is not None
+                made = PreparedChains(_finished, [None] * setup.chains, checkpoint.report)
+            if checkpoint is None and result:
+                try:
+                    more = run_chains(
+                        made.step_block, [c.state for c in result], times * draws - done, 0,
+                        executor=executor, progress=progress, title=f"{title}, on",
+                    )  # fmt: skip
+                except KeyboardInterrupt:  # there are the draws of before
+                    result = [replace(c, interrupted=True) for c in result]
+                    break
+                result = [a.then(b) for a, b in zip(result, more, strict=True)]
+            else:
+                result = run_chains(
+                    made.step_block, made.states, times * draws, setup.warmup, executor=executor,
+                    progress=progress, title=title, checkpoint=checkpoint,
+                )  # fmt: skip
+            report = made.report
+        total = len(result[0].draws["theta"])
+        if total > draws:
+            report = {**report, "further_draws": total - draws}
+            result = [c.latter_half(draws) for c in result]
+        return result, report
 
     def advice(self, settings: Any) -> str:
         """What to try, besides more draws, where parameters mix slowly."""
         if getattr(settings, "interweave", "auto") is False:
             return f', or ssm.{type(settings).__name__}(interweave="auto")'
         return self.where_slow
+
+
+def _on_file(checkpoint: Checkpoint | None, draws: int) -> bool:
+    """Whether a checkpoint has all that is asked for, so that no chain is needed."""
+    if checkpoint is None or checkpoint.report is None:
+        return False
+    return checkpoint.finished(draws)
 
 
 def _finished(state: Any, n: int) -> tuple[Any, Block]:

@@ -17,6 +17,10 @@ from ssmppl.language.model.trace import Trace
 
 LEVELS = 7
 SHRINK = 1.6
+STEP = 0.01  # of the differences of a score, in units of 1 / sqrt(information)
+# What the square of a step may add to a difference, in units of sqrt(I_ii I_jj): of two steps,
+# extrapolated, the square of that is left, and it is above the rounding errors of a score.
+CURVED = 1e-4
 
 
 def jacobian(
@@ -41,10 +45,7 @@ def _derivative(
     function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, j: int, step: float
 ) -> tuple[np.ndarray, np.ndarray]:
     def central(h: float) -> np.ndarray:
-        up, down = x.copy(), x.copy()
-        up[j] += h
-        down[j] -= h
-        return (function(up) - function(down)) / (up[j] - down[j])
+        return _central(function, x, j, h)
 
     first = central(step)
     for _ in range(40):
@@ -73,8 +74,8 @@ def observed_information(
     """Minus the derivatives of a score, (P, P), symmetric, and the error of each entry.
 
     gradient : theta (P,) -> (P,), NaN where there is none. free : (P,) bool; rows and columns of
-    the others are zero. The largest steps are a third of the scale 1 / sqrt(information) of each
-    parameter, which is where differences of a score are far above its rounding errors.
+    the others are zero. Central differences at two steps, extrapolated: four scores a parameter,
+    and two or more that look for the step. Where the score bends too much for these, `jacobian`.
     """
     index = np.flatnonzero(free)
 
@@ -84,8 +85,13 @@ def observed_information(
         return gradient(full)[index]
 
     x = theta[index]
-    steps = np.array([_step(inner, x, j) for j in range(len(x))])
-    slope, error = jacobian(inner, x, steps)
+    slope, error = _differences(inner, x)
+    scale = np.sqrt(abs(np.diagonal(slope)))
+    wild = np.flatnonzero(~(error <= CURVED * np.outer(scale, scale)).all(axis=0))
+    error = error**2 / np.where(error > 0.0, np.outer(scale, scale), 1.0)
+    for j in wild.tolist():
+        column, spread = _derivative(inner, x, j, _step(inner, x, j))
+        slope[:, j], error[:, j] = column, spread
     error = np.maximum(error, abs(slope - slope.T) / 2.0)
     matrix, spread = np.zeros((len(theta),) * 2), np.zeros((len(theta),) * 2)
     matrix[np.ix_(index, index)] = -(slope + slope.T) / 2.0
@@ -93,14 +99,46 @@ def observed_information(
     return matrix, spread
 
 
+def _differences(
+    function: Callable[[np.ndarray], np.ndarray], x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (F, X) by two central differences each, extrapolated to zero step, and how far
+    the one at the smaller step was from that; NaN where no step was found."""
+    columns, errors = [], []
+    for j in range(len(x)):
+        step = 1e-2 * max(abs(x[j]), 1e-6)
+        fine, curvature = _central(function, x, j, step), 0.0
+        for _ in range(6):
+            curvature = abs(fine[j])
+            if not np.isfinite(curvature) or curvature == 0.0:
+                break
+            wanted = STEP / np.sqrt(curvature)
+            if 0.2 * wanted <= step <= 1.5 * wanted:
+                break
+            step = min(wanted, 100.0 * step)
+            fine = _central(function, x, j, step)
+        coarse = _central(function, x, j, 2.0 * step)
+        change = (fine - coarse) / 3.0
+        columns.append(fine + change)
+        errors.append(abs(change))
+    return np.array(columns).T, np.array(errors).T
+
+
+def _central(
+    function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, j: int, step: float
+) -> np.ndarray:
+    up, down = x.copy(), x.copy()
+    up[j] += step
+    down[j] -= step
+    return (function(up) - function(down)) / (up[j] - down[j])
+
+
 def _step(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, j: int) -> float:
-    """A third of 1 / sqrt(curvature), found from differences at growing steps."""
+    """A third of 1 / sqrt(curvature), found from differences at growing steps: there differences of
+    a score are far above its rounding errors."""
     step = 1e-2 * max(abs(x[j]), 1e-6)
     for _ in range(6):
-        up, down = x.copy(), x.copy()
-        up[j] += step
-        down[j] -= step
-        curvature = abs(function(up)[j] - function(down)[j]) / (up[j] - down[j])
+        curvature = abs(_central(function, x, j, step)[j])
         if not np.isfinite(curvature) or curvature == 0.0:
             return step if curvature != 0.0 else 1.0
         scale = 1.0 / (3.0 * np.sqrt(curvature))
@@ -145,8 +183,8 @@ class Scored(ABC):
     ) -> np.ndarray:
         """The observed information -d^2 log p(y | theta), (P, P), by differences of the score.
 
-        Extrapolated to zero step: errors of about 1e-9 of
-        sqrt(I_ii I_jj). free : as in `score`; rows and columns of the others are zero.
+        Extrapolated to zero step: errors of about 1e-8 of sqrt(I_ii I_jj), mostly far less. free :
+        as in `score`; rows and columns of the others are zero.
 
         Raises
         ------

@@ -1,37 +1,46 @@
 """The exact filter of linear Gaussian models (Kalman 1960), its start, and its score.
 
-Applies where `structure.linear_gaussian` does. The matrices are evaluated by the interpreter, all
-time steps at once, and handed to the compiled filter of `codegen/kernels/kalman/square_root.py`;
-the smoother and the sampler are in `kalman_matrices.py`.
+Applies where `structure.linear_gaussian` does. The matrices are put together by compiled code
+(`codegen/modules/linear_gaussian.py`) and handed to the compiled filter of
+`codegen/kernels/kalman/square_root.py`; the smoother and the sampler are in `kalman_matrices.py`.
 
 Flat components of x_1 (`codegen/kernels/kalman/diffuse.py`): given the flat part the model is an
 ordinary one, and given the data the flat part is Gaussian; so everything but the filter runs on the
 ordinary model from the mean of that Gaussian, with its root in further columns.
 
+The likelihood and the score run with the states in the order in which the filter passes over the
+most zeros (`filter_order`); moments and draws in that of the trace.
+
 The score: the matrices are differentiated as expressions, once for each model; their derivatives
-are evaluated as the matrices themselves are, and meet what one backward pass of the filter says
-about every entry (`codegen/kernels/kalman/adjoint.py`). No parameter costs another pass.
+are computed as the matrices themselves are, and meet what one backward pass of the filter says
+about their entries (`codegen/kernels/kalman/adjoint.py`). No parameter costs another pass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
 
 from ssmppl.analysis.structure import LinearGaussian, linear_gaussian
-from ssmppl.codegen.kernels.kalman.adjoint import zeros_like
 from ssmppl.codegen.kernels.kalman.square_root import LOG_2PI, OK
 from ssmppl.codegen.kernels.kalman.steps import Matrices
 from ssmppl.codegen.modules.exact import exact_entry
+from ssmppl.codegen.modules.linear_gaussian import (
+    MatrixProgram,
+    Slope,
+    SlopeProgram,
+    compile_matrices,
+    compile_slopes,
+)
 from ssmppl.codegen.modules.program import Program
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, Location, NotApplicable, SamplingError
+from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
-from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact import kalman_matrices
 from ssmppl.inference.exact.derivatives import Scored
@@ -41,7 +50,6 @@ from ssmppl.inference.exact.kalman_matrices import (
     Stopped,
     drawn,
     smoothed,
-    values_of,
 )
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.language.model.trace import Trace, once_per_trace
@@ -141,15 +149,6 @@ def check_agreement(trace: Trace, start: Start, log_given: float) -> None:
     )
 
 
-class Slope(NamedTuple):
-    """The derivative of one entry of one matrix in one parameter, where it is not zero."""
-
-    parameter: int
-    field: str
-    entry: int
-    expression: Expr
-
-
 @dataclass(frozen=True)
 class Slopes:
     """Derivatives of a model's matrices in its parameters.
@@ -215,41 +214,25 @@ def check_free(trace: Trace, found: Slopes, free: np.ndarray) -> None:
 
 
 def score(
-    trace: Trace, found: Slopes, model: Matrices, start: np.ndarray, experiment: Experiment,
-    theta: np.ndarray,
-) -> tuple[float, np.ndarray]:  # fmt: skip
-    """Log density of column 0 of the start, and the gradient (P,) of log p(y), of one experiment.
+    program: MatrixProgram, slope: SlopeProgram, model: Matrices, start: np.ndarray,
+    experiment: Experiment, theta: np.ndarray, gradient: np.ndarray,
+) -> float:  # fmt: skip
+    """Log density of column 0 of the start, of one experiment; to gradient (P,) that of log p(y) is
+    added.
 
     Raises
     ------
     Stopped : the laws have no density at theta.
     """
-    adjoint, increments = zeros_like(model), np.empty(experiment.steps)
+    flat, adjoint = program.room(experiment.steps, filled=False)
+    increments = np.empty(experiment.steps)
     status, t = exact_entry("adjoints")(
-        model, start, experiment.y, experiment.seen, increments, adjoint
+        model, start, experiment.y, experiment.seen, slope.wanted, increments, adjoint
     )
     if status != OK:
         raise Stopped(status, t)
-    gradient = np.zeros(len(theta))
-    values = evaluate([s.expression for s in found.known], values_of(trace, experiment, theta))
-    for slope, value in zip(found.known, values, strict=True):
-        gradient[slope.parameter] += _product(slope, np.asarray(value), adjoint, experiment.steps)
-    return total_of(increments), gradient
-
-
-def _product(slope: Slope, value: np.ndarray, adjoint: Matrices, steps: int) -> float:
-    """Derivative of an entry times its adjoint, summed over the steps at which it acts."""
-    weights: np.ndarray = getattr(adjoint, slope.field)
-    if LAWS[slope.field] == "initial":
-        return float(weights.ravel()[slope.entry] * value.ravel()[0])
-    weight = weights.reshape(len(weights), -1)[:, slope.entry]
-    if LAWS[slope.field] == "transition":  # row 0 has no transition
-        if steps == 1:
-            return 0.0
-        if len(weight) > 1:
-            weight = weight[1:]
-            value = value[1:] if value.ndim else value
-    return float(np.sum(weight * value))
+    slope.add_gradient(theta, experiment.y, experiment.seen, experiment.u, flat, gradient)
+    return total_of(increments)
 
 
 @dataclass(frozen=True)
@@ -283,7 +266,8 @@ class KalmanModel(Scored):
 
     def matrices(self, experiment: Experiment, theta: np.ndarray) -> Matrices:
         """The matrices at theta (P,), for the rows of one experiment."""
-        return kalman_matrices.matrices(self.trace, self.form, experiment, theta)
+        e = experiment
+        return _program(self.trace).matrices(theta, e.y, e.seen, e.u)
 
     def log_likelihood(self, experiments: Iterable[Experiment], theta: np.ndarray) -> float:
         """log p(y | theta), summed over experiments; -inf where it does not exist at theta.
@@ -299,9 +283,9 @@ class KalmanModel(Scored):
             np.empty((0, d)), np.empty((0, d, d)), np.empty((0, d)), np.empty((0, d, d)),
             np.empty((0, k)), np.empty((0, k, k)),
         )  # fmt: skip
-        total = 0.0
+        total, (_, program) = 0.0, _ordered(self.trace)
         for e in experiments:
-            model, increments = self.matrices(e, theta), np.empty(e.steps)
+            model, increments = program.matrices(theta, e.y, e.seen, e.u), np.empty(e.steps)
             if self.form.flat:
                 try:
                     total += start_of(self.trace, self.form.flat, model, e).log_density(np.nan)
@@ -395,18 +379,18 @@ class KalmanModel(Scored):
         ArgumentError : a matrix has no derivative in a free parameter; names it and the reason.
         """
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
-        found = _slopes(self.trace)
+        found, slope = _slopes(self.trace)
         check_free(self.trace, found, wanted)
-        total, gradient = 0.0, np.zeros(len(theta))
+        (_, program), total, gradient = _ordered(self.trace), 0.0, np.zeros(len(theta))
         for e in experiments:
-            model = self.matrices(e, theta)
+            model = program.matrices(theta, e.y, e.seen, e.u)
             try:
                 start = start_of(self.trace, self.form.flat, model, e)
-                log_given, slope = score(self.trace, found, model, start.columns, e, theta)
+                log_given = score(program, slope, model, start.columns, e, theta, gradient)
             except Stopped:
                 return -np.inf, np.where(wanted, np.nan, 0.0)
             check_agreement(self.trace, start, log_given)
-            total, gradient = total + start.log_density(log_given), gradient + slope
+            total += start.log_density(log_given)
         return total, np.where(wanted, gradient, 0.0)
 
     def _smooth(
@@ -432,12 +416,69 @@ def kalman_model(source: Trace | Program) -> KalmanModel | NotApplicable:
     return form if isinstance(form, NotApplicable) else KalmanModel(trace, form)
 
 
+def filter_order(form: LinearGaussian) -> list[int]:
+    """The order of the states for a filter's likelihood: that of the trace, or its reverse.
+
+    The reflections of a prediction take the rows of A L one after the other, with L lower
+    triangular. In a chain of lags or seasons each state is the one before it, so that from its end
+    on a row has one entry right of the diagonal, and the dense row of its head comes last. Models
+    with a flat start keep the order, by which they name what the data do not tell.
+    """
+    n = len(form.m)
+    forth, back = list(range(n)), list(range(n))[::-1]
+    if form.flat:
+        return forth
+    return back if _work(form.reordered(back)) < 0.8 * _work(form) else forth
+
+
+def _work(form: LinearGaussian) -> int:
+    """About the multiplications of a prediction's reflections, whose zeros fill up on the way."""
+    a, q = (~_zeros(f) for f in (form.A, form.Q))
+    n = len(a)
+    noise = np.eye(n, dtype=bool)[:, q.any(axis=0)]
+    array, total = np.hstack([(a.astype(int) @ np.tri(n, dtype=int)) > 0, noise]), 0
+    for i in range(n):
+        taken = np.flatnonzero(array[i, i:]) + i
+        if len(taken) > 1:
+            total += len(taken) * (n - i)
+            touched = np.flatnonzero(array[i + 1 :, taken].any(axis=1)) + i + 1
+            array[np.ix_(touched, taken)] = True
+    return total
+
+
+def _zeros(field: ExprArray) -> np.ndarray:
+    """Which entries are the number zero."""
+    flat = [e.op == "const" and e.data == 0.0 for e in field.ravel()]
+    return np.array(flat, dtype=bool).reshape(field.shape)
+
+
 @once_per_trace
-def _slopes(trace: Trace) -> Slopes:
-    """The derivatives of a linear Gaussian model's matrices."""
+def _program(trace: Trace) -> MatrixProgram:
+    """The compiled matrices of a linear Gaussian model."""
     form = _form(trace)
     assert not isinstance(form, NotApplicable)
-    return slopes(trace, form)
+    return compile_matrices(trace, form)
+
+
+@once_per_trace
+def _ordered(trace: Trace) -> tuple[LinearGaussian, MatrixProgram]:
+    """The form with the states as the likelihood has them, and its compiled matrices."""
+    form = _form(trace)
+    assert not isinstance(form, NotApplicable)
+    order = filter_order(form)
+    if order == sorted(order):
+        return form, _program(trace)
+    ordered = form.reordered(order)
+    return ordered, compile_matrices(trace, ordered)
+
+
+@once_per_trace
+def _slopes(trace: Trace) -> tuple[Slopes, SlopeProgram]:
+    """The derivatives of the matrices of `_ordered`, and these compiled."""
+    form, program = _ordered(trace)
+    found = slopes(trace, form)
+    later = [field for field, law in LAWS.items() if law == "transition"]
+    return found, compile_slopes(trace, program, found.known, later)
 
 
 def _applicable(source: Trace | Program) -> KalmanModel:

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssmppl.analysis.structure import LinearGaussian
 from ssmppl.codegen.kernels.kalman import square_root as kernel
 from ssmppl.codegen.kernels.kalman.square_root import OK
 from ssmppl.codegen.kernels.kalman.steps import Matrices
 from ssmppl.codegen.modules.exact import exact_entry
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import SamplingError
-from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
 from ssmppl.inference.run.invalid_laws import law_without_density_at, total_of
 from ssmppl.language.model.trace import Trace, previous
@@ -37,17 +35,6 @@ CAUSE = {
 }
 
 
-def matrices(
-    trace: Trace, form: LinearGaussian, experiment: Experiment, theta: np.ndarray
-) -> Matrices:
-    """The matrices at theta (P,), for the rows of one experiment."""
-    values = values_of(trace, experiment, theta)
-    fields = [getattr(form, name) for name in Matrices._fields]
-    flat = iter(evaluate([e for field in fields for e in field.ravel()], values))
-    rows = [_by_row([next(flat) for _ in range(f.size)], f.shape) for f in fields]
-    return Matrices(rows[0][0], rows[1][0], *rows[2:])
-
-
 def values_of(trace: Trace, experiment: Experiment, theta: np.ndarray) -> dict[Expr, np.ndarray]:
     """Values of every symbol that a matrix may depend on: numbers, or one for each row."""
     t = np.arange(experiment.steps)
@@ -59,12 +46,6 @@ def values_of(trace: Trace, experiment: Experiment, theta: np.ndarray) -> dict[E
     for s, column in zip(trace.observation_symbols, experiment.y.T, strict=True):
         values[previous(s)] = column[before]
     return values
-
-
-def _by_row(entries: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """Entries, each a number or one for each row, as an array (T or 1, *shape)."""
-    columns = np.broadcast_arrays(*(np.atleast_1d(e) for e in entries))
-    return np.ascontiguousarray(np.stack(columns, axis=-1), dtype=float).reshape(-1, *shape)
 
 
 def failure(trace: Trace, theta: np.ndarray, status: int, t: int) -> SamplingError:

@@ -1,6 +1,10 @@
-"""Approximate log-likelihoods of a problem: Laplace's, and the extended Kalman filter's."""
+"""Approximate log-likelihoods of a problem: Laplace's, and the extended and unscented Kalman
+filters'.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,7 +13,7 @@ from ssmppl.codegen.native.loading import Loaded
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.run.problem import Problem
 
-APPROXIMATE = ("laplace", "extended")  # the names under which verbs know them
+APPROXIMATE = ("laplace", "extended", "unscented")  # the names under which verbs know them
 
 
 class LaplaceLikelihood:
@@ -62,6 +66,44 @@ class LaplaceLikelihood:
         return value, total
 
 
+@dataclass(frozen=True)
+class Approximated:
+    """An approximate log p(y | theta), -inf where it comes to no number; with the noise (T, R') of
+    each experiment's likeliest trajectory, where Laplace's gave it."""
+
+    log_likelihood: float
+    noise: tuple[np.ndarray, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ApproximateLikelihood:
+    """An approximate log p(y | theta) that is a function of theta alone, as chains need it.
+
+    kind : of `APPROXIMATE`. noise : (T, R') of each experiment, from where every search for
+    Laplace's modes begins; None: from the extended Kalman filter. Where Laplace's comes to no
+    number, the extended filter's stands in for it.
+    """
+
+    problem: Problem
+    kind: str
+    noise: tuple[np.ndarray, ...] | None = None
+
+    def at(self, theta: np.ndarray) -> Approximated:
+        """At theta (P,)."""
+        found = approximation_of(self.problem, self.kind)
+        total, noise = 0.0, []
+        for i, e in enumerate(self.problem.experiments if self.kind == "laplace" else ()):
+            begin = None if self.noise is None else self.noise[i]
+            mode = found.laplace(theta, e.y, e.seen, e.u, begin)
+            if mode is None:
+                break
+            noise.append(mode.e)
+            total += mode.log_likelihood
+        if len(noise) == len(self.problem.experiments):
+            return Approximated(total, tuple(noise))
+        return Approximated(approximate_log_likelihood(self.problem, theta, found, "extended"))
+
+
 def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplicable:
     """What gives Laplace's, or why the model has none."""
     found = problem.program.gaussian
@@ -70,17 +112,22 @@ def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplic
     return found
 
 
-def approximation_of(problem: Problem, kind: str) -> GaussianApproximation:
-    """What gives "laplace" or "extended".
+def approximation_of(
+    problem: Problem, kind: str, instead: str = 'use proposal="auto" or "bootstrap"'
+) -> GaussianApproximation:
+    """What gives "laplace", "extended" or "unscented"; instead : what to do where nothing does.
 
     Raises
     ------
     ArgumentError : the model has no such approximation; says why.
     """
     found = laplace_approximation(problem) if kind == "laplace" else problem.program.gaussian
+    if kind == "unscented" and isinstance(found, GaussianApproximation):
+        points = found.by_points
+        found = points if isinstance(points, NotApplicable) else found
     if isinstance(found, NotApplicable):
         raise ArgumentError(
-            f"proposal={kind!r} does not apply: {found}", fix='use proposal="auto" or "bootstrap"'
+            f"proposal={kind!r} does not apply: {found.reason}", fix=instead, where=found.where
         )
     return found
 
@@ -88,7 +135,15 @@ def approximation_of(problem: Problem, kind: str) -> GaussianApproximation:
 def approximate_log_likelihood(
     problem: Problem, theta: np.ndarray, found: GaussianApproximation, kind: str
 ) -> float:
-    """log p(y | theta) by "laplace" or "extended"; -inf where it comes to no number."""
+    """log p(y | theta) by one of `APPROXIMATE`; -inf where it comes to no number."""
     if kind == "laplace":
         return LaplaceLikelihood(problem, found)(theta)
-    return sum(found.extended_log_likelihood(theta, e.y, e.seen, e.u) for e in problem.experiments)
+    total = 0.0
+    for e in problem.experiments:
+        given = theta, e.y, e.seen, e.u
+        if kind == "extended":
+            total += found.extended_log_likelihood(*given)
+        else:
+            told = found.unscented(*given)
+            total += -np.inf if told is None else float(np.sum(told[0].increments))
+    return total

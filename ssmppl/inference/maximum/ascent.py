@@ -30,6 +30,7 @@ from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.preparation.exact_models import ExactModel, exact_model
+from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
 from ssmppl.inference.preparation.pilot import Pilot, explained, find_mode, finite_point
 from ssmppl.inference.preparation.space import Space, at
 from ssmppl.inference.run.problem import Problem
@@ -179,6 +180,21 @@ def _differences(function: Callable[[np.ndarray], float | np.ndarray], z: np.nda
 
 
 @dataclass(frozen=True)
+class Edges:
+    """Which parameters are at an edge of their support.
+
+    z : (F,) an estimate inside the support. kept : (F,) bool, the numbers that are not held there.
+    components : index of each component of theta at an edge -> the value of that edge.
+    moving : those of them whose edge is where other free parameters put it.
+    """
+
+    z: np.ndarray
+    kept: np.ndarray
+    components: dict[int, float]
+    moving: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True)
 class Ascent:
     """Where a climb came to (P components of theta, K iterates).
 
@@ -188,7 +204,7 @@ class Ascent:
     in theta, where the method has them. error : (P, P), the Monte Carlo covariance of theta itself.
     Of several starts the iterates are (starts, K, P); figures : what else is known of each iterate,
     (K,) or (starts, K), by name. no_information : why no information is to be looked for, where
-    that is so.
+    that is so. held : what the climb found to be at an edge; None: nothing, or it did not look.
     """
 
     theta: np.ndarray
@@ -200,6 +216,7 @@ class Ascent:
     interrupted: bool = False
     figures: dict[str, np.ndarray] = field(default_factory=dict)
     no_information: str = ""
+    held: Edges | None = None
 
 
 @dataclass(frozen=True)
@@ -228,6 +245,19 @@ class Maximization:
     def exact(self) -> ExactModel | NotApplicable:
         """The exact filter, or why there is none."""
         return exact_model(self.problem.trace)
+
+    def exact_score(self, free: np.ndarray) -> ExactScore:
+        """Score and information of the exact likelihood in these components, free (P,) bool."""
+        assert not isinstance(self.exact, NotApplicable), self.exact
+        key = free.tobytes()
+        if key not in self._scores:
+            data, theta = self.problem.experiments, self.space.theta
+            self._scores[key] = exact_score(self.exact, data, free, theta)
+        return self._scores[key]
+
+    @cached_property
+    def _scores(self) -> dict[bytes, ExactScore]:
+        return {}
 
     @cached_property
     def kalman(self) -> KalmanModel | NotApplicable:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,12 +27,12 @@ from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
-from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Maximization
-from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges
+from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximization
+from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.quasi_newton import quasi_newton
 from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
-from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.invalid_laws import total_of
@@ -254,13 +253,13 @@ class ExactClimb:
     def __init__(self, setup: Maximization, model: ExactModel, method: DirectOptimization):
         self.setup, self.model, self.method = setup, model, method
         self.experiments = setup.problem.experiments
-        free = free_components(setup.problem.trace, setup.fixed)
-        self.exact = exact_score(model, self.experiments, free, setup.space.theta)
+        self.exact = setup.exact_score(free_components(setup.problem.trace, setup.fixed))
         self.best, self.best_value = np.empty(0), -np.inf
         self.without_slope = ""  # at the last point of that kind
         self.iterates: list[np.ndarray] = []
         self.values: list[float] = []
         self.evaluations = 0
+        self.held: Edges | None = None
         self.known: dict[bytes, float] = {}  # objective at the points since the last iterate
 
     def run(self) -> Ascent:
@@ -311,6 +310,7 @@ class ExactClimb:
             point.theta, self.model.log_likelihood(self.experiments, point.theta),
             np.array(self.iterates), report, interrupted=interrupted,
             figures={"objective": np.array(self.values)},
+            held=held_at(self.setup, self.held, point.theta),
         )  # fmt: skip
 
     def value(self, z: np.ndarray) -> tuple[float, np.ndarray]:
@@ -345,16 +345,7 @@ class ExactClimb:
             raise _WithoutMaximum(reason.reason)
 
     def _quasi_newton(self, start: np.ndarray) -> str:
-        def downhill(z: np.ndarray) -> tuple[float, np.ndarray]:
-            value, slope = self.value(z)
-            return (-value, -slope) if value > -np.inf else (FAR, slope)
-
-        self._remember(start)
-        found: Any = scipy.optimize.minimize(
-            downhill, start, jac=True, method="L-BFGS-B", callback=self._remember,
-            options={"maxiter": self.method.steps, "ftol": 1e-13, "gtol": 1e-7},
-        )  # fmt: skip
-        return str(found.message)
+        return quasi_newton(self.value, start, self.method.steps, self._remember)
 
     def _leave_flats(self) -> None:
         """Climb again from the other side of a flat stretch: a spread that is a millionth of the
@@ -380,13 +371,13 @@ class ExactClimb:
         """
         gap = np.inf
         theta = self.setup.transform.at(self.best).theta
-        found = edges(self.setup, theta, self.exact.information(theta))
+        found = self.held = edges(self.setup, theta, self.exact.information(theta))
         kept = np.ones(len(self.best), dtype=bool) if found is None else found.kept
         free = self.exact.free.copy()
         free[list(found.components) if found is not None else []] = False
         if not kept.any():
             return 0.0
-        exact = replace(self.exact, free=free)
+        exact = self.setup.exact_score(free)
         for _ in range(NEWTON_STEPS):
             value, slope = self.value(self.best)
             curvature = _curvature(self.setup, exact, self.best)[np.ix_(kept, kept)]
@@ -418,11 +409,10 @@ class ExactClimb:
         self.known.clear()
 
 
-def observed_information(setup: Maximization, model: ExactModel, z: np.ndarray) -> np.ndarray:
+def observed_information(setup: Maximization, z: np.ndarray) -> np.ndarray:
     """Minus the second derivatives of the objective in z (F,), (F, F), by the exact score."""
     free = free_components(setup.problem.trace, setup.fixed)
-    theta = setup.transform.at(z).theta
-    return _curvature(setup, exact_score(model, setup.problem.experiments, free, theta), z)
+    return _curvature(setup, setup.exact_score(free), z)
 
 
 def _curvature(setup: Maximization, exact: Any, z: np.ndarray) -> np.ndarray:

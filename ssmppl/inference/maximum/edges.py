@@ -11,7 +11,7 @@ before, which tells it from a parameter that is not identified.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from ssmppl.errors import SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbols_of
-from ssmppl.inference.maximum.ascent import Maximization
+from ssmppl.inference.maximum.ascent import Edges, Maximization
 from ssmppl.language.model.trace import Site
 from ssmppl.language.model.transforms import Transform, transforms, unconstrain
 
@@ -36,21 +36,6 @@ AT_MOST = 0.05  # higher at the edge than at the estimate; from there on a climb
 FALL = 0.5  # of the objective inwards: half a unit, as at one standard error of a normal law
 FLAT = 1e-2  # information in z below which an edge may be near: a standard error of 10
 INSIDE = 1e-12  # what takes the place of a share of exactly zero
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Which parameters are at an edge of their support.
-
-    z : (F,) an estimate inside the support. kept : (F,) bool, the numbers that are not held there.
-    components : index of each component of theta at an edge -> the value of that edge.
-    moving : those of them whose edge is where other free parameters put it.
-    """
-
-    z: np.ndarray
-    kept: np.ndarray
-    components: dict[int, float]
-    moving: frozenset[int] = frozenset()
 
 
 def directions(objective: Callable[[np.ndarray], float], z: np.ndarray) -> np.ndarray:
@@ -109,6 +94,14 @@ def edges(setup: Maximization, theta: np.ndarray, information: np.ndarray) -> Ed
             if symbols_of(bounds) - fixed:
                 moving.add(place[t.components[i]])
     return Edges(z, kept, components, frozenset(moving)) if components else None
+
+
+def held_at(setup: Maximization, found: Edges | None, theta: np.ndarray) -> Edges | None:
+    """The same edges at theta (P,), to which the others have gone on; None where an edge may have
+    moved with them, or none was found."""
+    if found is None or found.moving:
+        return None
+    return replace(found, z=_inside(setup, theta))
 
 
 def _reached(

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ import scipy
 from ssmppl.analysis.conjugacy.m_step import MStep, counted, derive_m_step, unsuited
 from ssmppl.analysis.conjugacy.separation import complete_data, restricted
 from ssmppl.codegen.modules.trajectory_sums import compile_statistics
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.maximum.ascent import (
@@ -194,7 +194,7 @@ class Maximiser:
         return QFunction(self.step)
 
     @once_property
-    def module(self) -> ModuleType:
+    def module(self) -> Loaded:
         assert isinstance(self.step, MStep)
         return compile_statistics(self.step)
 
@@ -211,11 +211,11 @@ class Maximiser:
         self, theta: np.ndarray, paths: Sequence[np.ndarray], weights: Sequence[np.ndarray]
     ) -> np.ndarray:
         """The C_i averaged over weighted paths, (M, T, D) and (M,) of each experiment."""
-        total = self.q.prior(theta)
+        total, theta = self.q.prior(theta), np.ascontiguousarray(theta, dtype=float)
         part = np.empty(len(total))
         run = self.module.weighted_statistics
         for e, some, w in zip(self.problem.experiments, paths, weights, strict=True):
-            run(theta, e.y, e.seen, e.u, some, w, None, part, total)
+            run(theta, e.y, e.seen, e.u, np.ascontiguousarray(some), w, None, part, total)
         return total
 
     def from_paths(

@@ -91,15 +91,19 @@ class PMMH:
     Parameters
     ----------
     particles : N; None tunes it in a pilot to a standard deviation of log Z of about `target_sd`
-        (Doucet et al. 2015; Sherlock et al. 2015).
-    proposal : the particle filter's proposal, as in `log_likelihood`.
+        (Doucet et al. 2015; Sherlock et al. 2015); with the twisted proposal, whose cost hardly
+        depends on N, to at most 0.3, from 8 particles up.
+    proposal : the particle filter's proposal, as in `log_likelihood`; "auto" considers "twisted".
     target_sd : of the estimate of the log-likelihood, which the pilot aims at; with `correlation`,
         of the difference between two successive estimates, over sqrt(2).
     target_acceptance : what the walk adapts to during warmup (Vihola 2012); None: 0.25 for one
         parameter, less for more; 0.25 for orders 1 and 2; 0.3 with `correlation`.
     covariance : (d, d), of the steps, the free parameters in the order of declaration, on the scale
         below. None: the inverse information at the mode, which a pilot estimates, times 2.562^2 / d
-        for a random walk (Sherlock et al. 2015).
+        for a random walk (Sherlock et al. 2015). Where the model has a Gaussian approximation mode
+        and information are those of the approximate posterior, and most steps are
+        independence proposals round it (Student's t of 5 degrees of freedom), a fifth where few of
+        these are accepted.
     scale : on which the walk moves: "unconstrained" (numbers between bounds by logit, positive ones
         by log, simplices by stick breaking, matrices by their Cholesky factor), or "natural".
         What falls outside the support is refused; the Jacobian is accounted for.
@@ -120,6 +124,11 @@ class PMMH:
     rescue : of the particle filter, as in `log_likelihood`: how many times N particles a row may
         take where weights vanish; 0: N, and the parameters are refused. Not with orders 1 and 2
         nor `correlation`.
+    delayed_acceptance : whether a proposal is first accepted or refused by Laplace's approximation
+        of the likelihood (the extended Kalman filter's, where there is no Laplace's), and the
+        particle filter runs only for what that accepts (Christen and Fox 2005); the posterior is
+        exact all the same. "auto": with the twisted proposal, whose guide comes from the mode that
+        Laplace's finds anyway. Only with order 0, without `correlation` and `rescue`.
     """
 
     particles: int | None = setting(None, optional(count(1)))
@@ -142,9 +151,17 @@ class PMMH:
         ),
     )
     rescue: int = setting(0, rescue_factor)
+    delayed_acceptance: bool | str = setting("auto", flag_or_auto)
 
     def _check_together(self) -> None:
         """The filters of some settings exclude those of others."""
+        if self.delayed_acceptance is True and (self.order or self.correlation or self.rescue):
+            raise ArgumentError(
+                f"delayed_acceptance=True together with order={self.order}, correlation="
+                f"{self.correlation}, rescue={self.rescue}",
+                fix="use ssm.PMMH(delayed_acceptance=True) with order=0, correlation=0.0 and "
+                "rescue=0",
+            )
         if self.rescue and (self.order or self.correlation):
             raise ArgumentError(
                 f"rescue={self.rescue} together with order={self.order}, correlation="
@@ -160,6 +177,42 @@ class PMMH:
                 f"order={self.order} together with correlation={self.correlation}",
                 fix="use one of them: the sorted filter of the correlated method keeps no scores",
             )
+
+
+@dataclass(frozen=True)
+class ISMCMC:
+    """Markov chains on an approximate posterior, corrected by importance sampling (Vihola, Helske
+    and Franks 2020; the R package bssm).
+
+    For models whose states have a Gaussian approximation. A chain moves on the prior times
+    Laplace's approximation of the likelihood; at its distinct draws twisted particle filters give
+    unbiased estimates of the likelihood, and trajectories, and their ratio to the approximation is
+    the draw's weight. The second part is independent tasks for any executor, of which as many run
+    at a time as it has workers.
+
+    The posterior has draws of equal weight, resampled by these weights: statistics that count on
+    draws (R-hat, effective sample sizes) can be read as they stand. `sample_stats` has of each the
+    `weight` that it was resampled by (mean 1 in a chain); the attributes `weights_ess`,
+    `weights_ess_share` and `largest_weight_share` tell how good the approximation was, and
+    `weights_warning` is there, and given as a warning, where few distinct draws carry all weight.
+    Where the posterior reaches where the approximate one does not, no weight tells of it: compare
+    with `PMMH` or `PGAS` where it matters.
+
+    Parameters
+    ----------
+    particles : N of the twisted filters; any number is exact. None: tuned in a pilot to a standard
+        deviation of log Z of at most 0.3, from 8 up.
+    approximation : of the likelihood: "laplace", "extended" (the extended Kalman filter's), or
+        "auto": Laplace's where there is one.
+    steps : of the chain between the draws that are corrected, times `thin`. None: 2 where most
+        independence proposals round the mode are accepted, else 6.
+    target_acceptance : that the walk adapts to during warmup, as in `MetropolisHastings`.
+    """
+
+    particles: int | None = setting(None, optional(count(1)))
+    approximation: str = setting("auto", one_of(("auto", "laplace", "extended")))
+    steps: int | None = setting(None, optional(count(1)))
+    target_acceptance: float | None = setting(None, ACCEPTANCE)
 
 
 @dataclass(frozen=True)
@@ -427,13 +480,22 @@ class SMC2:
     proposal: str = setting("auto", a_name)
 
 
-Method = MetropolisHastings | Gibbs | PMMH | PGAS | SMC2
+Method = MetropolisHastings | Gibbs | PMMH | ISMCMC | PGAS | SMC2
 
 
 @dataclass(frozen=True)
 class KalmanSmoother:
-    """Exact smoothing of linear Gaussian models: moments (Rauch, Tung and Striebel 1965), or
-    independent draws by backward sampling."""
+    """Smoothing by Kalman passes: moments (Rauch, Tung and Striebel 1965), or independent draws by
+    backward sampling. Exact on linear Gaussian models.
+
+    Parameters
+    ----------
+    proposal : "kalman", exact; or an approximation for states driven by Gaussian noise: "laplace",
+        the Gaussian law round the mode of all states together (Tierney and Kadane 1986),
+        "extended", or "unscented" (Julier and Uhlmann 1997; Särkkä 2008).
+    """
+
+    proposal: str = setting("kalman", one_of(("kalman", "laplace", "extended", "unscented")))
 
 
 @dataclass(frozen=True)

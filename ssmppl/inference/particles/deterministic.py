@@ -137,6 +137,7 @@ class Deterministic(Scored):
 
     def _run(self, problem: Problem, e: Experiment, theta: np.ndarray) -> tuple[float, np.ndarray]:
         path, total = np.zeros((e.steps, len(self.trace.state_symbols))), np.empty(1)
+        theta = np.ascontiguousarray(theta, dtype=float)
         problem.program.entry("log_joint")(theta, e.y, e.seen, e.u, path, total)
         return float(total[0]), path
 

@@ -128,9 +128,10 @@ class CompleteScores:
         """(M,) log p(x, y | theta) of the noisy components and the observations."""
         run, part = self.problem.program.entry("log_joint"), np.empty(1)
         total = np.zeros(len(paths[0]))
+        theta = np.ascontiguousarray(theta, dtype=float)
         for e, group in zip(self.problem.experiments, paths, strict=True):
             for m, path in enumerate(group):
-                run(theta, e.y, e.seen, e.u, np.array(path), part)
+                run(theta, e.y, e.seen, e.u, np.array(path, order="C"), part)
                 total[m] += part[0]
         return total
 

@@ -7,7 +7,7 @@ through an opaque primitive, the exact likelihood itself is differenced, which i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ssmppl.inference.exact.derivatives import jacobian, observed_information
 from ssmppl.inference.preparation.exact_models import ExactModel
 
 STEP = 1e-2  # the largest of the differences, relative to the parameter
+KEPT = 8  # informations
 LEAST = 0.1  # parameters nearer to zero count as this large
 
 
@@ -31,6 +32,7 @@ class ExactScore:
     experiments: Sequence[Experiment]
     free: np.ndarray
     differences: str = ""
+    _known: dict[bytes, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
 
     def score(self, theta: np.ndarray) -> tuple[float, np.ndarray]:
         """(log p(y | theta), gradient (P,), zero in what is not free); -inf and NaN where none."""
@@ -53,9 +55,17 @@ class ExactScore:
         return value, gradient
 
     def information(self, theta: np.ndarray) -> np.ndarray:
-        """(P, P) the observed information, zero in what is not free; NaN where there is none."""
-        with np.errstate(invalid="ignore"):
-            return observed_information(lambda v: self.score(v)[1], theta, self.free)[0]
+        """(P, P) the observed information, zero in what is not free; NaN where there is none.
+
+        Kept for the last thetas that were asked for, as a climb and what reports it ask twice."""
+        key = np.asarray(theta, dtype=float).tobytes()
+        if key not in self._known:
+            with np.errstate(invalid="ignore"):
+                found = observed_information(lambda v: self.score(v)[1], theta, self.free)[0]
+            if len(self._known) >= KEPT:
+                self._known.clear()
+            self._known[key] = found
+        return self._known[key].copy()
 
 
 def exact_score(

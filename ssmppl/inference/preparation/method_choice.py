@@ -22,6 +22,7 @@ from ssmppl.inference.methods.methods import (
 )
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import KIND
+from ssmppl.inference.preparation.pilot import TunedParticles
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.trace import Trace
 
@@ -35,6 +36,8 @@ def choose_sampler(
     numbers: int,
     stuck: str = "",
     singular: NotApplicable | None = None,
+    twisted: TunedParticles | None = None,
+    laplace: bool = False,
     counted: bool = False,
 ) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
@@ -47,8 +50,22 @@ def choose_sampler(
     have no noise there is nothing else.
     updates : where the states are drawn exactly. numbers : of the free parameters. stuck : as of
     `why_stuck`, for the others. singular : why the states have no joint density, as Gibbs and PGAS
-    need it. counted : as of `only_counts`.
+    need it. twisted : how well a pilot found that the twisted filter knows the likelihood, where
+    that is well enough. laplace : whether there may be such a pilot, before there are data.
+    counted : as of `only_counts`.
     """
+    if isinstance(kind, NotApplicable) and twisted is not None:
+        return PMMH(), (
+            "the states have a Gaussian approximation, and twisted particle filters along it know "
+            f"the likelihood (sd of log Z {twisted.sd:.2g} with {twisted.particles} particles, by "
+            "a pilot): Metropolis-Hastings over them, with proposals from the approximate posterior"
+        )
+    if isinstance(kind, NotApplicable) and laplace:
+        other, why = choose_sampler(kind, updates, numbers, stuck, singular, counted=counted)
+        return PMMH(), (
+            "over twisted particle filters, where a pilot on the data finds that these know the "
+            f"likelihood; else {type(other).__name__}: {why}"
+        )
     if singular is not None:
         if isinstance(kind, NotApplicable):
             return (

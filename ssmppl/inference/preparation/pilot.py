@@ -243,9 +243,13 @@ def _small_step(drop_at: Callable[[float], float], size: float) -> tuple[float, 
 def dispersed(
     space: Space, pilot: Pilot, chains: int, seed: np.random.SeedSequence, proposal: str,
     rescue: int = 0,
+    likelihood: Callable[[np.ndarray, np.random.SeedSequence], float] | None = None,
 ) -> list[np.ndarray]:  # fmt: skip
-    """A start for each chain, three scales about the mode, with a finite likelihood."""
-    estimate = pilot_likelihood(space.problem, proposal, rescue)
+    """A start for each chain, three scales about the mode, with a finite likelihood.
+
+    likelihood : (theta, seed) -> the log-likelihood; None: as of `pilot_likelihood`.
+    """
+    estimate = likelihood or pilot_likelihood(space.problem, proposal, rescue)
     starts = []
     for chain in range(chains):
         child = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 7, chain))

@@ -57,7 +57,7 @@ class Space:
         z, theta = self.z.copy(), self.theta.copy()
         z[self.positions] = z_free
         program = self.problem.program
-        log_jacobian = float(program.entry("constrain")(z, self.free, theta))
+        log_jacobian = float(program.entry("constrain")(theta, z, self.free))
         log_prior = float(program.entry("log_prior")(theta))
         if not np.isfinite(theta).all() or not log_prior < np.inf:
             log_prior = -np.inf

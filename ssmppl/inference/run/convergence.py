@@ -70,6 +70,17 @@ def mixing_attributes(
     return {"mixing_warning": text}
 
 
+def have_mixed(chains: Sequence[ChainDraws[Any]], free: np.ndarray) -> bool:
+    """Whether there is nothing to warn of, in the parameters that are free (P,)."""
+    draws = np.stack([c.draws["theta"] for c in chains])[:, :, free]
+    if len(chains) < LEAST_CHAINS or draws.shape[1] < FEWEST or not draws.shape[2]:
+        return True
+    for component in np.moveaxis(draws, 2, 0):
+        if rank_r_hat(component) > APART or bulk_ess(component) < FEW:
+            return False
+    return True
+
+
 def rank_r_hat(draws: np.ndarray) -> float:
     """The larger R-hat of ranks and of folded ranks, split chains; draws (chains, n)."""
     halves = _split(draws)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -54,6 +54,19 @@ class ChainDraws(Generic[State]):
     state: State
     interrupted: bool = False
     lost: ExecutorError | None = None
+
+    def then(self, later: ChainDraws[State]) -> ChainDraws[State]:
+        """With the draws that the chain made from where it stood."""
+        draws, stats = joined([self.draws, later.draws]), joined([self.stats, later.stats])
+        return replace(later, draws=draws, stats=stats, warmup_stats=self.warmup_stats)
+
+    def latter_half(self, most: int) -> ChainDraws[State]:
+        """Without its first half, the rest thinned to at most so many draws."""
+        n = len(next(iter(self.draws.values())))
+        left = max(n // 2, min(most, n))
+        own = slice(n - left, None, max(left // most, 1))
+        draws, stats = ({k: v[own][:most] for k, v in d.items()} for d in (self.draws, self.stats))
+        return replace(self, draws=draws, stats=stats)
 
 
 @dataclass(frozen=True)

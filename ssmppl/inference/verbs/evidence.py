@@ -264,7 +264,8 @@ def _with_filter(
         if particles is None:
             tuned = tune_particles(problem, theta, proposal, TARGET_SD, root, method.rescue)
             particles = tuned.particles
-    return replace(method, proposal=proposal, particles=particles)
+    # One law of estimates on both sides: a first stage would give the twisted filter another guide.
+    return replace(method, proposal=proposal, particles=particles, delayed_acceptance=False)
 
 
 def _without_parameters(

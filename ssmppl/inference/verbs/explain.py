@@ -31,6 +31,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
+from ssmppl.inference.preparation.gaussian_pilot import MOST_NUMBERS
 from ssmppl.inference.preparation.method_choice import (
     choose_maximiser,
     choose_sampler,
@@ -163,7 +164,8 @@ class Plan:
                 self._numbers(),
                 why_stuck(self.trace, self.rows),
                 singular_covariance(self.trace),
-                only_counts(self.trace),
+                laplace=self.laplace is None and 0 < self._numbers() <= MOST_NUMBERS,
+                counted=only_counts(self.trace),
             )
         }
         if self.trace.parameters:

@@ -18,6 +18,8 @@ from ssmppl.data import Experiment, check_parameters, unpack_observations, unpac
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
+from ssmppl.inference.gaussian.likelihood import APPROXIMATE, approximation_of
+from ssmppl.inference.gaussian.moments import ApproximateKalman
 from ssmppl.inference.particles.filtering import FilterRun, FilterSettings, full_run
 from ssmppl.inference.particles.marginal import is_marginal, marginal_run
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot, resolve_settings
@@ -257,35 +259,57 @@ def kalman_filter(
     data: Any,
     parameters: Mapping[str, Any],
     *,
+    proposal: str = "kalman",
     quantiles: tuple[float, ...] = LEVELS,
 ) -> xr.Dataset | list[xr.Dataset]:
-    """Run the exact filter of a linear Gaussian model (Kalman 1960).
+    """Run the exact filter of a linear Gaussian model (Kalman 1960), or an approximate one.
 
     Parameters
     ----------
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
+    proposal : "kalman", exact, for linear Gaussian models; or, where states are driven by Gaussian
+        noise, one of the approximations "extended" (the update is the mode of each row),
+        "unscented" (Julier and Uhlmann 1997) and "laplace" (the law round the mode of all states
+        given the data up to each row, whose cost grows with the square of the rows).
     quantiles : levels of the quantiles of states and predictions.
 
     Returns
     -------
     Dataset, or a list of them for several experiments
-        As of `particle_filter`, with one `draw` and without `ess`; everything is exact.
+        As of `particle_filter`, with one `draw` and without `ess`. Everything is exact with
+        "kalman"; else all laws are Gaussian approximations, and the attribute `approximate` is 1.
 
     Raises
     ------
-    ArgumentError : the model is not linear and Gaussian; gives the reason and the user's line.
+    ArgumentError : the model is not linear and Gaussian, or has no such approximation; gives the
+        reason and the user's line.
+    SamplingError : an approximation comes to no number.
     """
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
-    resolve_settings(problem, theta, 1, "kalman")
     levels = quantile_levels(quantiles)
-    attrs = {"model": problem.trace.name, "proposal": "kalman"}
+    attrs: dict[str, Any] = {"model": problem.trace.name, "proposal": proposal}
+    if proposal in APPROXIMATE:
+        attrs["approximate"] = 1
+        run_filter = ApproximateKalman(
+            problem, approximation_of(problem, proposal, "use ssm.particle_filter"), proposal
+        ).filter
+    else:
+        if proposal != "kalman":
+            raise ArgumentError(
+                f"kalman_filter with proposal={proposal!r}",
+                fix="use one of: "
+                + ", ".join(("kalman", *APPROXIMATE))
+                + "; the others are of ssm.particle_filter",
+            )
+        resolve_settings(problem, theta, 1, "kalman")
+        run_filter = partial(kalman.kalman_filter, problem.trace)
     root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
     datasets = []
     for e in problem.experiments:
-        run = _as_run(kalman.kalman_filter(problem.trace, e, theta), e, levels)
+        run = _as_run(run_filter(e, theta), e, levels)
         datasets.append(filter_dataset(problem, e, [run], levels, attrs, root).drop_vars("ess"))
     return datasets if len(datasets) > 1 else datasets[0]
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ssmppl.counts import check_room
 from ssmppl.data import (
     bind_inputs,
     check_defined,
+    check_parameters,
     unpack_observations,
     unpack_parameters,
     unpack_states,
@@ -24,10 +26,13 @@ from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.maximum.estimate import Estimate
 from ssmppl.inference.run.labels import TIME_ZONES, observes, zone_of
+from ssmppl.inference.run.problem import pose
 from ssmppl.inference.run.seeds import random_state, seed_sequence
 from ssmppl.inference.verbs.predict import all_draws, group, parameters_of, posterior_of, states_of
 from ssmppl.inference.verbs.simulate import check_finite, check_samplers, feeds_back
+from ssmppl.inference.verbs.smooth import smooth
 from ssmppl.language.distributions import MvNormal
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
@@ -38,11 +43,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-# A forecast starts from draws of the last state, which known parameters have as well.
 KNOWN = (
-    "give what ssm.sample returns; at known parameters that is "
-    "ssm.sample(model, data, fixed=estimate.parameters, warmup=0)"
+    "give what ssm.sample returns; or, at known parameters, these and the data: "
+    "ssm.forecast(model, estimate.parameters, steps, data=data)"
 )
+DRAWS = 1000
 
 
 def forecast(
@@ -51,18 +56,26 @@ def forecast(
     steps: int | None = None,
     inputs: Any = None,
     *,
+    data: Any = None,
+    proposal: str | None = None,
+    draws: int | None = None,
     experiment: int | None = None,
     seed: int | None = None,
 ) -> xr.Dataset:
     """Draws of the states and observations after the last row of the data.
 
     Each posterior draw of the parameters and of x_T is continued by the model's laws: one draw of
-    p(x_{T+1:T+H}, y_{T+1:T+H} | y_{1:T}) each.
+    p(x_{T+1:T+H}, y_{T+1:T+H} | y_{1:T}) each. At known parameters x_T is drawn by `smooth`.
 
     Parameters
     ----------
     model : the model that was sampled.
-    idata : what `sample` returned, with its states.
+    idata : what `sample` returned, with its states; or, beside `data`, values of the parameters: a
+        mapping, or what `maximize` returned.
+    data : what the forecast goes on from, at known parameters: as of `smooth`.
+    proposal, draws : at known parameters, how x_T is drawn, as of `smooth`, where "laplace",
+        "extended" and "unscented" are approximations, then told by the attribute `approximate`
+        (None: exactly where that can be, else by particles); and how often (None: 1000).
     steps : number H of rows; may be left out where `inputs` tell it.
     inputs : the inputs of the rows T+1, ..., T+H: mapping of arrays, DataFrame or Dataset. The step
         into the first of them is driven by the data's last input.
@@ -81,40 +94,35 @@ def forecast(
     ModelError, DataError, ArgumentError, SamplingError : what is wrong, where, and the fix; inputs
         with labels of the data's rows among them.
     """
-    traced, posterior = trace(model), posterior_of(idata, KNOWN)
+    if data is None and (proposal is not None or draws is not None):
+        raise ArgumentError(
+            "proposal= and draws= are of a forecast at known parameters, which needs the data",
+            fix="give data=, and values of the parameters in place of the posterior",
+        )
+    traced = trace(model)
     check_samplers(traced)
     future, steps, source = bind_inputs(traced, inputs, steps)
     labels = source.time
-    mark, axis = _which(traced, posterior, experiment)
-    theta = parameters_of(traced, posterior)
-    paths = states_of(traced, posterior, mark, axis)
-    if paths is None:
-        raise ArgumentError(
-            "the posterior holds no trajectories: a forecast starts from the last state",
-            fix="sample with states=True",
-        )
-    theta, paths = all_draws(theta), all_draws(paths)
+    past = (
+        _sampled(traced, idata, experiment) if data is None
+        else _at_known(model, idata, data, proposal, draws, experiment, seed)
+    )  # fmt: skip
+    theta, paths, zone = past.theta, past.paths, past.zone
     rows = paths.shape[1]
     d, k = paths.shape[2], len(traced.observation_symbols)
     check_room(
         f"{len(paths)} draws of {steps} rows", len(paths) * steps * (d + k), "ask for fewer rows"
     )
-    given = _past(idata, "constant_data", traced.inputs, mark, rows)
-    columns = [given[n].reshape(rows, -1) for n in traced.inputs]
-    u = np.concatenate([np.concatenate([np.zeros((rows, 0)), *columns], axis=1), future])
+    u = np.concatenate([past.u, future])
     check_defined(traced, source, u, after=rows)
-    y = np.zeros((rows + steps, len(traced.observation_symbols)))
     feedback = feeds_back(traced)
-    if feedback:
-        seen = _past(idata, "observed_data", traced.observations, mark, rows)
-        y[:rows] = pack(traced.observations.values(), seen)
+    y = np.concatenate([past.y if feedback else np.zeros((rows, k)), np.zeros((steps, k))])
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     states, observed = _continued(program, theta, paths, y, u, feedback, root)
     check_finite(traced, states, observed)
-    zone = zone_of(posterior.attrs, axis)
-    _check_after(posterior[axis].values, labels)
+    _check_after(past.time, labels)
     if labels is None:
-        labels = after(posterior[axis].values, steps, zone)
+        labels = after(past.time, steps, zone)
     over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
     return to_dataset(
         over_time | unpack_parameters(traced, theta),
@@ -127,8 +135,79 @@ def forecast(
             "experiment": experiment or 1,
             "observes": observes(traced),
         }
-        | ({TIME_ZONES: {"time": zone}} if zone else {}),
+        | ({TIME_ZONES: {"time": zone}} if zone else {})
+        | past.attrs,
     )
+
+
+@dataclass(frozen=True)
+class _Past:
+    """What a forecast goes on from: T rows, n draws.
+
+    theta (n, P), paths (n, T, D); u (T, U), y (T, K), NaN where missing: of the data. time : labels
+    of the rows; zone : that they were given in. attrs : of the result, what the draws are.
+    """
+
+    theta: np.ndarray
+    paths: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    time: np.ndarray
+    zone: str
+    attrs: dict[str, Any] = field(default_factory=dict)
+
+
+def _sampled(traced: Trace, idata: Any, experiment: int | None) -> _Past:
+    """The draws of a posterior, and the data that it holds."""
+    posterior = posterior_of(idata, KNOWN)
+    mark, axis = _which(traced, posterior, experiment)
+    theta = parameters_of(traced, posterior)
+    paths = states_of(traced, posterior, mark, axis)
+    if paths is None:
+        raise ArgumentError(
+            "the posterior holds no trajectories: a forecast starts from the last state",
+            fix="sample with states=True",
+        )
+    theta, paths = all_draws(theta), all_draws(paths)
+    rows = paths.shape[1]
+    given = _past(idata, "constant_data", traced.inputs, mark, rows)
+    columns = [given[n].reshape(rows, -1) for n in traced.inputs]
+    y = np.zeros((rows, len(traced.observation_symbols)))
+    if feeds_back(traced):
+        seen = _past(idata, "observed_data", traced.observations, mark, rows)
+        y[:] = pack(traced.observations.values(), seen)
+    u = np.concatenate([np.zeros((rows, 0)), *columns], axis=1)
+    return _Past(theta, paths, u, y, posterior[axis].values, zone_of(posterior.attrs, axis))
+
+
+def _at_known(
+    model: Model, parameters: Any, data: Any, proposal: str | None, draws: int | None,
+    experiment: int | None, seed: int | None,
+) -> _Past:  # fmt: skip
+    """Draws of the states of one data set at known parameters, by `smooth`."""
+    if isinstance(parameters, Estimate):
+        parameters = parameters.parameters
+    if not isinstance(parameters, Mapping):
+        raise ArgumentError(
+            f"data= beside {type(parameters).__name__}, which is no parameters",
+            fix="leave data out where a posterior is given; else give {name: value}, or what "
+            "ssm.maximize returned",
+        )
+    problem = pose(model, data)
+    several = len(problem.experiments)
+    which = _one_of(list(range(1, several + 1)) if several > 1 else [], experiment, "data are")
+    e, n = problem.experiments[which - 1], DRAWS if draws is None else draws
+    found = smooth(
+        model, data, parameters, proposal=proposal, trajectories=n, quantiles=(), seed=seed
+    )
+    one = found[which - 1] if isinstance(found, list) else found
+    paths = pack(
+        problem.trace.initial.values(), {name: one[name].values for name in problem.trace.initial}
+    )
+    theta = np.tile(check_parameters(problem.trace, parameters), (n, 1))
+    time = np.arange(1, e.steps + 1) if e.time is None else e.time
+    told = {k: one.attrs[k] for k in ("approximate", "method", "method_chosen") if k in one.attrs}
+    return _Past(theta, paths, e.u, np.where(e.seen > 0.0, e.y, np.nan), time, e.zone, told)
 
 
 def _check_after(time: np.ndarray, labels: np.ndarray | None) -> None:
@@ -262,12 +341,18 @@ def _which(trace: Trace, posterior: Any, experiment: int | None) -> tuple[str, s
     ArgumentError : there are several, and none or an unknown one was asked for.
     """
     known = [int(d.removeprefix("time_")) for d in time_axes(posterior.dims) if d != "time"]
+    which = _one_of(known, experiment, "posterior is")
+    return (f"_{which}", f"time_{which}") if known else ("", "time")
+
+
+def _one_of(known: list[int], experiment: int | None, what: str) -> int:
+    """The number of the experiment asked for; known : empty where there is a single one."""
     if not known and experiment in (None, 1):
-        return "", "time"
+        return 1
     if experiment in known:
-        return f"_{experiment}", f"time_{experiment}"
+        return int(experiment)
     raise ArgumentError(
-        f"experiment={experiment!r}, and the posterior is of "
+        f"experiment={experiment!r}, and the {what} of "
         + (f"the experiments {', '.join(map(str, known))}" if known else "a single experiment"),
         fix=f"give experiment={known[0]}, or another of them" if known else "leave experiment out",
     )

@@ -52,7 +52,8 @@ def log_likelihood(
     particles : number N of particles.
     repeats : number of independent estimates.
     proposal : "auto", "kalman", "forward", "deterministic", "bootstrap", "guided", "auxiliary",
-        "twisted", "tempered", "laplace", "extended", or "user" where the model has a @proposal.
+        "twisted", "tempered", "laplace", "extended", "unscented", or "user" where the model has a
+        @proposal.
         "auto" is exact on linear Gaussian models, on those of finitely many states ("forward", the
         forward algorithm) and on those without noise in their states ("deterministic"), else the
         proposal with the least variance for its cost in a pilot; "twisted", which looks ahead to
@@ -68,10 +69,12 @@ def log_likelihood(
         no derivative is known of; a pilot of its own random numbers fixes powers and steps for each
         estimate. It costs tens of times what "bootstrap" does, and "auto" tries it where no
         guided proposal is derived and others tell log Z to no better than 1.2.
-        "laplace" and "extended" are approximations without particles or random numbers, for models
-        whose states are driven by Gaussian noise: Laplace's, at the mode of all states together
-        (Tierney and Kadane 1986), and an extended Kalman filter, whose update is the mode of each
-        row. They are exact where the model is linear and Gaussian, and never taken by "auto".
+        "laplace", "extended" and "unscented" are approximations without particles or random
+        numbers, for models whose states are driven by Gaussian noise: Laplace's, at the mode of
+        all states together (Tierney and Kadane 1986), an extended Kalman filter, whose update is
+        the mode of each row, and an unscented one (Julier and Uhlmann 1997), to which observations
+        count by their mean and covariance. They are exact where the model is linear and Gaussian,
+        and never taken by "auto".
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     rescue : where all N particles have weight zero, go on drawing, up to `rescue` times N at a row,
@@ -91,7 +94,7 @@ def log_likelihood(
     -------
     float64 array (repeats,)
         The exp of each is an unbiased estimate of the likelihood (Del Moral 2004; Schön et al.
-        2015, section 5), except of the two approximations. -inf at parameters at which nothing is
+        2015, section 5), except of the approximations. -inf at parameters at which nothing is
         finite.
 
     Raises

@@ -23,8 +23,8 @@ from ssmppl.inference.maximum import (
     psaem,
     score_ascent,
 )
-from ssmppl.inference.maximum.ascent import Ascent, Maximization
-from ssmppl.inference.maximum.edges import Edges, edges
+from ssmppl.inference.maximum.ascent import Ascent, Edges, Maximization
+from ssmppl.inference.maximum.edges import edges
 from ssmppl.inference.maximum.estimate import NO_METHOD, Estimate, make_estimate
 from ssmppl.inference.methods.methods import (
     EM,
@@ -38,7 +38,7 @@ from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.particles.filtering import FilterSettings, estimates_task, log_of_mean
 from ssmppl.inference.particles.scores import Smoothing, combine, complete_scores, several_runs
 from ssmppl.inference.preparation.exact_models import exact_kind
-from ssmppl.inference.preparation.exact_score import ExactScore, exact_score
+from ssmppl.inference.preparation.exact_score import ExactScore
 from ssmppl.inference.preparation.method_choice import choose_maximiser, start_as_parameter
 from ssmppl.inference.preparation.proposal_choice import choose_by_pilot
 from ssmppl.inference.preparation.space import free_components, space_of
@@ -226,10 +226,10 @@ def _covariance(setup: Maximization, ascent: Ascent, attrs: dict[str, Any]) -> n
     if ascent.no_information:
         attrs["covariance"] = f"none: {ascent.no_information}"
         return nothing
-    if information is None:
+    found, score = ascent.held, None
+    if information is None and found is None:
         information = _information(setup, ascent.theta, None)
-    found = score = None
-    if information is not None and not isinstance(setup.exact, NotApplicable):
+    if found is None and information is not None and not isinstance(setup.exact, NotApplicable):
         found = edges(setup, ascent.theta, information)
     if found is not None:
         labels = [repr(s) for s in setup.problem.trace.parameter_symbols]
@@ -272,10 +272,9 @@ def _information(setup: Maximization, theta: np.ndarray, found: Edges | None) ->
 
 def _score_of(setup: Maximization, found: Edges | None) -> ExactScore:
     """Of an exact likelihood, in what is free and not held at an edge that stays where it is."""
-    assert not isinstance(setup.exact, NotApplicable), setup.exact
     free = free_components(setup.problem.trace, setup.fixed)
     free[[] if found is None else [i for i in found.components if i not in found.moving]] = False
-    return exact_score(setup.exact, setup.problem.experiments, free, setup.space.theta)
+    return setup.exact_score(free)
 
 
 def natural_covariance(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,18 +16,27 @@ from ssmppl.analysis.structure import singular_covariance
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
-from ssmppl.inference.chains import gibbs, metropolis, pgas, pmmh, smc2
+from ssmppl.inference.chains import gibbs, ismcmc, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.gibbs_updates import plan_updates
-from ssmppl.inference.chains.sampling import SamplingMethod, SamplingSetup
+from ssmppl.inference.chains.sampling import GO_ON, SamplingMethod, SamplingSetup
 from ssmppl.inference.checkpoints.chains import CheckpointFile
 from ssmppl.inference.checkpoints.codec import Codec
 from ssmppl.inference.checkpoints.origin import Origin, data_digest, model_digest, text_of, versions
-from ssmppl.inference.methods.methods import PGAS, PMMH, SMC2, Gibbs, Method, MetropolisHastings
+from ssmppl.inference.methods.methods import (
+    ISMCMC,
+    PGAS,
+    PMMH,
+    SMC2,
+    Gibbs,
+    Method,
+    MetropolisHastings,
+)
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
+from ssmppl.inference.preparation.gaussian_pilot import precise_twisted
 from ssmppl.inference.preparation.method_choice import choose_sampler, only_counts, why_stuck
-from ssmppl.inference.preparation.space import free_components, space_of
-from ssmppl.inference.run.convergence import mixing_attributes
+from ssmppl.inference.preparation.space import Space, free_components, space_of
+from ssmppl.inference.run.convergence import have_mixed, mixing_attributes
 from ssmppl.inference.run.draws import stack
 from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, observes
@@ -41,6 +51,7 @@ METHODS: dict[type, SamplingMethod] = {
     MetropolisHastings: metropolis.METHOD,
     Gibbs: gibbs.METHOD,
     PMMH: pmmh.METHOD,
+    ISMCMC: ismcmc.METHOD,
     PGAS: pgas.METHOD,
     SMC2: smc2.METHOD,
 }
@@ -72,11 +83,17 @@ def sample(
     method : `ssm.MetropolisHastings(...)` or `ssm.Gibbs()` for linear Gaussian models and for those
         of finitely many states, `ssm.MetropolisHastings(...)` where states have no noise too,
         `ssm.PMMH(...)`, `ssm.PGAS(...)` or `ssm.SMC2(...)` for all.
+        `ssm.ISMCMC(...)` for those whose states have a Gaussian approximation.
         None: for the former Gibbs if every parameter has a closed-form conditional (with
         `interweave="auto"` in linear Gaussian models), else a random walk on the exact likelihood
-        while the parameters are few; for the others PGAS, likewise with `interweave="auto"`, or
-        PMMH where no ancestors can be sampled, the data are long or the states counts, and the
-        parameters are few. `explain` and the attributes say which, and why.
+        while the parameters are few; for the others PMMH where a pilot finds that twisted particle
+        filters of at most 64 particles know the likelihood (sd of log Z at most 0.3), with up to 12
+        free numbers; else PGAS, likewise with `interweave="auto"`, or PMMH where no ancestors can
+        be sampled, the data are long or the states counts, and the parameters are few. `explain`
+        and the attributes say which, and why. Chains of a method that was chosen like this and have
+        not mixed (R-hat above 1.05, or a bulk ESS below 100) go on to twice and, if need be, four
+        times the draws, of which the first half then counts as warmup and the second is thinned to
+        as many draws as were asked for; the attribute `further_draws` says how many were made.
     draws, warmup, chains : kept draws and dropped ones of each chain. Random walks adapt during
         warmup. `SMC2` has independent runs for chains, and neither warmup nor thinning.
     start : parameter values near which to begin; the chains are dispersed round a mode found from
@@ -92,8 +109,9 @@ def sample(
         goes on from it and returns the draws that it would have returned, bit for bit; without a
         seed it takes up that of the file. Once all is drawn, it returns that at once. The same call
         with more `draws` (of `SMC2`: up to its `parameters`) goes on to those of one longer run;
-        with fewer it returns the first of them. All else has to be as it was: model, data, method
-        and settings, versions of this package, Python, NumPy, SciPy and Numba. Draws that exceed
+        with fewer it returns the first of them (of `ISMCMC`: those of a shorter run). All else has
+        to be as it was: model, data, method and settings, versions of this package, Python, NumPy,
+        SciPy and Numba. Draws that exceed
         128 MB go to a folder beside it, `<checkpoint>.draws`, and variables of the result that do
         are read from there when they are looked at. Reading a checkpoint executes nothing.
 
@@ -104,9 +122,10 @@ def sample(
 
         * posterior: parameters (chain, draw, ...) and states (chain, draw, time, ...);
         * sample_stats (not of SMC2): lp, acceptance_rate, and log_likelihood (MetropolisHastings:
-          exact; PMMH: the estimate at the draw) or update_rate and ess (PGAS: share of the
-          trajectory that a sweep changed, ESS / N);
-        * log_likelihood (PMMH; PGAS on request): log p(y_t | y_1:t-1, theta), for
+          exact; PMMH: the estimate at the draw; ISMCMC: likewise, with the approximation's, and the
+          weight by which the draw was resampled in place of acceptance_rate) or update_rate and
+          ess (PGAS: share of the trajectory that a sweep changed, ESS / N);
+        * log_likelihood (PMMH; ISMCMC; PGAS on request): log p(y_t | y_1:t-1, theta), for
           leave-future-out scores; az.loo on it is not valid, as the rows are not exchangeable;
         * observed_data, constant_data (inputs).
 
@@ -133,7 +152,8 @@ def sample(
     problem = pose(model, data)
     fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
-    chosen, reason = (method, "") if method is not None else _chosen(problem, fixed_values)
+    space = space_of(problem, fixed_values, near)
+    chosen, reason = (method, "") if method is not None else _chosen(space, fixed_values)
     sampling_method = METHODS.get(type(chosen))
     if sampling_method is None:
         names = ", ".join(f"ssm.{m.__name__}(...)" for m in METHODS)
@@ -158,7 +178,7 @@ def sample(
     check_names(problem.trace, problem.experiments, states)
     if checkpoint is None:
         _check_room(problem, sampling_method.by_row(chosen), chains, draws, states)
-    root, space, checkpoint_file = seed_sequence(seed), space_of(problem, fixed_values, near), None
+    root, checkpoint_file = seed_sequence(seed), None
     if checkpoint is not None:
         origin = _origin(problem, chosen, fixed_values, near, chains, warmup, thin, states)
         checkpoint_file = CheckpointFile(checkpoint, origin, seed, root, _codec(), draws)
@@ -166,7 +186,10 @@ def sample(
     setup = SamplingSetup(
         problem, space, fixed_values, chains, warmup, thin, root, states, checkpoint_file
     )
-    result, report = sampling_method.draw(setup, chosen, draws, executor, progress)
+    free = free_components(problem.trace, fixed_values)
+    patience = _room_to_go_on(problem, sampling_method, chosen, chains, draws, states)
+    mixed = partial(have_mixed, free=free) if method is None and patience else None
+    result, report = sampling_method.draw(setup, chosen, draws, executor, progress, mixed)
     attrs = {
         "model": problem.trace.name,
         "method": type(chosen).__name__,
@@ -179,9 +202,11 @@ def sample(
         "seconds": checkpoint_file.seconds if checkpoint_file else time.perf_counter() - began,
     }  # fmt: skip
     attrs |= sampling_method.attributes(problem, result)
-    whole = stack(result) if checkpoint_file is None else checkpoint_file.stack(result)
+    if checkpoint_file is None or sampling_method.independent or "further_draws" in report:
+        whole = stack(result)
+    else:
+        whole = checkpoint_file.stack(result)
     if sampling_method.markov:
-        free = free_components(problem.trace, fixed_values)
         labels = [repr(s) for s, f in zip(problem.trace.parameter_symbols, free, strict=True) if f]
         theta, interrupted = whole[0]["theta"][:, :, free], bool(attrs["interrupted"])
         attrs |= mixing_attributes(
@@ -210,6 +235,19 @@ def _check_room(problem: Problem, by_row: bool, chains: int, draws: int, states:
     )
 
 
+def _room_to_go_on(
+    problem: Problem, sampling_method: SamplingMethod, settings: Method, chains: int, draws: int,
+    states: bool,
+) -> bool:  # fmt: skip
+    """Whether memory holds the draws of chains that are continued."""
+    try:
+        by_row = sampling_method.by_row(settings)
+        _check_room(problem, by_row, chains, GO_ON[-1] * draws, states)
+    except ArgumentError:
+        return False
+    return True
+
+
 def _origin(
     problem: Problem, method: Method, fixed_values: Mapping[str, np.ndarray],
     near: Mapping[str, np.ndarray], chains: int, warmup: int, thin: int, states: bool,
@@ -225,14 +263,18 @@ def _origin(
     return Origin(digests, plain | versions())
 
 
-def _chosen(problem: Problem, fixed_values: dict[str, np.ndarray]) -> tuple[Method, str]:
+def _chosen(space: Space, fixed_values: dict[str, np.ndarray]) -> tuple[Method, str]:
+    problem = space.problem
     exact, singular = exact_model(problem.trace), singular_covariance(problem.trace)
     numbers = sum(len(t.free) for t in transforms(problem.trace) if t.site.name not in fixed_values)
     stuck = why_stuck(problem.trace, max(e.steps for e in problem.experiments))
     drawn = not isinstance(exact, NotApplicable) and singular is None
     updates = plan_updates(problem, fixed_values) if drawn else ()
+    twisted = precise_twisted(space) if isinstance(exact, NotApplicable) else None
     counted = only_counts(problem.trace)
-    return choose_sampler(exact_kind(exact), updates, numbers, stuck, singular, counted)
+    return choose_sampler(
+        exact_kind(exact), updates, numbers, stuck, singular, twisted, counted=counted
+    )
 
 
 def _to_arviz(

@@ -21,6 +21,8 @@ from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
+from ssmppl.inference.gaussian.likelihood import APPROXIMATE, approximation_of
+from ssmppl.inference.gaussian.moments import ApproximateKalman
 from ssmppl.inference.methods.methods import (
     PGAS,
     FFBSi,
@@ -88,19 +90,39 @@ class SmoothedStates:
 
 
 def by_kalman(setup: SmoothingSetup, method: KalmanSmoother) -> list[SmoothedStates]:
-    """Exact moments, or exact draws, of a linear Gaussian model."""
+    """Moments, or draws: exact of a linear Gaussian model, or by an approximation."""
     _without_particles(setup, method)
+    if method.proposal in APPROXIMATE:
+        return _by_approximation(setup, method.proposal)
     model = kalman_model(setup.problem.trace)
     assert not isinstance(model, NotApplicable)
     experiments, theta = setup.problem.experiments, setup.theta
     if setup.trajectories is not None:
         return _exact_draws(setup, model, [model.log_likelihood([e], theta) for e in experiments])
     moments = [model.smooth(e, theta) for e in experiments]
+    return _exact_moments(moments, _normal_spreads(moments, setup.levels))
+
+
+def _by_approximation(setup: SmoothingSetup, kind: str) -> list[SmoothedStates]:
+    found = approximation_of(setup.problem, kind, "use method=ssm.FFBSi()")
+    model, experiments = ApproximateKalman(setup.problem, found, kind), setup.problem.experiments
+    if setup.trajectories is not None:
+        out = []
+        for i, e in enumerate(experiments):
+            rng = np.random.default_rng(setup.root.spawn(i + 1)[i])
+            value, paths = model.draw(e, setup.theta, rng, setup.trajectories)
+            out.append(SmoothedStates({"log_likelihood": value}, paths=paths))
+    else:
+        moments = [model.smooth(e, setup.theta) for e in experiments]
+        out = _exact_moments(moments, _normal_spreads(moments, setup.levels))
+    for one in out:
+        one.attrs["approximate"] = 1
+    return out
+
+
+def _normal_spreads(moments: Sequence[SmoothedMoments], levels: np.ndarray) -> list[np.ndarray]:
     sds = [np.sqrt(np.maximum(np.diagonal(m.covariance, 0, 1, 2), 0.0)) for m in moments]
-    spreads = [
-        normal_quantiles(m.mean, sd, setup.levels) for m, sd in zip(moments, sds, strict=True)
-    ]
-    return _exact_moments(moments, spreads)
+    return [normal_quantiles(m.mean, sd, levels) for m, sd in zip(moments, sds, strict=True)]
 
 
 def by_forward_backward(setup: SmoothingSetup, method: ForwardBackward) -> list[SmoothedStates]:
@@ -273,6 +295,7 @@ NEEDED: dict[type, tuple[str, Callable[[Trace], Any]]] = {  # what a method need
 }
 NAMES: dict[str, SmoothingMethod] = {
     "kalman": KalmanSmoother(),
+    **{kind: KalmanSmoother(kind) for kind in APPROXIMATE},
     "forward_backward": ForwardBackward(),
     "ffbsi": FFBSi(),
     "exact": FFBSi(kernel="exact"),
@@ -292,6 +315,7 @@ def smooth(
     *,
     particles: int | None = None,
     trajectories: int | None = None,
+    proposal: str | None = None,
     quantiles: tuple[float, ...] = LEVELS,
     seed: int | None = None,
 ) -> xr.Dataset | list[xr.Dataset]:
@@ -305,15 +329,19 @@ def smooth(
     method : `ssm.KalmanSmoother()`, exact, for linear Gaussian models; `ssm.ForwardBackward()`,
         exact, where the states take finitely many values; `ssm.FFBSi(...)`, particles
         with backward simulation; `ssm.PGAS(...)`, a Markov chain of conditional particle filters;
+        `ssm.KalmanSmoother("laplace")`, "extended" or "unscented", approximations without
+        particles where states are driven by Gaussian noise;
         `ssm.FixedLag(...)`, marginal moments from the genealogy. Or one of the names "kalman",
-        "forward_backward", "ffbsi", "exact", "rejection", "mcmc", "genealogy", "pgas",
-        "fixed_lag". None: the exact one where there is one, else FFBSi; the attribute
-        `method_chosen` says why.
+        "forward_backward", "laplace", "extended", "unscented", "ffbsi", "exact", "rejection",
+        "mcmc", "genealogy", "pgas", "fixed_lag". None: the exact one where there is one, else
+        FFBSi; the attribute `method_chosen` says why.
     particles : number N; None: 1000, and for PGAS its own. An exact smoother, where `method` is
         left to the model, does without. Moments have a bias of order 1 / N, but
         those of PGAS, whose chain has the right law for every N >= 2.
     trajectories : number M of draws; None: exact moments from an exact smoother, and 1000 draws
         from FFBSi and PGAS.
+    proposal : in place of `method`: "laplace", "extended" or "unscented", as of `kalman_filter`, or
+        the proposal of FFBSi's particle filter.
     quantiles : levels of the quantiles that go with moments.
     seed : the same seed gives the same numbers; None: a random one.
 
@@ -328,7 +356,8 @@ def smooth(
         row. For FixedLag also `distinct`, the ancestors that are left.
         Both: the data, ``y_observed`` of channels y and ``u_input`` of inputs u, (time, ...).
         Attributes name method, settings, seed and the log-likelihood (exact, or the filter's
-        estimate).
+        estimate); `approximate` is 1 where moments, draws and log-likelihood are those of a
+        Gaussian approximation.
 
     Raises
     ------
@@ -336,6 +365,7 @@ def smooth(
     SamplingError : weights vanish or are NaN; names the step, the user's line, the parameters.
     """
     began = time.perf_counter()
+    method = _with_proposal(method, proposal)
     check_settings(method)
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
@@ -358,6 +388,20 @@ def smooth(
         _dataset(setup, e, f, attrs) for e, f in zip(problem.experiments, found, strict=True)
     ]
     return datasets if len(datasets) > 1 else datasets[0]
+
+
+def _with_proposal(
+    method: SmoothingMethod | str | None, proposal: str | None
+) -> SmoothingMethod | str | None:
+    """The method that a proposal alone asks for."""
+    if proposal is None:
+        return method
+    if method is not None:
+        raise ArgumentError(
+            f"proposal={proposal!r} beside method={method!r}",
+            fix=f"give it to the method, as in ssm.FFBSi(proposal={proposal!r})",
+        )
+    return KalmanSmoother(proposal) if proposal in APPROXIMATE else FFBSi(proposal=proposal)
 
 
 def _kind(method: Any) -> type | None:
@@ -383,6 +427,8 @@ def _choose(problem: Problem, method: SmoothingMethod | str | None) -> tuple[Smo
             f"method={method!r} is no method of smoothing",
             fix=written_as(method, METHODS) or f"use {names}, a name, or None",
         )
+    if isinstance(method, KalmanSmoother) and method.proposal in APPROXIMATE:
+        return method, "by the user"
     what, find = NEEDED.get(kind, ("", None))
     if find is not None and isinstance(model := find(problem.trace), NotApplicable):
         raise ArgumentError(

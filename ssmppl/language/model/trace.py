@@ -15,7 +15,6 @@ input, input_prev u_t and u_{t-1};  time, time_prev: the row number, from 1
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property, wraps
@@ -140,17 +139,19 @@ Derived = TypeVar("Derived")
 
 
 def once_per_trace(derive: Callable[[Trace], Derived]) -> Callable[[Trace], Derived]:
-    """What is derived from a trace alone: derived once, and kept for as long as the trace lives."""
-    kept: dict[int, tuple[weakref.ref[Trace], Derived]] = {}
+    """What is derived from a trace alone: derived once, and kept for as long as the trace lives.
+
+    It is kept by the trace itself, as it may know the trace: both go together.
+    """
 
     @wraps(derive)
     def derived(trace: Trace) -> Derived:
-        key = id(trace)
-        if key not in kept:
+        kept: dict[Callable, Any] = trace.__dict__.setdefault("_derived", {})
+        if derive not in kept:
             with LOCK:
-                if key not in kept:
-                    reference = weakref.ref(trace, lambda _: kept.pop(key, None))
-                    kept[key] = reference, derive(trace)
-        return kept[key][1]
+                if derive not in kept:
+                    kept[derive] = derive(trace)
+        found: Derived = kept[derive]
+        return found
 
     return derived

@@ -98,7 +98,8 @@ def test_adjoints(d, k, flat, missing):
     data = experiment(y, seen)
     adjoint, increments = zeros_like(model), np.empty(len(y))
     start = start_of(None, flat, model, data)
-    exact_entry("adjoints")(model, start.columns, y, seen, increments, adjoint)
+    wanted = np.ones(8, np.int64)
+    exact_entry("adjoints")(model, start.columns, y, seen, wanted, increments, adjoint)
     for field in Matrices._fields:
         direction = rng.normal(size=getattr(model, field).shape)
         if field in "PQR":

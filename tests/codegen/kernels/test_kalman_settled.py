@@ -85,14 +85,14 @@ def test_covariances_settle_and_start_anew(d, k):
 
 def test_roots_at_rest():
     """But for rounding, whatever the signs of the columns."""
-    root = np.array([[2.0, 0.0], [3.0, 4.0]])
+    root = np.array([[2.0, 3.0], [0.0, 4.0]])  # transposed: a column in each row
     last = root.copy()
-    assert rests(root * np.array([-1.0, 1.0]), last)
+    assert rests(root * np.array([[-1.0], [1.0]]), last)
     np.testing.assert_array_equal(last, root)
-    root[1, 0] += 4e-14
+    root[0, 1] += 4e-14
     assert not rests(root, last)
     assert rests(root, last)
-    root[1, 0] += 4e-15
+    root[0, 1] += 4e-15
     assert rests(root, last)
 
 

@@ -16,7 +16,13 @@ import ssmppl as ssm
 from ssmppl.analysis.proposals.noises import noises
 from ssmppl.data import bind
 from ssmppl.errors import ArgumentError, NotApplicable
-from ssmppl.inference.chains.interweaving import Interweaving, InterweavingTuning, NoiseMove
+from ssmppl.inference.chains.interweaving import (
+    Collapsed,
+    Interweaving,
+    InterweavingTuning,
+    NoiseMove,
+    Reference,
+)
 from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run.problem import pose
 from ssmppl.language.model.transforms import parameter_bounds
@@ -289,6 +295,55 @@ def test_of_two_moves_that_can_be_made_the_wider_is_chosen():
     for _ in range(402):
         tuning, _ = kernel.step(tuning, theta, paths, rng)
     assert tuning.chosen == 1
+
+
+class AboutPrior(Collapsed):
+    """The prior as the law of the chain, about a Gaussian that is not quite its approximation."""
+
+    def about(self, space, near):
+        d = len(near)
+        precision = 1.5 * np.eye(d) + 0.4 * np.ones((d, d)) / d
+        return Reference(near + 0.3, precision)
+
+    def stand(self, theta, paths):
+        return 0.0, None
+
+    def at(self, theta, held, paths):
+        return 0.0, paths
+
+
+@pytest.mark.parametrize("some_of_them", [False, True])
+def test_steps_about_a_mode_leave_the_law_invariant(some_of_them):
+    """All numbers, or some given the others, which stay; heavier tails than the Gaussian's."""
+    model = ssm.Model("many")
+    model.prior(lambda: {"a": ssm.StudentT(np.full(6, 5.0), loc=0.0, scale=1.0),
+                         "q": ssm.Gamma(np.full(2, 4.0), rate=2.0)})  # fmt: skip
+    model.initial(lambda: {"x": ssm.Normal(0, sd=1)})
+    model.transition(lambda x, a, q: {"x": ssm.Normal(0.5 * x + a.sum(), sd=q[0])})
+    model.observation(lambda x, q: {"y": ssm.Normal(x, sd=q[1])})
+    problem = pose(model, {"y": np.zeros(2)})
+    space, adapting = space_of(problem, {}, {}), 300
+    moves = (AboutPrior(problem, None),)
+    kernel = Interweaving(
+        space, moves, np.arange(8), np.ones(8), adapting, 0, parameter_bounds(problem.trace),
+        np.zeros(8),
+    )  # fmt: skip
+    tuning, rng = kernel.begin(), np.random.default_rng(8)
+    if some_of_them:
+        tuning = kernel._tune(tuning, np.arange(1, 8))
+    theta, drawn = space.theta.copy(), []
+    first = theta[0]
+    for k in range(adapting + 20_000):
+        tuning, _ = kernel.step(tuning, theta, [], rng)
+        if k >= adapting and k % 40 == 0:
+            drawn.append(theta.copy())
+    assert 0.05 < tuning.share <= 1.0
+    laws = [stats.t(5)] * 6 + [stats.gamma(4, scale=0.5)] * 2
+    for i, (values, law) in enumerate(zip(np.array(drawn).T, laws, strict=True)):
+        if some_of_them and i == 0:
+            assert np.all(values == first)
+        else:
+            assert stats.kstest(values, law.cdf).pvalue > LEVEL
 
 
 def without_guide():

@@ -129,6 +129,13 @@ def test_more_draws_are_those_of_one_longer_run(tmp_path):
     assert bits(call("SMC2", path)) == bits(call("SMC2"))
 
 
+def test_more_corrected_draws_are_those_of_one_longer_run(tmp_path):
+    path = tmp_path / "a.npz"
+    short = bits(call("ISMCMC", path, draws=20))
+    assert bits(call("ISMCMC", path, draws=50)) == bits(call("ISMCMC", draws=50))
+    assert bits(call("ISMCMC", path, draws=20)) == short, "and fewer those of a shorter one"
+
+
 def test_a_finished_call_prepares_nothing(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     expected = bits(call("PGAS", path))
@@ -238,7 +245,8 @@ def kill_9(tmp_path, name, rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "names", [("Gibbs", "PMMH", "PGAS", "SMC2"), pytest.param(tuple(CALLS), marks=EXHAUSTIVE)]
+    "names",
+    [("Gibbs", "PMMH", "ISMCMC", "PGAS", "SMC2"), pytest.param(tuple(CALLS), marks=EXHAUSTIVE)],
 )
 def test_kill_9_of_every_method(tmp_path, names):
     rng = np.random.default_rng()

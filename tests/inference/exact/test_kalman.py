@@ -132,13 +132,15 @@ def test_square_root_of_semidefinite_matrices():
         assert not kernel.square_root(np.array(bad), np.empty((len(bad), len(bad))))
 
 
+@pytest.mark.parametrize("zeros", [0.0, 0.5])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 3), (3, 7), (5, 6)])
-def test_triangularise_keeps_the_product(shape):
-    a = np.random.default_rng(1).normal(size=shape)
-    lower = a.copy()
-    kernel.triangularise(lower)
-    np.testing.assert_allclose(lower @ lower.T, a @ a.T, atol=1e-12)
-    assert not np.triu(lower, 1).any()
+def test_reflections_keep_the_product(shape, zeros):
+    rng = np.random.default_rng(1)
+    a = rng.normal(size=shape) * (rng.random(shape) >= zeros)
+    columns = a.T.copy()
+    kernel.reflect_columns(columns, shape[1], shape[0], np.empty(shape[0]))
+    np.testing.assert_allclose(columns.T @ columns, a @ a.T, atol=1e-12)
+    assert not np.tril(columns, -1).any()
 
 
 # -- what does not exist

@@ -41,6 +41,7 @@ SMALL = [
     ssm.MetropolisHastings(),
     ssm.Gibbs(),
     ssm.PMMH(particles=8, proposal="bootstrap"),
+    ssm.ISMCMC(particles=5),
     ssm.PGAS(particles=5, proposal="bootstrap"),
     ssm.SMC2(parameters=4, particles=5, moves=1, proposal="bootstrap"),
     ssm.DirectOptimization(restarts=0, steps=3),

@@ -98,11 +98,20 @@ def squared(executor):
     return np.concatenate([found[v].values.ravel() for v in ("phi", "tau")])
 
 
+def corrected(executor):
+    found = ssm.sample(
+        models.proper_varves, DATA, ssm.ISMCMC(particles=8), draws=20, warmup=20, chains=2,
+        executor=executor, **QUIET,
+    )["posterior"]  # fmt: skip
+    return np.concatenate([found[v].values.ravel() for v in ("phi", "tau", "x")])
+
+
 MORE = {
     "evidence": evidence,
     "leave_future_out": left_out,
     "score": scored,
     "SMC2": squared,
+    "ISMCMC": corrected,
     "particle EM": partial(maximized, ssm.ParticleEM(iterations=4, burn_in=1, particles=30)),
     "PSAEM": partial(maximized, ssm.PSAEM(iterations=20, burn_in=5, particles=10)),
     "score ascent": partial(maximized, ssm.ScoreAscent(iterations=4, particles=50)),
@@ -112,7 +121,7 @@ MORE = {
 }
 
 
-FEW = ("evidence", "SMC2", "PSAEM")  # of each kind of task one; the others are exhaustive
+FEW = ("evidence", "ISMCMC", "SMC2", "PSAEM")  # of each kind of task one; the others are exhaustive
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.inference.chains.pgas import PGASState
+from ssmppl.inference.preparation.space import space_of
 from ssmppl.inference.run import convergence
 from ssmppl.inference.run.convergence import (
     PathMovement,
@@ -18,6 +19,7 @@ from ssmppl.inference.run.convergence import (
 from ssmppl.inference.run.draws import ChainDraws
 from ssmppl.inference.run.problem import pose
 from ssmppl.inference.verbs.sample import _chosen
+from tests.models import standard, wider
 
 
 def town():
@@ -56,9 +58,11 @@ def test_pmmh_is_chosen_where_no_ancestor_can_be_sampled_and_parameters_are_few(
     assert "sample PMMH:" in chosen(integrated())  # of unknown length
     assert "sample PMMH:" in chosen(integrated(), {"y": np.zeros(101)})
     assert "more than 100 rows" in chosen(integrated(), [{"y": np.zeros(101)}, {"y": np.zeros(3)}])
-    assert "sample PGAS: the model is not" in chosen(integrated(), {"y": np.zeros(100)})
+    few = chosen(integrated(), {"y": np.zeros(100)})
+    assert "sample PMMH: over twisted particle filters, where a pilot on the data finds" in few
+    assert "else PGAS: the model is not" in few
     many = chosen(integrated(7))
-    assert "sample PGAS: the model has a deterministic state" in many
+    assert "else PGAS: the model has a deterministic state" in many
     assert "7 parameters are too many" in many
     moved = ssm.Model("moved by what is seen, from a start that is not known")
     moved.prior(lambda: {"a": ssm.Beta(2, 2)})
@@ -77,11 +81,30 @@ def test_pmmh_is_chosen_where_no_ancestor_can_be_sampled_and_parameters_are_few(
 
 
 def test_sample_takes_what_explain_says_and_counts_free_parameters_only():
-    assert isinstance(_chosen(pose(town(), {"y": np.full(4, 80.0)}), {})[0], ssm.PMMH)
-    problem = pose(integrated(7), {"y": np.zeros(150)})
-    assert isinstance(_chosen(problem, {})[0], ssm.PGAS)
-    assert isinstance(_chosen(pose(integrated(), {"y": np.zeros(9)}), {})[0], ssm.PGAS)
-    assert isinstance(_chosen(problem, {"q": np.full(7, 0.2)})[0], ssm.PMMH)
+    def method(problem, **fixed):
+        return _chosen(space_of(problem, fixed, {}), fixed)
+
+    assert isinstance(method(pose(town(), {"y": np.full(4, 80.0)}))[0], ssm.PMMH)
+    problem = pose(integrated(13), {"y": np.zeros(150)})  # too many for a pilot
+    assert isinstance(method(problem)[0], ssm.PGAS)
+    assert isinstance(method(problem, q=np.full(13, 0.2))[0], ssm.PMMH)
+
+
+def test_a_pilot_decides_between_twisted_filters_and_pgas():
+    """It refuses where the states are bimodal or the approximate posterior is ragged, and
+    takes what is nearly Gaussian."""
+
+    def chosen_for(model, truth):
+        y = ssm.simulate(model, truth, steps=60, seed=1)["y"].values[0]
+        space = space_of(pose(model, {"y": y.astype(float)}), {}, {})
+        return _chosen(space, {})
+
+    assert isinstance(chosen_for(wider.growth, None)[0], ssm.PGAS)
+    overshooting = {"log_r": 2.8, "q": 0.1, "scale": 10.0, "dispersion": 20.0}
+    assert isinstance(chosen_for(wider.ricker, overshooting)[0], ssm.PGAS)
+    method, reason = chosen_for(standard.counts, None)
+    assert isinstance(method, ssm.PMMH)
+    assert "by a pilot" in reason
 
 
 @pytest.mark.slow

@@ -234,7 +234,7 @@ def test_what_cannot_be_continued_is_said():
         ssm.forecast(model(), bare, inputs={"u": FUTURE})
     with pytest.raises(ArgumentError, match="without a group `posterior`"):
         ssm.forecast(model(), {"a": 1.0}, inputs={"u": FUTURE})
-    with pytest.raises(ArgumentError, match=r"fixed=estimate.parameters, warmup=0\)$"):
+    with pytest.raises(ArgumentError, match=r"estimate.parameters, steps, data=data\)$"):
         ssm.forecast(model(), None, inputs={"u": FUTURE})
     with pytest.raises(ArgumentError, match="no parameter 'b'"):
         ssm.forecast(model(), to_inference_data(posterior={"a": np.zeros((1, 2))}),
@@ -260,3 +260,46 @@ def test_inputs_of_rows_of_the_data_drive_no_forecast(time, wrong, right):
     found = ssm.forecast(model(), made(time=np.asarray(time)), inputs={"u": FUTURE, "time": right})
     assert np.array_equal(found["time"].values, np.asarray(right))
     ssm.forecast(model(), made(time=np.asarray(time)), inputs={"u": FUTURE})
+
+
+@pytest.mark.parametrize("proposal", [None, "laplace", "extended", "unscented"])
+def test_at_known_parameters(proposal):
+    """From the exact law of x_T of a linear model: by hand, with NumPy's Kalman filter."""
+    u, y = np.linspace(-1, 1, ROWS), np.random.default_rng(seed_of("known")).standard_normal(ROWS)
+    y[2] = np.nan
+    mean, variance = 0.0, 1.0
+    for t in range(ROWS):
+        if t:
+            mean, variance = A * mean + B * u[t - 1] + 0.1 * t, A**2 * variance + Q**2
+        if np.isfinite(y[t]):
+            gain = variance / (variance + R**2)
+            mean, variance = mean + gain * (y[t] - mean + u[t]), (1 - gain) * variance
+    found = ssm.forecast(
+        model(), {"a": A, "b": B}, inputs={"u": FUTURE}, data={"y": y, "u": u}, seed=3,
+        proposal=proposal, draws=20_000,
+    )  # fmt: skip
+    assert found.attrs.get("approximate", 0) == (proposal is not None)
+    assert found.sizes["draw"] == 20_000
+    before = u[-1]
+    for h in range(STEPS):
+        mean = A * mean + B * before + 0.1 * (ROWS + h)
+        variance = A**2 * variance + Q**2
+        agree(found["x"].values[:, h], mean, variance)
+        agree(found["y"].values[:, h], mean - FUTURE[h], variance + R**2)
+        before = FUTURE[h]
+
+
+def test_an_estimate_is_known_parameters():
+    drawn = ssm.simulate(model(), {"a": A, "b": B}, inputs={"u": np.ones(30)}, seed=1)
+    data = [{"y": drawn["y"].values[0], "u": np.ones(30)}, {"y": [0.1, 0.2], "u": [1.0, 1.0]}]
+    estimate = ssm.maximize(model(), data, progress=False)
+    inputs = {"u": np.ones(2)}
+    of_second = ssm.forecast(model(), estimate, inputs=inputs, data=data, experiment=2, seed=1)
+    assert of_second.attrs["after"] == 2
+    assert of_second["a"].values[0] == estimate.parameters["a"]
+    with pytest.raises(ArgumentError, match="experiment=None, and the data are of"):
+        ssm.forecast(model(), estimate, inputs=inputs, data=data)
+    with pytest.raises(ArgumentError, match="needs the data"):
+        ssm.forecast(model(), estimate, inputs=inputs, proposal="laplace")
+    with pytest.raises(ArgumentError, match="which is no parameters"):
+        ssm.forecast(model(), 3.0, inputs=inputs, data=data)

@@ -19,6 +19,10 @@ LOWER, UPPER, X = symbol("input", "lower"), symbol("input", "upper"), symbol("st
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
 NORMAL = D.Normal(0.0, sd=1.0)
 PIECES = np.arange(100)[:, None]
+SIDES = {"lower": LOWER, "upper": UPPER}
+# Laws of heavy tails, of which each writes its expressions once.
+STUDENT, LAPLACE = D.StudentT(5.0, 0.0, scale=1.0), D.Laplace(0.0, scale=1.0)
+INVERSE_GAMMA = D.InverseGamma(30.0, scale=30.0)
 
 
 def moments(law, lower: float, upper: float) -> tuple[float, float]:
@@ -33,9 +37,27 @@ def forms(law):
     return [array(f)[()] for f in (d.mean(), d.variance())]
 
 
-def one_sided(law, **bound: float) -> tuple[float, float]:
-    d = D.Truncated(law, **bound)
-    return float(evaluate(array(d.mean())[()])), float(evaluate(array(d.variance())[()]))
+def one_sided(law, **bounds: float) -> tuple[float, float]:
+    """(mean, variance) of a law between numbers, of which one may be left out."""
+    values = {SIDES[side]: value for side, value in bounds.items()}
+    mean, variance = evaluate(cut_forms(law, tuple(bounds)), values)
+    return float(mean), float(variance)
+
+
+@functools.cache
+def cut_forms(law, sides: tuple[str, ...]):
+    """The same expressions whatever the bounds are: quadratures, which take seconds to write."""
+    d = D.Truncated(law, **{side: SIDES[side] for side in sides})
+    return [array(f)[()] for f in (d.mean(), d.variance())]
+
+
+@pytest.mark.parametrize(
+    "bounds", [{"lower": -1e4}, {"upper": 30.0}, {"lower": -2.0, "upper": 1.0}]
+)
+def test_bounds_may_be_numbers(bounds):
+    d = D.Truncated(LAPLACE, **bounds)
+    found = [float(evaluate(array(f)[()])) for f in (d.mean(), d.variance())]
+    assert found == pytest.approx(one_sided(LAPLACE, **bounds), rel=1e-12)
 
 
 def integrated(log_density, width: float) -> tuple[float, float]:
@@ -203,21 +225,21 @@ def test_bounds_far_in_heavy_tails_leave_the_moments(bound, sides):
     bounds = {"lower": {"lower": -bound}, "upper": {"upper": bound}}
     given = bounds.get(sides, {"lower": -bound, "upper": bound})
     for law, variance, left in [
-        (D.StudentT(5.0, 0.0, scale=1.0), 5.0 / 3.0, 100.0 / bound**3),
-        (D.Laplace(0.0, scale=1.0), 2.0, 0.0),
+        (STUDENT, 5.0 / 3.0, 100.0 / bound**3),
+        (LAPLACE, 2.0, 0.0),
     ]:
         found = one_sided(law, **given)
         assert abs(found[0]) < 1e-9 + left
         assert found[1] == pytest.approx(variance, rel=1e-8 + left)
     if sides == "upper":
-        found = one_sided(D.InverseGamma(30.0, scale=30.0), **given)
+        found = one_sided(INVERSE_GAMMA, **given)
         assert found[1] == pytest.approx(st.invgamma(30, scale=30).var(), rel=1e-8)
 
 
 @pytest.mark.parametrize("upper", [-0.5, 0.0, 0.1, 2.0, 30.0])
 def test_laplace_cut_on_either_side_of_its_kink(upper):
     """From below it is upper - Exponential on the far side; X and its reflection beyond."""
-    found = one_sided(D.Laplace(0.0, scale=1.0), lower=-1e9, upper=upper)
+    found = one_sided(LAPLACE, lower=-1e9, upper=upper)
     rest = np.exp(-max(upper, 0.0))  # the density is exp(-|x|) / 2
     mass = 2.0 - rest if upper > 0.0 else np.exp(upper)
     first = -(upper + 1.0) * rest if upper > 0.0 else (upper - 1.0) * mass
@@ -230,12 +252,12 @@ def test_laplace_cut_on_either_side_of_its_kink(upper):
 @pytest.mark.parametrize(("lower", "rel"), [(1.0, 1e-4), (100.0, 0.02)])
 def test_a_law_of_the_users_own_has_the_moments_that_exist(lower, rel):
     """Its upper tail is one less its distribution function, to 1e-16 of the law."""
-    found = one_sided(Pareto(3.0), lower=lower)
+    law, heavy = PARETO
+    found = one_sided(law, lower=lower)
     assert found[0] == pytest.approx(lower + 0.5 * (lower + 1.0), rel=rel)
     assert found[1] == pytest.approx(0.75 * (lower + 1.0) ** 2, rel=10 * rel)
-    assert one_sided(Pareto(3.0), upper=1e9)[1] == pytest.approx(0.75, rel=1e-4)
-    heavy = one_sided(Pareto(0.5), lower=lower)
-    assert heavy[0] == np.inf
+    assert one_sided(law, upper=1e9)[1] == pytest.approx(0.75, rel=1e-4)
+    assert one_sided(heavy, lower=lower)[0] == np.inf
 
 
 @ssm.distribution(lower=0, positive=("shape",))
@@ -256,3 +278,6 @@ def value(p, shape):
 @Pareto.mean
 def mean_of_pareto(shape):
     return np.where(shape > 1, 1 / (shape - 1.0), np.inf)
+
+
+PARETO = Pareto(3.0), Pareto(0.5)

@@ -16,8 +16,13 @@ section 7.3.3; those in A and C by Fisher's identity from the same smoothed dist
     m: r_1      P: (r_1 r_1' - N_1) / 2
 
 with F_t the filtered covariance and xs_t the smoothed mean; the array of the update gives K by
-K^- = K S^1/2. Only S is inverted, by its triangular root; N and D are sums of squares. A symmetric
-matrix has the derivative of its entries taken one by one.
+K^- = K S^1/2. Only S is inverted, by its triangular root. N is found from one side, then from the
+other, V (I - K C) and (I - K C)' times that: what the data tell is small, and is so before it is
+subtracted from. A symmetric matrix has the derivative of its entries taken one by one.
+
+The forward pass keeps the arrays of each update; zeros of A and C are passed over, and of the
+adjoints only those are found that are asked for. Steps of a filter that has settled share one
+array.
 
 Where a part of the start is unknown, products of r, u and xs are expectations over it, that is,
 sums over the columns (see `steps.py`).
@@ -27,41 +32,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssmppl.codegen.kernels.kalman.square_root import OK, at, multiply, square
-from ssmppl.codegen.kernels.kalman.steps import copy, forward, multiply_add, root_at, update
+from ssmppl.codegen.kernels.kalman.square_root import (
+    NOT_COVARIANCE,
+    NOT_FINITE,
+    OK,
+    SINGULAR,
+    at,
+    begin_roots,
+    measure_step,
+    nonzeros,
+    predict_step,
+    rests,
+    roots_of,
+    same,
+    square_columns,
+    update_step,
+)
+from ssmppl.codegen.kernels.kalman.steps import add_known, copy, fill, innovate, log_density
 from ssmppl.codegen.kernels.math.flags import exact
 
-
-@exact
-def transposed(a, out):
-    """out <- a'."""
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
-            out[j, i] = a[i, j]
-
-
-@exact
-def congruence(n, a, product, out):
-    """out <- a' n a, symmetric; product: scratch of the shape of a."""
-    multiply(n, a, product)
-    for i in range(a.shape[1]):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(a.shape[0]):
-                total += a[k, i] * product[k, j]
-            out[i, j] = total
-            out[j, i] = total
-
-
-@exact
-def add_products(a, b, out):
-    """out += sum over columns of a b'."""
-    for i in range(a.shape[0]):
-        for j in range(b.shape[0]):
-            total = 0.0
-            for f in range(a.shape[1]):
-                total += a[i, f] * b[j, f]
-            out[i, j] += total
+# Which adjoints are asked for, in the order of `Matrices`.
+M_, P_, A_, B_, Q_, C_, D_, R_ = 0, 1, 2, 3, 4, 5, 6, 7
 
 
 @exact
@@ -76,166 +67,277 @@ def half_square_less(a, b, out):
 
 
 @exact
-def solve_transposed(array, b, k):
-    """b, first k rows <- L^-T b, L the leading lower triangle (k, k) of array."""
-    for j in range(b.shape[1]):
-        for i in range(k - 1, -1, -1):
-            for l in range(i + 1, k):
-                b[i, j] -= array[l, i] * b[l, j]
-            b[i, j] /= array[i, i]
+def filter_forward(model, start, y, seen, x, kept, z, roots, log_increment):
+    """Run the filter; returns (status, t) as `kalman_filter` does.
 
-
-@exact
-def observation_adjoints(
-    model, adjoint, t, seen, array, k, z, rho, v, smoothed, filtered_cov, u, gain, spread
-):
-    """Those of C, d and R at step t; u and gain = K' = S^-T/2 K^-' left behind.
-
-    u (K, F), gain (K, D), spread (K, K): first k rows written.
-    """
-    n = v.shape[0]
-    for i in range(k):
-        for f in range(z.shape[1]):
-            u[i, f] = z[i, f]
-            for j in range(n):
-                u[i, f] -= array[k + j, i] * rho[j, f]
-        for j in range(n):
-            gain[i, j] = array[k + j, i]
-    # spread = S^-T/2 (I + K^-' V K^-) S^-1/2
-    inner = np.empty((n, k))
-    for j in range(n):
-        for i in range(k):
-            inner[j, i] = 0.0
-            for l in range(n):
-                inner[j, i] += v[j, l] * gain[i, l]
-    for i in range(k):
-        for j in range(k):
-            total = 1.0 if i == j else 0.0
-            for l in range(n):
-                total += gain[i, l] * inner[l, j]
-            spread[i, j] = total
-    solve_transposed(array, u, k)
-    solve_transposed(array, spread[:k, :k], k)
-    solve_transposed(array, spread[:k, :k].T, k)
-    solve_transposed(array, gain, k)
-    for i in range(k):  # inner' <- K' V
-        for l in range(n):
-            inner[l, i] = 0.0
-            for h in range(n):
-                inner[l, i] += gain[i, h] * v[h, l]
-    d_adjoint = adjoint.d[at(t, adjoint.d.shape[0])]
-    c_adjoint = adjoint.C[at(t, adjoint.C.shape[0])]
-    r_adjoint = adjoint.R[at(t, adjoint.R.shape[0])]
-    i = 0
-    for p in range(seen.size):
-        if seen[p] == 0.0:
-            continue
-        d_adjoint[p] += u[i, 0]
-        for a in range(n):
-            total = -gain[i, a]
-            for l in range(n):
-                total += inner[l, i] * filtered_cov[l, a]
-            for f in range(u.shape[1]):
-                total += u[i, f] * smoothed[a, f]
-            c_adjoint[p, a] += total
-        j = 0
-        for q in range(seen.size):
-            if seen[q] == 0.0:
-                continue
-            total = -0.5 * (spread[i, j] + spread[j, i])
-            for f in range(u.shape[1]):
-                total += u[i, f] * u[j, f]
-            r_adjoint[p, q] += 0.5 * total
-            j += 1
-        i += 1
-
-
-@exact
-def adjoints(model, start, y, seen, log_increment, adjoint):
-    """Derivatives of log p(y); returns (status, t) of the forward pass.
-
-    start (D, F): the mean of x_1, and a root of the law of its unknown part; log_increment (T,),
-    written. adjoint: `Matrices` of the shapes of the model's; to each is added, summed over time
-    where the matrix is one for all steps.
+    start (D, F). Written: x (T, D, F), filtered means; kept (T, K, K + D), the first k rows of the
+    array of each update, and z (T, K, F), the whitened innovations; log_increment (T,), of column
+    0; and where its first axis is not empty roots (T, D, D), transposed, of the filtered
+    covariances.
     """
     n_steps, n, k_all, columns = y.shape[0], start.shape[0], y.shape[1], start.shape[1]
-    x, roots = np.empty((n_steps, n, columns)), np.empty((n_steps, n, n))
-    status, stopped = forward(model, start, y, seen, x, roots, log_increment)
-    if status != OK:
-        return status, stopped
-    r_root, array = np.empty((k_all, k_all)), np.empty((k_all + n, k_all + n))
-    filtered, z = np.empty((n, columns)), np.empty((k_all, columns))
-    r, rho, u = np.zeros((n, columns)), np.zeros((n, columns)), np.empty((k_all, columns))
-    info, v, product = np.zeros((n, n)), np.zeros((n, n)), np.empty((n, n))  # N and V
-    filtered_cov, turned = np.empty((n, n)), np.empty((n, n))
-    gain, spread = np.empty((k_all, n)), np.empty((k_all, k_all))
-    for t in range(n_steps - 1, -1, -1):
-        c = model.C[at(t, model.C.shape[0])]
-        root_at(model.R, t, n_steps - 1, r_root)
-        k = update(model, t, y[t], seen[t], x[t], roots[t], r_root, array, z, filtered)
-        square(array[k : k + n, k : k + n], filtered_cov)
-        if t < n_steps - 1:
-            a = model.A[at(t + 1, model.A.shape[0])]
-            transposed(a, turned)
-            multiply(turned, r, rho)
-            congruence(info, a, product, v)
-            multiply_add(filtered_cov, rho, filtered)  # the smoothed mean
-            b_adjoint = adjoint.b[at(t + 1, adjoint.b.shape[0])]
-            for i in range(n):
-                b_adjoint[i] += r[i, 0]
-            half_square_less(r, info, adjoint.Q[at(t + 1, adjoint.Q.shape[0])])
-            a_adjoint = adjoint.A[at(t + 1, adjoint.A.shape[0])]
-            add_products(r, filtered, a_adjoint)
-            for i in range(n):  # product holds N A
-                for j in range(n):
-                    for l in range(n):
-                        a_adjoint[i, j] -= product[i, l] * filtered_cov[l, j]
-        observation_adjoints(
-            model, adjoint, t, seen[t], array, k, z, rho, v, filtered, filtered_cov, u, gain, spread
-        )
-        back(c, seen[t], array, k, rho, v, u, gain, product, turned, r, info)
-    for i in range(n):
-        adjoint.m[i] += r[i, 0]
-    half_square_less(r, info, adjoint.P)
+    constant = (
+        model.A.shape[0] == 1
+        and model.Q.shape[0] == 1
+        and model.C.shape[0] == 1
+        and model.R.shape[0] == 1
+    )
+    settled, s = False, roots_of(n, k_all)
+    before, last = np.empty((n, columns)), np.zeros((n, n))
+    log_increment[:] = -np.inf
+    if not begin_roots(model.P, s):
+        return NOT_COVARIANCE, 0
+    copy(start, before)
+    for t in range(n_steps):
+        c, d = model.C[at(t, model.C.shape[0])], model.d[at(t, model.d.shape[0])]
+        alike = t > 0 and same(seen[t], seen[t - 1])
+        settled = settled and alike
+        if not settled:
+            if t > 0 and not predict_step(model.A, model.Q, t, s):
+                return NOT_COVARIANCE, t
+            if not measure_step(model.C, model.R, t, seen[t], alike, s):
+                return NOT_COVARIANCE, t
+            update_step(c, s)
+            if constant:
+                settled = rests(s.root, last) and alike
+        if t > 0:
+            a, b = model.A[at(t, model.A.shape[0])], model.b[at(t, model.b.shape[0])]
+            add_known(a, s.a, s.counts[0], x[t - 1], b, before)
+        k = s.counts[3]
+        for i in range(k):
+            for j in range(k + n):
+                kept[t, i, j] = s.array[i, j]
+        if roots.shape[0] > 0:
+            copy(s.root, roots[t])
+        innovate(c, s.c, s.counts[1], d, y[t], s.place, k, before, s.array, z[t], x[t])
+        increment = log_density(s.array, z[t], k)
+        if increment == np.inf:
+            return SINGULAR, t
+        if not abs(increment) < np.inf:
+            return NOT_FINITE, t
+        log_increment[t] = increment
     return OK, n_steps
 
 
 @exact
-def back(c, seen, array, k, rho, v, u, gain, product, turned, r, info):
-    """r and info (N) <- those before the update; product and turned: scratch (D, D).
+def adjoints(model, start, y, seen, wanted, log_increment, adjoint):
+    """Derivatives of log p(y); returns (status, t) of the forward pass.
 
-    gain (K, D), first k rows: K'. turned holds I - K C.
+    start (D, F): the mean of x_1, and a root of the law of its unknown part; wanted (8,): not 0 for
+    the fields of `Matrices` whose derivatives are asked for; log_increment (T,), written. adjoint:
+    `Matrices` of the shapes of the model's; to each that is wanted is added, summed over time where
+    the matrix is one for all steps.
     """
+    n_steps, n, k_all, columns = y.shape[0], start.shape[0], y.shape[1], start.shape[1]
+    told = wanted[A_] != 0 or wanted[C_] != 0  # those for which the smoothed states are needed
+    x, kept = np.empty((n_steps, n, columns)), np.empty((n_steps, k_all, k_all + n))
+    z, roots = np.empty((n_steps, k_all, columns)), np.empty((n_steps if told else 0, n, n))
+    status, stopped = filter_forward(model, start, y, seen, x, kept, z, roots, log_increment)
+    if status != OK:
+        return status, stopped
+    r, rho, u = np.zeros((n, columns)), np.zeros((n, columns)), np.empty((k_all, columns))
+    info, v, product = np.zeros((n, n)), np.zeros((n, n)), np.empty((n, n))  # N, V and N A
+    covariance, smoothed = np.empty((n, n)), np.empty((n, columns))
+    gain, by_v = np.empty((k_all, n)), np.empty((k_all, n))
+    inverse, spread = np.empty((k_all, k_all)), np.empty((k_all, k_all))
+    where_a, where_c = np.empty((n * n, 2), np.int64), np.empty((k_all * n, 2), np.int64)
+    count_a, count_c, place = 0, 0, np.empty(k_all, np.int64)
+    for t in range(n_steps - 1, -1, -1):
+        c = model.C[at(t, model.C.shape[0])]
+        if t == n_steps - 1 or model.C.shape[0] > 1:
+            count_c = nonzeros(c, where_c)
+        k = 0
+        for p in range(k_all):
+            place[p] = -1
+            if seen[t, p] != 0.0:
+                place[p] = k
+                k += 1
+        if told:
+            square_columns(roots[t], covariance)
+        if t < n_steps - 1:
+            a = model.A[at(t + 1, model.A.shape[0])]
+            if t == n_steps - 2 or model.A.shape[0] > 1:
+                count_a = nonzeros(a, where_a)
+            if wanted[B_] != 0:
+                b_adjoint = adjoint.b[at(t + 1, adjoint.b.shape[0])]
+                for i in range(n):
+                    b_adjoint[i] += r[i, 0]
+            if wanted[Q_] != 0:
+                half_square_less(r, info, adjoint.Q[at(t + 1, adjoint.Q.shape[0])])
+            go_back(a, where_a, count_a, r, info, rho, product, v)
+        if told:
+            copy(x[t], smoothed)
+            for i in range(n):
+                for l in range(n):
+                    for f in range(columns):
+                        smoothed[i, f] += covariance[i, l] * rho[l, f]
+        if wanted[A_] != 0 and t < n_steps - 1:
+            a_adjoint = adjoint.A[at(t + 1, adjoint.A.shape[0])]
+            for i in range(n):
+                for j in range(n):
+                    for f in range(columns):
+                        a_adjoint[i, j] += r[i, f] * smoothed[j, f]
+                for l in range(n):
+                    for j in range(n):
+                        a_adjoint[i, j] -= product[i, l] * covariance[l, j]
+        look_back(kept[t], k, z[t], rho, v, inverse, u, gain, by_v, spread)
+        observation_adjoints(
+            adjoint, wanted, t, place, k, u, spread, gain, by_v, smoothed, covariance
+        )
+        learn_back(c, where_c, count_c, place, k, rho, v, u, gain, by_v, inverse, r, info)
+    if wanted[M_] != 0:
+        for i in range(n):
+            adjoint.m[i] += r[i, 0]
+    if wanted[P_] != 0:
+        half_square_less(r, info, adjoint.P)
+    return OK, n_steps
+
+
+@exact
+def go_back(a, where, count, r, info, rho, product, v):
+    """rho <- a' r, product <- info a, v <- a' info a, from the nonzero entries of a."""
+    n = info.shape[0]
+    fill(rho, 0.0)
+    fill(product, 0.0)
+    fill(v, 0.0)
+    for e in range(count):
+        factor, row, into = a[where[e, 0], where[e, 1]], r[where[e, 0]], rho[where[e, 1]]
+        for f in range(row.size):
+            into[f] += factor * row[f]
+    for i in range(n):
+        row, into = info[i], product[i]
+        for e in range(count):
+            into[where[e, 1]] += row[where[e, 0]] * a[where[e, 0], where[e, 1]]
+    for e in range(count):
+        factor, row, into = a[where[e, 0], where[e, 1]], product[where[e, 0]], v[where[e, 1]]
+        for j in range(n):
+            into[j] += factor * row[j]
+
+
+@exact
+def look_back(array, k, z, rho, v, inverse, u, gain, by_v, spread):
+    """What an update adds: u, gain = K', by_v = K' V, spread = D and inverse = S^-1.
+
+    array : the rows that `filter_forward` keeps. u (K, F), gain and by_v (K, D), inverse and spread
+    (K, K): first k rows written.
+    """
+    n, columns = v.shape[0], rho.shape[1]
+    for i in range(k):  # S^-1/2, lower triangular
+        for j in range(k):
+            spread[i, j] = 0.0
+        spread[i, i] = 1.0 / array[i, i]
+        for j in range(i):
+            total = 0.0
+            for l in range(j, i):
+                total -= array[l, i] * spread[l, j]
+            spread[i, j] = total / array[i, i]
+    for i in range(k):  # S^-T/2 times z - K^-' rho and K^-'
+        for j in range(n):
+            gain[i, j] = 0.0
+        for l in range(i, k):
+            factor = spread[l, i]
+            for j in range(n):
+                gain[i, j] += factor * array[l, k + j]
+        for j in range(k):
+            total = 0.0
+            for l in range(max(i, j), k):
+                total += spread[l, i] * spread[l, j]
+            inverse[i, j] = total
+        for f in range(columns):
+            total = 0.0
+            for l in range(i, k):
+                total += spread[l, i] * z[l, f]
+            for j in range(n):
+                total -= gain[i, j] * rho[j, f]
+            u[i, f] = total
+    for i in range(k):
+        row = by_v[i]
+        for j in range(n):
+            row[j] = 0.0
+        for l in range(n):
+            factor, other = gain[i, l], v[l]
+            for j in range(n):
+                row[j] += factor * other[j]
+        for j in range(i + 1):
+            total = inverse[i, j]
+            for l in range(n):
+                total += row[l] * gain[j, l]
+            spread[i, j] = total
+            spread[j, i] = total
+
+
+@exact
+def observation_adjoints(adjoint, wanted, t, place, k, u, spread, gain, by_v, smoothed, covariance):
+    """Those of C, d and R at step t, as far as they are wanted."""
+    k_all, n = place.size, gain.shape[1]
+    d_adjoint = adjoint.d[at(t, adjoint.d.shape[0])]
+    c_adjoint = adjoint.C[at(t, adjoint.C.shape[0])]
+    r_adjoint = adjoint.R[at(t, adjoint.R.shape[0])]
+    for p in range(k_all):
+        i = place[p]
+        if i < 0:
+            continue
+        if wanted[D_] != 0:
+            d_adjoint[p] += u[i, 0]
+        if wanted[C_] != 0:
+            row = c_adjoint[p]
+            for a in range(n):
+                total = -gain[i, a]
+                for f in range(u.shape[1]):
+                    total += u[i, f] * smoothed[a, f]
+                row[a] += total
+            for l in range(n):
+                factor, other = by_v[i, l], covariance[l]
+                for a in range(n):
+                    row[a] += factor * other[a]
+        if wanted[R_] != 0:
+            for q in range(k_all):
+                j = place[q]
+                if j >= 0:
+                    total = -spread[i, j]
+                    for f in range(u.shape[1]):
+                        total += u[i, f] * u[j, f]
+                    r_adjoint[p, q] += 0.5 * total
+
+
+@exact
+def learn_back(c, where, count, place, k, rho, v, u, gain, by_v, inverse, r, info):
+    """r and info (N) <- those before the update; v is destroyed, and by_v."""
     n = v.shape[0]
     copy(rho, r)
-    for i in range(n):
-        for j in range(n):
-            turned[i, j] = 1.0 if i == j else 0.0
-    i = 0
-    for p in range(seen.size):
-        if seen[p] != 0.0:
-            for a in range(n):
-                for f in range(u.shape[1]):
-                    r[a, f] += c[p, a] * u[i, f]
-                for b in range(n):
-                    turned[a, b] -= gain[i, a] * c[p, b]
-            i += 1
-    congruence(v, turned, product, info)
-    whitened = np.zeros((k, n))  # S^-1/2 C, row by row
-    i = 0
-    for p in range(seen.size):
-        if seen[p] == 0.0:
+    for e in range(count):
+        i = place[where[e, 0]]
+        if i < 0:
             continue
-        for a in range(n):
-            total = c[p, a]
-            for j in range(i):
-                total -= array[i, j] * whitened[j, a]
-            whitened[i, a] = total / array[i, i]
-        i += 1
-    for a in range(n):
-        for b in range(n):
-            for i in range(k):
-                info[a, b] += whitened[i, a] * whitened[i, b]
+        p, b = where[e, 0], where[e, 1]
+        for f in range(u.shape[1]):
+            r[b, f] += c[p, b] * u[i, f]
+        for l in range(n):
+            v[l, b] -= by_v[i, l] * c[p, b]  # V (I - K C)
+    for i in range(k):  # by_v <- K' V (I - K C) - S^-1 C
+        row = by_v[i]
+        for j in range(n):
+            row[j] = 0.0
+        for l in range(n):
+            factor, other = gain[i, l], v[l]
+            for j in range(n):
+                row[j] += factor * other[j]
+        for e in range(count):
+            j = place[where[e, 0]]
+            if j >= 0:
+                row[where[e, 1]] -= inverse[i, j] * c[where[e, 0], where[e, 1]]
+    for e in range(count):
+        i = place[where[e, 0]]
+        if i < 0:
+            continue
+        factor, row, into = c[where[e, 0], where[e, 1]], by_v[i], v[where[e, 1]]
+        for j in range(n):
+            into[j] -= factor * row[j]
+    for i in range(n):
+        for j in range(i + 1):
+            entry = 0.5 * (v[i, j] + v[j, i])
+            info[i, j] = entry
+            info[j, i] = entry
 
 
 def zeros_like(model):

@@ -26,16 +26,22 @@ from ssmppl.codegen.kernels.kalman.square_root import (
     OK,
     SINGULAR,
     at,
+    begin_roots,
+    measure_step,
+    predict_step,
+    roots_of,
+    same,
+    turn,
+    update_step,
 )
 from ssmppl.codegen.kernels.kalman.steps import (
+    add_known,
     add_square,
     copy,
     fill,
+    innovate,
     multiply_add,
-    predict_array,
     predict_columns,
-    root_at,
-    update,
 )
 from ssmppl.codegen.kernels.math.flags import exact
 
@@ -129,8 +135,7 @@ def diffuse_filter(
     moments of `kalman_filter`, NaN and infinite where they do not exist yet.
     """
     n_steps, n, k_all, g = y.shape[0], model.m.size, y.shape[1], flat.size
-    q_root, r_root, root = np.empty((n, n)), np.empty((k_all, k_all)), np.empty((n, n))
-    both, array = np.empty((n, 2 * n)), np.empty((k_all + n, k_all + n))
+    s, root = roots_of(n, k_all), np.empty((n, n))
     x, filtered, z = np.zeros((n, 1 + g)), np.empty((n, 1 + g)), np.empty((k_all, 1 + g))
     for i in range(n):
         x[i, 0] = model.m[i]
@@ -142,36 +147,37 @@ def diffuse_filter(
     row = np.empty(g)
     extra, known = np.empty((max(n, k_all), g)), np.empty(max(n, k_all))
     rows, seen_root = np.empty((k_all, 1 + g)), np.empty((k_all, n + k_all))
-    if not root_at(model.P.reshape(1, n, n), 0, 0, root):
+    if not begin_roots(model.P, s):
         return NOT_COVARIANCE, 0
     for t in range(n_steps):
+        c, d = model.C[at(t, model.C.shape[0])], model.d[at(t, model.d.shape[0])]
+        alike = t > 0 and same(seen[t], seen[t - 1])
         if t > 0:
-            if not root_at(model.Q, t, 1, q_root):
+            if not predict_step(model.A, model.Q, t, s):
                 return NOT_COVARIANCE, t
-            a = model.A[at(t, model.A.shape[0])]
-            predict_columns(a, model.b[at(t, model.b.shape[0])], filtered, x)
-            predict_array(a, root, q_root, both)
-            copy(both[:, :n], root)
-        if not root_at(model.R, t, 0, r_root):
+            a, b = model.A[at(t, model.A.shape[0])], model.b[at(t, model.b.shape[0])]
+            add_known(a, s.a, s.counts[0], filtered, b, x)
+        if not measure_step(model.C, model.R, t, seen[t], alike, s):
             return NOT_COVARIANCE, t
         if mean is not None:
+            turn(s.root, root)
             report(x, root, factor, right, extra, known, mean_predicted[t], covariance_predicted[t])
-            c, d = model.C[at(t, model.C.shape[0])], model.d[at(t, model.d.shape[0])]
             predict_columns(c, d, x, rows)
             fill(seen_root, 0.0)
             multiply_add(c, root, seen_root[:, :n])
-            copy(r_root, seen_root[:, n:])
+            copy(s.r_root, seen_root[:, n:])
             report(
                 rows, seen_root, factor, right, extra, known,
                 observation_mean[t], observation_covariance[t],
             )  # fmt: skip
-        k = update(model, t, y[t], seen[t], x, root, r_root, array, z, filtered)
-        copy(array[k : k + n, k : k + n], root)
+        update_step(c, s)
+        k = s.counts[3]
+        innovate(c, s.c, s.counts[1], d, y[t], s.place, k, x, s.array, z, filtered)
         increment = -0.5 * k * LOG_2PI
         for i in range(k):
-            if array[i, i] == 0.0:
+            if s.array[i, i] == 0.0:
                 return SINGULAR, t
-            increment -= math.log(abs(array[i, i]))
+            increment -= math.log(abs(s.array[i, i]))
             for j in range(g):
                 row[j] = z[i, 1 + j]
             new, residual, change = absorb(row, -z[i, 0], factor, right)
@@ -182,5 +188,6 @@ def diffuse_filter(
             return NOT_FINITE, t
         log_increment[t] = increment
         if mean is not None:
+            turn(s.root, root)
             report(filtered, root, factor, right, extra, known, mean[t], covariance[t])
     return OK, n_steps

@@ -3,7 +3,7 @@
 x_1 = start + N(0, P), x_t = A_t x_{t-1} + b_t + N(0, Q_t), y_t = C_t x_t + d_t + N(0, R_t).
 
 What is known at a step is written as x = mean + root e, e ~ N(0, I). Both steps of the filter are
-orthogonal changes of these standard normal variables (`kalman.py` has the same arrays):
+orthogonal changes of these standard normal variables (`square_root.py` has the same arrays):
 
     (e; w) = Theta (e_pred; rest)      from  [A L  Q^1/2]   Theta = [L_pred  0]
 
@@ -168,6 +168,48 @@ def innovations(c, d, y, seen, x, array, z):
                 value -= array[k, i] * z[i, f]
             z[k, f] = value / array[k, k]
         k += 1
+
+
+@exact
+def add_known(a, where, count, x, b, out):
+    """out (n, F) <- a x, and b more in column 0, from the nonzero entries of a."""
+    fill(out, 0.0)
+    for i in range(b.size):
+        out[i, 0] = b[i]
+    for e in range(count):
+        factor, row, into = a[where[e, 0], where[e, 1]], x[where[e, 1]], out[where[e, 0]]
+        for f in range(row.size):
+            into[f] += factor * row[f]
+
+
+@exact
+def innovate(c, where, count, d, y, place, k, x, array, z, filtered):
+    """z (K, F), first k rows <- S^-1/2 (y - C x - d), -S^-1/2 C x in the further columns; filtered
+    <- the mean given these.
+
+    array, place, k : of `update_root`; where, count : of the entries of c that are not zero.
+    """
+    columns = x.shape[1]
+    for p in range(y.size):
+        if place[p] >= 0:
+            z[place[p], 0] = y[p] - d[p]
+            for f in range(1, columns):
+                z[place[p], f] = 0.0
+    for e in range(count):
+        row = place[where[e, 0]]
+        if row >= 0:
+            factor = c[where[e, 0], where[e, 1]]
+            for f in range(columns):
+                z[row, f] -= factor * x[where[e, 1], f]
+    copy(x, filtered)
+    for i in range(k):
+        for f in range(columns):
+            for j in range(i):
+                z[i, f] -= array[j, i] * z[j, f]
+            z[i, f] /= array[i, i]
+        for a in range(filtered.shape[0]):
+            for f in range(columns):
+                filtered[a, f] += array[i, k + a] * z[i, f]
 
 
 @exact

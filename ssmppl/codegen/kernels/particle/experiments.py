@@ -12,11 +12,12 @@ from ssmppl.codegen.kernels.particle.weights import OK
 
 
 @exact
-def sums_of_each(sums, theta, y, seen, u, first, paths, each):
-    """Fill each (E, F) with the sums over a data set and its path, of paths (R, D)."""
+def sums_of_each(run, constants, theta, y, seen, u, first, paths, each):
+    """Fill each (E, F) with the sums over a data set and its path (`math/sums.py`, `sum_of_path`),
+    of paths (R, D)."""
     for e in range(each.shape[0]):
         a, b = first[e], first[e + 1]
-        sums(theta, y[a:b], seen[a:b], u[a:b], paths[a:b], each[e])
+        run(*constants, theta, y[a:b], seen[a:b], u[a:b], paths[a:b], each[e])
 
 
 @exact

@@ -229,14 +229,14 @@ def most_likely(
 @exact
 def follow_filter(
     prepare, step, linear_initial, linear, look_at, most_likely, sizes, flat,
-    theta, y, seen, u, x, covariance, rest, jacobian, spread, spread_initial, g, h,
+    theta, y, seen, u, x, covariance, increments, rest, jacobian, spread, spread_initial, g, h,
 ):  # fmt: skip
     """The first reference: an extended Kalman filter; returns its log-likelihood, -inf where it
     comes to no number, +inf where its covariances do and rounding has eaten the log-likelihood: an
     observation determines a state better than `RESOLVED`.
 
-    x (T, D) its means, covariance (T, D, D), rest (T, D), jacobian (T, D, D), spread (T, D, R),
-    spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
+    x (T, D) its means, covariance (T, D, D), increments (T,) of the log-likelihood, rest (T, D),
+    jacobian (T, D, D), spread (T, D, R), spread_initial (D, R_1), g (T, D), h (T, D, D) : written.
     """
     n_steps, d = x.shape
     r, r_initial = spread.shape[2], spread_initial.shape[1]
@@ -277,9 +277,10 @@ def follow_filter(
                     for k in range(r):
                         total += spread[t, i, k] * spread[t, j, k]
                     p[i, j] = total
-        log_likelihood += most_likely(
+        increments[t] = most_likely(
             theta, c, s, rest[t], p, seen_so, now, g[t], h[t], after, toward, move, lead, target
         )
+        log_likelihood += increments[t]
         if not abs(log_likelihood) < np.inf:
             return -np.inf
         for i in range(d):
