@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def evaluate(
 def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> list[Any]:
     done: dict[Expr, Any] = {}
     with np.errstate(all="ignore"):
-        for node in topological(roots):
+        for node in _order(tuple(roots)):
             args = [done[a] for a in node.args]
             if node in values:
                 done[node] = np.asarray(values[node], dtype=float)
@@ -72,6 +73,13 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
             else:
                 done[node] = MEANING[node.op](*args)
     return [done[r] for r in roots]
+
+
+@lru_cache(maxsize=256)
+def _order(roots: tuple[Expr, ...]) -> list[Expr]:
+    """Kept, as the same expressions are evaluated at point after point, of which the walk over a
+    large graph takes longer than its few numbers."""
+    return topological(roots)
 
 
 def _matrix(op: str, n: int, entries: list[Any]) -> np.ndarray:

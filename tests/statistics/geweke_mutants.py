@@ -123,7 +123,7 @@ def stand_without(original):
 
     def stand(move, theta, paths):
         _, held = original(move, theta, paths)
-        return sum(move._log_joint(theta, e, p) for e, p in _pairs(move, paths)), held
+        return float(np.sum(move._log_joints(theta, np.concatenate(paths)))), held
 
     return stand
 
@@ -135,13 +135,9 @@ def at_without(original):
         value, moved = original(move, theta, held, paths)
         if not value > -np.inf:
             return value, moved
-        return sum(move._log_joint(theta, e, p) for e, p in _pairs(move, moved)), moved
+        return float(np.sum(move._log_joints(theta, np.concatenate(moved)))), moved
 
     return at
-
-
-def _pairs(move, paths):
-    return zip(move.problem.experiments, paths, strict=True)
 
 
 def states_kept(original):

@@ -520,3 +520,10 @@ def backward_passes() -> ModuleType:
         lookahead_backward.write_guide,
     )
     return load_kernels("guide", "backward passes of the guide", {k.__name__: k for k in kernels})
+
+
+@once
+def backward_passes_of_each() -> ModuleType:
+    """Those over all data sets, likewise."""
+    kernels = lookahead_backward.look_back_each, lookahead_backward.look_back_scalar_each
+    return load_kernels("guides", "the guides of all data sets", {k.__name__: k for k in kernels})

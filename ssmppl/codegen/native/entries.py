@@ -11,6 +11,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -166,21 +167,68 @@ def entry(
             values[n] = vars(particle_filter)[text] if constant else literal(text)
     constants = [values[p] for p in parameters if p in values]
     if not aside:
-        return lambda theta, *rest: run(*constants, (codes, theta), *rest)
-
+        return ByAddress(run, tuple(constants), codes)
     taken = {*own, *dict(fixed), *values, "predict", "theta"}
     at = [p for p in parameters if p not in taken].index("moments")
-    sizes, waiting = aside.algorithm.sizes, True
+    return Predicting(run, tuple(constants), codes, aside, at, beside)
 
-    def call(theta: Any, *rest: Any) -> Any:
-        nonlocal waiting
-        if waiting and rest[at] is not None:
+
+class ByAddress:
+    """A compiled algorithm for one model: called with theta and all that follows.
+
+    run : the algorithm. constants : what it takes before theta. codes : the addresses.
+    """
+
+    def __init__(
+        self, run: Callable[..., Any], constants: tuple[Any, ...], codes: np.ndarray,
+        further: tuple[Any, ...] = (),
+    ):  # fmt: skip
+        self.run, self.constants, self.codes, self.further = run, constants, codes, further
+
+    def __call__(self, theta: np.ndarray, *rest: Any) -> Any:
+        return self.run(*self.constants, (self.codes, theta, *self.further), *rest)
+
+
+class Predicting(ByAddress):
+    """Likewise a filter, whose functions for predictions are looked up when they are first wanted.
+
+    at : the place behind theta of what asks for them. beside : their roles.
+    """
+
+    def __init__(
+        self, run: Callable[..., Any], constants: tuple[Any, ...], codes: np.ndarray, aside: Aside,
+        at: int, beside: tuple[str, ...],
+    ):  # fmt: skip
+        super().__init__(run, constants, codes, (aside.algorithm.sizes,))
+        self.aside, self.at, self.beside, self.waiting = aside, at, beside, True
+
+    def __call__(self, theta: np.ndarray, *rest: Any) -> Any:
+        if self.waiting and rest[self.at] is not None:
             try:
-                found = aside.places()
+                found = self.aside.places()
             except Untranslatable:
-                return aside.instead(theta, *rest)
-            codes[len(own) :] = [found[r] for r in beside]
-            waiting = False
-        return run(*constants, (codes, theta, sizes), *rest)
+                return self.aside.instead(theta, *rest)
+            self.codes[len(self.codes) - len(self.beside) :] = [found[r] for r in self.beside]
+            self.waiting = False
+        return super().__call__(theta, *rest)
 
-    return call
+
+def for_each(kernel: Callable[..., Any], algorithm: Callable[..., Any]) -> Callable[..., Any]:
+    """A kernel of `kernels/particle/experiments.py` with an algorithm of one model for its `run`:
+    called with theta and all that follows. Where the algorithm has no addresses, the loop over
+    data sets is Python's."""
+    if isinstance(algorithm, ByAddress):
+        over = _over(kernel, algorithm.run)
+        return ByAddress(over, (algorithm.constants,), algorithm.codes, algorithm.further)
+    plain: Callable[..., Any] = getattr(kernel, "py_func", kernel)
+    return partial(plain, algorithm, ())
+
+
+@once
+def _over(kernel: Callable[..., Any], run: Any) -> Callable[..., Any]:
+    name = kernel.__name__
+    made = specialise(kernel, name, {"run": run.__name__})
+    lines = [f"from {home} import {n}" for n, home in sorted(made.imports.items()) if n != "exact"]
+    lines.append(f"from {run.__module__} import {run.__name__}")
+    head = HEAD.format(name=name, imports="\n".join(lines))
+    return getattr(folder.load(name, head + made.text.replace("@exact", "@entry", 1)), name)

@@ -15,14 +15,17 @@ import numpy as np
 from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
+from ssmppl.analysis.structure import deterministic
+from ssmppl.codegen.kernels.particle.experiments import sums_of_each
 from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
+from ssmppl.codegen.native.entries import for_each
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
 from ssmppl.errors import SamplingError
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr
 from ssmppl.inference.run.invalid_laws import law_without_density_at
-from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.problem import Problem, joined
 from ssmppl.inference.updates.draw_update import draw
 from ssmppl.language.model.trace import Trace, once_per_trace
 
@@ -142,11 +145,10 @@ def _totals(steps: GibbsUpdates, k: int, theta: np.ndarray, paths: list[np.ndarr
     update = steps.updates[k]
     if update.needs_log_joint or not update.functions:
         return np.empty(0)
-    total, part = np.zeros(len(update.functions)), np.empty(len(update.functions))
-    run = getattr(steps.module, statistics_name(update))
-    for e, path in zip(steps.problem.experiments, paths, strict=True):
-        run(theta, e.y, e.seen, e.u, path, part)
-        total += part
+    each = np.empty((len(paths), len(update.functions)))
+    run = for_each(sums_of_each, getattr(steps.module, statistics_name(update)))
+    run(theta, *steps.problem.end_to_end.data, joined(paths), each)
+    total = np.add.reduce(each)  # one after the other, as they stand
     prior = steps.prior_totals[k]
     if prior is None:
         values = ThetaValues(steps.index, theta)
@@ -159,12 +161,23 @@ def log_joint(steps: GibbsUpdates, theta: np.ndarray, paths: list[np.ndarray]) -
 
     +inf where a density is infinite, which is no point to go to (`inference/updates/slices.py`).
     """
-    program = steps.problem.program
-    value = program.entry("log_prior")(theta) if len(theta) else 0.0
+    value = steps.problem.program.entry("log_prior")(theta) if len(theta) else 0.0
     if value == -np.inf:
         return -np.inf
-    value, part = float(value), np.empty(1)  # floats, which add inf and -inf without a warning
-    for e, path in zip(steps.problem.experiments, paths, strict=True):
-        program.entry("log_joint")(theta, e.y, e.seen, e.u, path, part)
-        value += float(part[0])
+    rows, several = joined(paths), len(paths) > 1
+    value = float(value)
+    for part in log_joints(steps.problem, theta, rows).tolist():
+        value += part  # floats, which add inf and -inf without a warning
+    if several and deterministic(list(steps.problem.trace.transition.values())):
+        for path, new in zip(paths, steps.problem.end_to_end.split(rows), strict=True):
+            path[:] = new
     return -np.inf if np.isnan(value) else value
+
+
+def log_joints(problem: Problem, theta: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(E,) log p(x, y | theta) of each data set, of trajectories end to end (R, D); deterministic
+    components of x are set on the way."""
+    each = np.empty((len(problem.experiments), 1))
+    run = for_each(sums_of_each, problem.program.entry("log_joint"))
+    run(theta, *problem.end_to_end.data, rows, each)
+    return each[:, 0]

@@ -49,13 +49,20 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.proposals.noises import Noises, noises
-from ssmppl.codegen.modules.gaussian import GaussianApproximation, backward_passes
+from ssmppl.codegen.kernels.particle.experiments import (
+    linearise_each,
+    noise_of_each,
+    path_of_each,
+)
+from ssmppl.codegen.modules.gaussian import GaussianApproximation, backward_passes_of_each
 from ssmppl.codegen.modules.interweaving import compile_noises
+from ssmppl.codegen.native.entries import for_each
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.compiling import once_property
-from ssmppl.data import Experiment, unpack_parameters
+from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.expr import symbols_of
+from ssmppl.inference.chains.gibbs_updates import log_joints
 from ssmppl.inference.chains.metropolis_kernel import RandomWalk
 from ssmppl.inference.chains.sampling import SamplingSetup
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
@@ -63,7 +70,7 @@ from ssmppl.inference.optimisation.newton import climb
 from ssmppl.inference.preparation.exact_models import ExactModel
 from ssmppl.inference.preparation.pilot import Pilot
 from ssmppl.inference.preparation.space import Space
-from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.problem import Problem, joined
 from ssmppl.inference.updates.slices import comparable
 from ssmppl.language.model.transforms import free_number, parameter_bounds, transforms, unconstrain
 
@@ -121,89 +128,88 @@ class NoiseMove:
         return compile_noises(self.problem.trace, self.found, self.steered)
 
     @cached_property
-    def references(self) -> tuple[np.ndarray | None, ...]:
-        """For each experiment the trajectory (T, D) to linearise along; None where there is none.
-        It depends on no chain, and never changes: see the kernel."""
+    def references(self) -> np.ndarray | None:
+        """The trajectories to linearise along, end to end (R, D); None where some data set has
+        none. They depend on no chain, and never change: see the kernel."""
         gaussian = self.problem.program.gaussian if self.steered else None
         if not isinstance(gaussian, GaussianApproximation):
-            return (None,) * len(self.problem.experiments)
-        return tuple(
-            gaussian.likely_trajectory(self.near, e.y, e.seen, e.u)
-            for e in self.problem.experiments
-        )
+            return None
+        parts = []
+        for e in self.problem.experiments:
+            part = gaussian.likely_trajectory(self.near, e.y, e.seen, e.u)
+            if part is None:
+                return None
+            parts.append(part)
+        return joined(parts)
 
     def stands_near(self) -> bool:
         """Whether every experiment has a guide at `near`; elsewhere it hardly has, if not there."""
-        experiments = self.problem.experiments
-        return all(self._guide(i, self.near, e) is not None for i, e in enumerate(experiments))
+        return self._guide(self.near) is not None
 
-    def stand(self, theta: np.ndarray, paths: Paths) -> tuple[float, Paths]:
-        total, held = 0.0, []
+    def stand(self, theta: np.ndarray, paths: Paths) -> tuple[float, np.ndarray]:
+        every, rows = self.problem.end_to_end, joined(paths)
         widest = max(len(self.found.initial.noise), len(self.found.transition.noise))
-        for i, (e, path) in enumerate(zip(self.problem.experiments, paths, strict=True)):
-            guide = self._guide(i, theta, e)
-            noise = np.empty((e.steps, widest))
-            held.append(noise)
-            if guide is None:
-                return -np.inf, held
-            total += self.module.noise_of(theta, e.y, e.seen, e.u, *guide, path, noise)
-            total += self._log_joint(theta, e, path)
-        return comparable(float(total)), held
+        held, log_volume = np.empty((len(rows), widest)), np.empty(len(paths))
+        guide = self._guide(theta)
+        if guide is None:
+            return -np.inf, held
+        run = for_each(noise_of_each, self.module.noise_of)
+        run(theta, *every.data, *guide, rows, held, log_volume)
+        return self._density(theta, rows, log_volume), held
 
-    def at(self, theta: np.ndarray, held: Paths, paths: Paths) -> tuple[float, Paths]:
-        total, moved = 0.0, []
-        for i, (e, path) in enumerate(zip(self.problem.experiments, paths, strict=True)):
-            guide = self._guide(i, theta, e)
-            if guide is None:
-                return -np.inf, paths
-            new = np.empty_like(path)
-            given = (theta, e.y, e.seen, e.u, *guide, path, held[i], new)
-            total += self.module.path_of(*given)
-            if not abs(total) < np.inf:
-                return -np.inf, paths
-            total += self._log_joint(theta, e, new)
-            moved.append(new)
-        return comparable(float(total)), moved
+    def at(self, theta: np.ndarray, held: np.ndarray, paths: Paths) -> tuple[float, Paths]:
+        every, rows, guide = self.problem.end_to_end, joined(paths), self._guide(theta)
+        if guide is None:
+            return -np.inf, paths
+        new, log_volume = np.empty_like(rows), np.empty(len(paths))
+        run = for_each(path_of_each, self.module.path_of)
+        if not run(theta, *every.data, *guide, rows, held, new, log_volume):
+            return -np.inf, paths
+        return self._density(theta, new, log_volume), every.split(new)
 
-    def _log_joint(self, theta: np.ndarray, e: Experiment, path: np.ndarray) -> float:
-        """log p(x, y | theta); deterministic components are set on the way."""
-        part = np.empty(1)
-        self.problem.program.entry("log_joint")(theta, e.y, e.seen, e.u, path, part)
-        return float(part[0])
+    def _density(self, theta: np.ndarray, rows: np.ndarray, log_volume: np.ndarray) -> float:
+        """log p(x, y | theta) + log |dx / de|; deterministic components are set on the way."""
+        parts = self._log_joints(theta, rows)
+        with np.errstate(all="ignore"):
+            total = np.cumsum(np.stack([log_volume, parts], axis=1))[-1]
+        return comparable(float(total))
 
-    def _guide(
-        self, i: int, theta: np.ndarray, e: Experiment
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """A (T, D, D), g (T, D) and their centre (T, D); None where they come to no number."""
+    def _log_joints(self, theta: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return log_joints(self.problem, theta, rows)
+
+    def _guide(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """A (R, D, D), g (R, D) and their centre (R, D); None where they come to no number."""
         if not self.steered:
             return _NO_GUIDE
-        x = self.references[i]
+        x = self.references
         if x is None:
             return None
-        steps, d = x.shape
+        every = self.problem.end_to_end
+        (rows, d), n = x.shape, len(every.first) - 1
         r, r_initial = len(self.found.transition.noise), len(self.found.initial.noise)
-        shapes = (steps, d), (steps, d, d), (steps, d, r), (d, r_initial)
+        shapes = (rows, d), (rows, d, d), (rows, d, r), (n, d, r_initial)
         derivatives = [np.zeros(s) for s in shapes]
-        looking = i not in self.looks
-        g, h = (np.empty((steps, d)), np.empty((steps, d, d))) if looking else self.looks[i]
-        given = (theta, e.y, e.seen, e.u, x, looking)
-        if not self.module.linearise(*given, *derivatives, g, h):
+        looking = not self.looks
+        g, h = self.looks[0] if self.looks else (np.empty((rows, d)), np.empty((rows, d, d)))
+        linearise = for_each(linearise_each, self.module.linearise)
+        if not linearise(theta, *every.data, x, looking, *derivatives, g, h):
             return None
         if looking and not self.data_told_by:
-            self.looks[i] = g, h
-        a, pull = np.empty((steps, d, d)), np.empty((steps, d))
+            self.looks.append((g, h))
+        a, pull = np.empty((rows, d, d)), np.empty((rows, d))
+        given = (every.first, x, *derivatives, g, h)
         if d == r == r_initial == 1:
-            fine = backward_passes().look_back_scalar(x, *derivatives, g, h, a, pull)
+            fine = backward_passes_of_each().look_back_scalar_each(*given, a, pull)
         else:
             widest = max(r, r_initial)
-            rest = np.empty((steps, widest)), np.empty((steps, widest, d))
-            fine = backward_passes().look_back(x, *derivatives, g, h, 0, a, pull, *rest)
+            rest = np.empty((rows, widest)), np.empty((rows, widest, d))
+            fine = backward_passes_of_each().look_back_each(*given, a, pull, *rest)
         return (a, pull, x) if fine else None
 
     @cached_property
-    def looks(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """By experiment, what the data say of the reference, where no parameter stands in it."""
-        return {}
+    def looks(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """What the data say of the references, where no parameter stands in it, once known."""
+        return []
 
     @cached_property
     def data_told_by(self) -> bool:
@@ -493,7 +499,7 @@ def prepare_interweaving(
                 return None, f"none: {reason}"
     if model is None and found.parameters:
         moves.append(NoiseMove(setup.problem, found, False, near))
-    names = found.tied if steered or model is not None else found.parameters
+    names = found.tied
     owner = [t.site.name for t in transforms(setup.problem.trace) for _ in t.free]
     movable = np.array([k for k, i in enumerate(space.positions) if owner[i] in names], dtype=int)
     if not len(movable):

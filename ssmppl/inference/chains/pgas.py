@@ -14,7 +14,9 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory, singular_covariance
+from ssmppl.codegen.kernels.particle.experiments import conditional_smc_each
 from ssmppl.codegen.kernels.particle.weights import OK
+from ssmppl.codegen.native.entries import for_each
 from ssmppl.errors import NotApplicable
 from ssmppl.inference.chains.elimination import (
     Eliminating,
@@ -57,7 +59,7 @@ from ssmppl.inference.preparation.pilot import Pilot, dispersed, find_mode
 from ssmppl.inference.preparation.proposal_choice import choose_for_csmc
 from ssmppl.inference.run.convergence import PathMovement, update_rate_attributes
 from ssmppl.inference.run.draws import Block
-from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.run.problem import Problem, joined
 
 PARTICLES = 25
 PARTICLES_WITHOUT_ANCESTORS = 200
@@ -251,17 +253,18 @@ def _trajectories(
     sweeper: Sweeper, theta: np.ndarray, paths: list[np.ndarray], stream: np.ndarray
 ) -> tuple[float, float]:
     """New trajectories given theta, in place; (share of steps that changed, ESS / N)."""
-    problem, settings = sweeper.problem, sweeper.settings
-    run = problem.program.entry(f"conditional_smc_{settings.proposal}")
-    figures = np.zeros(2)
-    for i, e in enumerate(problem.experiments):
-        new, own = np.empty_like(paths[i]), np.empty(2)
-        status, t = run(theta, e.y, e.seen, e.u, settings.particles, stream, paths[i], new, own)
-        if status != OK:
-            raise sweep_failure(problem, theta, status, t, e)
-        paths[i] = new
-        figures += own / len(paths)
-    return float(figures[0]), float(figures[1])
+    problem, settings, every = sweeper.problem, sweeper.settings, sweeper.problem.end_to_end
+    one = problem.program.entry(f"conditional_smc_{settings.proposal}")
+    old, figures = joined(paths), np.empty((len(paths), 2))
+    new = np.empty_like(old)
+    status, t, e = for_each(conditional_smc_each, one)(
+        theta, *every.data, settings.particles, stream, old, new, figures
+    )
+    if status != OK:
+        raise sweep_failure(problem, theta, status, t, problem.experiments[e])
+    paths[:] = every.split(new)
+    rates = np.add.reduce(figures / len(paths))
+    return float(rates[0]), float(rates[1])
 
 
 def explain(plan: Derived) -> Mapping[str, PlanRows]:

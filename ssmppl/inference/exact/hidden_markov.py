@@ -1,8 +1,10 @@
 """Exact inference where the states take few values: hidden Markov models and what is like them.
 
 The laws of the model are tables over the values; they may depend on parameters, inputs, time and
-observations before. Their densities are evaluated by the interpreter, over all values, rows and
-data sets of one shape (`histories.py`) at once, and handed to the compiled passes.
+observations before. One generated pass writes them down, over all values, rows and data sets
+(`histories.py`), and another sums their derivatives up; what lies between are the compiled passes
+that know no model. Whatever else is a function of the values, as what is expected of an
+observation, is evaluated by the interpreter.
 
 A value that the data have made 1e-300 times as likely as another is no number any more, and yet it
 may be the only one that later rows leave: before a change from which no way leads back. The pass in
@@ -14,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,10 +26,12 @@ from ssmppl.analysis.proposals.channels import Channel, channels
 from ssmppl.codegen.kernels.hmm.passes import UNSURE
 from ssmppl.codegen.kernels.math.random import fill_uniform
 from ssmppl.codegen.modules.exact import exact_entry
+from ssmppl.codegen.modules.finite import compile_slopes, compile_tables, varies_by_row
+from ssmppl.codegen.native.loading import Loaded
 from ssmppl.codegen.text.kernel_functions import predictive
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
-from ssmppl.expressions.calculus import differentiate
+from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant
 from ssmppl.inference.exact.derivatives import Scored
@@ -44,19 +48,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Filtered:
-    """What the forward pass tells of one experiment (T rows, K values).
+    """What the forward pass tells of some histories (R rows in all, K values), or of one.
 
-    log_increments : (T,) log p(y_t | y_{1:t-1}). predicted, filtered : (T, K) laws of x_t given
-    y_{1:t-1} and y_{1:t}, or their logarithms if `logs`. move : (T or 1, K, K), as of the kernels,
-    likewise.
-
-    Of S histories at once every array has one axis more, the first.
+    log_increments : (R,) log p(y_t | y_{1:t-1}). predicted, filtered : (R, K) laws of x_t given
+    y_{1:t-1} and y_{1:t}, or their logarithms if `logs`. first : (S + 1,) and move : (R or 1, K,
+    K), as of the kernels, likewise.
     """
 
     log_increments: np.ndarray
     _predicted: np.ndarray
     _filtered: np.ndarray
-    _move: np.ndarray
+    _first: np.ndarray
+    move: np.ndarray
     logs: bool
 
     @property
@@ -69,42 +72,50 @@ class Filtered:
 
     def of(self, s: int) -> Filtered:
         """What it tells of history s."""
-        move = self._move[s if len(self._move) > 1 else 0]
-        own = self.log_increments[s], self._predicted[s], self._filtered[s]
-        return Filtered(*own, move, self.logs)
+        rows = slice(self._first[s], self._first[s + 1])
+        move = self.move[rows] if len(self.move) > 1 else self.move
+        own = self.log_increments[rows], self._predicted[rows], self._filtered[rows]
+        return Filtered(*own, self._first[s : s + 2] - self._first[s], move, self.logs)
 
     def smoothed(self, pairs: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Laws (S, T, K) of x_t given all data, and (S, T, K, K) of (x_{t-1}, x_t), row 0 zero;
+        """Laws (R, K) of x_t given all data, and (R, K, K) of (x_{t-1}, x_t), zero in first rows;
         without pairs the latter is empty."""
         shape = self._filtered.shape
-        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0, 0))
+        law, both = np.empty(shape), np.empty((*shape, shape[-1]) if pairs else (0, 0, 0))
         entry = exact_entry("finite_backward_logs" if self.logs else "finite_backward")
-        entry(self._move, self._predicted, self._filtered, law, both)
+        entry(self._first, self.move, self._predicted, self._filtered, law, both)
         return law, both
 
     def paths(self, which: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
-        """(M, T) indices of values drawn given all data, path m of history which[m], by uniforms
-        (M, T)."""
+        """Indices of values drawn given all data, path m of history which[m], end to end, by as
+        many uniforms."""
         found = np.empty(uniforms.shape, dtype=np.int64)
         entry = exact_entry("finite_draw_logs" if self.logs else "finite_draw")
-        entry(self._move, self._filtered, which, uniforms, found)
+        entry(self._first, self.move, self._filtered, which, uniforms, found)
         return found
 
 
-def forward(
-    log_start: np.ndarray, log_move: np.ndarray, log_g: np.ndarray
-) -> tuple[Filtered, np.ndarray]:
-    """The forward pass, and (S,) the row at which it came to an end, -1 if at none; arguments as of
-    the kernels."""
-    shape = log_g.shape
-    found = np.empty(shape[:2]), np.empty(shape), np.empty(shape)
-    stopped = np.empty(len(log_g), dtype=np.int64)
-    move = np.exp(log_move)
-    exact_entry("finite_forward")(move, log_start, log_move, log_g, *found, stopped)
-    if not np.any(stopped == UNSURE):
-        return Filtered(*found, move, logs=False), stopped
-    exact_entry("finite_forward_logs")(log_start, log_move, log_g, *found, stopped)
-    return Filtered(*found, log_move, logs=True), stopped
+@dataclass(frozen=True)
+class Tables:
+    """The laws over the values of some histories, as of the kernels: log_start (S, K), log_move and
+    move (R or 1, K, K), log_g (R, K)."""
+
+    log_start: np.ndarray
+    log_move: np.ndarray
+    move: np.ndarray
+    log_g: np.ndarray
+
+    def forward(self, first: np.ndarray) -> tuple[Filtered, np.ndarray]:
+        """The forward pass, and (S,) the row at which it came to an end, -1 if at none."""
+        shape = self.log_g.shape
+        found = np.empty(shape[0]), np.empty(shape), np.empty(shape)
+        stopped = np.empty(len(self.log_start), dtype=np.int64)
+        logs = self.log_start, self.log_move, self.log_g
+        exact_entry("finite_forward")(first, self.move, *logs, *found, stopped)
+        if not np.any(stopped == UNSURE):
+            return Filtered(*found, first, self.move, logs=False), stopped
+        exact_entry("finite_forward_logs")(first, *logs, *found, stopped)
+        return Filtered(*found, first, self.log_move, logs=True), stopped
 
 
 def inverted(
@@ -133,18 +144,55 @@ def inverted(
     return high
 
 
+class Kept:
+    """What is derived of a model once, by what it is. It is no part of what is sent elsewhere."""
+
+    def __init__(self) -> None:
+        self._made: dict[tuple, Any] = {}
+
+    def __reduce__(self) -> tuple:
+        return Kept, ()
+
+    def once(self, key: tuple, make: Callable[..., Any], *arguments: Any) -> Any:
+        if key not in self._made:
+            self._made[key] = make(*arguments)
+        return self._made[key]
+
+
 @dataclass(frozen=True)
 class HiddenMarkov(Scored):
     """A traced model as one of finitely many values (K, D): its laws as tables over these, and its
     exact passes."""
 
     form: FiniteStates
-    _densities: dict[str, Expr] = field(default_factory=dict, repr=False)
+    _kept: Kept = field(default_factory=Kept, repr=False, compare=False)
 
     # -- tables
     @property
     def values(self) -> np.ndarray:
         return self.form.values
+
+    def _over(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """values (D, K), and the pairs of them before and after a move (D, K * K)."""
+        return self._kept.once(("values",), self._columns)
+
+    def _columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        columns, size = np.ascontiguousarray(self.values.T), len(self.values)
+        return columns, np.repeat(columns, size, axis=1), np.tile(columns, size)
+
+    def tables(self, h: Histories, theta: np.ndarray) -> Tables:
+        """The laws over the values."""
+        size, rows = len(self.values), len(h.y)
+        given = self.trace, h.missing
+        moves = rows if self._kept.once(("varies", h.missing), varies_by_row, *given) else 1
+        out = Tables(
+            np.empty((h.size, size)), np.empty((moves, size * size)),
+            np.empty((moves, size * size)), np.empty((rows, size)),
+        )  # fmt: skip
+        module = self._kept.once(("tables", h.missing), compile_tables, *given)
+        module.write_tables(theta, h.y, h.seen, h.u, h.first, *self._over(), *vars(out).values())
+        square = moves, size, size
+        return replace(out, log_move=out.log_move.reshape(square), move=out.move.reshape(square))
 
     def histories_of(self, experiments: Iterable[Experiment]) -> tuple[Histories, ...]:
         entries = max(1, ENTRIES // len(self.values) ** 2)
@@ -152,19 +200,13 @@ class HiddenMarkov(Scored):
 
     def density(self, role: str, h: Histories, by: Expr | None = None) -> Expr:
         """The log density of a role, or its derivative by a parameter."""
-        missing = Missing(partial=h.partial)
-        key = f"{role} {sorted(h.partial)}"
-        if key not in self._densities:
-            total = constant(0.0)
-            for t in terms(self.trace, role, missing):
-                total = total + t.guarded()
-            self._densities[key] = total
+        total = self._kept.once((role, h.missing), self._density, role, h.missing)
         if by is None:
-            return self._densities[key]
-        slope = f"{key} by {by!r}"
-        if slope not in self._densities:
-            self._densities[slope] = differentiate([self._densities[key]], by)[0]
-        return self._densities[slope]
+            return total
+        return self._kept.once((role, h.missing, by), differentiate, [total], by)[0]
+
+    def _density(self, role: str, missing: Missing) -> Expr:
+        return sum((t.guarded() for t in terms(self.trace, role, missing)), start=constant(0.0))
 
     def expected(
         self, h: Histories, theta: np.ndarray, role: str, expressions: Sequence[Expr],
@@ -173,28 +215,28 @@ class HiddenMarkov(Scored):
         """Sums over data sets, rows and values of each expression, weighed by a law of `laws`: of
         pairs for "transition". What has no weight does not count, be it infinite."""
         out = np.zeros(len(expressions))
-        law = law * h.weights.reshape(-1, *(1,) * (law.ndim - 1))
+        counts = np.repeat(h.weights, h.steps)
+        law = law * counts.reshape(-1, *(1,) * (law.ndim - 1))
         for rows, found in self._by_rows(expressions, h, theta, role):
-            own = law[:, rows]
+            own = law[rows]
             out += [np.sum(own * np.where(own > 0.0, values, 0.0)) for values in found]
         return out
 
     def over_values(
         self, expression: Expr, h: Histories, theta: np.ndarray, role: str
     ) -> np.ndarray:
-        """(Q, R, K), or (Q, R, K, K) over x_{t-1} and x_t for "transition"; Q is S, or 1 where it
-        is the same for all histories, and R is T, or 1 where it is the same in all rows (and for
-        "initial")."""
+        """(R, K), or (R, K, K) over x_{t-1} and x_t for "transition"; 1 for R where it is the same
+        in all rows, and S for "initial"."""
         parts = []
         for _, (found,) in self._by_rows([expression], h, theta, role):
             parts.append(found)
-            if found.shape[1] == 1:
+            if len(found) == 1:
                 break
-        return np.ascontiguousarray(np.concatenate(parts, axis=1) if parts[1:] else parts[0])
+        return np.ascontiguousarray(np.concatenate(parts) if parts[1:] else parts[0])
 
     def _by_rows(
         self, expressions: Sequence[Expr], h: Histories, theta: np.ndarray, role: str
-    ) -> Iterator[tuple[slice, list[np.ndarray]]]:
+    ) -> Iterator[tuple[slice | np.ndarray, list[np.ndarray]]]:
         """The rows of a role, and each expression over them as of `over_values`, as many rows at a
         time as memory allows."""
         size, pair = len(self.values), role == "transition"
@@ -204,17 +246,16 @@ class HiddenMarkov(Scored):
             if pair:
                 given[previous(s)] = column[:, None]
         shape = (size, size) if pair else (size,)
-        last = 1 if role == "initial" else h.steps
-        step = max(2, ENTRIES // (h.size * int(np.prod(shape)) * max(1, len(expressions))))
-        for a in range(0, last, step):
-            rows = slice(a, min(a + step, last))
-            own = {s: v[:, rows].reshape(len(v), -1, *(1,) * len(shape))
-                   for s, v in h.rows.items()}  # fmt: skip
+        which = h.first[:-1] if role == "initial" else np.arange(len(h.y))
+        step = max(2, ENTRIES // (int(np.prod(shape)) * max(1, len(expressions))))
+        for a in range(0, len(which), step):
+            rows = which[a : a + step]
+            own = {s: v[rows].reshape(-1, *(1,) * len(shape)) for s, v in h.rows.items()}
             found = []
             for values in evaluate(expressions, {**given, **own}):
                 values = np.asarray(values, dtype=float)
-                values = values.reshape((1,) * (2 + len(shape) - values.ndim) + values.shape)
-                found.append(np.broadcast_to(values, (*values.shape[:2], *shape)))
+                values = values.reshape((1,) * (1 + len(shape) - values.ndim) + values.shape)
+                found.append(np.broadcast_to(values, (len(values), *shape)))
             yield rows, found
 
     # -- likelihood and laws
@@ -225,7 +266,7 @@ class HiddenMarkov(Scored):
             found, stopped = self._forward(h, theta)
             if np.any(stopped >= 0):
                 return -np.inf
-            total += float(h.weights @ found.log_increments.sum(axis=1))
+            total += _total(h, found)
         return total
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> Filtered:
@@ -250,13 +291,13 @@ class HiddenMarkov(Scored):
     def probabilities(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
         """(T, K) of each combination of values given all data."""
         _, found = next(self._passes([experiment], theta))
-        return found.smoothed(pairs=False)[0][0]
+        return found.smoothed(pairs=False)[0]
 
     def laws(
         self, experiments: Sequence[Experiment], theta: np.ndarray
     ) -> list[tuple[Histories, np.ndarray, np.ndarray]]:
-        """Of all experiments, by histories: (S, T, K) of x_t, and (S, T, K, K) of (x_{t-1}, x_t),
-        row 0 zero, given all data.
+        """Of all experiments, by histories: (R, K) of x_t, and (R, K, K) of (x_{t-1}, x_t), zero
+        in first rows, given all data.
 
         Raises
         ------
@@ -286,10 +327,11 @@ class HiddenMarkov(Scored):
         out = []
         for h, found in self._passes(experiments, theta):
             law, pairs = found.smoothed(pairs=True)
-            value = found.log_increments.sum(axis=1)
-            each = [
-                (self._moments(law[s], pairs[s], float(value[s])), law[s]) for s in range(h.size)
-            ]
+            each = []
+            for s in range(h.size):
+                rows = h.of(s)
+                value = float(found.log_increments[rows].sum())
+                each.append((self._moments(law[rows], pairs[rows], value), law[rows]))
             out.append((h, each))
         return _in_order(out)
 
@@ -327,17 +369,22 @@ class HiddenMarkov(Scored):
         ------
         SamplingError : as of `filter_each`.
         """
-        uniforms = []
-        for e, stream in zip(experiments, streams, strict=True):
-            uniforms.append(np.empty(draws * e.steps))
-            fill_uniform(stream, uniforms[-1])
+        ends = np.cumsum([draws * e.steps for e in experiments])
+        uniforms, begins = np.empty(ends[-1]), np.concatenate([[0], ends[:-1]])
+        if all(stream is streams[0] for stream in streams):  # one after the other
+            fill_uniform(streams[0], uniforms)
+        else:
+            for stream, begin, end in zip(streams, begins, ends, strict=True):
+                fill_uniform(stream, uniforms[begin:end])
         out: list[np.ndarray] = [np.empty(0)] * len(experiments)
         for h, found in self._passes(experiments, theta):
-            own = np.concatenate([uniforms[i] for i in h.members]).reshape(-1, h.steps)
-            paths = found.paths(np.repeat(h.which, draws), own)
-            drawn = self.values[paths.reshape(-1, draws, h.steps)]
-            for i, x in zip(h.members, drawn, strict=True):
-                out[i] = x
+            sizes = draws * h.steps[h.which]
+            at = np.concatenate([[0], np.cumsum(sizes)])
+            own = uniforms[np.arange(at[-1]) + np.repeat(begins[h.members] - at[:-1], sizes)]
+            drawn = self.values[found.paths(np.repeat(h.which, draws), own)]
+            bounds = at.tolist()
+            for k, i in enumerate(h.members.tolist()):
+                out[i] = drawn[bounds[k] : bounds[k + 1]].reshape(draws, -1, drawn.shape[1])
         return out
 
     def quantiles(self, law: np.ndarray, levels: np.ndarray) -> np.ndarray:
@@ -365,11 +412,11 @@ class HiddenMarkov(Scored):
                         np.where(law > 0.0, self.over_values(f, h, theta, "observation"), 0.0)
                         for f in figures
                     )
-                    middle = np.sum(law * mean, axis=2)
-                    spread = np.sum(law * (variance + (mean - middle[..., None]) ** 2), axis=2)
-                    shares = [np.sum(law * b, axis=2) for b in (below, strictly)]
-                    out.append(np.stack([middle, spread, *shares], axis=2))
-            each.append((h, list(np.stack(out, axis=3))))
+                    middle = np.sum(law * mean, axis=1)
+                    spread = np.sum(law * (variance + (mean - middle[:, None]) ** 2), axis=1)
+                    shares = [np.sum(law * b, axis=1) for b in (below, strictly)]
+                    out.append(np.stack([middle, spread, *shares], axis=1))
+            each.append((h, _of_each(h, np.stack(out, axis=2))))
         return _in_order(each)
 
     def predicted_quantiles(
@@ -382,38 +429,38 @@ class HiddenMarkov(Scored):
         every = [c for site in sites for c in channels(site)]
         each = []
         for h, law in self._by_history(experiments, laws):
-            out = np.full((*law.shape[:2], len(levels), len(every)), np.nan)
+            out = np.full((len(law), len(levels), len(every)), np.nan)
             for k, channel in enumerate(every):
                 for j, level in enumerate(levels):
                     if channel is not None:
-                        out[:, :, j, k] = self._quantile(h, theta, law, k, channel, level)
-            each.append((h, list(out)))
+                        out[:, j, k] = self._quantile(h, theta, law, k, channel, level)
+            each.append((h, _of_each(h, out)))
         return _in_order(each)
 
     def _quantile(
         self, h: Histories, theta: np.ndarray, law: np.ndarray, k: int, channel: Channel,
         level: float,
     ) -> np.ndarray:  # fmt: skip
-        """(S, T) of channel k, by the laws (S, T, K) of the combinations that are predicted."""
+        """(R,) of channel k, by the laws (R, K) of the combinations that are predicted."""
         own = self.trace.observation_symbols[k]
 
         def below(values: np.ndarray) -> np.ndarray:
             there = replace(h, rows={**h.rows, own: values})
             found = self.over_values(channel.below, there, theta, "observation")
-            return np.sum(law * np.where(law > 0.0, found, 0.0), axis=2)
+            return np.sum(law * np.where(law > 0.0, found, 0.0), axis=1)
 
         ends = [self.over_values(f, h, theta, "observation") for f in channel.ends(level)]
-        low = np.min([np.where(law > 0.0, q, np.inf) for q in ends], axis=(0, 3))
-        high = np.max([np.where(law > 0.0, q, -np.inf) for q in ends], axis=(0, 3))
+        low = np.min([np.where(law > 0.0, q, np.inf) for q in ends], axis=(0, 2))
+        high = np.max([np.where(law > 0.0, q, -np.inf) for q in ends], axis=(0, 2))
         return inverted(below, level, low, high, channel.whole)
 
     def _by_history(
         self, experiments: Sequence[Experiment], laws: Sequence[np.ndarray]
     ) -> Iterator[tuple[Histories, np.ndarray]]:
-        """The laws (T, K) of each experiment as (S, T, K) of the distinct ones."""
+        """The laws (T, K) of each experiment as (R, K) of the distinct ones."""
         for h in self.histories_of(experiments):
             first = h.members[np.searchsorted(h.which, np.arange(h.size))]
-            yield h, np.stack([laws[i] for i in first])
+            yield h, np.concatenate([laws[i] for i in first])
 
     # -- derivatives
     def score(
@@ -426,28 +473,50 @@ class HiddenMarkov(Scored):
         Where the density does not exist at theta: -inf, and NaN for the gradient.
         """
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
-        symbols = [s for s, w in zip(self.trace.parameter_symbols, wanted, strict=True) if w]
         total, gradient = 0.0, np.zeros(len(theta))
         for h in self.histories_of(experiments):
             found, stopped = self._forward(h, theta)
             if np.any(stopped >= 0):
                 return -np.inf, np.where(wanted, np.nan, 0.0)
             law, pairs = found.smoothed(pairs=True)
-            total += float(h.weights @ found.log_increments.sum(axis=1))
-            for role in ("initial", "transition", "observation"):
-                own = pairs if role == "transition" else law
-                slopes = [self.density(role, h, s) for s in symbols]
-                gradient[wanted] += self.expected(h, theta, role, slopes, own)
-        return total, gradient
+            total += _total(h, found)
+            module, which = self._slopes(h.missing, wanted)
+            own = np.zeros(len(which))
+            module.expected_slopes(
+                theta, h.y, h.seen, h.u, h.first, h.weights.astype(float), *self._over(),
+                len(found.move) > 1, law, pairs.reshape(len(law), -1), own,
+            )  # fmt: skip
+            gradient[which] += own
+        return total, np.where(wanted, gradient, 0.0)
+
+    def _slopes(self, missing: Missing, wanted: np.ndarray) -> tuple[Loaded, np.ndarray]:
+        """What sums derivatives up, and the positions of the parameters in which it does: all, as
+        long as there are derivatives in all, so that one module serves whatever is wanted.
+
+        Raises
+        ------
+        NotDifferentiable : there is none in closed form in some parameter that is wanted.
+        """
+        every = np.arange(len(wanted))
+        found = self._kept.once(("slopes", missing), self._tried, missing, every)
+        if not isinstance(found, NotDifferentiable):
+            return found, every
+        which, key = np.flatnonzero(wanted), ("slopes", missing, wanted.tobytes())
+        if isinstance(found := self._kept.once(key, self._tried, missing, which), Exception):
+            raise found
+        return found, which
+
+    def _tried(self, missing: Missing, which: np.ndarray) -> Loaded | NotDifferentiable:
+        symbols = self.trace.parameter_symbols
+        try:
+            return compile_slopes(self.trace, missing, [symbols[i] for i in which])
+        except NotDifferentiable as reason:
+            return reason
 
     # -- the pieces
     def _forward(self, h: Histories, theta: np.ndarray) -> tuple[Filtered, np.ndarray]:
         """The forward pass, and (S,) the row at which it came to an end, -1 if at none."""
-        start = self.over_values(self.density("initial", h), h, theta, "initial")[:, 0]
-        move = self.over_values(self.density("transition", h), h, theta, "transition")
-        log_g = self.over_values(self.density("observation", h), h, theta, "observation")
-        log_g = np.broadcast_to(log_g, (h.size, h.steps, len(self.values)))
-        return forward(np.ascontiguousarray(start), move, np.ascontiguousarray(log_g))
+        return self.tables(h, theta).forward(h.first)
 
     def _passes(
         self, experiments: Sequence[Experiment], theta: np.ndarray
@@ -473,6 +542,17 @@ class HiddenMarkov(Scored):
             yield h, found
 
 
+def _total(h: Histories, found: Filtered) -> float:
+    """The log-likelihood of all data sets."""
+    each = np.add.reduceat(found.log_increments, h.first[:-1])
+    return float(h.weights @ each)
+
+
+def _of_each(h: Histories, values: np.ndarray) -> list[np.ndarray]:
+    """Rows of all histories, by history."""
+    return np.split(values, h.first[1:-1])
+
+
 def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(T, D, D) sums over K of products of a and b (T, K, D)."""
     return a.transpose(0, 2, 1) @ b
@@ -487,12 +567,12 @@ def _in_order(each: Sequence[tuple[Histories, Sequence[T]]]) -> list[T]:
 
 
 @once_per_trace
-def _form(trace: Trace) -> tuple[FiniteStates | NotApplicable, dict[str, Expr]]:
-    """The finite form, and where its densities are kept."""
-    return finite_states(trace), {}
+def _form(trace: Trace) -> tuple[FiniteStates | NotApplicable, Kept]:
+    """The finite form, and where what is derived of it is kept."""
+    return finite_states(trace), Kept()
 
 
 def hidden_markov(trace: Trace) -> HiddenMarkov | NotApplicable:
     """The finite form of a traced model, derived once; or the reason why it has none."""
-    form, densities = _form(trace)
-    return form if isinstance(form, NotApplicable) else HiddenMarkov(trace, form, densities)
+    form, kept = _form(trace)
+    return form if isinstance(form, NotApplicable) else HiddenMarkov(trace, form, kept)

@@ -22,7 +22,6 @@ from ssmppl.codegen.text.kernel_functions import predictive
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
@@ -94,7 +93,7 @@ class Deterministic(Scored):
     def observation_variances(self, experiment: Experiment, theta: np.ndarray) -> np.ndarray:
         """(T, K) of each component of y_t given the states; NaN where there is none."""
         (h,) = histories(self.trace, [experiment], experiment.steps)
-        given: dict[Expr, np.ndarray] = {s: values[0] for s, values in h.rows.items()}
+        given = dict(h.rows)
         given |= dict(zip(self.trace.parameter_symbols, theta, strict=True))
         states = self.path(experiment, theta).T
         given |= dict(zip(self.trace.state_symbols, states, strict=True))

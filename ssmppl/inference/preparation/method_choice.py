@@ -38,6 +38,7 @@ def choose_sampler(
     singular: NotApplicable | None = None,
     twisted: TunedParticles | None = None,
     laplace: bool = False,
+    counted: bool = False,
 ) -> tuple[MetropolisHastings | Gibbs | PGAS | PMMH, str]:
     """The method for a model of this kind with these updates, and the reason.
 
@@ -51,6 +52,7 @@ def choose_sampler(
     `why_stuck`, for the others. singular : why the states have no joint density, as Gibbs and PGAS
     need it. twisted : how well a pilot found that the twisted filter knows the likelihood, where
     that is well enough. laplace : whether there may be such a pilot, before there are data.
+    counted : as of `only_counts`.
     """
     if isinstance(kind, NotApplicable) and twisted is not None:
         return PMMH(), (
@@ -59,7 +61,7 @@ def choose_sampler(
             "a pilot): Metropolis-Hastings over them, with proposals from the approximate posterior"
         )
     if isinstance(kind, NotApplicable) and laplace:
-        other, why = choose_sampler(kind, updates, numbers, stuck, singular)
+        other, why = choose_sampler(kind, updates, numbers, stuck, singular, counted=counted)
         return PMMH(), (
             "over twisted particle filters, where a pilot on the data finds that these know the "
             f"likelihood; else {type(other).__name__}: {why}"
@@ -75,6 +77,11 @@ def choose_sampler(
             "which needs none"
         )
     if isinstance(kind, NotApplicable):
+        if not stuck and counted and numbers <= FEW:
+            return PMMH(), (
+                "the states are counts, given whose trajectory parameters mix slowly: random-walk "
+                "Metropolis on the particle filter's likelihood"
+            )
         if not stuck:
             return PGAS(interweave="auto"), (
                 "the model is not linear Gaussian: trajectories by conditional SMC; parameters "
@@ -138,18 +145,24 @@ def why_stuck(trace: Trace, rows: int | None) -> str:
             "the transition is noise-free, so that PGAS cannot update the states; "
             + start_as_parameter(trace)
         )
-    random = [
-        s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
-    ]
     reason = (
         "the model has a deterministic state with infinite memory, so that ancestor sampling is "
         "impossible"
     )
-    if all(d.support().kind == "integers" for d in random):
+    if only_counts(trace):
         return f"{reason}, and given a trajectory of counts parameters mix slowly"
     if rows is None or rows > ROWS_WITHOUT_ANCESTORS:
         return f"{reason}; with more than {ROWS_WITHOUT_ANCESTORS} rows early states mix slowly"
     return ""
+
+
+def only_counts(trace: Trace) -> bool:
+    """Whether every state that moves by chance is a whole number: then there are no noises to hold
+    fixed, and what the parameters are known by given a trajectory is all that moves them."""
+    random = [
+        s.distribution for s in trace.transition.values() if not isinstance(s.distribution, Dirac)
+    ]
+    return bool(random) and all(d.support().kind == "integers" for d in random)
 
 
 def start_as_parameter(trace: Trace) -> str:

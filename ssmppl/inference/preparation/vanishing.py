@@ -10,13 +10,14 @@ mixture of normal distributions", *Biometrika* 56).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from ssmppl.codegen.text.kernel_functions import predictive
 from ssmppl.data import Experiment, spelled
 from ssmppl.errors import NotApplicable, SamplingError
+from ssmppl.expressions.expr import Expr
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import ExactModel
@@ -34,9 +35,12 @@ def without_maximum(
     rows : how many a value of finitely many states has to tell exactly.
     """
     laws = {n: site.distribution for n, site in model.trace.observations.items()}
+    if all(law.discrete for law in laws.values()):
+        return None
+    forms = [v for site in model.trace.observations.values() for _, v, *_ in predictive(site)]
     for e in experiments:
         try:
-            predicted = _variances(model, e, theta)
+            predicted = _variances(model, e, theta, forms)
         except SamplingError:
             continue
         for k, symbol in enumerate(model.trace.observation_symbols):
@@ -63,20 +67,20 @@ def without_maximum(
     return None
 
 
-def _variances(model: ExactModel, e: Experiment, theta: np.ndarray) -> np.ndarray:
+def _variances(
+    model: ExactModel, e: Experiment, theta: np.ndarray, forms: Sequence[Expr]
+) -> np.ndarray:
     """(T, K) of the one-step predictions of each component; of finitely many states, given the
-    value that is likeliest by all data."""
+    value that is likeliest by all data, by the forms that the variances have then."""
     if isinstance(model, Deterministic):
         return model.observation_variances(e, theta)
     if isinstance(model, HiddenMarkov):
         ((h, law, _),) = model.laws([e], theta)
-        likeliest = np.argmax(law[0], axis=1)
+        likeliest = np.argmax(law, axis=1)
         found = []
-        for site in model.trace.observations.values():
-            for _, variance, *_ in predictive(site):
-                each = model.over_values(variance, h, theta, "observation")[0]
-                each = np.broadcast_to(each, law[0].shape)
-                found.append(each[np.arange(e.steps), likeliest])
+        for variance in forms:
+            each = np.broadcast_to(model.over_values(variance, h, theta, "observation"), law.shape)
+            found.append(each[np.arange(e.steps), likeliest])
         return np.stack(found, axis=1)
     return np.diagonal(model.filter(e, theta).observation_covariance, axis1=1, axis2=2)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,40 @@ EXACT = ("kalman", "forward", "deterministic")
 
 
 @dataclass(frozen=True)
+class EndToEnd:
+    """E data sets end to end in R rows: that of number e has the rows first[e], ...,
+    first[e + 1] - 1. y, seen, u : (R, ...), as of `Experiment`."""
+
+    first: np.ndarray
+    y: np.ndarray
+    seen: np.ndarray
+    u: np.ndarray
+
+    @classmethod
+    def of(cls, experiments: Sequence[Experiment]) -> EndToEnd:
+        first = np.concatenate([[0], np.cumsum([e.steps for e in experiments])])
+        return cls(first, *(joined([getattr(e, n) for e in experiments]) for n in _ROWS))
+
+    @property
+    def data(self) -> tuple[np.ndarray, ...]:
+        """y, seen, u and first, as kernels over all data sets take them."""
+        return self.y, self.seen, self.u, self.first
+
+    def split(self, rows: np.ndarray) -> list[np.ndarray]:
+        """The rows (R, ...) of each data set, not copied."""
+        first = self.first.tolist()
+        return [rows[a:b] for a, b in pairwise(first)]
+
+
+_ROWS = ("y", "seen", "u")
+
+
+def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows of all data sets end to end; of a single one its own."""
+    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+
+
+@dataclass(frozen=True)
 class Problem:
     """The traced model, its data sets and its generated program."""
 
@@ -35,6 +71,11 @@ class Problem:
     def rows(self) -> int:
         """Of all data sets together."""
         return sum(e.steps for e in self.experiments)
+
+    @cached_property
+    def end_to_end(self) -> EndToEnd:
+        """The data sets as passes over all of them take them."""
+        return EndToEnd.of(self.experiments)
 
     def proposal(self, name: str, integrate: bool = False, others: Sequence[str] = ()) -> Proposal:
         """A derived proposal.

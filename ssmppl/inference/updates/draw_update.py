@@ -4,8 +4,10 @@ The draw leaves the exact conditional invariant, whatever path it takes:
 
 - conjugate part, kept if it lies within the bounds and passes the correction: accept-reject, an
   independent draw from the conditional itself;
-- after `MAX_TRIES` refusals a sweep of slice steps instead. How many refusals there were does not
-  depend on the current value, so this mixes two kernels that both leave the conditional invariant;
+- after `MAX_TRIES` refusals a sweep of slice steps instead, or after `LOOK` of them that had next
+  to no chance, as where many data sets share a parameter of their initial law. How many refusals
+  there were, and what was refused, does not depend on the current value, so this mixes two kernels
+  that both leave the conditional invariant;
 - a correction without a known upper bound, or one that does not separate and is taken from the log
   joint density: a Metropolis-Hastings step that proposes from the conjugate part, then always a
   sweep of slice steps, so that no value is held for long;
@@ -45,6 +47,8 @@ from ssmppl.inference.updates.slices import (
 )
 
 MAX_TRIES = 100
+LOOK = 10  # tries, after which
+HOPELESS = 1e-3  # is the mean chance of acceptance with which no more are made
 LogJoint = Callable[[np.ndarray], float]
 
 
@@ -146,6 +150,7 @@ class UpdateSampler:
         ceiling = self.ceiling(c) if weights else 0.0
         if update.inseparable_terms or not ceiling < math.inf:
             return self.metropolis(c, current, limits, rng, log_joint)
+        refused, chances = 0, 0.0
         for tries in range(1, MAX_TRIES + 1):
             v = self.conjugate(c, limits, rng)
             if v is None:
@@ -155,9 +160,12 @@ class UpdateSampler:
             if weights:
                 excess = self.correct(v, weights) - ceiling
                 if not (excess >= 0.0 or rng.standard_exponential() >= -excess):
+                    refused, chances = refused + 1, chances + math.exp(excess)
+                    if refused == LOOK and chances < LOOK * HOPELESS:
+                        break
                     continue
             return np.array(v), DrawInfo("conjugate", tries, True)
-        return self.slices(c, current, limits, rng, None, MAX_TRIES)
+        return self.slices(c, current, limits, rng, None, tries)
 
     def metropolis(
         self, c: list[float], current: np.ndarray, limits: list[Interval],

@@ -36,6 +36,7 @@ from ssmppl.inference.preparation.method_choice import (
     choose_maximiser,
     choose_sampler,
     choose_smoother,
+    only_counts,
     why_stuck,
 )
 from ssmppl.inference.run.problem import missing_of
@@ -164,6 +165,7 @@ class Plan:
                 why_stuck(self.trace, self.rows),
                 singular_covariance(self.trace),
                 laplace=self.laplace is None and 0 < self._numbers() <= MOST_NUMBERS,
+                counted=only_counts(self.trace),
             )
         }
         if self.trace.parameters:

@@ -34,7 +34,7 @@ from ssmppl.inference.methods.methods import (
 from ssmppl.inference.methods.settings import check_settings
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
 from ssmppl.inference.preparation.gaussian_pilot import precise_twisted
-from ssmppl.inference.preparation.method_choice import choose_sampler, why_stuck
+from ssmppl.inference.preparation.method_choice import choose_sampler, only_counts, why_stuck
 from ssmppl.inference.preparation.space import Space, free_components, space_of
 from ssmppl.inference.run.convergence import have_mixed, mixing_attributes
 from ssmppl.inference.run.draws import stack
@@ -271,7 +271,10 @@ def _chosen(space: Space, fixed_values: dict[str, np.ndarray]) -> tuple[Method, 
     drawn = not isinstance(exact, NotApplicable) and singular is None
     updates = plan_updates(problem, fixed_values) if drawn else ()
     twisted = precise_twisted(space) if isinstance(exact, NotApplicable) else None
-    return choose_sampler(exact_kind(exact), updates, numbers, stuck, singular, twisted)
+    counted = only_counts(problem.trace)
+    return choose_sampler(
+        exact_kind(exact), updates, numbers, stuck, singular, twisted, counted=counted
+    )
 
 
 def _to_arviz(

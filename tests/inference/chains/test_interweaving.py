@@ -71,7 +71,7 @@ def test_noises_and_back(name, steered):
         _back, home = move.at(theta, held, away)
         np.testing.assert_allclose(home[0], paths[0], rtol=1e-8, atol=1e-8)
         _, held_there = move.stand(near, away)
-        np.testing.assert_allclose(held_there[0], held[0], rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(held_there, held, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize(("name", "steered"), SHAPES)
@@ -80,8 +80,8 @@ def test_volume_is_that_of_finite_differences(name, steered):
     problem, theta, paths = posed(name, 1)
     move = move_of(problem, theta, steered)
     _, held = move.stand(theta, paths)
-    e, (experiment,) = held[0], problem.experiments
-    guide = move._guide(0, theta, experiment)
+    e, (experiment,) = held, problem.experiments
+    guide = move._guide(theta)
 
     def path_of(noise):
         new = np.empty_like(paths[0])
@@ -153,17 +153,18 @@ class WithoutVolume(NoiseMove):
 class WithoutStart(NoiseMove):
     """A mutant, of `linear`: the initial law is forgotten."""
 
-    def _log_joint(self, theta, e, path):
+    def _log_joints(self, theta, rows):
         phi, q, _ = theta
-        return super()._log_joint(theta, e, path) - normal_log(path[0, 0], q / (1 - phi**2))
+        return super()._log_joints(theta, rows) - normal_log(rows[0, 0], q / (1 - phi**2))
 
 
 class WithoutData(NoiseMove):
     """A mutant, of `linear`: the observations' ratio is forgotten."""
 
-    def _log_joint(self, theta, e, path):
-        away = normal_log(e.y[:, 0] - path[:, 0], theta[2])
-        return super()._log_joint(theta, e, path) - away[e.seen[:, 0] == 1.0].sum()
+    def _log_joints(self, theta, rows):
+        (e,) = self.problem.experiments
+        away = normal_log(e.y[:, 0] - rows[:, 0], theta[2])
+        return super()._log_joints(theta, rows) - away[e.seen[:, 0] == 1.0].sum()
 
 
 def changes(name, steered, kind, draws=2000, sweeps=5):

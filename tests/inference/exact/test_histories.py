@@ -12,6 +12,7 @@ from ssmppl.inference.exact import hidden_markov as tables
 from ssmppl.inference.exact.hidden_markov import hidden_markov
 from ssmppl.inference.exact.histories import histories
 from ssmppl.inference.run.seeds import random_state, seed_sequence
+from ssmppl.language.model.trace import previous
 from ssmppl.language.tracing import trace
 from tests.models.finite import MODELS, data_of, enumerated, weather
 from tests.statistics.checks import LEVEL, seed_of
@@ -128,24 +129,29 @@ def test_equal_data_sets_stand_once_and_inputs_apart(case):
     for h in found:
         for i, s in zip(h.members, h.which, strict=True):
             e = experiments[i]
-            assert (e.steps, e.partial) == (h.steps, h.partial)
+            assert e.steps == h.steps[s]
+            np.testing.assert_array_equal(h.y[h.of(s)], e.y)
             for k, u in enumerate(traced.input_symbols):
-                rows = np.broadcast_to(h.rows[u], (h.size, h.steps))
-                np.testing.assert_array_equal(rows[s], e.u[:, k])
+                np.testing.assert_array_equal(h.rows[u][h.of(s)], e.u[:, k])
+                before = np.concatenate([e.u[:1, k], e.u[:-1, k]])
+                np.testing.assert_array_equal(h.rows[previous(u)][h.of(s)], before)
     assert any(h.weights.max() > 1 for h in found)
     assert histories(traced, experiments, 10**6) is found
     assert histories(traced, [*experiments], 10**6) is found
     assert histories(traced, experiments, 2) is not found
 
 
-def test_the_laws_are_evaluated_once_for_all_of_a_shape(monkeypatch):
+def test_all_data_sets_share_one_pass(monkeypatch):
+    """Whatever their lengths; no density is left to the interpreter."""
     traced, calls = trace(weather()), []
     evaluate = tables.evaluate
     monkeypatch.setattr(tables, "evaluate", lambda *a: calls.append(1) or evaluate(*a))
+    forward = tables.Tables.forward
+    monkeypatch.setattr(tables.Tables, "forward", lambda *a: calls.append(2) or forward(*a))
     rng = np.random.default_rng(1)
-    experiments = bind(traced, [{"y": rng.normal(size=7)} for _ in range(100)])
-    hidden_markov(traced).log_likelihood(experiments, np.array(MODELS["weather"][1]))
-    assert len(calls) == 3  # initial, transition, observation
+    experiments = bind(traced, [{"y": rng.normal(size=n)} for n in (7, 3, 5, 1) * 25])
+    hidden_markov(traced).score(experiments, np.array(MODELS["weather"][1]))
+    assert calls == [2]
 
 
 def test_what_cannot_be_names_the_data_set():

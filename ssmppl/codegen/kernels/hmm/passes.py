@@ -3,11 +3,11 @@
 L. Rabiner, *Proceedings of the IEEE* 77 (1989), sections III A, B and V A (scaling); backward
 sampling: C. Chib, *Journal of Econometrics* 75 (1996).
 
-Notation: S sequences of T rows, K values; log_start (S or 1, K), log_move (S or 1, T or 1, K, K)
-with exp(log_move[s, t, i, j]) = move[s, t, i, j] = P(x_t = j | x_{t-1} = i) (row 0 without meaning
-where there are T), log_g (S, T, K) of y_t given x_t. What has one row where there are S or T is the
-same for all. From a value i that the data rule out the move need not be defined: its probability 0
-is no factor of it.
+Notation: S sequences end to end in R rows, sequence s in rows first[s], ..., first[s + 1] - 1; K
+values; log_start (S, K), log_move (R or 1, K, K) with exp(log_move[t, i, j]) = move[t, i, j] =
+P(x_t = j | x_{t-1} = i), which is without meaning at the first row of a sequence, and the same for
+all where there is one row; log_g (R, K) of y_t given x_t. From a value i that the data rule out the
+move need not be defined: its probability 0 is no factor of it.
 
 Each pass stands here twice: by probabilities, and (`..._logs`) by logarithms, exact however
 unlikely a value has become, with the logarithms of `move`, `predicted` and `filtered` in their
@@ -41,220 +41,220 @@ def chosen_of(w, level):
 
 
 @exact
-def forward(move, log_start, log_move, log_g, increments, predicted, filtered, stopped):
-    """Fill increments (S, T), log p(y_t | y_{1:t-1}), the laws (S, T, K) of x_t given y_{1:t-1} and
-    given y_{1:t}, and stopped (S,), the row (from 0) at which no value is possible, -1 if none
-    is, UNSURE where these laws may lack a value that matters.
+def forward(first, move, log_start, log_move, log_g, increments, predicted, filtered, stopped):
+    """Fill increments (R,), log p(y_t | y_{1:t-1}), the laws (R, K) of x_t given y_{1:t-1} and
+    given y_{1:t}, and stopped (S,), the row (from 0, of the sequence) at which no value is
+    possible, -1 if none is, UNSURE where these laws may lack a value that matters.
 
     A share below FAINT is faint. It does not matter in the next row where the others come to DIM;
     where they do not, the value there is dim, of a share below about DIM, and it has to be shown
     that the row of data leaves it faint. In the end what is faint does not matter.
     """
-    n_sequences, n_steps, n = log_g.shape
+    n = log_g.shape[1]
     faint, dim = np.empty(n, dtype=np.bool_), np.empty(n, dtype=np.bool_)
-    for s in range(n_sequences):
-        first = s if log_start.shape[0] > 1 else 0
-        b = s if move.shape[0] > 1 else 0
+    for s in range(stopped.size):
+        begin = first[s]
         stopped[s] = -1
-        for t in range(n_steps):
-            a = t if move.shape[1] > 1 else 0
+        for t in range(begin, first[s + 1]):
+            a = t if move.shape[0] > 1 else 0
             for j in range(n):
-                if t == 0:
-                    total = math.exp(log_start[first, j])
-                    dim[j] = total < DIM and log_start[first, j] > -np.inf
+                if t == begin:
+                    total = math.exp(log_start[s, j])
+                    dim[j] = total < DIM and log_start[s, j] > -np.inf
                 else:
                     total = 0.0
                     for i in range(n):
-                        if filtered[s, t - 1, i] > 0.0:
-                            total += filtered[s, t - 1, i] * move[b, a, i, j]
+                        if filtered[t - 1, i] > 0.0:
+                            total += filtered[t - 1, i] * move[a, i, j]
                     dim[j] = False
                     if total < DIM:
                         for i in range(n):
-                            if faint[i] or filtered[s, t - 1, i] > 0.0:
-                                dim[j] = dim[j] or log_move[b, a, i, j] > -np.inf
-                predicted[s, t, j] = total
+                            if faint[i] or filtered[t - 1, i] > 0.0:
+                                dim[j] = dim[j] or log_move[a, i, j] > -np.inf
+                predicted[t, j] = total
             top, hidden = -np.inf, -np.inf
             for j in range(n):
-                if dim[j] and log_g[s, t, j] > hidden:
-                    hidden = log_g[s, t, j]
-                if not dim[j] and predicted[s, t, j] > 0.0 and log_g[s, t, j] > top:
-                    top = log_g[s, t, j]
+                if dim[j] and log_g[t, j] > hidden:
+                    hidden = log_g[t, j]
+                if not dim[j] and predicted[t, j] > 0.0 and log_g[t, j] > top:
+                    top = log_g[t, j]
             if top == np.inf:
-                stopped[s] = t
+                stopped[s] = t - begin
                 break
             if not top > -np.inf:
-                stopped[s] = UNSURE if hidden > -np.inf else t
+                stopped[s] = UNSURE if hidden > -np.inf else t - begin
                 break
             total = 0.0
             for j in range(n):
-                filtered[s, t, j] = 0.0
-                if predicted[s, t, j] > 0.0 and not dim[j]:
-                    filtered[s, t, j] = predicted[s, t, j] * math.exp(log_g[s, t, j] - top)
-                total += filtered[s, t, j]
+                filtered[t, j] = 0.0
+                if predicted[t, j] > 0.0 and not dim[j]:
+                    filtered[t, j] = predicted[t, j] * math.exp(log_g[t, j] - top)
+                total += filtered[t, j]
             if not 0.0 < total < np.inf:
                 # the likeliest by the data may be too unlikely before them
-                stopped[s] = UNSURE if total == 0.0 else t
+                stopped[s] = UNSURE if total == 0.0 else t - begin
                 break
-            increments[s, t] = math.log(total) + top
-            if hidden - increments[s, t] > LEFT_FAINT:
+            increments[t] = math.log(total) + top
+            if hidden - increments[t] > LEFT_FAINT:
                 stopped[s] = UNSURE
                 break
             for j in range(n):
-                filtered[s, t, j] /= total
-                possible = dim[j] or predicted[s, t, j] > 0.0
-                faint[j] = possible and filtered[s, t, j] < FAINT and log_g[s, t, j] > -np.inf
+                filtered[t, j] /= total
+                possible = dim[j] or predicted[t, j] > 0.0
+                faint[j] = possible and filtered[t, j] < FAINT and log_g[t, j] > -np.inf
 
 
 @exact
-def backward(move, predicted, filtered, smoothed, pairs):
-    """Fill the laws (S, T, K) of x_t given y_{1:T}, and pairs (S, T, K, K) of (x_{t-1}, x_t), row 0
-    zero; pairs of no sequences are left out."""
-    n_sequences, n_steps, n = filtered.shape
-    last = n_steps - 1
+def backward(first, move, predicted, filtered, smoothed, pairs):
+    """Fill the laws (R, K) of x_t given y_{1:T}, and pairs (R, K, K) of (x_{t-1}, x_t), zero at the
+    first rows; pairs of no rows are left out."""
+    n = filtered.shape[1]
     ratio = np.empty(n)
-    for s in range(n_sequences):
-        b = s if move.shape[0] > 1 else 0
+    for s in range(first.size - 1):
+        begin, last = first[s], first[s + 1] - 1
         for j in range(n):
-            smoothed[s, last, j] = filtered[s, last, j]
-        for t in range(last, 0, -1):
-            a = t if move.shape[1] > 1 else 0
+            smoothed[last, j] = filtered[last, j]
+        for t in range(last, begin, -1):
+            a = t if move.shape[0] > 1 else 0
             for j in range(n):
                 ratio[j] = 0.0
-                if predicted[s, t, j] > 0.0:
-                    ratio[j] = smoothed[s, t, j] / predicted[s, t, j]
+                if predicted[t, j] > 0.0:
+                    ratio[j] = smoothed[t, j] / predicted[t, j]
             for i in range(n):
                 total = 0.0
                 for j in range(n):
                     share = 0.0
-                    if filtered[s, t - 1, i] > 0.0:
-                        share = filtered[s, t - 1, i] * move[b, a, i, j] * ratio[j]
+                    if filtered[t - 1, i] > 0.0:
+                        share = filtered[t - 1, i] * move[a, i, j] * ratio[j]
                     total += share
                     if pairs.shape[0]:
-                        pairs[s, t, i, j] = share
-                smoothed[s, t - 1, i] = total
+                        pairs[t, i, j] = share
+                smoothed[t - 1, i] = total
         if pairs.shape[0]:
-            pairs[s, 0] = 0.0
+            pairs[begin] = 0.0
 
 
 @exact
-def sample_backward(move, filtered, which, uniforms, paths):
-    """Fill paths (M, T) with indices of values drawn from p(x_{1:T} | y_{1:T}), path m of sequence
-    which[m], by uniforms of the same shape."""
-    n_steps, n = filtered.shape[1:]
+def sample_backward(first, move, filtered, which, uniforms, paths):
+    """Fill paths with indices of values drawn from p(x_{1:T} | y_{1:T}), path m of sequence
+    which[m], end to end, by as many uniforms."""
+    n = filtered.shape[1]
     w = np.empty(n)
-    for m in range(paths.shape[0]):
-        s = which[m]
-        b = s if move.shape[0] > 1 else 0
-        for t in range(n_steps - 1, -1, -1):
+    at = 0  # the place of the row `first[which[m]]` of path m
+    for m in range(which.size):
+        begin, end = first[which[m]], first[which[m] + 1]
+        for t in range(end - 1, begin - 1, -1):
+            k = at + t - begin
             total = 0.0
             for i in range(n):
-                w[i] = filtered[s, t, i]
-                if t < n_steps - 1 and w[i] > 0.0:
-                    a = t + 1 if move.shape[1] > 1 else 0
-                    w[i] *= move[b, a, i, paths[m, t + 1]]
+                w[i] = filtered[t, i]
+                if t < end - 1 and w[i] > 0.0:
+                    a = t + 1 if move.shape[0] > 1 else 0
+                    w[i] *= move[a, i, paths[k + 1]]
                 total += w[i]
-            paths[m, t] = chosen_of(w, uniforms[m, t] * total)
+            paths[k] = chosen_of(w, uniforms[k] * total)
+        at += end - begin
 
 
 @exact
-def forward_logs(log_start, log_move, log_g, increments, predicted, filtered, stopped):
+def forward_logs(first, log_start, log_move, log_g, increments, predicted, filtered, stopped):
     """As `forward`; stopped is never UNSURE."""
-    n_sequences, n_steps, n = log_g.shape
-    for s in range(n_sequences):
-        first = s if log_start.shape[0] > 1 else 0
-        b = s if log_move.shape[0] > 1 else 0
+    n = log_g.shape[1]
+    for s in range(stopped.size):
+        begin = first[s]
         stopped[s] = -1
-        for t in range(n_steps):
-            a = t if log_move.shape[1] > 1 else 0
+        for t in range(begin, first[s + 1]):
+            a = t if log_move.shape[0] > 1 else 0
             top = -np.inf
             for j in range(n):
-                if t == 0:
-                    predicted[s, 0, j] = log_start[first, j]
+                if t == begin:
+                    predicted[t, j] = log_start[s, j]
                 else:
                     most, total = -np.inf, 0.0
                     for i in range(n):
-                        way = filtered[s, t - 1, i] + log_move[b, a, i, j]
-                        if filtered[s, t - 1, i] > -np.inf and way > most:
+                        way = filtered[t - 1, i] + log_move[a, i, j]
+                        if filtered[t - 1, i] > -np.inf and way > most:
                             most = way
                     for i in range(n):
-                        if most > -np.inf and filtered[s, t - 1, i] > -np.inf:
-                            total += math.exp(filtered[s, t - 1, i] + log_move[b, a, i, j] - most)
-                    predicted[s, t, j] = math.log(total) + most if total > 0.0 else -np.inf
-                if predicted[s, t, j] > -np.inf and predicted[s, t, j] + log_g[s, t, j] > top:
-                    top = predicted[s, t, j] + log_g[s, t, j]
+                        if most > -np.inf and filtered[t - 1, i] > -np.inf:
+                            total += math.exp(filtered[t - 1, i] + log_move[a, i, j] - most)
+                    predicted[t, j] = math.log(total) + most if total > 0.0 else -np.inf
+                if predicted[t, j] > -np.inf and predicted[t, j] + log_g[t, j] > top:
+                    top = predicted[t, j] + log_g[t, j]
             if not top > -np.inf or top == np.inf:
-                stopped[s] = t
+                stopped[s] = t - begin
                 break
             total = 0.0
             for j in range(n):
-                filtered[s, t, j] = -np.inf
-                if predicted[s, t, j] > -np.inf:
-                    filtered[s, t, j] = predicted[s, t, j] + log_g[s, t, j] - top
-                    total += math.exp(filtered[s, t, j])
+                filtered[t, j] = -np.inf
+                if predicted[t, j] > -np.inf:
+                    filtered[t, j] = predicted[t, j] + log_g[t, j] - top
+                    total += math.exp(filtered[t, j])
             if not 0.0 < total < np.inf:
-                stopped[s] = t
+                stopped[s] = t - begin
                 break
             for j in range(n):
-                filtered[s, t, j] -= math.log(total)
-            increments[s, t] = math.log(total) + top
+                filtered[t, j] -= math.log(total)
+            increments[t] = math.log(total) + top
 
 
 @exact
-def backward_logs(move, predicted, filtered, smoothed, pairs):
+def backward_logs(first, move, predicted, filtered, smoothed, pairs):
     """As `backward`; smoothed and pairs are probabilities."""
-    n_sequences, n_steps, n = filtered.shape
-    last = n_steps - 1
+    n = filtered.shape[1]
     ratio, log_law = np.empty(n), np.empty(n)
-    for s in range(n_sequences):
-        b = s if move.shape[0] > 1 else 0
+    for s in range(first.size - 1):
+        begin, last = first[s], first[s + 1] - 1
         for j in range(n):
-            log_law[j] = filtered[s, last, j]
-            smoothed[s, last, j] = math.exp(log_law[j])
-        for t in range(last, 0, -1):
-            a = t if move.shape[1] > 1 else 0
+            log_law[j] = filtered[last, j]
+            smoothed[last, j] = math.exp(log_law[j])
+        for t in range(last, begin, -1):
+            a = t if move.shape[0] > 1 else 0
             for j in range(n):
                 ratio[j] = -np.inf
                 if log_law[j] > -np.inf:
-                    ratio[j] = log_law[j] - predicted[s, t, j]
+                    ratio[j] = log_law[j] - predicted[t, j]
             for i in range(n):
-                own = filtered[s, t - 1, i]
+                own = filtered[t - 1, i]
                 most, total = -np.inf, 0.0
                 for j in range(n):
                     possible = own > -np.inf and ratio[j] > -np.inf
-                    if possible and move[b, a, i, j] + ratio[j] > most:
-                        most = move[b, a, i, j] + ratio[j]
+                    if possible and move[a, i, j] + ratio[j] > most:
+                        most = move[a, i, j] + ratio[j]
                 for j in range(n):
                     share = -np.inf
                     if own > -np.inf and ratio[j] > -np.inf:
-                        share = move[b, a, i, j] + ratio[j]
+                        share = move[a, i, j] + ratio[j]
                     if most > -np.inf:
                         total += math.exp(share - most)
                     if pairs.shape[0]:
-                        pairs[s, t, i, j] = math.exp(share + own)
+                        pairs[t, i, j] = math.exp(share + own)
                 log_law[i] = own + math.log(total) + most if total > 0.0 else -np.inf
-                smoothed[s, t - 1, i] = math.exp(log_law[i])
+                smoothed[t - 1, i] = math.exp(log_law[i])
         if pairs.shape[0]:
-            pairs[s, 0] = 0.0
+            pairs[begin] = 0.0
 
 
 @exact
-def sample_backward_logs(move, filtered, which, uniforms, paths):
+def sample_backward_logs(first, move, filtered, which, uniforms, paths):
     """As `sample_backward`."""
-    n_steps, n = filtered.shape[1:]
+    n = filtered.shape[1]
     w = np.empty(n)
-    for m in range(paths.shape[0]):
-        s = which[m]
-        b = s if move.shape[0] > 1 else 0
-        for t in range(n_steps - 1, -1, -1):
+    at = 0
+    for m in range(which.size):
+        begin, end = first[which[m]], first[which[m] + 1]
+        for t in range(end - 1, begin - 1, -1):
+            k = at + t - begin
             most, total = -np.inf, 0.0
             for i in range(n):
-                w[i] = filtered[s, t, i]
-                if t < n_steps - 1 and w[i] > -np.inf:
-                    a = t + 1 if move.shape[1] > 1 else 0
-                    w[i] += move[b, a, i, paths[m, t + 1]]
+                w[i] = filtered[t, i]
+                if t < end - 1 and w[i] > -np.inf:
+                    a = t + 1 if move.shape[0] > 1 else 0
+                    w[i] += move[a, i, paths[k + 1]]
                 if w[i] > most:
                     most = w[i]
             for i in range(n):
                 w[i] = math.exp(w[i] - most)
                 total += w[i]
-            paths[m, t] = chosen_of(w, uniforms[m, t] * total)
+            paths[k] = chosen_of(w, uniforms[k] * total)
+        at += end - begin

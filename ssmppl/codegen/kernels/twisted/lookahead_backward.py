@@ -196,6 +196,33 @@ def look_back_scalar(x, rest, jacobian, spread, spread_initial, g, h, a, pull):
 
 
 @exact
+def look_back_each(first, x, rest, jacobian, spread, spread_initial, g, h, a, pull, aim, gain):
+    """`look_back` over E data sets end to end, that of number e in the rows first[e], ...,
+    first[e + 1] - 1; spread_initial : (E, D, R_1)."""
+    for e in range(first.size - 1):
+        i, j = first[e], first[e + 1]
+        if not look_back(
+            x[i:j], rest[i:j], jacobian[i:j], spread[i:j], spread_initial[e], g[i:j], h[i:j], 0,
+            a[i:j], pull[i:j], aim[i:j], gain[i:j],
+        ):  # fmt: skip
+            return False
+    return True
+
+
+@exact
+def look_back_scalar_each(first, x, rest, jacobian, spread, spread_initial, g, h, a, pull):
+    """`look_back_scalar` likewise."""
+    for e in range(first.size - 1):
+        i, j = first[e], first[e + 1]
+        if not look_back_scalar(
+            x[i:j], rest[i:j], jacobian[i:j], spread[i:j], spread_initial[e], g[i:j], h[i:j],
+            a[i:j], pull[i:j],
+        ):  # fmt: skip
+            return False
+    return True
+
+
+@exact
 def write_guide(a, pull, x, u, aim, spread_initial, out):
     """out (T, U + G): the inputs, then each row's guide; False where its start is no number.
 
