@@ -29,6 +29,7 @@ WHOLE = [("case", "emps"), ("case", "silverbox"), ("gap", "simulator")]
 # What takes longest; models of single features of the language, of which those above have most.
 HEAVY = [("example", "seir"), ("example", "vehicle"), ("case", "pendulum_steps"),
          ("bench", "motor_belt"), *(m for m in MODELS if m[0] == "features")]  # fmt: skip
+RARER = [m for i, m in enumerate(m for m in MODELS if m[0] == "corpus") if i % 3]  # much alike
 SOME, MORE = 4000, 400  # of the pairs of all models, one in so many by itself
 
 
@@ -49,7 +50,7 @@ def as_it_is(function, role, arguments, known):
     return function(**{n: arguments[n] for n in own if n in arguments})
 
 
-@pytest.mark.parametrize(("where", "name"), marked(MODELS, HEAVY))
+@pytest.mark.parametrize(("where", "name"), marked(MODELS, HEAVY + RARER))
 def test_every_effect_by_itself(where, name):
     """Added and analysed one by one; and scored, all at once as a screen does it."""
     t = traced(where, name)

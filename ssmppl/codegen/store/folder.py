@@ -151,7 +151,8 @@ def _wait_for(handle: int) -> None:
     if _locked(handle):
         return
     until = time.monotonic() + PATIENCE
-    with event.trigger_event("numba:compile"):  # a notice is due as if we compiled ourselves
+    # A notice is due as if we compiled ourselves.
+    with event.trigger_event("numba:compile", data={"dispatcher": None}):
         while not _locked(handle) and time.monotonic() < until:
             time.sleep(0.02)
 
