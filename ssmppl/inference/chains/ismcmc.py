@@ -208,13 +208,11 @@ def _jump_chains(
     runs = ApproximateRuns(gaussian.likelihood(setup.problem))
     like = MetropolisHastings(target_acceptance=method.target_acceptance)
     usual = USUAL_EXACT.get(len(where), 0.234)
-    kernel, states, _ = walk(
-        setup, like, runs, where, gaussian.pilot, "bootstrap", 0, usual, gaussian=gaussian
-    )
+    made = walk(setup, like, runs, where, gaussian.pilot, "bootstrap", 0, usual, gaussian=gaussian)
     steps = method.steps or (FEW_STEPS if gaussian.well_proposed else MANY_STEPS)
-    kernel = replace(kernel, thin=steps * setup.thin)
+    kernel = replace(made.kernel, thin=steps * setup.thin)
     found: Sequence[ChainDraws[Any]] = run_chains(
-        partial(jump_block, kernel), states, length, setup.warmup, executor=executor,
+        partial(jump_block, kernel), made.states, length, setup.warmup, executor=executor,
         progress=progress, title="ISMCMC, approximate chain",
     )  # fmt: skip
     if any(c.interrupted for c in found):
