@@ -166,19 +166,6 @@ def ratio_without_prior(original):
     return iterate
 
 
-def first_stage_not_taken_back(original):
-    """The second stage of delayed acceptance takes the ratio of the likelihoods as it is."""
-
-    def delayed(kernel, state, made, normals):
-        new, promising, probability = original(kernel, state, made, normals)
-        if new is not None:
-            change = new.run.log_likelihood - state.point.run.log_likelihood
-            probability = min(1.0, float(np.exp(min(change, 0.0))))
-        return new, promising, probability
-
-    return delayed
-
-
 @dataclass(frozen=True)
 class _Flat:
     """Coordinates whose log density is nought inside of the support."""
@@ -251,8 +238,6 @@ MUTANTS = {
         Mutant("states of before", "counts PMMH", ((metropolis_kernel, "_iterate", states_kept),)),
         Mutant("no prior in the ratio", "counts PMMH",
                ((metropolis_kernel, "_iterate", ratio_without_prior),)),
-        Mutant("first stage not taken back", "counts PMMH delayed",
-               ((metropolis_kernel, "_delayed", first_stage_not_taken_back),)),
         Mutant("prior counted twice", "two_states PGAS eliminated",
                ((elimination.Eliminating, "_draw", prior_twice),)),
     )

@@ -102,7 +102,7 @@ def test_joint_distribution_is_left_invariant(name):
 
 
 FEW = ("wrong rate", "stationary initial law forgotten", "no Jacobian of the scale",
-       "no prior in the ratio", "first stage not taken back")  # fmt: skip
+       "no prior in the ratio")  # fmt: skip
 WEAK = {  # beyond the power of this length
     "no Jacobian of the scale, PMMH", "states of before", "given the other blocks of before",
 }  # fmt: skip

@@ -138,8 +138,7 @@ class TwistedFilter:
         """
         out = np.zeros((len(y), u.shape[1] + len(self.order)))
         out[:, : u.shape[1]] = u
-        ones = [k for k, s in enumerate(self.order) if _on_diagonal(s)]
-        out[0, u.shape[1] + np.array(ones, dtype=int)] = 1.0
+        out[0, u.shape[1] + self._ones] = 1.0
         reference = self.gaussian.reference((theta, y, seen, u), e)
         if reference is None:
             return out
@@ -151,6 +150,11 @@ class TwistedFilter:
             if backward_passes().write_guide(*where) and np.all(np.isfinite(found)):
                 return found
         return out
+
+    @cached_property
+    def _ones(self) -> np.ndarray:
+        """Columns, among those of the guide, of the diagonal of the initial noise's factor."""
+        return np.array([k for k, s in enumerate(self.order) if _on_diagonal(s)], dtype=int)
 
     @cached_property
     def order(self) -> list[Expr]:
