@@ -128,18 +128,19 @@ class TwistedFilter:
 
     def guide(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, horizon: int = 0,
-        e: np.ndarray | None = None,
+        e: np.ndarray | None = None, at_mode: bool = True,
     ) -> np.ndarray:  # fmt: skip
         """The inputs (T, U), and behind them each row's guide: precision, slope, centre.
 
-        e : noise (T, R') of the likeliest trajectory where it is known, which saves the search.
+        e : noise (T, R') of a trajectory from which the search for the likeliest begins; at_mode :
+        whether it is that already.
 
         A guide that nothing can be computed of is flat: the particles move by the transition.
         """
         out = np.zeros((len(y), u.shape[1] + len(self.order)))
         out[:, : u.shape[1]] = u
         out[0, u.shape[1] + self._ones] = 1.0
-        reference = self.gaussian.reference((theta, y, seen, u), e)
+        reference = self.gaussian.reference((theta, y, seen, u), e, at_mode)
         if reference is None:
             return out
         back = Backward.like(reference)

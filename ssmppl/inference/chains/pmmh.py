@@ -161,7 +161,7 @@ class ParticleLikelihood(_KeepsPaths):
     def run_given(
         self, theta: np.ndarray, found: Approximated | None, stream: np.ndarray
     ) -> LikelihoodRun | None:
-        """As `run`; the twisted filter takes its guide from the mode that a first stage found."""
+        """As `run`; the twisted filter takes its guide from where a first stage has been."""
         n, name = self.settings.particles, self.settings.proposal
         carried = len(self.problem.program.carried(name))
         modes = found.noise if found is not None and name == "twisted" else None
@@ -172,7 +172,8 @@ class ParticleLikelihood(_KeepsPaths):
             twisted = self.problem.program.twisted
             assert isinstance(twisted, TwistedFilter)
             assert modes is not None
-            guide = twisted.guide(theta, e.y, e.seen, e.u, e=modes[i])
+            assert found is not None
+            guide = twisted.guide(theta, e.y, e.seen, e.u, e=modes[i], at_mode=found.at_mode)
             run = twisted.module.filtered_path_twisted
             return run(theta, e.y, e.seen, guide, n, stream, path, increment)
 
@@ -511,7 +512,7 @@ def _planned(setup: SamplingSetup, method: PMMH) -> _Plan:
     particles = method.particles if tuned is None else tuned.particles
     assert particles is not None
     settings = FilterSettings(int(particles), proposal, rescue=int(method.rescue))
-    cheap = proposal == "twisted" and gaussian is not None and gaussian.kind == "laplace"
+    cheap = proposal == "twisted" and gaussian is not None
     delayed = cheap if asked == "auto" else bool(asked)
     return _Plan(
         pilot, settings, str(choice or proposal), None if tuned is None else tuned.sd, gaussian,
