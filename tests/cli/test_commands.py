@@ -279,7 +279,7 @@ def test_a_model_file_may_import_its_neighbours(folder):
     ("args", "code", "found"),
     [
         (["--particles", "5"], 2, "--particles needs --method"),
-        (["--method", "nuts"], 2, "'pmmh', 'pgas'"),
+        (["--method", "nuts"], 2, "'pmmh', 'ismcmc', 'pgas'"),
         (["--fixed", "q"], 1, "not of the form name=value"),
         (["--fixed", "p=1"], 1, "'p'"),
         (["--fixed", "q=abc"], 1, "no number"),

@@ -126,7 +126,7 @@ def test_settings_and_particles_need_a_method(series):
         "sample", "walk.py", series, "--settings", "particles=5", code=2
     )
     said = fails("sample", "walk.py", series, "--particles", 5, "--method", "mh", code=2)
-    assert "--particles needs --method pmmh, pgas or smc2" in said
+    assert "--particles needs --method pmmh, ismcmc, pgas or smc2" in said
 
 
 @pytest.mark.parametrize("text", ["0.1,x", ",", "0.5;0.6"])

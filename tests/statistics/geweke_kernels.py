@@ -101,7 +101,8 @@ class Transitions:
         else:
             begin = replace(self.state, point=self._point(self.state, theta))
         self.state, block = self.sampler.step_block(begin, 1)
-        return block.draws["theta"][0], np.ascontiguousarray(block.draws["path_0"][0])
+        paths = block.draws.get("path_0", [path])  # none in a warmup by an approximation alone
+        return block.draws["theta"][0], np.ascontiguousarray(paths[0])
 
     def _point(self, state: WalkState, theta: np.ndarray) -> ChainPoint:
         kernel: Metropolis = self.sampler.step_block.args[0]  # type: ignore[attr-defined]

@@ -284,24 +284,27 @@ class GaussianApproximation:
 
     # -- the reference of a guide
     def reference(
-        self, given: tuple[np.ndarray, ...], e: np.ndarray | None = None
+        self, given: tuple[np.ndarray, ...], e: np.ndarray | None = None, at_mode: bool = True
     ) -> Reference | None:
         """About the likeliest trajectory, with the model's derivatives along it; None where the
         extended Kalman filter, which it begins from, comes to no number.
 
-        e : noise (T, R') of the likeliest trajectory where it is known, as of `Mode`.
+        e : noise (T, R') to begin from instead. at_mode : whether that is the mode at theta, as of
+        `Mode`, so that nothing is left to be done.
         """
-        if e is not None:
-            known, _ = self._empty(len(given[1]))
-            known = replace(known, e=e)
-            new, value = self._follow(given, 0.0, known, Backward.like(known))
-            if value > -np.inf:
-                return new
         best, spread = self._empty(len(given[1]))
-        if not self.module.follow_filter(*given, best.x, *spread, *best.derivatives) > -np.inf:
-            return None
         value = -np.inf
-        for k in range(MOST_STEPS):
+        if e is not None:
+            known = replace(best, e=e)
+            best, value = self._follow(given, 0.0, known, Backward.like(known))
+            if value > -np.inf and at_mode:
+                return best
+        first = value > -np.inf
+        if not first:
+            follow = self.module.follow_filter
+            if not follow(*given, best.x, *spread, *best.derivatives) > -np.inf:
+                return None
+        for k in range(int(first), MOST_STEPS):
             back = Backward.like(best)
             if not backward_passes().look_back(best.x, *best.derivatives, 0, *back.arrays):
                 break

@@ -128,19 +128,19 @@ class TwistedFilter:
 
     def guide(
         self, theta: np.ndarray, y: np.ndarray, seen: np.ndarray, u: np.ndarray, horizon: int = 0,
-        e: np.ndarray | None = None,
+        e: np.ndarray | None = None, at_mode: bool = True,
     ) -> np.ndarray:  # fmt: skip
         """The inputs (T, U), and behind them each row's guide: precision, slope, centre.
 
-        e : noise (T, R') of the likeliest trajectory where it is known, which saves the search.
+        e : noise (T, R') of a trajectory from which the search for the likeliest begins; at_mode :
+        whether it is that already.
 
         A guide that nothing can be computed of is flat: the particles move by the transition.
         """
         out = np.zeros((len(y), u.shape[1] + len(self.order)))
         out[:, : u.shape[1]] = u
-        ones = [k for k, s in enumerate(self.order) if _on_diagonal(s)]
-        out[0, u.shape[1] + np.array(ones, dtype=int)] = 1.0
-        reference = self.gaussian.reference((theta, y, seen, u), e)
+        out[0, u.shape[1] + self._ones] = 1.0
+        reference = self.gaussian.reference((theta, y, seen, u), e, at_mode)
         if reference is None:
             return out
         back = Backward.like(reference)
@@ -151,6 +151,11 @@ class TwistedFilter:
             if backward_passes().write_guide(*where) and np.all(np.isfinite(found)):
                 return found
         return out
+
+    @cached_property
+    def _ones(self) -> np.ndarray:
+        """Columns, among those of the guide, of the diagonal of the initial noise's factor."""
+        return np.array([k for k, s in enumerate(self.order) if _on_diagonal(s)], dtype=int)
 
     @cached_property
     def order(self) -> list[Expr]:

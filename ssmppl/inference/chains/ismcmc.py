@@ -55,6 +55,7 @@ from ssmppl.inference.preparation.gaussian_pilot import (
 from ssmppl.inference.preparation.pilot import Pilot, TunedParticles
 from ssmppl.inference.run.chain_runner import run_chains
 from ssmppl.inference.run.draws import Block, ChainDraws
+from ssmppl.inference.run.problem import Problem
 from ssmppl.inference.run.progress import announced
 from ssmppl.inference.run.seeds import random_state
 
@@ -151,7 +152,7 @@ def drawn(
         if method.particles is None:
             tuned = setup.once("twisted", lambda: tune_twisted(problem, mode, PRECISE))
     particles = method.particles or (NUMBERS[-1] if tuned is None else tuned.particles)
-    approximation = gaussian.likelihood(problem)
+    approximation = _likelihood(problem, method, gaussian)
     each = -(-draws // LANES)
     chains = setup.once(
         f"approximate chains of {each * LANES}",
@@ -168,7 +169,7 @@ def drawn(
     own = [lanes[c * LANES : (c + 1) * LANES] for c in range(setup.chains)]
     weighted = [_weighted(chains, c, joined_lanes(of, draws)) for c, of in enumerate(own)]
     report = {
-        "particles": int(particles), "approximation": NAMED[gaussian.kind],
+        "particles": int(particles), "approximation": NAMED[approximation.kind],
         "settings": asdict(method), "pilot_mode": setup.by_name(mode),
         "acceptance_of_approximate_chains": chains.acceptance,
         **_quality(weighted, interrupted=lanes[0].interrupted),
@@ -199,22 +200,24 @@ def _approximation(setup: SamplingSetup, method: ISMCMC) -> GaussianPilot:
     return found
 
 
+def _likelihood(problem: Problem, method: ISMCMC, gaussian: GaussianPilot) -> ApproximateLikelihood:
+    return gaussian.likelihood(problem, gaussian.kind if method.approximation != "auto" else "")
+
+
 def _jump_chains(
     setup: SamplingSetup, method: ISMCMC, gaussian: GaussianPilot, length: int,
     executor: Executor | None, progress: bool,
 ) -> JumpChains:  # fmt: skip
     """Phase 1."""
     where = coordinates(setup.space, "unconstrained", None)
-    runs = ApproximateRuns(gaussian.likelihood(setup.problem))
+    runs = ApproximateRuns(_likelihood(setup.problem, method, gaussian))
     like = MetropolisHastings(target_acceptance=method.target_acceptance)
     usual = USUAL_EXACT.get(len(where), 0.234)
-    kernel, states, _ = walk(
-        setup, like, runs, where, gaussian.pilot, "bootstrap", 0, usual, gaussian=gaussian
-    )
+    made = walk(setup, like, runs, where, gaussian.pilot, "bootstrap", 0, usual, gaussian=gaussian)
     steps = method.steps or (FEW_STEPS if gaussian.well_proposed else MANY_STEPS)
-    kernel = replace(kernel, thin=steps * setup.thin)
+    kernel = replace(made.kernel, thin=steps * setup.thin)
     found: Sequence[ChainDraws[Any]] = run_chains(
-        partial(jump_block, kernel), states, length, setup.warmup, executor=executor,
+        partial(jump_block, kernel), made.states, length, setup.warmup, executor=executor,
         progress=progress, title="ISMCMC, approximate chain",
     )  # fmt: skip
     if any(c.interrupted for c in found):

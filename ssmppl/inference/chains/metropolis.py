@@ -21,8 +21,8 @@ from ssmppl.inference.chains.metropolis_kernel import (
 from ssmppl.inference.chains.pmmh import (
     LocalProposal,
     given_factor,
-    prepared_walk,
     settings_of,
+    walk,
 )
 from ssmppl.inference.chains.sampling import PreparedChains, SamplingMethod, SamplingSetup
 from ssmppl.inference.methods.methods import MetropolisHastings
@@ -121,7 +121,8 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
         )
     usual = 0.574 if order else 0.44 if d <= 1 else 0.35 if d == 2 else 0.234
     likelihood = ExactLikelihood(problem, setup.states, free if order else None)
-    chains = prepared_walk(setup, method, likelihood, where, pilot, kind, order, usual)
+    made = walk(setup, method, likelihood, where, pilot, kind, order, usual)
+    chains = made.prepared()
     report = {
         "settings": settings_of(replace(method, order=order)),
         "likelihood": f"exact, by {filter_name(exact)}",

@@ -21,6 +21,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -581,8 +582,11 @@ class WalkAndIndependence(RandomWalk):
             return 0.0
         return self._log_density(old.w) - self._log_density(new.w)
 
+    @cached_property
+    def _inverse(self) -> np.ndarray:
+        return np.linalg.inv(self.factor)
+
     def _log_density(self, w: np.ndarray) -> float:
         """Of t at w, up to a constant."""
-        white = np.linalg.solve(self.factor, w - self.centre)
-        d = len(w)
+        white, d = self._inverse @ (w - self.centre), len(w)
         return -0.5 * (DEGREES + d) * float(np.log1p(white @ white / DEGREES))

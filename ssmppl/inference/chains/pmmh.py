@@ -161,7 +161,7 @@ class ParticleLikelihood(_KeepsPaths):
     def run_given(
         self, theta: np.ndarray, found: Approximated | None, stream: np.ndarray
     ) -> LikelihoodRun | None:
-        """As `run`; the twisted filter takes its guide from the mode that a first stage found."""
+        """As `run`; the twisted filter takes its guide from where a first stage has been."""
         n, name = self.settings.particles, self.settings.proposal
         carried = len(self.problem.program.carried(name))
         modes = found.noise if found is not None and name == "twisted" else None
@@ -172,7 +172,8 @@ class ParticleLikelihood(_KeepsPaths):
             twisted = self.problem.program.twisted
             assert isinstance(twisted, TwistedFilter)
             assert modes is not None
-            guide = twisted.guide(theta, e.y, e.seen, e.u, e=modes[i])
+            assert found is not None
+            guide = twisted.guide(theta, e.y, e.seen, e.u, e=modes[i], at_mode=found.at_mode)
             run = twisted.module.filtered_path_twisted
             return run(theta, e.y, e.seen, guide, n, stream, path, increment)
 
@@ -430,10 +431,10 @@ def prepare(setup: SamplingSetup, method: PMMH) -> PreparedChains:
     if gaussian is not None and plan.delayed:
         first, usual = gaussian.likelihood(problem), USUAL_EXACT.get(d, 0.234)
     likelihood = _likelihood(setup, method, settings)
-    chains = prepared_walk(
+    chains = walk(
         setup, method, likelihood, where, plan.pilot, "bootstrap", method.order, usual,
         gaussian=gaussian, first=first,
-    )  # fmt: skip
+    ).prepared()  # fmt: skip
     report = {
         "particles": settings.particles,
         "proposal": plan.chosen,
@@ -485,7 +486,6 @@ def _planned(setup: SamplingSetup, method: PMMH) -> _Plan:
         usable = method.proposal in ("auto", "twisted") and method.particles is None
         if gaussian is None or not usable or twisted is None or twisted.sd > target:
             twisted = None  # by the ways of other filters, then
-    found = gaussian
     pilot = gaussian.pilot if gaussian is not None else setup.once(
         "pilot", lambda: find_mode(space, setup.root, rescue=method.rescue)
     )  # fmt: skip
@@ -512,10 +512,10 @@ def _planned(setup: SamplingSetup, method: PMMH) -> _Plan:
     particles = method.particles if tuned is None else tuned.particles
     assert particles is not None
     settings = FilterSettings(int(particles), proposal, rescue=int(method.rescue))
-    cheap = proposal == "twisted" and found is not None and found.kind == "laplace"
+    cheap = proposal == "twisted" and gaussian is not None
     delayed = cheap if asked == "auto" else bool(asked)
     return _Plan(
-        pilot, settings, str(choice or proposal), None if tuned is None else tuned.sd, found,
+        pilot, settings, str(choice or proposal), None if tuned is None else tuned.sd, gaussian,
         delayed and len(pilot.z) > 0, plain,
     )  # fmt: skip
 
@@ -557,19 +557,25 @@ def _draws_lost(sd: float) -> float:
     return 1.0 / math.erfc(0.5 * sd)
 
 
-def prepared_walk(*args: Any, **options: Any) -> PreparedChains:
-    """The chains of `walk`, made ready."""
-    kernel, states, report = walk(*args, **options)
-    return PreparedChains(partial(metropolis_block, kernel), states, report)
+@dataclass(frozen=True)
+class Walk:
+    """Metropolis-Hastings chains: their kernel, where each starts, and what to report."""
+
+    kernel: Metropolis
+    states: list[WalkState]
+    report: dict[str, Any]
+
+    def prepared(self) -> PreparedChains:
+        """Made ready for `sample`."""
+        return PreparedChains(partial(metropolis_block, self.kernel), self.states, self.report)
 
 
 def walk(
     setup: SamplingSetup, method: PMMH | MetropolisHastings, likelihood: Likelihood,
     where: Coordinates, pilot: Pilot, proposal: str, order: int, usual: float, *,
     gaussian: GaussianPilot | None = None, first: ApproximateLikelihood | None = None,
-) -> tuple[Metropolis, list[WalkState], dict[str, Any]]:  # fmt: skip
-    """The kernel of chains in the coordinates, these chains, started round the pilot's mode, and
-    what to report of both.
+) -> Walk:  # fmt: skip
+    """Chains in the coordinates, started round the pilot's mode.
 
     proposal : of the filter that looks at the starts. order : of the steps, as in `PMMH`. usual :
     rate of acceptance to adapt to, unless the method names one. gaussian : the approximation, whose
@@ -607,7 +613,7 @@ def walk(
         "pilot_mode": setup.by_name(space.parameters(pilot.z)[0]),
         "walk_covariance": (factor @ factor.T).tolist(),
     }
-    return kernel, states, report
+    return Walk(kernel, states, report)
 
 
 def _likelihood(setup: SamplingSetup, method: PMMH, settings: FilterSettings) -> Likelihood:

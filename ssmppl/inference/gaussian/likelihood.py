@@ -68,11 +68,12 @@ class LaplaceLikelihood:
 
 @dataclass(frozen=True)
 class Approximated:
-    """An approximate log p(y | theta), -inf where it comes to no number; with the noise (T, R') of
-    each experiment's likeliest trajectory, where Laplace's gave it."""
+    """An approximate log p(y | theta), -inf where it comes to no number; with noise (T, R') of each
+    experiment, where it is known: of the likeliest trajectory, or near it. at_mode : which."""
 
     log_likelihood: float
     noise: tuple[np.ndarray, ...] | None = None
+    at_mode: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ class ApproximateLikelihood:
     """An approximate log p(y | theta) that is a function of theta alone, as chains need it.
 
     kind : of `APPROXIMATE`. noise : (T, R') of each experiment, from where every search for
-    Laplace's modes begins; None: from the extended Kalman filter. Where Laplace's comes to no
-    number, the extended filter's stands in for it.
+    modes begins; None: from the extended Kalman filter. Where Laplace's comes to no number, the
+    extended filter's stands in for it.
     """
 
     problem: Problem
@@ -100,8 +101,9 @@ class ApproximateLikelihood:
             noise.append(mode.e)
             total += mode.log_likelihood
         if len(noise) == len(self.problem.experiments):
-            return Approximated(total, tuple(noise))
-        return Approximated(approximate_log_likelihood(self.problem, theta, found, "extended"))
+            return Approximated(total, tuple(noise), at_mode=True)
+        value = approximate_log_likelihood(self.problem, theta, found, "extended")
+        return Approximated(value, self.noise)
 
 
 def laplace_approximation(problem: Problem) -> GaussianApproximation | NotApplicable:

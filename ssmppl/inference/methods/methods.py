@@ -125,10 +125,10 @@ class PMMH:
         take where weights vanish; 0: N, and the parameters are refused. Not with orders 1 and 2
         nor `correlation`.
     delayed_acceptance : whether a proposal is first accepted or refused by Laplace's approximation
-        of the likelihood (the extended Kalman filter's, where there is no Laplace's), and the
-        particle filter runs only for what that accepts (Christen and Fox 2005); the posterior is
-        exact all the same. "auto": with the twisted proposal, whose guide comes from the mode that
-        Laplace's finds anyway. Only with order 0, without `correlation` and `rescue`.
+        of the likelihood (the extended Kalman filter's, where there is no Laplace's, or where a
+        pilot finds it as good), and the particle filter runs only for what that accepts (Christen
+        and Fox 2005); the posterior is exact all the same. "auto": with the twisted proposal, whose
+        guide then begins from there. Only with order 0, without `correlation` and `rescue`.
     """
 
     particles: int | None = setting(None, optional(count(1)))
@@ -203,7 +203,8 @@ class ISMCMC:
     particles : N of the twisted filters; any number is exact. None: tuned in a pilot to a standard
         deviation of log Z of at most 0.3, from 8 up.
     approximation : of the likelihood: "laplace", "extended" (the extended Kalman filter's), or
-        "auto": Laplace's where there is one.
+        "auto": Laplace's where there is one and a pilot does not find the extended filter's, which
+        costs less, as good.
     steps : of the chain between the draws that are corrected, times `thin`. None: 2 where most
         independence proposals round the mode are accepted, else 6.
     target_acceptance : that the walk adapts to during warmup, as in `MetropolisHastings`.

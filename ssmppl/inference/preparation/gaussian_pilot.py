@@ -11,7 +11,7 @@ accuracy.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,7 @@ REPEATS = 40
 LEAST_EIGENVALUE = 1e-3  # of the information as correlations
 DEGREES = 5.0  # of freedom of independence proposals: heavier tails than most posteriors have
 GOOD_ACCEPTANCE = 0.3  # of them
+AS_GOOD = 0.2  # sd in nats, below that of the twisted filter's log Z
 TRIED = 100  # of them, to know how many are accepted
 STARTS = 3  # climbs at most, until one comes to a top
 
@@ -46,7 +47,9 @@ class GaussianPilot:
     """kind : "laplace" or "extended". z (F,) : the mode. covariance (F, F) : inverse information
     there. log_density : there, approximate. noise : (T, R') of each experiment's likeliest
     trajectory there; None of the extended filter. acceptance : of independence proposals from
-    Student's t round the mode, of `DEGREES`, on the approximate posterior."""
+    Student's t round the mode, of `DEGREES`, on the approximate posterior. fast : "extended" where
+    the extended filter's likelihood is as good as Laplace's over the posterior, as it is where
+    models are nearly linear; else `kind`."""
 
     kind: str
     z: np.ndarray
@@ -54,6 +57,7 @@ class GaussianPilot:
     log_density: float
     noise: tuple[np.ndarray, ...] | None
     acceptance: float
+    fast: str
 
     @property
     def pilot(self) -> Pilot:
@@ -65,9 +69,9 @@ class GaussianPilot:
         """Whether independence proposals are worth more than steps of a walk."""
         return self.acceptance > GOOD_ACCEPTANCE
 
-    def likelihood(self, problem: Problem) -> ApproximateLikelihood:
-        """The approximation, as a function of the parameters."""
-        return ApproximateLikelihood(problem, self.kind, self.noise)
+    def likelihood(self, problem: Problem, kind: str = "") -> ApproximateLikelihood:
+        """The approximation, as a function of the parameters: of a kind, or the fast one."""
+        return ApproximateLikelihood(problem, kind or self.fast, self.noise)
 
 
 def approximation_kind(problem: Problem, asked: str = "auto") -> str | NotApplicable:
@@ -129,31 +133,41 @@ def gaussian_pilot(space: Space, kind: str, seed: np.random.SeedSequence) -> Gau
     theta, log_prior = space.parameters(best.z)
     found = start.at(theta)
     fixed = ApproximateLikelihood(problem, kind, found.noise)
-    acceptance = _acceptance(space, fixed, best.z, covariance, rng)
+    acceptance, apart = _tried(space, fixed, best.z, covariance, rng)
     value = found.log_likelihood + log_prior
-    return GaussianPilot(kind, best.z, covariance, value, found.noise, acceptance)
+    fast = "extended" if apart < AS_GOOD else kind
+    return GaussianPilot(kind, best.z, covariance, value, found.noise, acceptance, fast)
 
 
-def _acceptance(
+def _tried(
     space: Space, likelihood: ApproximateLikelihood, z: np.ndarray, covariance: np.ndarray,
     rng: np.random.Generator,
-) -> float:  # fmt: skip
-    """Of independence Metropolis from t round z at equilibrium: the mean of min(1, w' / w) over w'
-    by the proposal and w by the posterior, which is the proposal weighed by w."""
+) -> tuple[float, float]:  # fmt: skip
+    """Acceptance of independence Metropolis from t round z at equilibrium: the mean of min(1, w' /
+    w) over w' by the proposal and w by the posterior, which is the proposal weighed by w. And the
+    standard deviation over the posterior of Laplace's log-likelihood less the extended filter's."""
     if not len(z):
-        return 1.0
+        return 1.0, np.inf
     factor, d = np.linalg.cholesky(covariance), len(z)
-    log_w = np.full(TRIED, -np.inf)
+    log_w, lacking = np.full(TRIED, -np.inf), np.zeros(TRIED)
+    other = replace(likelihood, kind="extended")
     for i in range(TRIED):
         white = np.sqrt(DEGREES / rng.chisquare(DEGREES)) * rng.standard_normal(d)
         theta, log_prior = space.parameters(z + factor @ white)
         if log_prior > -np.inf:
             log_t = -0.5 * (DEGREES + d) * np.log1p(white @ white / DEGREES)
-            log_w[i] = likelihood.at(theta).log_likelihood + log_prior - log_t
+            value = likelihood.at(theta).log_likelihood
+            log_w[i] = value + log_prior - log_t
+            if value > -np.inf:
+                lacking[i] = value - other.at(theta).log_likelihood
     if not np.max(log_w) > -np.inf:
-        return 0.0
+        return 0.0, np.inf
     w = np.exp(log_w - np.max(log_w))
-    return float(np.minimum(w[:, None], w).sum() / (TRIED * w.sum()))
+    acceptance = float(np.minimum(w[:, None], w).sum() / (TRIED * w.sum()))
+    if not np.all(np.isfinite(lacking)):
+        return acceptance, np.inf
+    w /= w.sum()
+    return acceptance, float(np.sqrt(w @ (lacking - w @ lacking) ** 2))
 
 
 def _covariance(

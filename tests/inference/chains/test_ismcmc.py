@@ -38,10 +38,11 @@ def test_jump_chain_is_the_chain_with_its_repetitions_counted():
     setup = setup_of(models.counts, COUNTS)
     found = gaussian_pilot(setup.space, "laplace", setup.root)
     where = coordinates(setup.space, "unconstrained", None)
-    kernel, (state,), _ = walk(
+    made = walk(
         setup, MetropolisHastings(), ApproximateRuns(found.likelihood(setup.problem)), where,
         found.pilot, "bootstrap", 0, 0.3, gaussian=found,
     )  # fmt: skip
+    kernel, (state,) = made.kernel, made.states
     state, _ = metropolis_block(kernel, state, setup.warmup)
     _, jumps = jump_block(kernel, state, 25)
     holding = jumps.stats["holding"].astype(int)
