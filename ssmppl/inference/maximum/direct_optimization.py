@@ -14,6 +14,7 @@ scatter of the seeds' slopes at the top gives the estimate's Monte Carlo error.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -26,6 +27,7 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximization
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
@@ -47,6 +49,9 @@ CLOSE = 0.05  # standard deviations from the top: where the climb has arrived; c
 NEWTON_STEPS = 8
 GRADIENT = 1e-9  # relative to the root of the curvature: where Newton's steps are at an end
 EXACT_RESTARTS = 2
+# Of states that take finitely many values, whose likelihood has many maxima: short climbs from all
+# round the start, the best of which are gone on with (Biernacki, Celeux and Govaert 2003).
+SHORT_CLIMBS, SHORT_STEPS, SPREAD, GONE_ON_WITH = 24, 10, 2.0, 3
 FLATS = 3  # that a climb leaves
 
 
@@ -265,15 +270,15 @@ class ExactClimb:
     def run(self) -> Ascent:
         """All climbs, and Newton's steps from the best point."""
         restarts = self.method.restarts
+        many = restarts is None and isinstance(self.model, HiddenMarkov)
         restarts = EXACT_RESTARTS if restarts is None else restarts
         interrupted, stopped, unbounded, gap = False, "", "", np.inf
         try:
-            for k in range(restarts + 1):
-                start = self.setup.start
-                if k:
-                    rng = np.random.default_rng(self.setup.seed(k))
-                    centre = self.best if len(self.best) else self.setup.start
-                    start = centre + rng.standard_normal(len(start))
+            starts: Iterator[np.ndarray] = self._starts(restarts)
+            if many and len(self.setup.start):
+                restarts = SHORT_CLIMBS
+                starts = iter([self.setup.start, *self._short_climbs()])
+            for start in starts:
                 stopped = self._quasi_newton(start)
                 if len(self.best):
                     self._check(self.setup.transform.at(self.best).theta)
@@ -312,6 +317,26 @@ class ExactClimb:
             figures={"objective": np.array(self.values)},
             held=held_at(self.setup, self.held, point.theta),
         )  # fmt: skip
+
+    def _starts(self, restarts: int) -> Iterator[np.ndarray]:
+        """The start, and so many others about the best place by then."""
+        yield self.setup.start
+        for k in range(1, restarts + 1):
+            rng = np.random.default_rng(self.setup.seed(k))
+            centre = self.best if len(self.best) else self.setup.start
+            yield centre + rng.standard_normal(len(centre))
+
+    def _short_climbs(self) -> list[np.ndarray]:
+        """Where the best of many short climbs ended."""
+        found = []
+        for k in range(1, SHORT_CLIMBS + 1):
+            rng = np.random.default_rng(self.setup.seed(k))
+            iterates: list[np.ndarray] = []
+            start = self.setup.start + SPREAD * rng.standard_normal(len(self.setup.start))
+            quasi_newton(self.value, start, SHORT_STEPS, iterates.append)
+            found.append((self.value(iterates[-1])[0], iterates[-1]))
+        self.known.clear()
+        return [z for _, z in sorted(found, key=lambda one: -one[0])[:GONE_ON_WITH]]
 
     def value(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """The objective and its gradient (F,) at z; -inf and zeros where there is none."""

@@ -266,7 +266,8 @@ class DirectOptimization:
     particles : N of the continuous filter; the most that the twisted ones take.
     averages : number of random seeds that the likelihood is averaged over.
     restarts : further starts, dispersed round the first, of which the best is kept; None: 2 where
-        the likelihood is exact, and where a climb of Laplace's comes to no top, else 0.
+        the likelihood is exact, and where a climb of Laplace's comes to no top, else 0; where the
+        states take finitely many values 24 short climbs, the best 3 of which are gone on with.
     steps : most iterations of a climb of an exact likelihood or of the continuous filter's.
     laplace : whether to go by way of Laplace's approximation where there is one.
     """

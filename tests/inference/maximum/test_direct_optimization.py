@@ -127,3 +127,33 @@ def test_where_it_does_not_apply_it_says_why():
     assert reason.where is not None
     assert smooth_filter_applies(trace(models.varves)) is None
     assert "3 components" in smooth_filter_applies(trace(models.machine)).reason
+
+
+def test_of_many_maxima_of_a_markov_chain_a_high_one_is_found():
+    """Three states that start alike, where a climb goes to a saddle or to a maximum of two states:
+    whatever the seed, as high as the best of ten climbs from places that tell the states apart."""
+    model = ssm.Model("three levels")
+    model.prior(lambda: {
+        "stay": ssm.Dirichlet(1 + 8 * np.eye(3)), "level": ssm.Normal(np.zeros(3), sd=3),
+        "s": ssm.HalfNormal(sd=2),
+    })  # fmt: skip
+    model.initial(lambda: {"k": ssm.Categorical(np.full(3, 1 / 3))})
+    model.transition(lambda k, stay: {"k": ssm.Categorical(stay[k])})
+    model.observation(lambda k, level, s: {"y": ssm.Normal(level[k], sd=s)})
+    rng = np.random.default_rng(seed_of("three levels"))
+    k, y = 0, []
+    for _ in range(120):
+        k = k if rng.random() < 0.9 else int(rng.integers(3))
+        y.append(rng.normal([-2.0, 0.0, 2.5][k], 0.7))
+    data = {"y": np.array(y)}
+    apart = []
+    for seed in range(10):
+        start = {"level": np.quantile(y, [0.1, 0.5, 0.9]) + 0.5 * rng.standard_normal(3), "s": 1.0,
+                 "stay": 0.1 + 0.7 * np.eye(3)}  # fmt: skip
+        method = ssm.DirectOptimization(restarts=0)
+        climbed = ssm.maximize(model, data, method, start=start, seed=seed, progress=False)
+        apart.append(climbed.log_likelihood)
+    for seed in range(3):
+        found = ssm.maximize(model, data, seed=seed, progress=False)
+        assert found.attrs["restarts"] == 24
+        assert found.log_likelihood > max(apart) - 1e-3
