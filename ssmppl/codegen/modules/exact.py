@@ -1,7 +1,8 @@
 """Generated modules of the exact algorithms, and the tables of models of finitely many values.
 
 The algorithms know no model: they are the same for all models. What is kept goes by the name of a
-generated module, which holds the digest of all kernels. The text of an entry point is copied, not called: it is compiled once.
+generated module, which holds the digest of all kernels. The text of an entry point is copied, not
+called: it is compiled once.
 """
 
 from __future__ import annotations
