@@ -214,7 +214,7 @@ class Predicting(ByAddress):
 
 
 def for_each(kernel: Callable[..., Any], algorithm: Callable[..., Any]) -> Callable[..., Any]:
-    """A kernel of `kernels/particle/experiments.py` with an algorithm of one model for its `run`:
+    """A kernel of `kernels/panels/each.py` with an algorithm of one model for its `run`:
     called with theta and all that follows. Where the algorithm has no addresses, the loop over
     data sets is Python's."""
     if isinstance(algorithm, ByAddress):

@@ -16,7 +16,7 @@ from ssmppl.analysis.conjugacy.derive import derive_updates
 from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.structure import deterministic
-from ssmppl.codegen.kernels.particle.experiments import sums_of_each
+from ssmppl.codegen.kernels.panels.each import sums_of_each
 from ssmppl.codegen.modules.trajectory_sums import compile_updates, statistics_name
 from ssmppl.codegen.native.entries import for_each
 from ssmppl.codegen.native.loading import Loaded

@@ -49,7 +49,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ssmppl.analysis.proposals.noises import Noises, noises
-from ssmppl.codegen.kernels.particle.experiments import (
+from ssmppl.codegen.kernels.panels.each import (
     linearise_each,
     noise_of_each,
     path_of_each,

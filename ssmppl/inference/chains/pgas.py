@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from ssmppl.analysis.structure import deterministic_memory, singular_covariance
-from ssmppl.codegen.kernels.particle.experiments import conditional_smc_each
+from ssmppl.codegen.kernels.panels.each import conditional_smc_each
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.native.entries import for_each
 from ssmppl.errors import NotApplicable

@@ -25,8 +25,7 @@ from ssmppl.analysis.finite import FiniteStates, finite_states
 from ssmppl.analysis.proposals.channels import Channel, channels
 from ssmppl.codegen.kernels.hmm.passes import UNSURE
 from ssmppl.codegen.kernels.math.random import fill_uniform
-from ssmppl.codegen.modules.exact import exact_entry
-from ssmppl.codegen.modules.finite import compile_slopes, compile_tables, varies_by_row
+from ssmppl.codegen.modules.exact import compile_slopes, compile_tables, exact_entry, varies_by_row
 from ssmppl.codegen.native.loading import Loaded
 from ssmppl.codegen.text.kernel_functions import predictive
 from ssmppl.data import Experiment, spelled

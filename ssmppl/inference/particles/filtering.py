@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmppl.codegen.kernels.particle.experiments import filter_each
+from ssmppl.codegen.kernels.panels.each import filter_each
 from ssmppl.codegen.kernels.particle.resampling import MULTINOMIAL, RESIDUAL, STRATIFIED, SYSTEMATIC
 from ssmppl.codegen.kernels.particle.weights import ALL_ZERO, INFINITE, NAN, OK
 from ssmppl.codegen.native.entries import ByAddress, for_each

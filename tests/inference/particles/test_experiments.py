@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate, stats
 
 import ssmppl as ssm
-from ssmppl.codegen.kernels.particle.experiments import filter_each
+from ssmppl.codegen.kernels.panels.each import filter_each
 from ssmppl.codegen.native.entries import ByAddress, for_each
 from ssmppl.errors import SamplingError
 from ssmppl.inference.chains.gibbs_updates import (

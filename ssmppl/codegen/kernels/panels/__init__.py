@@ -1,0 +1,1 @@
+"""Passes over many data sets in one compiled call."""
