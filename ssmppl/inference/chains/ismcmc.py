@@ -191,7 +191,7 @@ def _approximation(setup: SamplingSetup, method: ISMCMC) -> GaussianPilot:
             fix="use ssm.PGAS(...) or ssm.PMMH(...), or None, which picks by structure",
             where=kind.where,
         )
-    found = gaussian_pilot(setup.space, kind, setup.root)
+    found = gaussian_pilot(setup.space, kind)
     if found is None:
         raise ArgumentError(
             f"{NAMED[kind]} comes to no number round the start, or its posterior to no mode",

@@ -530,7 +530,7 @@ def _gaussian(setup: SamplingSetup, method: PMMH) -> GaussianPilot | None:
     kind = approximation_kind(problem)
     if isinstance(kind, NotApplicable):
         return None
-    return gaussian_pilot(setup.space, kind, setup.root)
+    return gaussian_pilot(setup.space, kind)
 
 
 def _trusted(gaussian: GaussianPilot, twisted: TunedParticles | None) -> bool:

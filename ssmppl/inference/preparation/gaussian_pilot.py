@@ -25,6 +25,7 @@ from ssmppl.inference.gaussian.likelihood import (
 from ssmppl.inference.optimisation.newton import GOOD, climb, information_at
 from ssmppl.inference.particles.filtering import FilterSettings, repeated_estimates
 from ssmppl.inference.preparation.pilot import Pilot, TunedParticles, finite_point, scale_of
+from ssmppl.inference.preparation.proposal_choice import digest_of
 from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.problem import Problem
 
@@ -33,11 +34,11 @@ NUMBERS = (8, 16, 32, 64, 128, 256)
 # sd of log Z beyond which more particles pay: a run costs about the same from 8 to 32 of them, as
 # most of it is the guide, and at 0.3 the noise costs about a sixth of the draws.
 PRECISE = 0.3
-REPEATS = 40
+REPEATS, SEED = 40, 20150  # of the filters that tell the sd
 LEAST_EIGENVALUE = 1e-3  # of the information as correlations
 DEGREES = 5.0  # of freedom of independence proposals: heavier tails than most posteriors have
 GOOD_ACCEPTANCE = 0.3  # of them
-AS_GOOD = 0.2  # sd in nats, below that of the twisted filter's log Z
+AS_GOOD = 0.05  # sd in nats, far below that of the twisted filter's log Z
 TRIED = 100  # of them, to know how many are accepted
 STARTS = 3  # climbs at most, until one comes to a top
 
@@ -96,9 +97,25 @@ def approximately(
     return lambda theta, _: likelihood.at(theta).log_likelihood
 
 
-def gaussian_pilot(space: Space, kind: str, seed: np.random.SeedSequence) -> GaussianPilot | None:
+REMEMBERED = 16  # pilots, whose noise has a number for each row
+_pilots: dict[tuple, GaussianPilot | None] = {}
+_tuned: dict[tuple, TunedParticles | None] = {}
+
+
+def gaussian_pilot(space: Space, kind: str) -> GaussianPilot | None:
     """The mode of the approximate posterior; None where the approximation comes to no number, or
-    its posterior to no mode."""
+    its posterior to no mode. It has random numbers of its own, the same for every call, and is
+    remembered for each program, data and start, as `sample` asks for it twice."""
+    where = space.theta.tobytes(), space.z.tobytes(), space.free.tobytes()
+    key = (space.problem.program.path, digest_of(space.problem), kind, *where)
+    if key not in _pilots:
+        while len(_pilots) >= REMEMBERED:
+            del _pilots[next(iter(_pilots))]
+        _pilots[key] = _climbed(space, kind)
+    return _pilots[key]
+
+
+def _climbed(space: Space, kind: str) -> GaussianPilot | None:
     problem = space.problem
     start = ApproximateLikelihood(problem, kind)
     noise: list[tuple[np.ndarray, ...] | None] = [None]  # of the last point: where to begin
@@ -113,7 +130,7 @@ def gaussian_pilot(space: Space, kind: str, seed: np.random.SeedSequence) -> Gau
         return found.log_likelihood + log_prior
 
     z = space.z[space.positions]
-    rng = np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(8, 1)))
+    rng = np.random.default_rng(np.random.SeedSequence(SEED, spawn_key=(8, 1)))
     best = None
     for _ in range(STARTS if len(z) else 1):
         try:
@@ -189,16 +206,21 @@ def _covariance(
     return root @ root.T
 
 
-def tune_twisted(
-    problem: Problem, theta: np.ndarray, target: float, most: int = NUMBERS[-1]
-) -> TunedParticles | None:
+def tune_twisted(problem: Problem, theta: np.ndarray, target: float) -> TunedParticles | None:
     """The fewest particles of the twisted filter by which log Z has at most the target's standard
     deviation at theta; the best of those tried where none has; None where there is no filter, or
-    it comes to no number."""
+    it comes to no number. Remembered, as the pilot."""
+    key = (problem.program.path, digest_of(problem), theta.tobytes(), target)
+    if key not in _tuned:
+        _tuned[key] = _tried_numbers(problem, theta, target)
+    return _tuned[key]
+
+
+def _tried_numbers(problem: Problem, theta: np.ndarray, target: float) -> TunedParticles | None:
     if not isinstance(problem.program.twisted, TwistedFilter):
         return None
-    best, seed = None, np.random.SeedSequence(20150)
-    for particles in (n for n in NUMBERS if n <= most):
+    best, seed = None, np.random.SeedSequence(SEED)
+    for particles in NUMBERS:
         settings = FilterSettings(particles, "twisted")
         try:
             log_z = repeated_estimates(problem, theta, settings, seed, range(REPEATS))
@@ -221,15 +243,16 @@ MOST_NUMBERS = 12  # free ones, that independence proposals move at once
 def precise_twisted(space: Space) -> TunedParticles | None:
     """How well the twisted filter knows the likelihood at the mode of the approximate posterior,
     where it knows it well enough for Metropolis-Hastings over it to be the best of all methods;
-    else None. The pilot has random numbers of its own, the same for every call."""
+    else None."""
     problem = space.problem
     if "user" in problem.program.proposals or not 0 < len(space.positions) <= MOST_NUMBERS:
         return None
     if approximation_kind(problem) != "laplace":
         return None
-    found = gaussian_pilot(space, "laplace", np.random.SeedSequence(20150))
+    found = gaussian_pilot(space, "laplace")
     if found is None or not found.well_proposed:
         return None
     theta, _ = space.parameters(found.z)
-    tuned = tune_twisted(problem, theta, PRECISE, MOST_PARTICLES)
-    return tuned if tuned is not None and tuned.sd <= PRECISE else None
+    tuned = tune_twisted(problem, theta, PRECISE)
+    enough = tuned is not None and tuned.sd <= PRECISE and tuned.particles <= MOST_PARTICLES
+    return tuned if enough else None

@@ -120,7 +120,7 @@ def choose_by_pilot(
     if len(candidates) == 1 and not last:
         return Choice("bootstrap", {})
     flags = whole, integrate, temper, look_ahead
-    key = (problem.program.path, _digest(problem), theta.tobytes(), *flags)
+    key = (problem.program.path, digest_of(problem), theta.tobytes(), *flags)
     if key not in _choices:
         _choices[key] = _pilot(problem, theta, candidates, last)
     return _choices[key]
@@ -138,7 +138,8 @@ def choose_for_csmc(problem: Problem) -> str:
     return "auxiliary" if auxiliary.exact_look_ahead else "bootstrap"
 
 
-def _digest(problem: Problem) -> bytes:
+def digest_of(problem: Problem) -> bytes:
+    """Of the data."""
     digest = hashlib.sha256()
     for e in problem.experiments:
         for a in (e.y, e.seen, e.u):

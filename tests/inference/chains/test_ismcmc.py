@@ -36,7 +36,7 @@ def setup_of(model, data, warmup=20):
 
 def test_jump_chain_is_the_chain_with_its_repetitions_counted():
     setup = setup_of(models.counts, COUNTS)
-    found = gaussian_pilot(setup.space, "laplace", setup.root)
+    found = gaussian_pilot(setup.space, "laplace")
     where = coordinates(setup.space, "unconstrained", None)
     made = walk(
         setup, MetropolisHastings(), ApproximateRuns(found.likelihood(setup.problem)), where,
