@@ -17,6 +17,7 @@ from click.shell_completion import CompletionItem
 import ssmppl as ssm
 from ssmppl.cli.group import Argument, Option
 from ssmppl.errors import ArgumentError, listing
+from ssmppl.inference.gaussian.likelihood import APPROXIMATE
 from ssmppl.inference.particles.filtering import SCHEMES
 from ssmppl.inference.verbs.filters import LEVELS
 from ssmppl.inference.verbs.sample import METHODS
@@ -27,7 +28,7 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 PROPOSALS = (
     "auto", "kalman", "forward", "deterministic", "bootstrap", "guided", "auxiliary", "twisted",
     "tempered",
-    "marginal", "marginal_guided", "marginal_auxiliary", "user",
+    "marginal", "marginal_guided", "marginal_auxiliary", "user", *APPROXIMATE,
 )  # fmt: skip
 
 
@@ -156,6 +157,11 @@ POSTERIOR = click.argument(
     about="The file that `ssmppl sample` wrote.",
 )  # fmt: skip
 
+POSTERIOR_OR_DATA = click.argument(
+    "posterior", type=FILE, metavar="POSTERIOR.nc|DATA", cls=Argument,
+    about="The file that `ssmppl sample` wrote; or, with --parameters, the data.",
+)  # fmt: skip
+
 PARAMETERS = option(
     "-p", "--parameters", multiple=True, metavar="NAME=VALUE...", section="Model and data",
     help="The parameters of the model.",
@@ -190,7 +196,8 @@ PROGRESS = option(
 )  # fmt: skip
 PROPOSAL = option(
     "--proposal", default="auto", metavar="NAME", shell_complete=_proposals,
-    help=f"How particles move: {', '.join(PROPOSALS)}; `ssmppl explain` tells which there are.",
+    help=f"How particles move: {', '.join(PROPOSALS)}; `ssmppl explain` tells which there are. The "
+    f"last {len(APPROXIMATE)} are approximations of the likelihood, without particles.",
 )  # fmt: skip
 PARTICLE_FILTER = apply(
     option("--particles", type=int, default=1000, help="Number of particles."),

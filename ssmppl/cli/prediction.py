@@ -15,7 +15,8 @@ from ssmppl.cli.options import (
     FIXED,
     INPUTS,
     MODEL,
-    POSTERIOR,
+    PARAMETERS,
+    POSTERIOR_OR_DATA,
     PROGRESS,
     SAMPLERS,
     SEED,
@@ -28,7 +29,7 @@ from ssmppl.cli.options import (
     option,
     output,
 )
-from ssmppl.cli.reading import read_data, read_posterior, read_table
+from ssmppl.cli.reading import has_posterior, read_data, read_posterior, read_table
 from ssmppl.cli.rendering import (
     answer,
     file_of_model,
@@ -43,6 +44,7 @@ from ssmppl.cli.rendering import (
     write,
     wrote,
 )
+from ssmppl.errors import DataError
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.results import time_axes
 from ssmppl.tables import wide_table
@@ -116,34 +118,51 @@ def predict(
 
 @command("forecast", "Draws of the rows after the data.")
 @MODEL
-@POSTERIOR
+@POSTERIOR_OR_DATA
+@PARAMETERS
 @option("--steps", type=int, section="Model and data",
         help="Number of rows; the inputs, if any, tell it too.")  # fmt: skip
 @INPUTS
 @option("--experiment", type=int, section="Model and data",
         help="Which one is continued, from 1, where several were sampled.")  # fmt: skip
+@option("--proposal", metavar="NAME",
+        help="With --parameters: laplace, extended or unscented, approximations, or the proposal "
+        "of a particle filter [default: exact where the model allows it].")  # fmt: skip
+@option("--draws", type=int, section="Run", help="With --parameters [default: 1000].")
 @SEED
-@output("the name of the posterior, with _forecast.nc",
+@output("the name of the posterior, or of the data, with _forecast.nc",
         "File for the draws: .nc, or .csv and .parquet for a row per draw and time.")  # fmt: skip
 def forecast(
-    model: str, posterior: Path, steps: int | None, inputs: Path | None, experiment: int | None,
+    model: str, posterior: Path, parameters: tuple[str, ...], steps: int | None,
+    inputs: Path | None, experiment: int | None, proposal: str | None, draws: int | None,
     seed: int | None, output: Path | None,
 ) -> None:  # fmt: skip
     """Draws of states and observations after the last row of the data.
 
     Each draw of POSTERIOR.nc, which `ssmppl sample` wrote with its states, is continued by the laws
-    of MODEL.py. Prints mean, standard deviation and quantiles at each row, and writes the draws to
-    a netCDF file, which xarray.open_dataset reads.
+    of MODEL.py; with --parameters draws of the last state given DATA are. Prints mean, standard
+    deviation and quantiles at each row, and writes the draws to a netCDF file, which
+    xarray.open_dataset reads.
 
     \b
         ssmppl forecast model.py posterior.nc --steps 12 --seed 1
         ssmppl forecast model.py posterior.nc --inputs torque_tomorrow.csv -o tomorrow.csv
+        ssmppl forecast model.py data.csv -p phi=0.95 tau=47 --steps 12 --seed 1
     """
     given = [posterior, inputs] if inputs else [posterior]
     path = target(output, posterior, "_forecast.nc", "_2", given)
     loaded, seed = load_model(model), drawn_seed(seed)
+    known = parse_assignments(parameters, "--parameters") if parameters else None
+    if known is None and not has_posterior(posterior):
+        raise DataError(
+            f"{posterior} holds no posterior draws",
+            fix="give the netCDF file that `ssmppl sample` wrote; or, for a forecast from data, "
+            "the parameters too: -p NAME=VALUE ...",
+        )
     found = ssm.forecast(
-        loaded, read_posterior(posterior), steps, read_table(inputs) if inputs else None,
+        loaded, read_posterior(posterior) if known is None else known, steps,
+        read_table(inputs) if inputs else None,
+        data=None if known is None else read_data((posterior,)), proposal=proposal, draws=draws,
         experiment=experiment, seed=seed,
     )  # fmt: skip
     time = found["time"].values

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
+
 import ssmppl as ssm
 from ssmppl.cli.group import command
 from ssmppl.cli.options import (
@@ -32,11 +34,15 @@ from ssmppl.cli.rendering import (
     write,
     wrote,
 )
+from ssmppl.inference.gaussian.likelihood import APPROXIMATE
+from ssmppl.inference.gaussian.moments import NAMES
 from ssmppl.inference.verbs.smooth import NAMES as SMOOTHERS
 from ssmppl.modelfile import load_model, parse_assignments
 from ssmppl.tables import state_table
 
 __all__ = ["forward_filter", "kalman_filter", "particle_filter", "smooth"]
+
+LABELS = {k: n if k == "laplace" else f"{n} (approximate)" for k, n in NAMES.items()}
 
 FILE_OF_MOMENTS = output(
     "the name of the data file, with _filter.nc",
@@ -77,13 +83,17 @@ def particle_filter(
 @MODEL
 @NEEDED_DATA
 @PARAMETERS
+@option("--proposal", type=click.Choice(["kalman", *APPROXIMATE]), default="kalman",
+        help="kalman is exact; the others are approximations for states driven by Gaussian "
+        "noise.")  # fmt: skip
 @QUANTILES
 @FILE_OF_MOMENTS
 def kalman_filter(
     model: str, data: tuple[Path, ...], parameters: tuple[str, ...], output: Path | None,
-    quantiles: tuple[float, ...],
+    proposal: str, quantiles: tuple[float, ...],
 ) -> None:  # fmt: skip
-    """The states of a linear Gaussian MODEL.py given the data up to each row, exactly.
+    """The states of a linear Gaussian MODEL.py given the data up to each row, exactly; or of one
+    whose states are driven by Gaussian noise, by an approximation.
 
     Prints the log-likelihood, and means and standard deviations of the states and of the
     predicted observations. Writes these, covariances, quantiles, increments of the log-likelihood
@@ -92,8 +102,10 @@ def kalman_filter(
     \b
         ssmppl kalman-filter model.py data.csv -p q=0.3
         ssmppl kalman-filter model.py data.csv -p q=0.3 -o filtered.csv
+        ssmppl kalman-filter model.py data.csv -p q=0.3 --proposal unscented
     """
-    _filtered(model, data, parameters, output, ssm.kalman_filter, quantiles=quantiles)
+    _filtered(model, data, parameters, output, ssm.kalman_filter, proposal=proposal,
+              quantiles=quantiles)  # fmt: skip
 
 
 @command("forward-filter", "The same exactly, where states take few values.")
@@ -152,7 +164,9 @@ def _filtered(
 def _by(attrs: dict[str, Any]) -> str:
     name = str(attrs["proposal"])
     exact = {"kalman": "Kalman filter", "forward": "forward filter"}
-    return exact.get(name, f"particle filter of {attrs.get('particles')} particles, {name}")
+    return (exact | LABELS).get(
+        name, f"particle filter of {attrs.get('particles')} particles, {name}"
+    )
 
 
 def _values(dataset: Any) -> dict[str, Any]:
@@ -179,9 +193,14 @@ def _experiment(i: int, datasets: list[Any]) -> str:
 @NEEDED_DATA
 @PARAMETERS
 @option(
-    "--method", type=MethodName({name: type(method) for name, method in SMOOTHERS.items()}),
+    "--method", type=MethodName(
+        {name: type(method) for name, method in SMOOTHERS.items() if name not in APPROXIMATE}
+    ),
     help="How to smooth [default: exact where the model allows it, else ffbsi].",
 )  # fmt: skip
+@option("--proposal", metavar="NAME",
+        help=f"In place of a method: {', '.join(APPROXIMATE)}, approximations; or the proposal of "
+        "ffbsi's particle filter.")  # fmt: skip
 @option("--particles", type=int, help="Number of particles [default: 1000; pgas: 25].")
 @option("--trajectories", type=int, help="Draws [default: moments if exact, else 1000].")
 @QUANTILES
@@ -190,8 +209,8 @@ def _experiment(i: int, datasets: list[Any]) -> str:
         "netCDF file for the moments or draws; named .csv or .parquet, the table.")  # fmt: skip
 def smooth(
     model: str, data: tuple[Path, ...], parameters: tuple[str, ...], method: str | None,
-    particles: int | None, trajectories: int | None, quantiles: tuple[float, ...],
-    seed: int | None, output: Path | None,
+    proposal: str | None, particles: int | None, trajectories: int | None,
+    quantiles: tuple[float, ...], seed: int | None, output: Path | None,
 ) -> None:  # fmt: skip
     """The states of MODEL.py given all of the data, at known parameters.
 
@@ -209,13 +228,14 @@ def smooth(
     loaded = load_model(model)
     found = ssm.smooth(
         loaded, read_data(data), given, method, particles=particles, trajectories=trajectories,
-        quantiles=quantiles, seed=seed,
+        proposal=proposal, quantiles=quantiles, seed=seed,
     )  # fmt: skip
     datasets = found if isinstance(found, list) else [found]
     experiments, files, paths = [], [], numbered(path, len(datasets))
     for i, dataset in enumerate(datasets, start=1):
         attrs = dataset.attrs
-        heading(f"{attrs['model']} by {attrs['method']} (chosen {attrs['method_chosen']}), "
+        by = LABELS.get(str(attrs.get("proposal")), attrs["method"])
+        heading(f"{attrs['model']} by {by} (chosen {attrs['method_chosen']}), "
                 f"{attrs['seconds']:.1f} s")  # fmt: skip
         table = state_table(dataset)
         say(table_text(table))

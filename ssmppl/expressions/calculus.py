@@ -140,7 +140,7 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
         an incomplete gamma or beta function, an opaque primitive, a random draw's parameters).
     """
     involved = dependent(expressions, [symbol])
-    tangent: dict[Expr, Slope] = {symbol: Slope(constant(1.0))}
+    tangent: dict[Expr, _Slope] = {symbol: _Slope(constant(1.0))}
     matrix_tangent: dict[Expr, ExprArray] = {}
     for node in topological(expressions, involved):
         if node is symbol:
@@ -148,13 +148,13 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
         if node.op in ("cholesky", "inverse"):
             matrix_tangent[node] = _matrix_tangent(node, tangent)
         elif node.op == "item":
-            tangent[node] = Slope(matrix_tangent[node.args[0]][node.data])
+            tangent[node] = _Slope(matrix_tangent[node.args[0]][node.data])
         else:
             tangent[node] = _chain(node, tangent)
     return [tangent.get(e, _NONE).whole() for e in expressions]
 
 
-class Slope(NamedTuple):
+class _Slope(NamedTuple):
     """A slope, and the condition outside of which it is zero, whatever `value` is there."""
 
     value: Expr
@@ -164,27 +164,27 @@ class Slope(NamedTuple):
         """The slope as one expression."""
         return self.value if self.moves is None else apply("where", self.moves, self.value, 0.0)
 
-    def only(self, condition: Expr) -> Slope:
+    def only(self, condition: Expr) -> _Slope:
         """This slope where the condition holds, else zero."""
         if self.moves is None or self.moves is condition:
-            return Slope(self.value, condition)
-        return Slope(self.value, apply("and", condition, self.moves))
+            return _Slope(self.value, condition)
+        return _Slope(self.value, apply("and", condition, self.moves))
 
-    def plus(self, other: Slope) -> Slope:
+    def plus(self, other: _Slope) -> _Slope:
         if _is_zero(self.value) or _is_zero(other.value):
             return self if _is_zero(other.value) else other
         if self.moves is other.moves:
-            return Slope(self.value + other.value, self.moves)
+            return _Slope(self.value + other.value, self.moves)
         total = self.whole() + other.whole()
         if self.moves is None or other.moves is None:
-            return Slope(total)
-        return Slope(total, apply("or", self.moves, other.moves))
+            return _Slope(total)
+        return _Slope(total, apply("or", self.moves, other.moves))
 
 
-_NONE = Slope(constant(0.0))
+_NONE = _Slope(constant(0.0))
 
 
-def _chain(node: Expr, tangent: dict[Expr, Slope]) -> Slope:
+def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
     if node.op in FLAT:
         return _NONE
     if node.op == "where":
@@ -193,20 +193,20 @@ def _chain(node: Expr, tangent: dict[Expr, Slope]) -> Slope:
         return _either(CHOICES[node.op](*node.args), *(tangent.get(a, _NONE) for a in node.args))
     if node.op in ("logdet", "det"):
         slope = np.sum(_inverse_of(node).T * _entries(node, tangent))
-        return Slope(slope * node if node.op == "det" else slope)
+        return _Slope(slope * node if node.op == "det" else slope)
     if node.op not in PARTIALS:
-        raise NotDifferentiable(f"{as_told(node)} has no derivative in closed form")
+        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
     total = _NONE
     partials = PARTIALS[node.op](node, *node.args)
     for place, (argument, partial) in enumerate(zip(node.args, partials, strict=True)):
         if argument in tangent and not _is_zero(tangent[argument].value):
             if partial is None:
-                raise NotDifferentiable(f"{as_told(node)} has no derivative in {as_told(argument)}")
+                raise NotDifferentiable(f"{_told(node)} has no derivative in {_told(argument)}")
             total = total.plus(_summand(node, place, partial, tangent))
     return total
 
 
-def as_told(node: Expr) -> str:
+def _told(node: Expr) -> str:
     """The expression in a message, of which nobody reads more than a line."""
     text = repr(node)
     if node.op == "call":  # a primitive, by the name that its user gave it
@@ -214,7 +214,7 @@ def as_told(node: Expr) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
-def _either(condition: Expr, first: Slope, second: Slope) -> Slope:
+def _either(condition: Expr, first: _Slope, second: _Slope) -> _Slope:
     """The slope of where(condition, a, b), from those of a and b."""
     if _is_zero(second.value):
         return first if _is_zero(first.value) else first.only(condition)
@@ -222,27 +222,27 @@ def _either(condition: Expr, first: Slope, second: Slope) -> Slope:
         return second.only(apply("not", condition))
     whole = apply("where", condition, first.whole(), second.whole())
     if first.moves is None and second.moves is None:
-        return Slope(whole)
+        return _Slope(whole)
     ways = [
         case if slope.moves is None else apply("and", case, slope.moves)
         for case, slope in ((condition, first), (apply("not", condition), second))
     ]
-    return Slope(whole, apply("or", *ways))
+    return _Slope(whole, apply("or", *ways))
 
 
-def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, Slope]) -> Slope:
+def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, _Slope]) -> _Slope:
     """Partial times slope for one of the node's arguments."""
     argument, op = node.args[place], node.op
     value, moves = slope = tangent[argument]
     if op in _VANISHING:
         (down, falls), (up, grows) = map(without_exponentials, (as_expr(partial), value))
         if falls is not None and grows is not None:
-            return Slope(down * up * apply("exp", falls + grows), moves)
+            return _Slope(down * up * apply("exp", falls + grows), moves)
     if (op, place) == ("div", 1) or ((op, place) == ("pow", 0) and never_negative(argument)):
         relative = _relative(argument, tangent)
         if relative is not None:
             by = -1.0 if op == "div" else node.args[1]
-            return Slope(by * node * relative, moves)
+            return _Slope(by * node * relative, moves)
     zeros = []  # where any of these is 0, so is the slope
     if (op, place) == ("pow", 1):
         zeros = [node.args[0]]  # 0 ** b is 0 for every b above 0
@@ -254,10 +254,10 @@ def _summand(node: Expr, place: int, partial: Expr | float, tangent: dict[Expr, 
     for zero in zeros:
         if not _never_zero(zero):
             slope = slope.only(apply("ne", zero, 0.0))
-    return Slope(partial * value, slope.moves)
+    return _Slope(partial * value, slope.moves)
 
 
-def _relative(node: Expr, tangent: dict[Expr, Slope]) -> Expr | None:
+def _relative(node: Expr, tangent: dict[Expr, _Slope]) -> Expr | None:
     """The slope of a growing exponential relative to it, which is finite also where it is not."""
     if node.op == "exp":
         return tangent[node.args[0]].value
@@ -279,7 +279,7 @@ def _relative(node: Expr, tangent: dict[Expr, Slope]) -> Expr | None:
     return relative / (1.0 + share if node.op == "add" else 1.0 - share)
 
 
-def _fixed_factors(node: Expr, tangent: dict[Expr, Slope]) -> list[Expr]:
+def _fixed_factors(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
     """Of a product those factors that do not move."""
     if node not in tangent:
         return [node]
@@ -309,7 +309,7 @@ def _is_zero(node: Expr) -> bool:
     return node.op == "const" and node.data == 0.0
 
 
-def _entries(node: Expr, tangent: dict[Expr, Slope]) -> ExprArray:
+def _entries(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
     flat = array([tangent.get(a, _NONE).whole() for a in node.args])
     return array(flat.reshape(node.data, node.data))
 
@@ -318,7 +318,7 @@ def _inverse_of(node: Expr) -> ExprArray:
     return inverse(array(node.args).reshape(node.data, node.data))
 
 
-def _matrix_tangent(node: Expr, tangent: dict[Expr, Slope]) -> ExprArray:
+def _matrix_tangent(node: Expr, tangent: dict[Expr, _Slope]) -> ExprArray:
     n, d = node.data, _entries(node, tangent)
     item = np.array([[Expr("item", (node,), (i, j)) for j in range(n)] for i in range(n)])
     if node.op == "inverse":  # d(A^-1) = -A^-1 dA A^-1
@@ -361,3 +361,90 @@ def hessian(expression: Expr, symbols: Sequence[Expr]) -> ExprArray:
         for i in range(j + 1):
             out[i, j] = out[j, i] = column[i]
     return array(out) if n else out.view(ExprArray)
+
+
+def reverse_gradient(expression: Expr, symbols: Sequence[Expr]) -> list[Expr]:
+    """First derivatives of one expression in each symbol, by reverse accumulation over the graph.
+
+    It costs a few times the expression, however many the symbols, where `gradient` costs that for
+    each of them (Griewank and Walther 2008, chapter 3). It does without the care that is taken
+    above of products of zero and infinity, except for what a condition leaves out: where it comes
+    to no number, the caller has to do without.
+
+    Raises
+    ------
+    NotDifferentiable : as `calculus.differentiate`.
+    """
+    order = topological([expression], dependent([expression], symbols))
+    involved = set(symbols)  # what moves with them
+    for node in order:
+        moving = node.args[1:] if node.op == "where" else node.args
+        if node.op not in FLAT and not involved.isdisjoint(moving):
+            involved.add(node)
+    slopes: dict[Expr, _Slope] = {expression: _Slope(constant(1.0))}
+    entries: dict[Expr, ExprArray] = {}  # slopes in the entries of matrix nodes
+
+    def add(node: Expr, slope: _Slope) -> None:
+        if node in involved:
+            slopes[node] = slopes[node].plus(slope) if node in slopes else slope
+
+    for node in reversed(order):
+        if node not in involved:
+            continue
+        if node.op in ("cholesky", "inverse"):
+            if node in entries:
+                for argument, value in zip(node.args, _of_matrix(node, entries[node]), strict=True):
+                    add(argument, _Slope(value))
+            continue
+        if node not in slopes or _is_zero(slopes[node].value):
+            continue
+        if node.op == "item":
+            matrix = node.args[0]
+            n = matrix.data
+            here = entries.setdefault(matrix, array(np.full((n, n), constant(0.0), dtype=object)))
+            here[node.data] = here[node.data] + slopes[node].whole()
+        else:
+            for argument, slope in _of_arguments(node, slopes[node], involved):
+                add(argument, slope)
+    return [slopes[s].whole() if s in slopes else constant(0.0) for s in symbols]
+
+
+def _of_arguments(node: Expr, slope: _Slope, involved: set[Expr]) -> list[tuple[Expr, _Slope]]:
+    """What a node's slope makes in its arguments."""
+    if node.op == "symbol":
+        return []
+    if node.op == "where" or node.op in CHOICES:
+        first, second = node.args[-2:]
+        condition = node.args[0] if node.op == "where" else CHOICES[node.op](*node.args)
+        return [(first, slope.only(condition)), (second, slope.only(apply("not", condition)))]
+    if node.op in ("logdet", "det"):
+        n = node.data
+        value = inverse(array(node.args).reshape(n, n)).T * slope.whole()
+        value = value * node if node.op == "det" else value
+        return list(zip(node.args, map(_Slope, array(value).ravel()), strict=True))
+    if node.op not in PARTIALS:
+        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
+    out = []
+    for argument, partial in zip(node.args, PARTIALS[node.op](node, *node.args), strict=True):
+        if argument not in involved:
+            continue
+        if partial is None:
+            raise NotDifferentiable(f"{_told(node)} has no derivative in {_told(argument)}")
+        out.append((argument, _Slope(slope.value * as_expr(partial), slope.moves)))
+    return out
+
+
+def _of_matrix(node: Expr, slope: ExprArray) -> list[Expr]:
+    """The slopes in the entries of A, row by row, from those in the entries of A^-1 or of its
+    lower Cholesky factor, which reads the lower half of A only."""
+    n = node.data
+    item = np.array([[Expr("item", (node,), (i, j)) for j in range(n)] for i in range(n)])
+    if node.op == "inverse":
+        x = array(item)
+        return list(array(-(x.T @ slope @ x.T)).ravel())
+    lower = array(np.tril(array(item)))
+    middle = array(np.tril(lower.T @ array(np.tril(slope))) * (1.0 - 0.5 * np.eye(n)))
+    inv = lower_inverse(lower)
+    whole = inv.T @ middle @ inv
+    # d A symmetric from its lower half: both entries off the diagonal count for the lower one
+    return list(array(np.tril(whole) + np.tril(whole.T, -1)).ravel())

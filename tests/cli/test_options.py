@@ -28,6 +28,8 @@ def test_every_argument_of_a_verb_is_an_option_with_its_default(verb):
     for name, argument in inspect.signature(getattr(ssm, verb)).parameters.items():
         if name == "executor":
             continue
+        if (verb, name) == ("forecast", "data"):  # the file stands in the posterior's place
+            continue
         option = options[OTHER_NAMES.get(name, name)]
         if isinstance(option, click.Argument):
             continue

@@ -12,8 +12,12 @@ from dataclasses import dataclass
 from ssmppl.analysis.density import Missing
 from ssmppl.analysis.proposals.twisted import LookaheadModel, NoiseForm, lookahead_model
 from ssmppl.errors import NotApplicable
-from ssmppl.expressions.adjoint import reverse_gradient
-from ssmppl.expressions.calculus import NotDifferentiable, differentiate, hessian
+from ssmppl.expressions.calculus import (
+    NotDifferentiable,
+    differentiate,
+    hessian,
+    reverse_gradient,
+)
 from ssmppl.expressions.expr import Expr, constant, symbol
 from ssmppl.language.model.trace import Trace
 

@@ -7,6 +7,7 @@ import struct
 from dataclasses import dataclass
 
 from ssmppl.codegen.native import matrices
+from ssmppl.compiling import literal
 from ssmppl.errors import SSMError
 from ssmppl.expressions.operations import MATRIX_OPS
 
@@ -140,7 +141,7 @@ class Arithmetic:
             at = self.let(f"getelementptr double, ptr {array.text}, i64 {first.text}")
             return Value(ROW, at)
         if array.kind == MATRIX:
-            i, j = ast.literal_eval(node.slice)
+            i, j = literal(ast.unparse(node.slice))
             return Value(FLOAT, array.entries[i][j])
         if array.kind == PLANE and not isinstance(node.slice, ast.Tuple):
             first = self.value(node.slice)

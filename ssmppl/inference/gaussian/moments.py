@@ -19,6 +19,10 @@ from ssmppl.inference.exact.kalman import KalmanMoments
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
 from ssmppl.inference.run.problem import Problem
 
+NAMES = {
+    "laplace": "Laplace's approximation", "extended": "extended Kalman filter",
+    "unscented": "unscented Kalman filter",
+}  # fmt: skip
 ROUNDING = 1e-12  # of an eigenvalue of a covariance, as a correlation, below which it is none
 
 
@@ -170,11 +174,10 @@ class ApproximateKalman:
         return out
 
     def _nowhere(self, theta: np.ndarray) -> SamplingError:
-        name = {"laplace": "Laplace's approximation", "extended": "the extended Kalman filter",
-                "unscented": "the unscented Kalman filter"}[self.kind]  # fmt: skip
         where = next(iter(self.problem.trace.transition.values())).distribution.location
+        at = spelled(self.problem.trace, theta)
         return SamplingError(
-            f"{name} comes to no number; parameters: {spelled(self.problem.trace, theta)}",
+            f"{NAMES[self.kind]} comes to no number; parameters: {at}",
             fix="look whether the parameters are plausible; ssm.particle_filter does without it",
             where=where,
         )

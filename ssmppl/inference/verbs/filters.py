@@ -15,7 +15,7 @@ from scipy.special import ndtr, ndtri
 
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
-from ssmppl.errors import ArgumentError
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.exact import kalman
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.gaussian.likelihood import APPROXIMATE, approximation_of
@@ -304,7 +304,14 @@ def kalman_filter(
                 + ", ".join(("kalman", *APPROXIMATE))
                 + "; the others are of ssm.particle_filter",
             )
-        resolve_settings(problem, theta, 1, "kalman")
+        found = kalman.kalman_model(problem.trace)
+        if isinstance(found, NotApplicable):
+            others = ", ".join(APPROXIMATE)
+            raise ArgumentError(
+                f'proposal="kalman" needs a linear Gaussian model: {found.reason}',
+                fix=f"use one of the approximations, {others}, or ssm.particle_filter",
+                where=found.where,
+            )
         run_filter = partial(kalman.kalman_filter, problem.trace)
     root = np.random.SeedSequence(0)  # no channel is discrete, so nothing is randomised
     datasets = []

@@ -116,7 +116,7 @@ def _by_approximation(setup: SmoothingSetup, kind: str) -> list[SmoothedStates]:
         moments = [model.smooth(e, setup.theta) for e in experiments]
         out = _exact_moments(moments, _normal_spreads(moments, setup.levels))
     for one in out:
-        one.attrs["approximate"] = 1
+        one.attrs.update(approximate=1, proposal=kind)
     return out
 
 

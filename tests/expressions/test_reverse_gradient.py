@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from ssmppl.expressions.adjoint import reverse_gradient
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.calculus import NotDifferentiable, gradient
+from ssmppl.expressions.calculus import NotDifferentiable, gradient, reverse_gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import MATRIX_OPS, apply, constant, symbol
 from tests.expressions.graphs import HALF_SMOOTH, KINKED, SMOOTH, X, Y, Z, programs, run
