@@ -148,8 +148,9 @@ class Plan:
         if self.laplace is not None:
             return f"none: {reason_and_line(self.laplace)}"
         return ("an approximation to the likelihood at the mode of the states, where maximize "
-                "begins, PMMH takes its proposals from and ISMCMC runs its chains; log_likelihood "
-                "gives it by proposal=\"laplace\"")  # fmt: skip
+                "begins, PMMH takes its proposals from and ISMCMC runs its chains; log_likelihood, "
+                "kalman_filter, smooth and forecast give it by proposal=\"laplace\", extended and "
+                "unscented Kalman filters by \"extended\" and \"unscented\"")  # fmt: skip
 
     def _proposal(self, name: str, proposal: Proposal | NotApplicable) -> tuple[str, str]:
         if isinstance(proposal, NotApplicable):
