@@ -10,8 +10,8 @@ import pytest
 
 import ssmppl as ssm
 from ssmppl.diagnosis.model.scales import VariableScale
+from ssmppl.inference.chains import gibbs_updates
 from ssmppl.inference.chains.bridge import Student
-from ssmppl.inference.chains.gibbs_updates import log_joint
 from ssmppl.inference.maximum.ascent import Maximization
 from ssmppl.inference.maximum.direct_optimization import SmoothLikelihood
 from ssmppl.inference.particles import backward
@@ -198,16 +198,16 @@ def test_a_climb_counts_all_its_backward_passes(method, monkeypatch):
         assert found.attrs["kernel"].startswith(kernel)
 
 
-def test_a_log_joint_of_both_infinities_is_no_probability():
+def test_a_log_joint_of_both_infinities_is_no_probability(monkeypatch):
     """An infinite prior density at an edge, and data that are impossible there."""
-
-    def log_joint_of(theta, y, seen, u, path, part):
-        part[0] = -np.inf
-
-    entries = {"log_prior": lambda theta: np.float64(np.inf), "log_joint": log_joint_of}
-    row = SimpleNamespace(y=None, seen=None, u=None)
-    problem = SimpleNamespace(program=SimpleNamespace(entry=entries.get), experiments=[row])
-    assert log_joint(SimpleNamespace(problem=problem), np.zeros(1), [np.zeros(1)]) == -np.inf
+    monkeypatch.setattr(gibbs_updates, "log_joints", lambda *_: np.array([-np.inf]))
+    entries = {"log_prior": lambda theta: np.float64(np.inf)}
+    problem = SimpleNamespace(
+        program=SimpleNamespace(entry=entries.get), trace=SimpleNamespace(transition={}),
+        experiments=[None],
+    )  # fmt: skip
+    steps = SimpleNamespace(problem=problem)
+    assert gibbs_updates.log_joint(steps, np.zeros(1), [np.zeros((1, 1))]) == -np.inf
 
 
 def test_errors_of_an_estimate_that_has_no_square():

@@ -387,7 +387,16 @@ def test_an_estimate_at_the_edge_of_its_support_says_so():
     model.transition(lambda x, q: {"x": ssm.Normal(np.sin(x) + q, sd=1)})
     model.observation(lambda x, p: {"y": ssm.Bernoulli(p), "z": ssm.Normal(x, sd=1)})
     z = np.random.default_rng(1).normal(size=30)
-    found = ssm.maximize(model, {"y": np.ones(30), "z": z}, seed=1, progress=False)
+    data = {"y": np.ones(30), "z": z}
+    held = ssm.maximize(model, data, seed=1, progress=False)
+    assert held.attrs["held_at_edge"] == {"p": 1.0}
+    assert np.isnan(held.standard_errors["p"])
+    assert "p" in "".join(held.notes)
+    method = ssm.DirectOptimization(laplace=False)  # which does not look for edges
+    found = ssm.maximize(model, data, method, seed=1, progress=False)
+    assert held.parameters["q"] == pytest.approx(
+        found.parameters["q"], abs=0.2 * held.standard_errors["q"]
+    )
     assert found.attrs["at_edge"] == {"p": 1.0}
     (note,) = found.notes
     assert note.startswith("p is within a standard error of 1, the edge")
