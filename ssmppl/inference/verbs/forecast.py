@@ -72,13 +72,13 @@ def forecast(
     model : the model that was sampled.
     idata : what `sample` returned, with its states; or, beside `data`, values of the parameters: a
         mapping, or what `maximize` returned.
+    steps : number H of rows; may be left out where `inputs` tell it.
+    inputs : the inputs of the rows T+1, ..., T+H: mapping of arrays, DataFrame or Dataset. The step
+        into the first of them is driven by the data's last input.
     data : what the forecast goes on from, at known parameters: as of `smooth`.
     proposal, draws : at known parameters, how x_T is drawn, as of `smooth`, where "laplace",
         "extended" and "unscented" are approximations, then told by the attribute `approximate`
         (None: exactly where that can be, else by particles); and how often (None: 1000).
-    steps : number H of rows; may be left out where `inputs` tell it.
-    inputs : the inputs of the rows T+1, ..., T+H: mapping of arrays, DataFrame or Dataset. The step
-        into the first of them is driven by the data's last input.
     experiment : which one is continued, from 1, where several were sampled.
     seed : the same seed gives the same draws.
 

@@ -363,7 +363,7 @@ def test_an_approximation_that_comes_to_no_number_is_left_out():
         chains=1, seed=1, progress=False,
     )  # fmt: skip
     told = found["posterior"].attrs["interweaving"]
-    assert told == "s: moved with the noises of the transition held fixed"
+    assert told == "s, r: moved with the noises of the transition held fixed"
 
 
 def test_where_nothing_else_could_be_held_the_reason_is_told():
