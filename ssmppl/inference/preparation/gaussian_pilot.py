@@ -18,7 +18,6 @@ import numpy as np
 from ssmppl.codegen.modules.twisted import TwistedFilter
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.gaussian.likelihood import (
-    APPROXIMATE,
     ApproximateLikelihood,
     laplace_approximation,
 )
@@ -81,7 +80,7 @@ def approximation_kind(problem: Problem, asked: str = "auto") -> str | NotApplic
     asked : the only one that will do.
     """
     laplace = laplace_approximation(problem)
-    if asked in APPROXIMATE:
+    if asked != "auto":
         found = laplace if asked == "laplace" else problem.program.gaussian
         return found if isinstance(found, NotApplicable) else asked
     if not isinstance(laplace, NotApplicable):
