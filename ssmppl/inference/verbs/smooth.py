@@ -108,8 +108,8 @@ def _by_approximation(setup: SmoothingSetup, kind: str) -> list[SmoothedStates]:
     model, experiments = ApproximateKalman(setup.problem, found, kind), setup.problem.experiments
     if setup.trajectories is not None:
         out = []
-        for i, e in enumerate(experiments):
-            rng = np.random.default_rng(setup.root.spawn(i + 1)[i])
+        for e, seeds in zip(experiments, setup.root.spawn(len(experiments)), strict=True):
+            rng = np.random.default_rng(seeds)
             value, paths = model.draw(e, setup.theta, rng, setup.trajectories)
             out.append(SmoothedStates({"log_likelihood": value}, paths=paths))
     else:
@@ -142,7 +142,7 @@ def by_forward_backward(setup: SmoothingSetup, method: ForwardBackward) -> list[
 def _without_particles(setup: SmoothingSetup, method: SmoothingMethod) -> None:
     if setup.particles is not None and setup.by_user:
         raise ArgumentError(
-            f"particles={setup.particles}: {type(method).__name__} is exact and has none",
+            f"particles={setup.particles}: {type(method).__name__} works without particles",
             fix="leave particles= out, or use method=ssm.FFBSi()",
         )
     _check_draws(setup, setup.trajectories or 0)

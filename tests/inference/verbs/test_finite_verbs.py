@@ -125,7 +125,7 @@ def test_smoothing_is_exact(data):
     error = np.sqrt(law[:, 1] * law[:, 0] / 4000)
     off = np.abs(drawn.mean("trajectory").values - law[:, 1])
     assert np.all(off <= stats.norm.isf(LEVEL / 160) * error + 1e-3)
-    with pytest.raises(ArgumentError, match="ForwardBackward is exact and has none"):
+    with pytest.raises(ArgumentError, match="ForwardBackward works without particles"):
         ssm.smooth(weather(), data, VALUES, "forward_backward", particles=10)
 
 
