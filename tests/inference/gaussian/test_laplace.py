@@ -55,14 +55,18 @@ def linear():
     return model
 
 
-def test_linear_gaussian_models_exactly():
-    rng = np.random.default_rng(seed_of("linear"))
-    data = []
+def with_gaps(name):
+    """Two experiments of the linear model."""
+    rng, data = np.random.default_rng(seed_of(name)), []
     for steps in (30, 7):
         y, w, u = rng.standard_normal((3, steps))
         y[2:5] = w[4] = np.nan
         data.append({"y": y, "w": w, "u": u})
-    problem, theta = posed(linear(), data, {"a": 0.9, "r": 0.4})
+    return data
+
+
+def test_linear_gaussian_models_exactly():
+    problem, theta = posed(linear(), with_gaps("linear"), {"a": 0.9, "r": 0.4})
     exact = exact_log_likelihood(problem.trace, problem.experiments, theta)
     for kind in ("laplace", "extended"):
         assert approximate_log_likelihood(problem, theta, kind) == pytest.approx(exact, rel=1e-12)
@@ -279,13 +283,7 @@ def test_the_gradient_of_every_statement(name, gaps):
 
 def test_the_gradient_of_a_linear_model():
     """With a joint law, gaps, an input, two experiments, and a state without noise."""
-    rng = np.random.default_rng(seed_of("gradient"))
-    data = []
-    for steps in (30, 7):
-        y, w, u = rng.standard_normal((3, steps))
-        y[2:5] = w[4] = np.nan
-        data.append({"y": y, "w": w, "u": u})
-    problem, theta = posed(linear(), data, {"a": 0.9, "r": 0.4})
+    problem, theta = posed(linear(), with_gaps("gradient"), {"a": 0.9, "r": 0.4})
     found = LaplaceLikelihood(problem, problem.program.gaussian).score(theta)
     model = kalman_model(problem.trace)
     free = np.ones(len(theta), dtype=bool)
