@@ -55,7 +55,7 @@ def choose_sampler(
     counted : as of `only_counts`.
     """
     if isinstance(kind, NotApplicable) and twisted is not None:
-        return PMMH(), (
+        return PMMH(proposal="twisted"), (
             "the states have a Gaussian approximation, and twisted particle filters along it know "
             f"the likelihood (sd of log Z {twisted.sd:.2g} with {twisted.particles} particles, by "
             "a pilot): Metropolis-Hastings over them, with proposals from the approximate posterior"

@@ -29,6 +29,8 @@ from ssmppl.language.model.trace import Site
 
 APART = 1.05  # R-hat above which there is a warning: no other number of a run then means anything
 FEW = 100.0  # bulk ESS of all chains below which R-hat itself is not to be trusted
+MET, ENOUGH = 1.01, 400.0  # R-hat and ESS that the first paper recommends, in its section 4
+FOR_THAT = 4000  # draws of all chains, as by default, from which chains are to come to them
 LEAST_CHAINS, FEWEST = 2, 100  # chains, and draws of each, from which that can be estimated
 LOW = 0.02  # share of draws at which a row changes, below which there is a warning
 STUCK_APART = 1.1  # R-hat from which chains of a discrete state are taken to have stuck apart
@@ -71,12 +73,14 @@ def mixing_attributes(
 
 
 def have_mixed(chains: Sequence[ChainDraws[Any]], free: np.ndarray) -> bool:
-    """Whether there is nothing to warn of, in the parameters that are free (P,)."""
+    """Whether the parameters that are free (P,) have what is recommended of R-hat and ESS; in runs
+    of fewer than `FOR_THAT` draws, whether there is nothing to warn of."""
     draws = np.stack([c.draws["theta"] for c in chains])[:, :, free]
     if len(chains) < LEAST_CHAINS or draws.shape[1] < FEWEST or not draws.shape[2]:
         return True
+    r_hat, ess = (MET, ENOUGH) if draws[:, :, 0].size >= FOR_THAT else (APART, FEW)
     for component in np.moveaxis(draws, 2, 0):
-        if rank_r_hat(component) > APART or bulk_ess(component) < FEW:
+        if rank_r_hat(component) > r_hat or bulk_ess(component) < ess:
             return False
     return True
 
