@@ -16,6 +16,7 @@ from ssmppl.errors import (
     SamplingError,
     SSMError,
 )
+from ssmppl.expressions.loops.integrate import expm, integrate, repeat
 from ssmppl.inference.methods.methods import (
     EM,
     IF2,
@@ -181,8 +182,10 @@ __all__ = [
     "effects",
     "evidence",
     "explain",
+    "expm",
     "forecast",
     "forward_filter",
+    "integrate",
     "kalman_filter",
     "leave_future_out",
     "log_likelihood",
@@ -199,6 +202,7 @@ __all__ = [
     "plots",
     "predict",
     "primitive",
+    "repeat",
     "sample",
     "score",
     "simulate",
