@@ -44,8 +44,9 @@ Step = Callable[[Rates, Sequence[Expr], Expr], list[Expr]]
 
 
 def integrate(
-    rhs: Callable[..., Any], state: Any, dt: Any, *, method: str = "rk4", steps: int = 1
-) -> Any:
+    rhs: Callable[..., Any], state: Any, dt: Any, *, method: str = "rk4", steps: int = 1,
+    linear: bool = True,
+) -> Any:  # fmt: skip
     """The state after a time `dt` of the differential equation d state / dt = rhs(state).
 
     Parameters
@@ -61,11 +62,13 @@ def integrate(
         4), or "implicit" (linearly implicit, of order 2, for stiff systems).
     steps : of length dt / steps each. The model's text and the time of its compilation do not grow
         with them.
+    linear : whether an equation that is linear in the state (with what else there is to add) is
+        recognised. Then it is solved exactly, whatever the method, and stays linear in the state,
+        as Kalman filters need it.
 
     Returns
     -------
-    The state at the end, of the form of `state`. Where `rhs` is linear in the state (with what else
-    there is to add), it is the exact solution, whatever the method, and linear in the state.
+    The state at the end, of the form of `state`.
 
     Raises
     ------
@@ -94,9 +97,9 @@ def integrate(
     symbols = fresh(len(form.values))
     rates = form.call(rhs, symbols, "derivative")
     time = _number(dt, "dt", where)
-    linear = affine_form(rates, symbols)
-    if linear is not None:
-        return form.like(_solved(*linear, form.values, time))
+    found = affine_form(rates, symbols) if linear else None
+    if found is not None:
+        return form.like(_solved(*found, form.values, time))
 
     def by(values: Sequence[Expr]) -> list[Expr]:
         return substitute(rates, dict(zip(symbols, values, strict=True)))
@@ -106,7 +109,7 @@ def integrate(
     return form.like(repeated(name, symbols, form.values, step, constant(float(steps))))
 
 
-def repeat(step: Callable[..., Any], state: Any, times: int) -> Any:
+def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = True) -> Any:
     """The state after so many times of state = step(state).
 
     Parameters
@@ -114,28 +117,30 @@ def repeat(step: Callable[..., Any], state: Any, times: int) -> Any:
     step : function of the state, written as the laws of a model are, that gives the next one; of a
         dict as in `integrate`.
     state : number or symbol, vector, or dict of these by name, at the beginning.
-    times : how often, from 0.
+    times : how often, from 0; a symbol counts as its whole part, and as 0 where it is none. The
+        model's text and the time of its compilation do not grow with it.
+    linear : whether a step that is linear in the state is recognised: then so is the whole.
 
     Returns
     -------
-    The state at the end, of the form of `state`. The model's text and the time of its compilation
-    do not grow with `times`; where a step is linear in the state, so is the whole.
+    The state at the end, of the form of `state`.
 
     Raises
     ------
     ModelError : as `integrate`.
     """
     where = user_location()
-    _check_whole("times", times, 0, where)
+    if not isinstance(times, Expr):
+        _check_whole("times", times, 0, where)
     form = _Form.of(state)
     symbols = fresh(len(form.values))
     update = form.call(step, symbols, "state")
     name = getattr(step, "__name__", "step").strip("<>")
-    count = constant(float(times))
-    linear = affine_form(update, symbols)
-    if linear is None:
+    count = as_expr(times)
+    found = affine_form(update, symbols) if linear else None
+    if found is None:
         return form.like(repeated(name, symbols, form.values, update, count))
-    rows, rest = linear
+    rows, rest = found
     columns = [i for i, e in enumerate(rest) if e is not constant(0.0)]
     power, total = power_and_sum(name, rows, count, columns)
     return form.like(applied(power, form.values, total, [rest[i] for i in columns]))
