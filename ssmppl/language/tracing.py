@@ -97,6 +97,7 @@ class _Tracer:
             observations=observations,
             proposal=proposal,
             inputs=dict(model.inputs),
+            time_step=model.time_step,
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
             choices=choices,

@@ -59,6 +59,7 @@ class Trace:
     """The traced model; see the module's docstring for its symbols.
 
     choices : element of an array that a symbol chose -> (the index, the number of elements).
+    time_step : the input that is the time to the next row, and its unit where times are dates.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Trace:
     locations: dict[Expr, Location]
     functions: dict[str, list[Location]] = field(default_factory=dict)
     choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
+    time_step: tuple[str, str] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Packed once, and one object in each process that gets it: what was generated for it is
