@@ -83,6 +83,7 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
 from ssmppl.language.user_defined.primitive import primitive
+from ssmppl.language.user_defined.sde import SDE
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:
@@ -126,6 +127,7 @@ __all__ = [
     "PGAS",
     "PMMH",
     "PSAEM",
+    "SDE",
     "SMC2",
     "ArgumentError",
     "Bernoulli",

@@ -27,6 +27,7 @@ from ssmppl.language.model.calling import call, check_outer_names, return_locati
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.trace import Site, Trace, symbols
+from ssmppl.language.user_defined.sde import started
 
 
 def _time(role: str) -> str:
@@ -111,6 +112,7 @@ class _Tracer:
             where = location_of(function)
             returned = self._call(function, function_role, where)
             line = return_location(function)
+            returned = started(returned, function_role, function.__name__, line, self._before)
             laws = check_returned(returned, function_role, function.__name__, line)
             for name, distribution in laws.items():
                 check_name(name, role, line)
@@ -135,6 +137,12 @@ class _Tracer:
                 value = symbols(role, name, distribution.shape, name in self.symmetric)
                 sites[name] = Site(name, role, distribution, value, where)
         return sites
+
+    def _before(self, name: str) -> Any:
+        """The value of a state at the row before; None where there is none of this name."""
+        if self.known.get(name, ("", ()))[0] != "state":
+            return None
+        return self._argument(name, "transition")
 
     def _claim(self, name: str, role: str, shape: tuple[int, ...], where: Location) -> None:
         if name in self.known:

@@ -219,7 +219,12 @@ def _integrated(split: ConditionallyLinear) -> str:
 
 
 def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
-    return [(s.name, _cut(f"~ {s.distribution!r}")) for s in sites.values()]
+    rows = []
+    for s in sites.values():
+        rows.append((s.name, _cut(f"~ {s.distribution!r}")))
+        if s.distribution.approximation:
+            rows.append(("", s.distribution.approximation))
+    return rows
 
 
 def _cut(law: str) -> str:
