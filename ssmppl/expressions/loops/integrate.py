@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -105,7 +106,7 @@ def integrate(
         return substitute(rates, dict(zip(symbols, values, strict=True)))
 
     step = STEPS[method](by, symbols, time / float(steps))
-    name = getattr(rhs, "__name__", "step").strip("<>")
+    name = _name(rhs)
     return form.like(repeated(name, symbols, form.values, step, constant(float(steps))))
 
 
@@ -135,7 +136,7 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
     form = _Form.of(state)
     symbols = fresh(len(form.values))
     update = form.call(step, symbols, "state")
-    name = getattr(step, "__name__", "step").strip("<>")
+    name = _name(step)
     count = as_expr(times)
     found = affine_form(update, symbols) if linear else None
     if found is None:
@@ -317,6 +318,11 @@ class _Form:
                 where=where,
             )
         return [_number(e, f"{name}()", where) for p in parts for e in array(p).ravel()]
+
+
+def _name(function: Callable[..., Any]) -> str:
+    """For people; without the number that tells two of one name apart in a file that is written."""
+    return re.sub(r"_\d+$", "", getattr(function, "__name__", "step").strip("<>"))
 
 
 def _by_name(function: Callable[..., Any], names: Sequence[str]) -> bool:
