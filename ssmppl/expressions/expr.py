@@ -238,6 +238,12 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
             return number, e
 
 
+def several(node: Expr) -> bool:
+    """Whether the node is several numbers, a matrix or the end of a loop, of which "item" nodes
+    take one."""
+    return node.op in ("cholesky", "inverse", "loop")
+
+
 # -- walks over the graph
 def topological(
     roots: Iterable[Expr], within: Container[Expr] | None = None, until: Container[Expr] = ()
