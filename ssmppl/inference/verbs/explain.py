@@ -304,7 +304,9 @@ def _labels(trace: Trace, experiments: Sequence[Experiment]) -> tuple[tuple[str,
     ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
     uneven = next((found for t in times if (found := spacing(t))), "")
     if trace.time_step is not None:
-        uneven = f"{trace.time_step[0]} is the time from each row to the next"
+        name, unit = trace.time_step
+        unit = f", in {unit}" if any(t.dtype.kind == "M" for t in times) else ""
+        uneven = f"{name} is the time from each row to the next{unit}"
     return (("labels", ends), *([("steps", uneven)] if uneven else []))
 
 
