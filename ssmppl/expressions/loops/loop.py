@@ -220,6 +220,6 @@ def _forms(update: list[Expr], change: dict[Expr, Expr]) -> list[int]:
         if node.op in SWAPPING:
             inner = tuple(sorted(inner))
         what = change.get(node, node) if not node.args else node
-        key = (id(what),) if not node.args else (node.op, repr(node.data), inner)
+        key = (id(what),) if not node.args else (node.op, node.data, inner)
         form[node] = known.setdefault(key, len(known))
     return [form[e] for e in update]

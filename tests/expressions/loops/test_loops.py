@@ -230,3 +230,17 @@ def test_the_number_of_times_may_be_a_symbol():
         evaluate(found, values), [0.4, expected[3], 0.4, 0.4, expected[1]], rtol=1e-14
     )
     assert isinstance(found, Expr)
+
+
+def test_two_functions_of_one_name_are_two():
+    def made(factor):
+        @ssm.primitive
+        def push(x):
+            return factor * x
+
+        return push
+
+    first, second = made(2.0), made(3.0)
+    s = fresh(2)
+    values = repeated("made", s, [X, X], [first(s[0]), second(s[1])], 3)
+    np.testing.assert_allclose(evaluate(values, AT), [0.4 * 8, 0.4 * 27])
