@@ -109,7 +109,7 @@ def integrate(
         return substitute(rates, dict(zip(symbols, values, strict=True)))
 
     step = STEPS[method](by, symbols, time / float(steps))
-    name = _name(rhs)
+    name = f"{_name(rhs)}_{method.replace('-', '_')}"
     return form.like(repeated(name, symbols, form.values, step, constant(float(steps))))
 
 

@@ -28,6 +28,7 @@ from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
@@ -104,6 +105,8 @@ class Plan:
             ("Transition, x_prev to x", _laws(t.transition)),
             ("Observation", _laws(t.observations)),
         ]
+        if loops := _loops(t):
+            out.append(("Small steps", loops))
         if t.inputs:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
@@ -225,6 +228,29 @@ def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows
+
+
+def _loops(trace: Trace) -> list[tuple[str, str]]:
+    """What the names of loops in the laws stand for, and of how many steps they are."""
+    sites = (trace.parameters, trace.initial, trace.transition, trace.observations)
+    laws = [s.distribution for group in sites for s in group.values()]
+    waiting = [e for law in reversed(laws) for e in reversed(law.expressions())]
+    found, seen = dict[str, str](), set[Expr]()
+    while waiting:
+        node = waiting.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        if node.op != "loop":
+            waiting += reversed(node.args)
+            continue
+        times, name = node.args[-1], node.data.name
+        count = f"{times.data:.0f}" if times.op == "const" else f"{times!r}"
+        text = (
+            "the exponential of a matrix" if name == "expm" else f"{name}, repeated {count} times"
+        )
+        found[repr(node).partition("(")[0]] = text
+    return list(found.items())
 
 
 def _cut(law: str) -> str:
