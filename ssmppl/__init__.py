@@ -16,6 +16,7 @@ from ssmppl.errors import (
     SamplingError,
     SSMError,
 )
+from ssmppl.expressions.loops.integrate import expm, integrate, repeat
 from ssmppl.inference.methods.methods import (
     EM,
     IF2,
@@ -82,6 +83,7 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
 from ssmppl.language.user_defined.primitive import primitive
+from ssmppl.language.user_defined.sde import SDE
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:
@@ -125,6 +127,7 @@ __all__ = [
     "PGAS",
     "PMMH",
     "PSAEM",
+    "SDE",
     "SMC2",
     "ArgumentError",
     "Bernoulli",
@@ -181,8 +184,10 @@ __all__ = [
     "effects",
     "evidence",
     "explain",
+    "expm",
     "forecast",
     "forward_filter",
+    "integrate",
     "kalman_filter",
     "leave_future_out",
     "log_likelihood",
@@ -199,6 +204,7 @@ __all__ = [
     "plots",
     "predict",
     "primitive",
+    "repeat",
     "sample",
     "score",
     "simulate",

@@ -7,22 +7,32 @@ finite upper end is a bound that rejection sampling may rely on. It need not be 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from ssmppl.expressions.expr import Expr, topological
 
 Interval = tuple[float, float]
 WHOLE: Interval = (-math.inf, math.inf)
+LONGEST = 60  # times of a loop that are followed
 
 
 def interval(expression: Expr, domain: Mapping[Expr, Interval]) -> Interval:
     """An enclosure of the values of `expression` where it is defined, symbols in `domain`."""
+    return _intervals([expression], domain)[expression]
+
+
+def _intervals(roots: Sequence[Expr], domain: Mapping[Expr, Interval]) -> dict[Expr, Interval]:
     done: dict[Expr, Interval] = {}
-    for node in topological([expression]):
+    ends: dict[Expr, list[Interval]] = {}
+    for node in topological(roots):
         if node.op == "const":
             done[node] = (node.data, node.data)
         elif node.op == "symbol":
             done[node] = domain.get(node, WHOLE)
+        elif node.op == "loop":
+            done[node], ends[node] = WHOLE, _of_loop(node, [done[a] for a in node.args])
+        elif node.op == "item" and node.args[0].op == "loop":
+            done[node] = ends[node.args[0]][node.data[0]]
         elif node.op == "mul" and node.args[0] is node.args[1]:
             done[node] = _pow(done[node.args[0]], 2.0)
         elif node.op == "pow" and node.args[1].op == "const":
@@ -33,7 +43,24 @@ def interval(expression: Expr, domain: Mapping[Expr, Interval]) -> Interval:
             done[node] = WHOLE
         if any(math.isnan(e) for e in done[node]):
             done[node] = WHOLE
-    return done[expression]
+    return done
+
+
+def _of_loop(node: Expr, args: list[Interval]) -> list[Interval]:
+    """Of the numbers of a loop at its end, step by step; of a long one nothing is known."""
+    loop = node.data
+    x, held = args[: loop.states], dict(zip(loop.held, args[loop.states : -1], strict=True))
+    least, most = args[-1]
+    reached: list[Interval] = []
+    for k in range(LONGEST + 1):
+        if k >= least:
+            reached = reached or x
+            reached = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(reached, x, strict=True)]
+        if k >= most:
+            return reached
+        found = _intervals(loop.update, held | dict(zip(loop.moving, x, strict=True)))
+        x = [found[e] for e in loop.update]
+    return [WHOLE] * loop.states
 
 
 def _sum(a: float, b: float, otherwise: float) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 
 from ssmppl.expressions.evaluate import MEANING, evaluate
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
+from ssmppl.expressions.loops.loop import Loop
 from ssmppl.expressions.operations import (
     MATRICES,
     OPERATIONS,
@@ -144,7 +145,9 @@ def _written(node: Expr, parts: list[str]) -> str:
     if node.op in MATRIX_OPS:
         return f"matrix_{node.op}({node.data}, ({', '.join(parts)},))"
     if node.op == "item":
-        return f"{parts[0]}[{node.data[0]}, {node.data[1]}]"
+        return f"{parts[0]}[{', '.join(map(str, node.data))}]"
+    if node.op == "loop":
+        return f"loops[{id(node.data)}]({', '.join(parts)})"
     if node.op == "call":
         return f"calls[{id(node.data)}]({', '.join(parts)})"
     if node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
@@ -171,6 +174,18 @@ def _matrix(function: Callable[..., Any]) -> Callable[[int, tuple[float, ...]], 
     return run
 
 
+def _loop(loop: Loop) -> Callable[..., tuple[float, ...]]:
+    once = python_function(loop.update, (*loop.moving, *loop.held))
+
+    def run(*args: float) -> tuple[float, ...]:
+        x, held = tuple(args[: loop.states]), args[loop.states : -1]
+        for _ in range(int(args[-1]) if args[-1] > 0.0 else 0):
+            x = once((*x, *held))
+        return x
+
+    return run
+
+
 def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
     """What the texts refer to."""
     return {
@@ -179,6 +194,7 @@ def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
         "logaddexp": _logaddexp,
         "DOMAIN": DOMAIN,
         "meaning": MEANING,
+        "loops": {id(n.data): _loop(n.data) for n in topological(expressions) if n.op == "loop"},
         "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
         **{f"matrix_{op}": _matrix(function) for op, (_, function) in MATRICES.items()},
     }

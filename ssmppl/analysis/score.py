@@ -22,7 +22,7 @@ from ssmppl.analysis.density import Missing, terms
 from ssmppl.analysis.structure import component_means, deterministic
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.calculus import JUMPING, differentiate
+from ssmppl.expressions.calculus import differentiate, jumps
 from ssmppl.expressions.expr import Expr, constant, dependent, symbol, symbols_of, topological
 from ssmppl.language.model.trace import Site, Trace, previous
 
@@ -115,10 +115,10 @@ class CompleteScore:
                     )
             roots = [e for a in site.distribution.parameters.values() for e in array(a).ravel()]
             changing = dependent(roots, symbols)
-            if not any(node.op in JUMPING for node in changing):
+            if not any(map(jumps, changing)):
                 continue
             for node in topological(roots):  # the first of them
-                if node.op in JUMPING and node in changing:
+                if jumps(node) and node in changing:
                     return NotApplicable(
                         f"the law of {site.name} changes by steps in {parameter!r}, by {node!r}",
                         where,

@@ -20,6 +20,7 @@ from ssmppl.data.channels import channel, holds
 from ssmppl.data.defined import check_defined
 from ssmppl.data.parameters import pack
 from ssmppl.data.sources import Source, sources
+from ssmppl.data.time_steps import with_time_step
 from ssmppl.data.values import name_of, number, outside
 from ssmppl.errors import ArgumentError, DataError
 from ssmppl.expressions.expr import Expr, symbol, symbols_of
@@ -76,7 +77,8 @@ def bind(
         {n: site.distribution.support() for n, site in trace.observations.items()},
         tuple(_needed(trace)),
     )
-    return [_bind(trace, s, need_observations, steps, common) for s in sources(data, named)]
+    given = [with_time_step(trace, s) for s in sources(data, named)]
+    return [_bind(trace, s, need_observations, steps, common) for s in given]
 
 
 def unread(trace: Trace, data: Any) -> list[str]:
@@ -98,7 +100,7 @@ def bind_inputs(trace: Trace, inputs: Any, steps: int | None) -> tuple[np.ndarra
         check_count("steps", steps, 1)
     if inputs is None:
         if trace.inputs:
-            names = ", ".join(f"{n!r}: ..." for n in trace.inputs)
+            names = ", ".join(f"{n!r}: ..." for n in _to_give(trace))
             raise ArgumentError(
                 f"the model {trace.name!r} has inputs, and none were given",
                 fix=f"pass inputs={{{names}}}, one row for each step",
@@ -121,10 +123,17 @@ def bind_inputs(trace: Trace, inputs: Any, steps: int | None) -> tuple[np.ndarra
             "neither steps nor inputs tell how many rows to simulate", fix="pass steps=100"
         )
     (source,) = found
+    source = with_time_step(trace, source)
     values = {n: channel(source, n, shape, "input") for n, shape in trace.inputs.items()}
     rows = _rows(source, values, steps)
     _check_inputs(source, values)
     return _input_array(trace, values, rows), rows, source
+
+
+def _to_give(trace: Trace) -> list[str]:
+    """The inputs, with the times of the rows in place of the time step that follows from them."""
+    own = None if trace.time_step is None else trace.time_step[0]
+    return ["time" if n == own else n for n in trace.inputs]
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,11 @@ from ssmppl.expressions.expr import (
     as_expr,
     constant,
     dependent,
+    depends_on,
     topological,
     without_exponentials,
 )
+from ssmppl.expressions.loops.slopes import loop_slopes
 from ssmppl.expressions.properties import never_negative
 
 Partial = Callable[..., Sequence[Expr | float | None]]
@@ -127,6 +129,13 @@ JUMPING = FLAT | {"mod"}  # not continuous
 LONGEST = 80  # characters of an expression in an error
 
 
+def jumps(node: Expr) -> bool:
+    """Whether an operation is not continuous, or a loop makes one that is not."""
+    if node.op == "loop":
+        return any(map(jumps, topological(node.data.update)))
+    return node.op in JUMPING
+
+
 class NotDifferentiable(SSMError):
     """The derivative has no closed form in this language."""
 
@@ -147,6 +156,8 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
             continue
         if node.op in ("cholesky", "inverse"):
             matrix_tangent[node] = _matrix_tangent(node, tangent)
+        elif node.op == "loop":
+            matrix_tangent[node] = array(loop_slopes(node, symbol, differentiate))
         elif node.op == "item":
             tangent[node] = _Slope(matrix_tangent[node.args[0]][node.data])
         else:
@@ -398,7 +409,12 @@ def reverse_gradient(expression: Expr, symbols: Sequence[Expr]) -> list[Expr]:
             continue
         if node not in slopes or _is_zero(slopes[node].value):
             continue
-        if node.op == "item":
+        if node.op == "item" and node.args[0].op == "loop":
+            for s in symbols:  # at once: the slopes in the arguments between would be many more
+                if s in involved and depends_on(node, [s]):
+                    value = loop_slopes(node.args[0], s, differentiate)[node.data[0]]
+                    add(s, _Slope(slopes[node].whole() * value))
+        elif node.op == "item":
             matrix = node.args[0]
             n = matrix.data
             here = entries.setdefault(matrix, array(np.full((n, n), constant(0.0), dtype=object)))

@@ -60,6 +60,8 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
                 raise KeyError(f"no value given for {node!r}")
             elif node.op == "item":
                 done[node] = args[0][(..., *node.data)]
+            elif node.op == "loop":
+                done[node] = _repeated(node, args)
             elif node.op in MATRIX_OPS:
                 done[node] = _matrix(node.op, node.data, args)
             elif node.op == "random":
@@ -73,6 +75,21 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
             else:
                 done[node] = MEANING[node.op](*args)
     return [done[r] for r in roots]
+
+
+def _repeated(node: Expr, args: list[Any]) -> np.ndarray:
+    """The values of a loop at the end, in the last axis. Where the number of times is an array,
+    each of its elements stops at its own."""
+    loop = node.data
+    x, fixed, times = args[: loop.states], args[loop.states : -1], args[-1]
+    each = np.ndim(times) > 0
+    times = np.where(times > 0.0, times, 0.0)
+    held = dict(zip(loop.held, fixed, strict=True))
+    for k in range(int(np.max(times, initial=0.0))):
+        new = _run(list(loop.update), held | dict(zip(loop.moving, x, strict=True)), None)
+        x = [np.where(k < times, b, a) for a, b in zip(x, new, strict=True)] if each else new
+    whole = np.broadcast_arrays(*x, times)[: loop.states]
+    return np.stack(whole, axis=-1).astype(float)
 
 
 @lru_cache(maxsize=256)

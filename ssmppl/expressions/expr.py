@@ -460,7 +460,12 @@ def _written(node: Expr, parts: list[Text]) -> Text:
     if op == "symbol":
         return symbol_text(node), Level.ATOM
     if op == "item":
-        return f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", Level.ATOM
+        return f"{parts[0][0]}[{', '.join(map(str, node.data))}]", Level.ATOM
+    if op == "loop":  # what it depends on, and a mark of how
+        whole = f"{node.data!r}({', '.join(text for text, _ in parts)})"
+        mark = hashlib.sha256(whole.encode()).hexdigest()[:6]
+        known = sorted(symbols_in(node), key=lambda s: (s.data[0] == "parameter", repr(s.data)))
+        return f"{node.data.name}_{mark}({', '.join(map(symbol_text, known))})", Level.ATOM
     inside = _matrix_name(node) if op in MATRIX_OPS else None
     if inside is None:
         inside = ", ".join(text for text, _ in parts)

@@ -208,4 +208,4 @@ DRAWS = ("normal", "uniform", "gamma", "gamma_by", "poisson", "binomial", "vonmi
 
 # Functions of `codegen/kernels/math` -> the file where they stand.
 KERNELS = dict(o.kernel.split(".")[::-1] for o in _TABLE if "." in o.kernel)
-KERNELS |= dict.fromkeys(MATRIX_OPS, "scalars") | dict.fromkeys(DRAWS, "random")
+KERNELS |= dict.fromkeys((*MATRIX_OPS, "whole"), "scalars") | dict.fromkeys(DRAWS, "random")

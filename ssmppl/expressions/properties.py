@@ -152,7 +152,11 @@ def _state(
         return np.maximum(state[condition], chosen)
     if node in values:
         value = np.asarray(values[node], dtype=float)  # matrices in the last two axes
-        wrong = np.isnan(value) if value.ndim < 2 else np.isnan(value).any(axis=(-2, -1))
+        wrong = np.isnan(value)
+        if node.op == "loop":  # its numbers in the last axis
+            wrong = wrong.any(axis=-1)
+        elif value.ndim >= 2:
+            wrong = wrong.any(axis=(-2, -1))
         if not wrong.any() and not out.any():
             return _NOTHING_WRONG
         return np.where(out == _OUTSIDE, _OUTSIDE, np.where(wrong, _NAN, _FINE))

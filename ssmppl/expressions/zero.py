@@ -143,7 +143,11 @@ def _rational(parts: list[Expr]) -> list[Expr]:
         moved = rebuilt(node, tuple(new[a] for a in node.args))
         if moved.op == "exp":
             moved = _exponential(moved.args[0], own)
-        elif moved.op not in _FOLLOWED and not (moved.op == "pow" and moved.args[1].op == "const"):
+        elif moved.op == "loop":
+            pass  # what is taken from it is a symbol
+        elif (moved.op == "item" and moved.args[0].op == "loop") or (
+            moved.op not in _FOLLOWED and not (moved.op == "pow" and moved.args[1].op == "const")
+        ):
             moved = own.setdefault(moved, symbol("function", str(len(own))))
         new[node] = moved
     return [new[p] for p in parts]

@@ -35,6 +35,7 @@ from ssmppl.language.model.calling import call, call_once, check_outer_names, re
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.trace import Site, Trace, symbols
+from ssmppl.language.user_defined.sde import started
 
 
 def _time(role: str) -> str:
@@ -109,6 +110,7 @@ class _Tracer:
             observations=observations,
             proposal=proposal,
             inputs=dict(model.inputs),
+            time_step=model.time_step,
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
             choices=choices,
@@ -123,6 +125,7 @@ class _Tracer:
             where = location_of(function)
             returned = self._call(function, function_role, where)
             line = return_location(function)
+            returned = started(returned, function_role, function.__name__, line, self._before)
             laws = check_returned(returned, function_role, function.__name__, line)
             handed = self.new.symbols(list(inspect.signature(function).parameters))
             for name, distribution in laws.items():
@@ -152,6 +155,12 @@ class _Tracer:
                 for name in laws:
                     self.new.give(sites[name])
         return sites
+
+    def _before(self, name: str) -> Any:
+        """The value of a state at the row before; None where there is none of this name."""
+        if self.known.get(name, ("", ()))[0] != "state":
+            return None
+        return self._argument(name, "transition")
 
     def _claim(self, name: str, role: str, shape: tuple[int, ...], where: Location) -> None:
         if name in self.known:

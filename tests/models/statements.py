@@ -7,6 +7,7 @@ moderate for all of them.
 import numpy as np
 
 import ssmppl.language.distributions as D
+from ssmppl.expressions.loops.integrate import integrate, repeat
 from ssmppl.language.model.model import Model
 
 MODELS = {}
@@ -464,3 +465,35 @@ def surveys():
     return declare(
         "surveys", prior=prior, initial=initial, transition=transition, observation=observation
     )
+
+
+@register
+def small_steps():
+    """A differential equation in small steps, one within another's, an observation by one, and the
+    exact solution of a linear one over a time from the data."""
+
+    def prior():
+        return {"k": D.HalfNormal(sd=3), "d": D.HalfNormal(sd=1)}
+
+    def initial():
+        return {"q": D.Normal(0.4, sd=0.3), "v": D.Normal(0, sd=0.5), "x": D.Normal(0, sd=1)}
+
+    def transition(q, v, x, k, d, torque, dt):
+        def swing(q, v):
+            drag = repeat(lambda a: a + 0.1 * (np.tanh(v) - a), 0.5 * v, 3)
+            return {"q": v, "v": torque - k * np.sin(q) - d * drag}
+
+        new = integrate(swing, {"q": q, "v": v}, 0.2, steps=5)
+        flow = integrate(lambda x: -(0.5 + d) * x + k, np.stack([x, 0.3 * q]), 0.3 * dt)
+        return {"q": D.Dirac(new["q"]), "v": D.Normal(new["v"], sd=0.1 * d),
+                "x": D.Normal(flow[0] + 0.1 * flow[1], sd=0.3)}  # fmt: skip
+
+    def observation(q, v, x):
+        def fall(q):
+            return -0.5 * q * q
+
+        ahead = integrate(fall, q + 0.1 * x, 0.1, steps=4, method="heun")
+        return {"y": D.Normal(np.stack([np.sin(q), ahead]), sd=0.1), "z": D.Normal(v, sd=0.2)}
+
+    return declare("small_steps", prior=prior, initial=initial, transition=transition,
+                   observation=observation, inputs=("torque", "dt"))  # fmt: skip

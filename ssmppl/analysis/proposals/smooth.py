@@ -9,7 +9,7 @@ from __future__ import annotations
 from ssmppl.analysis.structure import deterministic
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
-from ssmppl.expressions.calculus import JUMPING
+from ssmppl.expressions.calculus import jumps
 from ssmppl.expressions.expr import dependent, topological
 from ssmppl.language.distributions import Draws, Mixture, ZeroInflated
 from ssmppl.language.distributions.from_density import UserDefined
@@ -34,8 +34,8 @@ def smooth_filter_applies(trace: Trace) -> NotApplicable | None:
             return NotApplicable(f"draws of {kind} jump from one part to the other", d.location)
         draw = list(array(d.sample(Draws(site.name))).ravel())
         random = [n for n in topological(draw) if n.op == "random"]
-        jumps = dependent(draw, random) if isinstance(d, UserDefined) else set()
-        if any(n.op in JUMPING for n in jumps):
+        moving = dependent(draw, random) if isinstance(d, UserDefined) else set()
+        if any(map(jumps, moving)):
             return NotApplicable(f"the sampler of {type(d).__name__} may jump", d.location)
         for node in random:
             if node.data[0] not in ("normal", "uniform"):

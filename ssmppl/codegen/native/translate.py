@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from ssmppl.codegen.kernels.math.flags import FAST
 from ssmppl.codegen.native.arithmetic import (
     FLAG_ROW,
+    FLOAT,
     INTEGER,
     PLANE,
     ROW,
@@ -35,6 +36,7 @@ PLANES = frozenset(
 FLAGS = frozenset(["free"])  # of truth values
 WHOLE = frozenset(["t", "steps"])  # parameters that are whole numbers
 STREAMS = frozenset(["rng"])  # of unsigned words, for draws
+BLOCK = 64  # particles whose small steps are made together
 KINDS = {PLANE: PLANES, STREAM: STREAMS, FLAG_ROW: FLAGS}
 
 
@@ -74,6 +76,7 @@ class _Function(Arithmetic):
         super().__init__(node.name, " ".join(sorted(FAST)) + " " if fast else "")
         self.node, self.known = node, set(known)
         self.block = "entry"
+        self.buffers: list[str] = []  # room on the stack, of `BLOCK` numbers each
 
     def text(self) -> str:
         parameters = [a.arg for a in self.node.args.args]
@@ -86,7 +89,9 @@ class _Function(Arithmetic):
             kind = next((k for k, names in KINDS.items() if name in names), ROW)
             self.names[name] = Value(kind, pointer, words[1])
         self._statements(self.node.body)
-        body = "\n".join(f"  {line}" if not line.endswith(":") else line for line in self.lines)
+        room = [f"{name} = alloca [{BLOCK} x double], align 64" for name in self.buffers]
+        lines = [*room, *self.lines]
+        body = "\n".join(f"  {line}" if not line.endswith(":") else line for line in lines)
         head = f"define void @{self.node.name}(ptr %words) nounwind {{"
         return f"{head}\nentry:\n{body}\n  ret void\n}}\n"
 
@@ -142,12 +147,22 @@ class _Function(Arithmetic):
 
     def _loop(self, node: ast.For) -> None:
         call, target = node.iter, node.target
-        if not isinstance(call, ast.Call) or not isinstance(target, ast.Name) or self.in_loop:
+        if not isinstance(call, ast.Call) or not isinstance(target, ast.Name):
             raise self.unknown(node)
         if ast.unparse(call.func) != "range" or len(call.args) != 1 or node.orelse:
             raise self.unknown(node)
+        carried = _carried(node, self.names)
+        if carried:
+            self._repeat(node, call.args[0], carried)
+            return
+        if self.in_loop:
+            raise self.unknown(node)
         length = self.value(call.args[0])
-        index = self._begin_loop(length.text, over_steps=ast.unparse(call.args[0]) == "steps")
+        over_steps = ast.unparse(call.args[0]) == "steps"
+        if not over_steps and _in_blocks(node):
+            self._loop_in_blocks(node, target.id, length.text)
+            return
+        index = self._begin_loop(length.text, over_steps)
         outer = dict(self.names)
         self.names[target.id] = Value(INTEGER, index)
         self._statements(node.body)
@@ -155,6 +170,119 @@ class _Function(Arithmetic):
             raise self.unknown(node)  # the next iteration would have to know
         self.names = outer
         self._end_loop()
+
+    def _repeat(self, node: ast.For, times: ast.expr, carried: list[str]) -> None:
+        """A loop over small steps, from one of which to the next these numbers are carried."""
+        length = self._times(times)
+        begun = {name: self.float(self.names[name]) for name in carried}
+        self.count += 1
+        k = self.count
+        before, outer = self.block, dict(self.names)
+        self.lines += [f"br label %step{k}", f"step{k}:", ""]
+        place = len(self.lines) - 1  # of the values, known when the body is written
+        for i, name in enumerate(carried):
+            self.names[name] = Value(FLOAT, f"%x{k}_{i}")
+        at_head = dict(self.names)
+        self.lines += [
+            f"%more{k} = icmp slt i64 %i{k}, {length}",
+            f"br i1 %more{k}, label %inner{k}, label %done{k}", f"inner{k}:",
+        ]  # fmt: skip
+        self.block = f"inner{k}"
+        self._statements(node.body)
+        moved = [self.float(self.names[name]) for name in carried]
+        self.lines += [f"%next{k} = add nuw nsw i64 %i{k}, 1", f"br label %step{k}", f"done{k}:"]
+        phis = [f"%i{k} = phi i64 [ 0, %{before} ], [ %next{k}, %{self.block} ]"]
+        for i, (name, new) in enumerate(zip(carried, moved, strict=True)):
+            phis.append(
+                f"%x{k}_{i} = phi double [ {begun[name]}, %{before} ], [ {new}, %{self.block} ]"
+            )
+        self.lines[place : place + 1] = phis
+        self.block = f"done{k}"
+        self.names = {name: at_head[name] for name in outer}
+
+    def _loop_in_blocks(self, node: ast.For, index: str, length: str) -> None:
+        """A loop over particles with small steps inside, as loops over a few particles each: step
+        by step all of a block, as only the innermost loop vectorises."""
+        self.count += 1
+        k, before = self.count, self.block
+        self.lines += [
+            f"br label %block{k}", f"block{k}:",
+            f"%b{k} = phi i64 [ 0, %{before} ], [ %c{k}, %end{k} ]",
+            f"%some{k} = icmp slt i64 %b{k}, {length}",
+            f"br i1 %some{k}, label %into{k}, label %over{k}", f"into{k}:",
+            f"%left{k} = sub i64 {length}, %b{k}", f"%few{k} = icmp slt i64 %left{k}, {BLOCK}",
+            f"%size{k} = select i1 %few{k}, i64 %left{k}, i64 {BLOCK}",
+        ]  # fmt: skip
+        self.block, outer = f"into{k}", dict(self.names)
+        kept: dict[str, str] = {}  # name -> the buffer with its values
+        parts = _segments(node)
+        for place, part in enumerate(parts):
+            later = {n for p in parts[place + 1 :] for n in _read(p)}
+            if isinstance(part, ast.For):
+                self._step_of_block(part, index, k, outer, kept, later | _read(part))
+            else:
+                self._pass(part, index, k, outer, kept, later)
+        self.lines += [
+            f"br label %end{k}", f"end{k}:", f"%c{k} = add i64 %b{k}, {BLOCK}",
+            f"br label %block{k}", f"over{k}:",
+        ]  # fmt: skip
+        self.block, self.names = f"over{k}", outer
+
+    def _step_of_block(
+        self, node: ast.For, index: str, block: int, outer: dict[str, Value],
+        kept: dict[str, str], later: set[str],
+    ) -> None:  # fmt: skip
+        """The small steps, each of all particles of the block."""
+        assert isinstance(node.iter, ast.Call)
+        self.names = dict(outer)
+        length = self._times(node.iter.args[0])
+        self.count += 1
+        k, before = self.count, self.block
+        self.lines += [f"br label %step{k}", f"step{k}:", ""]
+        place = len(self.lines) - 1
+        self.lines += [
+            f"%more{k} = icmp slt i64 %i{k}, {length}",
+            f"br i1 %more{k}, label %inner{k}, label %done{k}", f"inner{k}:",
+        ]  # fmt: skip
+        self.block = f"inner{k}"
+        self._pass(node.body, index, block, outer, kept, later)
+        self.lines[place] = f"%i{k} = phi i64 [ 0, %{before} ], [ %next{k}, %{self.block} ]"
+        self.lines += [f"%next{k} = add nuw nsw i64 %i{k}, 1", f"br label %step{k}", f"done{k}:"]
+        self.block = f"done{k}"
+
+    def _pass(
+        self, body: list[ast.stmt], index: str, block: int, outer: dict[str, Value],
+        kept: dict[str, str], later: set[str],
+    ) -> None:  # fmt: skip
+        """Statements for each particle of the block; what is read later is kept in buffers."""
+        here = self._begin_loop(f"%size{block}")
+        self.names = dict(outer)
+        self.names[index] = Value(INTEGER, self.let(f"add i64 %b{block}, {here}"))
+        before = {}
+        for name in sorted(_read(body) & set(kept)):
+            at = self.let(f"getelementptr double, ptr {kept[name]}, i64 {here}")
+            self.names[name] = before[name] = Value(FLOAT, self.load(at))
+        self._statements(body)
+        for name, value in self.names.items():
+            if name == index or name not in later or value is before.get(name):
+                continue
+            if name in outer and outer[name] == value:
+                continue
+            if name not in kept:
+                kept[name] = f"%kept{len(self.buffers)}"
+                self.buffers.append(kept[name])
+            at = self.let(f"getelementptr double, ptr {kept[name]}, i64 {here}")
+            self.store(self.float(value), at)
+        self._end_loop()
+
+    def _times(self, node: ast.expr) -> str:
+        """How often: a whole number, or `whole(number)`."""
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "whole":
+            number = self.float(self.value(node.args[0]))
+            some = self.let(f"fcmp ogt double {number}, 0.0")
+            number = self.let(f"select i1 {some}, double {number}, double 0.0")
+            return self.let(f"fptosi double {number} to i64")
+        return self.value(node).text
 
     def _begin_loop(self, length: str, over_steps: bool = False) -> str:
         self.count += 1
@@ -202,6 +330,47 @@ class _Function(Arithmetic):
         if not isinstance(call.func, ast.Name) or call.func.id not in self.known or given != own:
             raise self.unknown(call)
         self.lines.append(f"call void @{call.func.id}(ptr %words)")
+
+
+def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For]:
+    """The body, cut at the loops in it."""
+    parts: list[list[ast.stmt] | ast.For] = []
+    for statement in node.body:
+        if isinstance(statement, ast.For):
+            parts.append(statement)
+        elif parts and isinstance(parts[-1], list):
+            parts[-1].append(statement)
+        else:
+            parts.append([statement])
+    return parts
+
+
+def _read(part: list[ast.stmt] | ast.For) -> set[str]:
+    """The names that it reads."""
+    nodes = [part] if isinstance(part, ast.For) else part
+    return {n.id for s in nodes for n in ast.walk(s)
+            if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)}  # fmt: skip
+
+
+def _in_blocks(node: ast.For) -> bool:
+    """Whether particles have small steps of their own, as many for all, and draw nothing besides:
+    the draws' order is that of the text."""
+    inner = [s for s in node.body if isinstance(s, ast.For)]
+    own = {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    alike = all(own.isdisjoint(_names_in(s.iter)) for s in inner)
+    return bool(inner) and alike and "rng" not in _names_in(node)
+
+
+def _names_in(node: ast.AST) -> set[str]:
+    return {n.id for n in ast.walk(node) if isinstance(n, ast.Name)}
+
+
+def _carried(node: ast.For, known: Iterable[str]) -> list[str]:
+    """The names that the loop sets and that had a value before."""
+    stores = {
+        n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+    }
+    return [name for name in known if name in stores]
 
 
 __all__ = ["PLANES", "WHOLE", "Translated", "Untranslatable", "translate"]

@@ -307,8 +307,8 @@ class Section:
 
 
 def is_matrix(node: Expr) -> bool:
-    """Whether the node is a whole matrix, which is no entry of `c` or `s`."""
-    return node.op in ("cholesky", "inverse")
+    """Whether the node is a whole matrix, or a loop: several numbers, no entry of `c` or `s`."""
+    return node.op in ("cholesky", "inverse", "loop")
 
 
 def _grouped(targets: Sequence[Target]) -> list[list[Target]]:

@@ -71,7 +71,7 @@ class Writer:
         self.text: dict[Expr, Text] = {n: (t, Level.ATOM) for n, t in names.items()}
         self.fresh, self.locations, self.indent = fresh, locations, indent
         self.lines: list[str] = []
-        self.counter = 0
+        self.counter = self.loops = 0
 
     def assign(self, targets: list[tuple[str, Expr]], operator: str = "=") -> None:
         """Append the statements `target = expression` for all targets."""
@@ -82,6 +82,9 @@ class Writer:
                 continue
             if node.op == "symbol":
                 raise KeyError(f"symbol {node!r} of kind {node.data[0]} has no name here")
+            if node.op == "loop":
+                self._loop(node)
+                continue
             written = self._written(node)
             named = uses.get(node, 0) > 1 or len(written[0]) > MAX_INLINE
             if _must_be_named(node) or (named and node not in finals):
@@ -95,6 +98,40 @@ class Writer:
     def get(self, node: Expr) -> str:
         """Text of a node that has been written."""
         return self._part(node)[0]
+
+    def _loop(self, node: Expr) -> None:
+        """The statements of a loop; what is taken from it are the names of its numbers."""
+        loop, name = node.data, self.fresh.fresh(f"{identifier(node.data.name)}_{self.loops}")
+        self.loops += 1
+        moving = [self.fresh.fresh(f"{name}_{i}") for i in range(loop.states)]
+        for own, first in zip(moving, node.args, strict=False):
+            begin = within(self._part(first), Level.PRODUCT)
+            self._line(f"{own} = 0.0 + {begin}", node)  # a float, whatever it was
+        names = dict(zip(loop.moving, moving, strict=True))
+        for symbol, outer in zip(loop.held, node.args[loop.states : -1], strict=True):
+            text, level = self._part(outer)
+            if level != Level.ATOM:
+                text, own = self.fresh.fresh(f"{name}_a{symbol.data[2][0]}"), text
+                self._line(f"{text} = {own}", outer)
+            names[symbol] = text
+        inner = Writer(names, self.fresh, self.locations, self.indent + "    ")
+        inner.loops = self.loops
+        new = [self.fresh.fresh(f"{own}n") for own in moving]
+        inner.assign(list(zip(new, loop.update, strict=True)))
+        self.loops = inner.loops
+        self._line(f"for {self.fresh.fresh('k')} in range({self._times(node)}):", node)
+        self.lines += inner.lines
+        for own, other in zip(moving, new, strict=True):
+            self.lines.append(f"{self.indent}    {own} = {other}")
+        for i, own in enumerate(moving):
+            self.text[Expr("item", (node,), (i,))] = own, Level.ATOM
+
+    def _times(self, node: Expr) -> str:
+        """How often, as a whole number."""
+        times = node.args[-1]
+        if times.op == "const":
+            return str(int(times.data))
+        return f"whole({self._part(times)[0]})"
 
     def _name(self, node: Expr) -> str:
         if node.op == "random":

@@ -121,7 +121,10 @@ class _Writer:
     def _arguments(self) -> str:
         name = repr(self.trace.name).replace("'", '"') if "'" in repr(self.trace.name) else ""
         out = name if name.count('"') == 2 else repr(self.trace.name)
-        inputs = self.trace.inputs
+        inputs, step = dict(self.trace.inputs), self.trace.time_step
+        if step is not None:  # an input that is declared so
+            del inputs[step[0]]
+            out += f', time_step="{step[0]}", time_unit="{step[1]}"'
         if any(inputs.values()):
             pairs = [f'"{n}": {s[0] if s else None}' for n, s in inputs.items()]
             out += f", inputs={{{', '.join(pairs)}}}"

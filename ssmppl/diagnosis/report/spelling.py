@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from keyword import iskeyword
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,8 @@ class Lines:
         if node.op == "const":
             negative = node.data < 0 or str(node.data)[0] == "-"
             return number(node.data), Level.SIGN if negative else Level.ATOM
+        if node.op == "loop":
+            return self._loop(node)
         made = self._combined(node)
         while len(made[0]) > WIDTH and self._split(node):
             made = self._combined(node)
@@ -145,7 +148,7 @@ class Lines:
         if node.op in PHRASES:
             return self._phrase(node, parts)
         if node.op == "item":
-            return f"{parts[0][0]}[{node.data[0]}, {node.data[1]}]", Level.ATOM
+            return f"{parts[0][0]}[{', '.join(map(str, node.data))}]", Level.ATOM
         if node.op in MATRIX_OPS:
             matrix = np.array(node.args, dtype=object).reshape(node.data, node.data)
             return MATRICES[node.op][0].format(self.array(matrix)), Level.ATOM
@@ -155,6 +158,31 @@ class Lines:
             f"the model holds {node!r}, whose operation {node.op!r} has no spelling in Python",
             fix="use what NumPy and scipy.special offer in the model's laws",
         )
+
+    def _loop(self, node: Expr) -> Text:
+        """A function of what moves, in the law's body, and its repetition."""
+        loop = node.data
+        first, held = node.args[: loop.states], node.args[loop.states : -1]
+        for a in held:  # numbers of the law, which the function reads
+            if a.args and not self._texts[a][0].isidentifier():
+                self._texts[a] = self._local(a, self._texts[a][0])
+        word = "".join(c if c.isalnum() else "_" for c in loop.name)
+        usable = word.isidentifier() and not iskeyword(word)
+        function, moving = self.name(word if usable else "step"), self.name("z")
+        inner = Lines(loop.update, {}, self._taken, primitive=self._primitive)
+        inner._texts = {s: (f"{moving}[{k}]", Level.ATOM) for k, s in enumerate(loop.moving)}
+        inner._texts |= {s: self._texts[a] for s, a in zip(loop.held, held, strict=True)}
+        new = _listed("np.stack", [inner.text(e) for e in loop.update])
+        self.special |= inner.special
+        body = "\n".join([*inner.statements, f"return {new}"])
+        indented = body.replace("\n", "\n    ")
+        self.statements.append(f"def {function}({moving}):\n    {indented}")
+        begin = _listed("np.stack", [self.text(e) for e in first])
+        times = self.text(node.args[-1])
+        return self._local(
+            node, f"ssm.repeat({function}, {begin}, {times}, linear=False)", f"{word}_end"
+            if usable else "end",
+        )  # fmt: skip
 
     def _phrase(self, node: Expr, parts: list[Text]) -> Text:
         phrase, first = PHRASES[node.op], node.args[0]

@@ -105,6 +105,7 @@ def _data(e: Experiment) -> str:
 def model_digest(trace: Trace) -> str:
     """Of laws and expressions, without where they were written."""
     lines = [trace.name, repr(trace.inputs)]
+    lines += [repr(trace.time_step)] if trace.time_step else []
     roots: list[Expr] = []
     for role in ("parameters", "initial", "transition", "observations", "proposal"):
         for name, site in getattr(trace, role).items():

@@ -73,11 +73,19 @@ def _pass_cost(roots: list[Expr], known: dict[Expr, bool]) -> float:
             continue
         if node.op == "random":
             total += {"normal": NORMAL, "uniform": UNIFORM}.get(node.data[0], SLOW)
-        elif node.op == "pow" and is_small_power(node):
-            total += CHEAP
         else:
-            total += COST.get(node.op, SLOW)
+            total += _cost_of(node)
     return total
+
+
+def _cost_of(node: Expr) -> float:
+    if node.op == "pow" and is_small_power(node):
+        return CHEAP
+    if node.op != "loop":
+        return COST.get(node.op, SLOW)
+    times = node.args[-1].data if node.args[-1].op == "const" else 1.0
+    inside = [n for n in topological(node.data.update) if n.args]
+    return times * sum(map(_cost_of, inside))  # type: ignore[no-any-return]
 
 
 _choices: dict[tuple, Choice] = {}

@@ -219,7 +219,12 @@ def _integrated(split: ConditionallyLinear) -> str:
 
 
 def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
-    return [(s.name, _cut(f"~ {s.distribution!r}")) for s in sites.values()]
+    rows = []
+    for s in sites.values():
+        rows.append((s.name, _cut(f"~ {s.distribution!r}")))
+        if s.distribution.approximation:
+            rows.append(("", s.distribution.approximation))
+    return rows
 
 
 def _cut(law: str) -> str:
@@ -271,7 +276,7 @@ def explain(model: Model, data: Any = None) -> Plan:
         rows = max(e.steps for e in experiments)
         bound = ", ".join(f"{e.steps} rows" for e in experiments)
         bound += f", {gaps} missing" if gaps else ", none missing"
-        labels = _labels(experiments) + _unread(unread(traced, data), experiments)
+        labels = _labels(traced, experiments) + _unread(unread(traced, data), experiments)
     program = compile_trace(traced, missing)
     nonlinear = isinstance(exact_model(traced), NotApplicable)
     return Plan(
@@ -291,13 +296,15 @@ def explain(model: Model, data: Any = None) -> Plan:
     )
 
 
-def _labels(experiments: Sequence[Experiment]) -> tuple[tuple[str, str], ...]:
+def _labels(trace: Trace, experiments: Sequence[Experiment]) -> tuple[tuple[str, str], ...]:
     """How rows are labelled: the ends of each data set that has labels, and uneven steps."""
     times = [e.time for e in experiments if e.time is not None]
     if not times:
         return ()
     ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
     uneven = next((found for t in times if (found := spacing(t))), "")
+    if trace.time_step is not None:
+        uneven = f"{trace.time_step[0]} is the time from each row to the next"
     return (("labels", ends), *([("steps", uneven)] if uneven else []))
 
 

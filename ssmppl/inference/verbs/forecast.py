@@ -21,7 +21,8 @@ from ssmppl.data import (
     unpack_states,
 )
 from ssmppl.data.parameters import pack
-from ssmppl.data.times import label_text
+from ssmppl.data.time_steps import lengths
+from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import ArgumentError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.evaluate import evaluate
@@ -101,12 +102,19 @@ def forecast(
         )
     traced = trace(model)
     check_samplers(traced)
+
+    def known() -> _Past:
+        if data is None:
+            return _sampled(traced, idata, experiment)
+        return _at_known(model, idata, data, proposal, draws, experiment, seed)
+
+    past = None
+    if inputs is None and steps and _needs_times_only(traced):
+        past = known()
+        inputs = _times_after(past, steps)
     future, steps, source = bind_inputs(traced, inputs, steps)
     labels = source.time
-    past = (
-        _sampled(traced, idata, experiment) if data is None
-        else _at_known(model, idata, data, proposal, draws, experiment, seed)
-    )  # fmt: skip
+    past = past or known()
     theta, paths, zone = past.theta, past.paths, past.zone
     rows = paths.shape[1]
     d, k = paths.shape[2], len(traced.observation_symbols)
@@ -114,6 +122,7 @@ def forecast(
         f"{len(paths)} draws of {steps} rows", len(paths) * steps * (d + k), "ask for fewer rows"
     )
     u = np.concatenate([past.u, future])
+    _set_step_between(traced, u, past.time, labels)
     check_defined(traced, source, u, after=rows)
     feedback = feeds_back(traced)
     y = np.concatenate([past.y if feedback else np.zeros((rows, k)), np.zeros((steps, k))])
@@ -210,6 +219,31 @@ def _at_known(
     return _Past(theta, paths, e.u, np.where(e.seen > 0.0, e.y, np.nan), time, e.zone, told)
 
 
+def _needs_times_only(traced: Trace) -> bool:
+    """Whether the time step is the only input."""
+    return traced.time_step is not None and list(traced.inputs) == [traced.time_step[0]]
+
+
+def _times_after(past: _Past, steps: int) -> dict[str, np.ndarray] | None:
+    """The times of the rows to come, where those of the data are evenly spaced."""
+    if past.time.dtype.kind not in "iufM" or len(past.time) < 2 or spacing(past.time):
+        return None
+    return {"time": after(past.time, steps, past.zone)}
+
+
+def _set_step_between(
+    traced: Trace, u: np.ndarray, time: np.ndarray, labels: np.ndarray | None
+) -> None:
+    """The time step of the last row of the data, u (T + H, U): up to the first row to come."""
+    if traced.time_step is None or labels is None:
+        return
+    if time.dtype.kind not in "iufM" or (time.dtype.kind == "M") != (labels.dtype.kind == "M"):
+        return
+    name, unit = traced.time_step
+    column = [s.data[1] for s in traced.input_symbols].index(name)
+    u[len(time) - 1, column] = lengths(np.array([time[-1], labels[0]]), unit)[0]
+
+
 def _check_after(time: np.ndarray, labels: np.ndarray | None) -> None:
     """Labels of the inputs follow those of the data, where both have an order."""
     if labels is None or time.dtype.kind not in "iufM" or labels.dtype.kind not in "iufM":
@@ -239,9 +273,9 @@ def after(time: np.ndarray, steps: int, zone: str = "") -> np.ndarray:
 
         if zone and len(time) > 2 and (found := _by_calendar(time, steps, zone)) is not None:
             return found
-        spacing = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
-        if spacing is not None:
-            return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=spacing)[1:])
+        regular = pd.DatetimeIndex(time, freq="infer").freq if len(time) > 2 else None
+        if regular is not None:
+            return np.asarray(pd.date_range(time[-1], periods=steps + 1, freq=regular)[1:])
         if len(time) > 2:
             warnings.warn(
                 "the dates of the data are not evenly spaced, so that the rows of the forecast are "

@@ -16,7 +16,7 @@ from ssmppl.errors import Location, ModelError, listing
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import Expr, symbols_of
 from ssmppl.language.checks.rules import a
-from ssmppl.language.distributions import Dirac, Distribution
+from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.model import location_of
 from ssmppl.language.model.trace import Site
 
@@ -219,4 +219,4 @@ def names_given(returned: Any) -> Mapping[str, Any]:
     """The laws that a function returned; none where it did not return any."""
     if not isinstance(returned, Mapping):
         return {}
-    return {n: d for n, d in returned.items() if isinstance(n, str) and isinstance(d, Distribution)}
+    return {n: d for n, d in returned.items() if isinstance(n, str)}

@@ -86,6 +86,7 @@ class Distribution:
     symmetric = False  # whether values are symmetric matrices, whose two halves share symbols
     by_name = "spread"  # what the keyword-only arguments are called in messages
     trials = ""  # the parameter that is a number of trials
+    approximation = ""  # what it stands for and how, where it is no exact law of that
     # What analyses make use of where it is known.
     truncatable = True  # whether `Truncated` takes it
     gaussian_noise = False  # whether draws are made of normal ones alone; then it has `standard`

@@ -21,6 +21,7 @@ from ssmppl.expressions.expr import user_location
 from ssmppl.language.model.closure_digest import digest_of_code, plain_function
 
 Law = TypeVar("Law", bound=Callable[..., Mapping[str, Any]])
+TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "D": 86400.0}  # in seconds
 _MISSING: Any = None  # so that `@model.prior()` reaches our message, not Python's
 ROLES = ("prior", "initial", "transition", "observation", "proposal")
 VERBS = ("compile", "diagnose", "evidence", "explain", "forecast", "forward_filter",
@@ -47,6 +48,11 @@ class Model:
     name : shown in results and messages.
     inputs : names of the measured inputs u_t; a mapping name -> length where some are vectors, with
         None for a number.
+    time_step : name of an input besides that is the time from a row to the next, taken from the
+        times of the data's rows (their index, or a column `time`), which may be uneven; a column of
+        that name in the data goes before.
+    time_unit : of the time step where the times are dates: "s", "min", "h" or "D". Numbers are
+        taken as they are.
 
     Examples
     --------
@@ -67,8 +73,9 @@ class Model:
     """
 
     def __init__(
-        self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = ()
-    ):
+        self, name: str = "model", *, inputs: Iterable[str] | Mapping[str, int | None] = (),
+        time_step: str | None = None, time_unit: str = "s",
+    ):  # fmt: skip
         self.location = user_location()
         if not isinstance(name, str):
             raise ModelError(
@@ -98,6 +105,9 @@ class Model:
                     "positive whole number, None stands for a number",
                     where=self.location,
                 )
+        self.time_step = self._checked_time_step(time_step, time_unit)
+        if time_step is not None and time_step not in dict(pairs):
+            pairs.append((time_step, None))
         if len(dict(pairs)) < len(pairs):
             names = [key for key, _ in pairs]
             raise ModelError(
@@ -110,6 +120,21 @@ class Model:
             key: () if length is None else (int(length),) for key, length in pairs
         }
         self.functions: dict[str, list[Callable[..., Any]]] = {role: [] for role in ROLES}
+
+    def _checked_time_step(self, name: str | None, unit: str) -> tuple[str, str] | None:
+        if name is not None and not (isinstance(name, str) and name.isidentifier()):
+            raise ModelError(
+                f"time_step={name!r}",
+                fix='give the name that laws call it by, time_step="dt"',
+                where=self.location,
+            )
+        if unit not in TIME_UNITS:
+            raise ModelError(
+                f"time_unit={unit!r}",
+                fix=f"use one of: {', '.join(map(repr, TIME_UNITS))}",
+                where=self.location,
+            )
+        return None if name is None else (name, unit)
 
     def prior(self, function: Law = _MISSING) -> Law:
         """Declare priors of parameters.

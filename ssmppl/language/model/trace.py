@@ -67,6 +67,7 @@ class Trace:
     choices : element of an array that a symbol chose -> (the index, the number of elements).
     auxiliary : names of the states that are draws of a step: read by later laws of the same step
         only. At the first row, where no step has led to, they are 0.
+    time_step : the input that is the time to the next row, and its unit where times are dates.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Trace:
     functions: dict[str, list[Location]] = field(default_factory=dict)
     choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
     auxiliary: frozenset[str] = frozenset()
+    time_step: tuple[str, str] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Packed once, and one object in each process that gets it: what was generated for it is

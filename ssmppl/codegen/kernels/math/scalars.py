@@ -50,6 +50,12 @@ def ceil(a):
     return np.ceil(a)
 
 
+@precise
+def whole(a):
+    """A number of times: 0 for what is negative or no number."""
+    return int(a) if a > 0.0 else 0
+
+
 @exact
 def power(a, b):
     """a ** b as NumPy has it: nan for a negative base with a fractional exponent."""
