@@ -10,20 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from ssmppl.expressions.expr import Expr, depends_on, substitute, symbols_of
-from ssmppl.language.model.trace import Site, Trace
+from ssmppl.language.model.trace import Site
 
 
 def reads_of(site: Site) -> frozenset[Expr]:
     """The symbols in a law, those of its own value not among them."""
     found = symbols_of(site.distribution.arguments())
     return frozenset(found) - frozenset(site.components)
-
-
-def readers(trace: Trace) -> dict[Site, frozenset[Expr]]:
-    """Transitions that read new values, and which."""
-    states = frozenset(trace.state_symbols)
-    found = {site.name: reads_of(site) & states for site in trace.transition.values()}
-    return {site: found[n] for n, site in trace.transition.items() if found[n]}
 
 
 def resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:

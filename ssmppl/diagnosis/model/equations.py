@@ -96,6 +96,8 @@ class Equations:
         for role, sites in (("state", trace.initial), ("channel", trace.observations),
                             ("parameter", trace.parameters)):  # fmt: skip
             for site in sites.values():
+                if site.name in trace.auxiliary:
+                    continue  # of which nothing is read a row later
                 for s in site.components:
                     self._add(role, s)
         for name, shape in trace.inputs.items():
@@ -143,7 +145,9 @@ class Equations:
         own: dict[Expr, Expr] = {}
         for s in symbols_of(mean):
             if s.data[0] == "state":
-                value = self._from_before(self.mean(self.parts[label_of(*s.data[1:])]))
+                _, name, index = s.data
+                read = Part(label_of(name, index), "state", name, index, s)
+                value = self._from_before(self.mean(read))
                 if isinstance(value, NotApplicable):
                     return NotApplicable(f"it reads the new value of {s!r}: {value.reason}")
                 own[s] = value
