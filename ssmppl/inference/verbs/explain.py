@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,10 +99,11 @@ class Plan:
             Of each part its title, and its rows: what, and how.
         """
         t = self.trace
+        first = {n: s for n, s in t.initial.items() if n not in t.auxiliary}
         out = [
             ("Priors", _laws(t.parameters)),
-            ("Initial law, t = 1", _laws(t.initial)),
-            ("Transition, x_prev to x", _laws(t.transition)),
+            ("Initial law, t = 1", _laws(first)),
+            ("Transition, x_prev to x", _laws(t.transition, t.auxiliary)),
             ("Observation", _laws(t.observations)),
         ]
         if loops := _loops(t):
@@ -221,10 +222,12 @@ def _integrated(split: ConditionallyLinear) -> str:
     )
 
 
-def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
+def _laws(sites: dict[str, Site], auxiliary: Collection[str] = ()) -> list[tuple[str, str]]:
     rows = []
     for s in sites.values():
         rows.append((s.name, _cut(f"~ {s.distribution!r}")))
+        if s.name in auxiliary:
+            rows.append(("", "a draw of the step, without a value at the first row"))
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows
