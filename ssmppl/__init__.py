@@ -14,6 +14,7 @@ from ssmppl.errors import (
     ExecutorError,
     ModelError,
     SamplingError,
+    SimulatorError,
     SSMError,
 )
 from ssmppl.expressions.loops.integrate import expm, integrate, repeat
@@ -83,6 +84,7 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
 from ssmppl.language.user_defined.primitive import primitive
+from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.language.user_defined.sde import SDE
 from ssmppl.tables import summary
 
@@ -170,6 +172,8 @@ __all__ = [
     "SSMError",
     "SamplingError",
     "ScoreAscent",
+    "Simulator",
+    "SimulatorError",
     "StudentT",
     "Truncated",
     "Uniform",
@@ -208,6 +212,7 @@ __all__ = [
     "sample",
     "score",
     "simulate",
+    "simulator",
     "smooth",
     "summary",
 ]

@@ -18,6 +18,7 @@ from ssmppl.expressions import special
 from ssmppl.expressions.node import (
     BOOLEAN,
     INDEX_BY_SYMBOL,
+    SEVERAL,
     Expr,
     as_expr,
     attributed,
@@ -461,6 +462,8 @@ def _written(node: Expr, parts: list[Text]) -> Text:
         return symbol_text(node), Level.ATOM
     if op == "item":
         return f"{parts[0][0]}[{', '.join(map(str, node.data))}]", Level.ATOM
+    if op == "simulator":  # the last argument is the row, for messages
+        return f"{node.data!r}({', '.join(text for text, _ in parts[:-1])})", Level.ATOM
     if op == "loop":  # what it depends on, and a mark of how
         whole = f"{node.data!r}({', '.join(text for text, _ in parts)})"
         mark = hashlib.sha256(whole.encode()).hexdigest()[:6]

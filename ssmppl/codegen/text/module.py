@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
+from ssmppl.codegen.text.callbacks import REQUESTS
 from ssmppl.codegen.text.render import (
     Names,
     Writer,
@@ -25,6 +26,7 @@ from ssmppl.codegen.text.render import (
 )
 from ssmppl.codegen.text.specialise import specialise
 from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.node import SEVERAL
 from ssmppl.expressions.operations import KERNELS
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
@@ -307,8 +309,8 @@ class Section:
 
 
 def is_matrix(node: Expr) -> bool:
-    """Whether the node is a whole matrix, or a loop: several numbers, no entry of `c` or `s`."""
-    return node.op in ("cholesky", "inverse", "loop")
+    """Whether the node is a whole matrix, a loop or a simulator: several numbers, no entry of `c` or `s`."""
+    return node.op in ("cholesky", "inverse", *SEVERAL)
 
 
 def _grouped(targets: Sequence[Target]) -> list[list[Target]]:
@@ -394,6 +396,10 @@ class ModuleText:
         if called:
             lines += ["from ssmppl.language.user_defined.primitive import REGISTRY", ""]
             lines += [f'{name} = REGISTRY["{name}"]' for name in called]
+        simulators = sorted(words & set(REQUESTS))
+        if simulators:
+            lines += ["from ssmppl.codegen.text.callbacks import simulated", ""]
+            lines += [f'{name} = simulated("{name}")' for name in simulators]
         lines += ["", 'entry = numba.njit(nogil=True, error_model="numpy")', "", ""]
         return "\n".join(lines) + "\n\n".join(self.parts)
 

@@ -19,6 +19,7 @@ from typing import Any
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     BOOLEAN,
+    SEVERAL,
     Expr,
     as_expr,
     constant,
@@ -146,7 +147,7 @@ def _outer(update: Sequence[Expr], symbols: Sequence[Expr]) -> list[Expr]:
 
 
 def _is_number(node: Expr) -> bool:
-    return node.op not in ("loop", "cholesky", "inverse")
+    return node.op not in (*SEVERAL, "cholesky", "inverse")
 
 
 def closed(
