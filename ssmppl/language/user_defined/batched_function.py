@@ -81,24 +81,34 @@ class BatchedFunction:
 
     # -- one call
     def _called(self, points: np.ndarray) -> np.ndarray:
-        n, m, _ = self.sizes
-        parts = [np.array(p, order="C") for p in np.split(points[:, :-1], [n, n + m], axis=1)]
+        if not np.isfinite(points).all():
+            fine = np.isfinite(points).all(axis=1)
+            values = np.full((len(points), self.outputs), np.nan)
+            if fine.any():
+                values[fine] = self._called(points[fine])
+            return values
         begun = time.perf_counter()
         try:
-            found = self.function(*parts)
+            found = self.function(*self._parts(points))
         except Exception as error:
             raise self._raised(error, points) from None
         self.seconds += time.perf_counter() - begun
         self.calls, self.points = self.calls + 1, self.points + len(points)
         values = self._array(found, len(points))
-        bad = np.isnan(values).any(axis=1) & np.isfinite(points[:, :-1]).all(axis=1)
-        if bad.any():
+        if np.isnan(values).any():
+            bad = np.isnan(values).any(axis=1)
             if not self.undefined:
                 k = int(np.argmax(bad))
                 lost = ", ".join(np.array(self.results)[np.isnan(values[k])])
                 self.first_undefined = f"{lost} at {self._told(points[k])}"
             self.undefined += int(bad.sum())
         return values
+
+    def _parts(self, points: np.ndarray) -> list[np.ndarray]:
+        """States, inputs and parameters, each an array of its own."""
+        n, m, p = self.sizes
+        ends = (0, n, n + m, n + m + p)
+        return [points[:, a:b].copy() for a, b in itertools.pairwise(ends)]
 
     def _array(self, found: Any, size: int) -> np.ndarray:
         wanted = f"an array ({size}, {self.outputs}) of float64, a row for each of {size} points"
@@ -174,11 +184,9 @@ class BatchedFunction:
     def _raised(self, error: Exception, points: np.ndarray) -> SimulatorError:
         point = points[0]
         if 1 < len(points) <= LOOKED_INTO:
-            n, m, _ = self.sizes
             for k in range(len(points)):
-                parts = np.split(np.array(points[k : k + 1, :-1]), [n, n + m], axis=1)
                 try:
-                    self.function(*parts)
+                    self.function(*self._parts(points[k : k + 1]))
                 except Exception as own:
                     point, error = points[k], own
                     break
