@@ -159,7 +159,9 @@ class _Function(Arithmetic):
         """The results for so many particles."""
         out = self._room(asked.results * width)
         self.simulators.add(asked.symbol)
-        self.lines.append(f"call void @{asked.symbol}(ptr {given}, ptr {out}, i64 {size}, i64 {width})")
+        self.lines.append(
+            f"call void @{asked.symbol}(ptr {given}, ptr {out}, i64 {size}, i64 {width})"
+        )
         return Value(SIMULATED, out, str(width))
 
     def _add_to(self, target: ast.expr, value: ast.expr) -> None:
@@ -394,9 +396,9 @@ def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For | ast.Assign]:
     """The body, cut at the loops and the calls of simulators in it."""
     parts: list[list[ast.stmt] | ast.For | ast.Assign] = []
     for statement in node.body:
-        if isinstance(statement, ast.For):
-            parts.append(statement)
-        elif isinstance(statement, ast.Assign) and _simulator(statement.value) is not None:
+        if isinstance(statement, ast.For) or (
+            isinstance(statement, ast.Assign) and _simulator(statement.value) is not None
+        ):
             parts.append(statement)
         elif parts and isinstance(parts[-1], list):
             parts[-1].append(statement)

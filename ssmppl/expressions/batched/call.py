@@ -108,7 +108,9 @@ def of_group(group: Sequence[Expr], args: Sequence[Any]) -> list[np.ndarray]:
     shape: tuple[int, ...] = ()
     for a in args:
         own = np.shape(a)
-        shape = own if not shape else shape if own in ((), shape) else np.broadcast_shapes(own, shape)
+        shape = (
+            own if not shape else shape if own in ((), shape) else np.broadcast_shapes(own, shape)
+        )
     x = np.empty((*shape, len(args)))
     for j, a in enumerate(args):
         x[..., j] = a

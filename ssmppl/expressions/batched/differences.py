@@ -79,9 +79,7 @@ class Stencil:
                 out[w] = self._second(index, points, values, x).T
         return out
 
-    def _first(
-        self, j: int, points: np.ndarray, values: np.ndarray, x: np.ndarray
-    ) -> np.ndarray:
+    def _first(self, j: int, points: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
         """(B, outputs); on one side where the other has no value, as beyond the end of a range."""
         up, down = self.place[FIRST, (j + 1,)], self.place[FIRST, (-j - 1,)]
         a, b = values[up], values[down]

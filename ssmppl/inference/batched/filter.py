@@ -76,9 +76,7 @@ class BatchedFilter:
         values = self._begin(lanes, None, None)
         return values[:, :d], values[:, d:].reshape(len(values), d, -1)
 
-    def _moved(
-        self, lanes: _Lanes, x: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _moved(self, lanes: _Lanes, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         d = self.size
         values = self._move(lanes, None, x)
         n = len(values)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,7 +27,9 @@ from ssmppl.analysis.proposals.smooth import smooth_filter_applies
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
+from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximization
@@ -34,8 +37,8 @@ from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_a
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
-from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
-from ssmppl.inference.preparation.space import free_components
+from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
+from ssmppl.inference.preparation.space import free_components, space_of
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
@@ -53,6 +56,7 @@ EXACT_RESTARTS = 2
 # round the start, the best of which are gone on with (Biernacki, Celeux and Govaert 2003).
 SHORT_CLIMBS, SHORT_STEPS, SPREAD, GONE_ON_WITH = 24, 10, 2.0, 3
 FLATS = 3  # that a climb leaves
+LOOKED_AT = 47  # points round the start, where many cost little more than one
 
 
 def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
@@ -271,9 +275,12 @@ class ExactClimb:
         """All climbs, and Newton's steps from the best point."""
         restarts = self.method.restarts
         many = restarts is None and isinstance(self.model, HiddenMarkov)
-        restarts = EXACT_RESTARTS if restarts is None else restarts
+        if restarts is None:
+            restarts = 0 if isinstance(self.model, Extended) else EXACT_RESTARTS
         interrupted, stopped, unbounded, gap = False, "", "", np.inf
         try:
+            if isinstance(self.model, Extended):
+                self.setup = self._started(self.model)
             starts: Iterator[np.ndarray] = self._starts(restarts)
             if many and len(self.setup.start):
                 restarts = SHORT_CLIMBS
@@ -305,7 +312,7 @@ class ExactClimb:
         point = self.setup.transform.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
-            "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
+            "likelihood": likelihood_by(self.model), "restarts": restarts,
         }  # fmt: skip
         if unbounded:
             report["without_maximum"] = True
@@ -317,6 +324,26 @@ class ExactClimb:
             figures={"objective": np.array(self.values)},
             held=held_at(self.setup, self.held, point.theta),
         )  # fmt: skip
+
+    def _started(self, model: Extended) -> Maximization:
+        """The question, begun from the best of some points round the start, all looked at together;
+        from the start itself where the user gave it."""
+        free = set(self.setup.problem.trace.parameters) - set(self.setup.fixed)
+        if free <= set(self.setup.near):
+            return self.setup
+        rng, start = np.random.default_rng(self.setup.seed(0)), self.setup.start
+        points = [start, *(start + SPREAD * rng.standard_normal((LOOKED_AT, len(start))))]
+        found = [self.setup.space.parameters(z) for z in points]
+        found = [(t.copy(), p) for t, p in found]
+        inside = [k for k, (_, log_prior) in enumerate(found) if log_prior > -np.inf]
+        values = np.full(len(points), -np.inf)
+        values[inside] = model.log_likelihoods(
+            self.experiments, np.array([found[k][0] for k in inside])
+        )
+        best = unpack_parameters(self.setup.problem.trace, found[int(np.argmax(values))][0])
+        near = {n: v for n, v in best.items() if n not in self.setup.fixed}
+        space = space_of(self.setup.problem, self.setup.fixed, near)
+        return replace(self.setup, space=space, near=near)
 
     def _starts(self, restarts: int) -> Iterator[np.ndarray]:
         """The start, and so many others about the best place by then."""

@@ -115,12 +115,13 @@ class BatchedFunction:
         try:
             values = np.asarray(found)
         except Exception as error:
-            raise self._error(f"gives {type(found).__name__}: {error}", f"return {wanted}") from None
+            raise self._error(
+                f"gives {type(found).__name__}: {error}", f"return {wanted}"
+            ) from None
         if values.dtype.kind == "f" and values.dtype.itemsize < 8:
             raise self._error(
                 f"gives {values.dtype}, too few digits for derivatives by differences",
-                "compute in double precision (in JAX: "
-                'jax.config.update("jax_enable_x64", True))',
+                'compute in double precision (in JAX: jax.config.update("jax_enable_x64", True))',
             )
         if values.dtype.kind not in "fiub":
             raise self._error(f"gives an array of {values.dtype}", f"return {wanted}")
@@ -143,7 +144,10 @@ class BatchedFunction:
         again = self._called(sample)
         if not np.array_equal(first, again, equal_nan=True):
             raise self._differs(
-                first, again, sample, "called twice with the same arguments it gives",
+                first,
+                again,
+                sample,
+                "called twice with the same arguments it gives",
                 "keeps something between calls, or draws random numbers",
                 "reset what it keeps at the beginning of each call (a warm start, a clock, a "
                 "generator); noise belongs into the model's laws",
@@ -151,7 +155,10 @@ class BatchedFunction:
         turned = self._called(sample[::-1])[::-1]
         if not self._alike(first, turned):
             raise self._differs(
-                first, turned, sample, "with the same points in another order it gives",
+                first,
+                turned,
+                sample,
+                "with the same points in another order it gives",
                 "does not move each point by itself",
                 "compute each row of the result from the same row of the arguments alone; an "
                 "adaptive step size for the whole batch needs a tighter tolerance, or fixed steps",
@@ -159,7 +166,10 @@ class BatchedFunction:
         alone = self._called(sample[:1])
         if not self._alike(first[:1], alone):
             raise self._differs(
-                first[:1], alone, sample, "with one point of a batch alone it gives",
+                first[:1],
+                alone,
+                sample,
+                "with one point of a batch alone it gives",
                 "does not move each point by itself",
                 "compute each row of the result from the same row of the arguments alone",
             )
