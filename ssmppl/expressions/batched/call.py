@@ -23,8 +23,8 @@ OP = "simulator"
 class Batched(Protocol):
     """A function of K numbers to `outputs` numbers, which takes a batch.
 
-    title : for people. name : unique in this process. moving : which of the arguments have derivatives. scales : (K,)
-    of the steps of differences.
+    title : for people. name : unique in this process. moving : which of the arguments have
+    derivatives. scales : (K,) of the steps of differences.
     """
 
     title: str

@@ -88,7 +88,7 @@ class BatchedFilter:
         d = self.size
         values = self._look(lanes, x, None)
         h = np.empty((len(values), d, d))
-        for k, (i, j) in enumerate((i, j) for i in range(d) for j in range(i + 1)):
+        for k, (i, j) in enumerate(zip(*np.tril_indices(d), strict=True)):
             h[:, i, j] = h[:, j, i] = values[:, 1 + d + k]
         if not self.flat:
             h = _positive_part(h)
@@ -101,7 +101,7 @@ class BatchedFilter:
         height, g, h = self._seen(lanes, rest)
         log_det, after, move = _step(p, h, g, np.zeros_like(rest))
         if self.flat:  # quadratic: one step, whose gain is known
-            # log g at the mode less half of (g - H move)' move, the prior's part, is half of g' move
+            # log g at the mode, less (g - H move)' move / 2, the prior's part
             gained = 0.5 * np.einsum("li,li->l", g, move)
             return height + gained - 0.5 * log_det, rest + move, after
         return self._climbed(lanes, rest, p, (height, g, h), (log_det, after, move))

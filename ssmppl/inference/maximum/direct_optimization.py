@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -27,7 +26,6 @@ from ssmppl.analysis.proposals.smooth import smooth_filter_applies
 from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
-from ssmppl.data import unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
@@ -36,9 +34,10 @@ from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximizati
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
 from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
-from ssmppl.inference.preparation.space import free_components, space_of
+from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.invalid_laws import total_of
 from ssmppl.inference.run.problem import Problem
@@ -57,6 +56,7 @@ EXACT_RESTARTS = 2
 SHORT_CLIMBS, SHORT_STEPS, SPREAD, GONE_ON_WITH = 24, 10, 2.0, 3
 FLATS = 3  # that a climb leaves
 LOOKED_AT = 47  # points round the start, where many cost little more than one
+SIDE_BY_SIDE = 2  # climbs beside the first
 
 
 def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
@@ -83,6 +83,8 @@ def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
         if isinstance(setup.exact, NotApplicable):
             with ThreadPoolExecutor() as pool:  # the filter runs without Python's lock
                 return SmoothClimb(setup, method, pool).run()
+        if isinstance(setup.exact, Extended):
+            return BatchedClimb(setup, setup.exact, method).run()
         return ExactClimb(setup, setup.exact, method).run()
 
 
@@ -275,12 +277,9 @@ class ExactClimb:
         """All climbs, and Newton's steps from the best point."""
         restarts = self.method.restarts
         many = restarts is None and isinstance(self.model, HiddenMarkov)
-        if restarts is None:
-            restarts = 0 if isinstance(self.model, Extended) else EXACT_RESTARTS
+        restarts = EXACT_RESTARTS if restarts is None else restarts
         interrupted, stopped, unbounded, gap = False, "", "", np.inf
         try:
-            if isinstance(self.model, Extended):
-                self.setup = self._started(self.model)
             starts: Iterator[np.ndarray] = self._starts(restarts)
             if many and len(self.setup.start):
                 restarts = SHORT_CLIMBS
@@ -324,26 +323,6 @@ class ExactClimb:
             figures={"objective": np.array(self.values)},
             held=held_at(self.setup, self.held, point.theta),
         )  # fmt: skip
-
-    def _started(self, model: Extended) -> Maximization:
-        """The question, begun from the best of some points round the start, all looked at together;
-        from the start itself where the user gave it."""
-        free = set(self.setup.problem.trace.parameters) - set(self.setup.fixed)
-        if free <= set(self.setup.near):
-            return self.setup
-        rng, start = np.random.default_rng(self.setup.seed(0)), self.setup.start
-        points = [start, *(start + SPREAD * rng.standard_normal((LOOKED_AT, len(start))))]
-        found = [self.setup.space.parameters(z) for z in points]
-        found = [(t.copy(), p) for t, p in found]
-        inside = [k for k, (_, log_prior) in enumerate(found) if log_prior > -np.inf]
-        values = np.full(len(points), -np.inf)
-        values[inside] = model.log_likelihoods(
-            self.experiments, np.array([found[k][0] for k in inside])
-        )
-        best = unpack_parameters(self.setup.problem.trace, found[int(np.argmax(values))][0])
-        near = {n: v for n, v in best.items() if n not in self.setup.fixed}
-        space = space_of(self.setup.problem, self.setup.fixed, near)
-        return replace(self.setup, space=space, near=near)
 
     def _starts(self, restarts: int) -> Iterator[np.ndarray]:
         """The start, and so many others about the best place by then."""
@@ -459,6 +438,89 @@ class ExactClimb:
         self.iterates.append(self.setup.space.parameters(z)[0].copy())
         self.values.append(self.known.get(z.tobytes(), -np.inf))
         self.known.clear()
+
+
+class BatchedClimb:
+    """Ascent of the extended Kalman filter's log-likelihood where the model calls a simulator: all
+    points of a step together, from the best of some places round the start."""
+
+    def __init__(self, setup: Maximization, model: Extended, method: DirectOptimization):
+        self.setup, self.model, self.method = setup, model, method
+        self.evaluations = 0
+        self.best, self.best_value = np.empty(0), -np.inf
+
+    def run(self) -> Ascent:
+        """The climb. Ctrl-C ends it early, with the best so far."""
+        setup = self.setup
+        try:
+            found = climb_together(self.objectives, self._starts())
+        except KeyboardInterrupt:
+            if not len(self.best):
+                raise
+            report: dict[str, Any] = {"converged": False, "evaluations": self.evaluations}
+            report["likelihood"] = likelihood_by(self.model)
+            theta = self._theta(self.best)
+            return Ascent(theta, None, theta[None], report, interrupted=True)
+        if found is None:
+            raise ArgumentError(
+                "the extended Kalman filter comes to no number at every point that was tried",
+                fix="give start={name: value} near plausible values, or look whether the simulator "
+                "gives NaN",
+            )
+        top, path = found.top, [self._theta(z) for z in found.path]
+        information, held, report = top.information, None, {
+            "converged": found.ended, "evaluations": self.evaluations,
+            "likelihood": likelihood_by(self.model),
+        }  # fmt: skip
+        theta = self._theta(top.z)
+        if setup.with_prior:
+            nothing = np.zeros(len(theta))
+            information = information + setup.transform.curvature(top.z, nothing).log_prior
+        natural = setup.natural(top.z, information)
+        if _lowest(top.information) < FLAT:
+            held = edges(setup, theta, natural, self.objective)
+            if held is not None:
+                report["converged"] = True
+        return Ascent(
+            theta, self.model.log_likelihood(setup.problem.experiments, theta), np.array(path),
+            report, natural, held=held,
+        )  # fmt: skip
+
+    def _starts(self) -> np.ndarray:
+        """The user's own point where all is given; else the best of some round the start."""
+        space, trace = self.setup.space, self.setup.problem.trace
+        z = space.z[space.positions]
+        restarts = self.method.restarts
+        if set(trace.parameters) - set(self.setup.fixed) <= set(self.setup.near) and not restarts:
+            return z[None]
+        rng = np.random.default_rng(self.setup.seed(0))
+        points = np.vstack([z, z + SPREAD * rng.standard_normal((LOOKED_AT, len(z)))])
+        values = self.objectives(points)
+        best = np.argsort(-values)[: 1 + (SIDE_BY_SIDE if restarts is None else restarts)]
+        return points[best]
+
+    def objectives(self, z: np.ndarray) -> np.ndarray:
+        """(B,) the log-likelihood at z (B, F), with the prior where it counts; -inf for none."""
+        self.evaluations += len(z)
+        out = np.full(len(z), -np.inf)
+        found = [self.setup.space.point(row) for row in z]
+        inside = [k for k, (_, log_prior, _) in enumerate(found) if log_prior > -np.inf]
+        if inside:
+            theta = np.array([found[k][0] for k in inside])
+            out[inside] = self.model.log_likelihoods(self.setup.problem.experiments, theta)
+        if self.setup.with_prior:
+            out[inside] += [found[k][1] for k in inside]
+        k = int(np.argmax(out))
+        if out[k] > self.best_value:
+            self.best, self.best_value = z[k].copy(), float(out[k])
+        return out
+
+    def objective(self, z: np.ndarray) -> float:
+        """Likewise, of one point."""
+        return float(self.objectives(z[None])[0])
+
+    def _theta(self, z: np.ndarray) -> np.ndarray:
+        return self.setup.space.parameters(z)[0].copy()
 
 
 def observed_information(setup: Maximization, z: np.ndarray) -> np.ndarray:
