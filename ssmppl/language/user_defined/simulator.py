@@ -306,10 +306,12 @@ def simulator(
                 where=user_location(),
             )
         where = location_of(step) if inspect.isfunction(step) else user_location()
-        title = name or getattr(step, "__name__", type(step).__name__)
+        title = str(name or getattr(step, "__name__", type(step).__name__))
         return Simulator(
-            step, output=output, name=title, scales=dict(scales or {}), where=where, **columns
-        )
+            step, state=columns["state"], inputs=columns["inputs"],
+            parameters=columns["parameters"], output=output, outputs=columns["outputs"],
+            forces=columns["forces"], name=title, scales=dict(scales or {}), where=where,
+        )  # fmt: skip
 
     return decorate
 
