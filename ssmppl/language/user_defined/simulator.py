@@ -95,6 +95,8 @@ class Simulator:
         if output is not None:
             title = f"{name}.sense"
             self.senses = BatchedFunction(title, output, *given, self.outputs, own, where)
+        for function in self.functions:
+            function.simulator = self
         _made[self._token] = self
 
     @property
