@@ -114,7 +114,9 @@ class _Build:
         transition = in_order(self._sites(trace.transition, filtered))
         if transition is None:
             first = trace.transition[self.split.linear[0].data[1]].distribution
-            reason = "states that move with the linear ones, and others, read each other's new values"
+            reason = (
+                "states that move with the linear ones, and others, read each other's new values"
+            )
             return NotApplicable(reason, first.location)
         made = replace(
             trace, initial=initial, transition=transition, observations=observations, proposal={}
