@@ -11,7 +11,15 @@ from ssmppl.analysis.structure import gaussian_block, linear_gaussian
 from ssmppl.errors import NotApplicable
 from ssmppl.language.tracing import trace
 from tests.models import new_values as models
-from tests.statistics.checks import LEVEL, MCSE, assert_within, deviations, mean_one_p, seed_of, some
+from tests.statistics.checks import (
+    LEVEL,
+    MCSE,
+    assert_within,
+    deviations,
+    mean_one_p,
+    seed_of,
+    some,
+)
 
 THETA = {"a": 0.6, "rho": 0.9, "q": 0.3}
 SHARES = {"p": 0.4, "r": 0.7}
