@@ -11,7 +11,7 @@ from ssmppl.analysis.new_values import in_order
 from ssmppl.analysis.proposals.proposals import split
 from ssmppl.analysis.structure import gaussian_block, linear_gaussian
 from ssmppl.datasets import boarding_school
-from ssmppl.errors import NotApplicable
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model, read_csv
 from tests.models import new_values as models
@@ -140,6 +140,11 @@ def test_the_order_of_laws():
     assert list(in_order(sites)) == list(sites)
 
 
+def test_what_follows_from_a_new_value_keeps_that_from_moving_by_itself():
+    with pytest.raises(ArgumentError, match="law of 'lag' is Dirac and follows from states of the"):
+        ssm.log_likelihood(models.correlated, DATA["correlated"], THETA, proposal="tempered")
+
+
 # -- likelihoods
 UNBIASED = [
     ("correlated", "bootstrap"), ("correlated", "guided"), ("correlated", "auxiliary"),
@@ -149,7 +154,6 @@ UNBIASED = [
     pytest.param("volatility", "marginal_guided", marks=pytest.mark.slow),
     pytest.param("volatility", "marginal_auxiliary", marks=pytest.mark.slow),
     pytest.param("volatility", "tempered", marks=pytest.mark.slow),
-    pytest.param("correlated", "tempered", marks=pytest.mark.slow),
 ]  # fmt: skip
 
 
