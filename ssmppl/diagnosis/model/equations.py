@@ -26,13 +26,22 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_of, topological
+from ssmppl.expressions.expr import (
+    Expr,
+    constant,
+    several,
+    substitute,
+    symbol,
+    symbols_of,
+    topological,
+)
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.trace import Trace, previous, symbols
 
 Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
 
 _POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
+_NEAR = 0.02  # that of what moves in small steps
 _TERM = symbol("flow", "F")  # stands for a shared term
 
 
@@ -204,8 +213,9 @@ class Equations:
     def _integrals(self) -> dict[str, str]:
         """x with mean - x_prev = a v_prev + b mean(v), a, b >= 0 the same whatever the parameters.
 
-        Which covers explicit, semi-implicit and trapezoidal steps. The parameters are varied, so
-        that -k x in the equation of v does not make v an integral of x.
+        Which covers explicit, semi-implicit and trapezoidal steps; of what moves in small steps
+        within a row it is so up to their higher orders. The parameters are varied, so that -k x in
+        the equation of v does not make v an integral of x.
         """
         states = [p for p in self.of_role("state") if isinstance(self.step(p), Expr)]
         steps = {p.label: self.step(p) for p in states}
@@ -216,7 +226,8 @@ class Equations:
             if p.label in self.copies:
                 continue
             for v in states:
-                if v is not p and all(_is_integral(p.label, v.label, s) for s in samples):
+                near = _NEAR if _in_small_steps(steps[p.label]) else _SMALL
+                if v is not p and all(_is_integral(p.label, v.label, s, near) for s in samples):
                     if out.get(v.label) != p.label:
                         out[p.label] = v.label
                     break
@@ -238,7 +249,11 @@ def _values(trace: Trace, steps: dict[str, Any], rng: Any) -> dict[str, tuple[An
     return {k: (own[k], wide + m) for k, m in zip(steps, moved, strict=True)}
 
 
-def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]]) -> bool:
+def _in_small_steps(step: Any) -> bool:
+    return any(n.op == "loop" for n in topological([step]))
+
+
+def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]], near: float) -> bool:
     moved = values[x][1]
     own, by = values[v]
     if not (np.all(np.isfinite(moved)) and np.all(np.isfinite(by))):
@@ -248,7 +263,7 @@ def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]]) -> bool:
     basis = np.stack([own, own + by], axis=1)
     coefficients, *_ = np.linalg.lstsq(basis, moved, rcond=1e-10)
     rest = moved - basis @ coefficients
-    exact = np.max(np.abs(rest)) <= _SMALL * np.max(np.abs(moved))
+    exact = np.max(np.abs(rest)) <= near * np.max(np.abs(moved))
     return bool(exact and np.all(coefficients >= -_SMALL))
 
 
@@ -340,7 +355,7 @@ def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
             continue
         seen.add(node)
         law = any(s.data[0] == "parameter" for s in symbols_of(node))
-        if law and node in elsewhere and node is not mean:
+        if law and node in elsewhere and node is not mean and not several(node):
             out.append(node)
         stack += node.args
     return out

@@ -122,6 +122,7 @@ def forecast(
         f"{len(paths)} draws of {steps} rows", len(paths) * steps * (d + k), "ask for fewer rows"
     )
     u = np.concatenate([past.u, future])
+    _check_after(past.time, labels)  # before a time step between them is made of it
     _set_step_between(traced, u, past.time, labels)
     check_defined(traced, source, u, after=rows)
     feedback = feeds_back(traced)
@@ -129,7 +130,6 @@ def forecast(
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     states, observed = _continued(program, theta, paths, y, u, feedback, root)
     check_finite(traced, states, observed)
-    _check_after(past.time, labels)
     if labels is None:
         labels = after(past.time, steps, zone)
     over_time = unpack_states(traced, states, started=False) | unpack_observations(traced, observed)

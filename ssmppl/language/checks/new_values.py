@@ -1,4 +1,4 @@
-"""`NAME_next` among the arguments of a transition: the new value of another state, in one step.
+"""`NAME_next` among the arguments of a transition: another state's new value, in the same step.
 
 The functions of a model are traced in the order in which they were declared, and each may name what
 earlier ones have given: the symbols of a noisy quantity, the expression of a deterministic one. A
@@ -147,7 +147,7 @@ class Refusal:
         )
 
     def _waits(self, function: Function, other: Function, met: set[int]) -> bool:
-        """Whether a function asks for new values of what another gives, or of what such gives."""
+        """Whether a function asks for new values of another, or of one that does."""
         if id(function) in met:
             return False
         met.add(id(function))
