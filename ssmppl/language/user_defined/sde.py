@@ -41,6 +41,11 @@ Matrix = np.ndarray
 class SDE:
     """The law of a state that moves by dx = drift(x) dt + diffusion(x) dW until the next row.
 
+    In a `@transition` function it stands as the law of the state by whose name it is returned, and
+    starts from that state's value. The law is Gaussian: the exact one where the drift is linear and
+    the diffusion does not depend on the state (then `steps` does not matter), else an approximation
+    that is the better the shorter `dt` is; `explain` says which.
+
     Parameters
     ----------
     drift : function of the state, a number or a vector (d,), that gives one of the same form.
@@ -49,11 +54,6 @@ class SDE:
     dt : the time to the next row, in the unit of the drift's; a number, or a symbol such as the
         time step of `ssm.Model(..., time_step="dt")`.
     steps : of the integration of mean and covariance, by the classical Runge-Kutta method.
-
-    In a `@transition` function it stands as the law of the state by whose name it is returned, and
-    starts from that state's value. The law is Gaussian: the exact one where the drift is linear and
-    the diffusion does not depend on the state (then `steps` does not matter), else an approximation
-    that is the better the shorter `dt` is; `explain` says which.
 
     Raises
     ------
@@ -90,7 +90,18 @@ class SDE:
         self.steps = int(steps)
 
     def law(self, name: str, before: Any) -> Distribution:
-        """The law of the state of this name, whose value at the row before is given."""
+        """The law of the state at a row, from its value at the row before.
+
+        Parameters
+        ----------
+        name : of the state.
+        before : its value at the row before, a number or a vector (d,).
+
+        Returns
+        -------
+        Distribution
+            Normal of a number, MvNormal of a vector.
+        """
         state = array(before)
         symbols = fresh(state.size)
         x = array(array_of(symbols, state.shape))
