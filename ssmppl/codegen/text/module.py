@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ssmppl.codegen.kernels.particle import particle_filter as kernels
+from ssmppl.codegen.text.callbacks import REQUESTS
 from ssmppl.codegen.text.render import (
     Names,
     Writer,
@@ -389,6 +390,10 @@ class ModuleText:
         if called:
             lines += ["from ssmppl.language.user_defined.primitive import REGISTRY", ""]
             lines += [f'{name} = REGISTRY["{name}"]' for name in called]
+        simulators = sorted(words & set(REQUESTS))
+        if simulators:
+            lines += ["from ssmppl.codegen.text.callbacks import simulated", ""]
+            lines += [f'{name} = simulated("{name}")' for name in simulators]
         lines += ["", 'entry = numba.njit(nogil=True, error_model="numpy")', "", ""]
         return "\n".join(lines) + "\n\n".join(self.parts)
 

@@ -105,6 +105,8 @@ class Equations:
         for role, sites in (("state", trace.initial), ("channel", trace.observations),
                             ("parameter", trace.parameters)):  # fmt: skip
             for site in sites.values():
+                if site.name in trace.auxiliary:
+                    continue  # of which nothing is read a row later
                 for s in site.components:
                     self._add(role, s)
         for name, shape in trace.inputs.items():
@@ -136,13 +138,29 @@ class Equations:
         return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
 
     def step(self, part: Part) -> Expr | NotApplicable:
-        """mean - x_prev: how far a state moves in a step, without noise."""
-        mean = self.mean(part)
+        """mean - x_prev: how far a state moves in a step, without noise in it nor in new values of
+        others that its law reads."""
+        mean = self._from_before(self.mean(part))
         if isinstance(mean, NotApplicable):
             return mean
         if scale_of_mean(self.law(part)) != "identity":
             return NotApplicable("its transition is no step from where it was")
         return mean - previous(part.symbol)
+
+    def _from_before(self, mean: Expr | NotApplicable) -> Expr | NotApplicable:
+        """A mean with new values that it reads replaced by their own means."""
+        if isinstance(mean, NotApplicable):
+            return mean
+        own: dict[Expr, Expr] = {}
+        for s in symbols_of(mean):
+            if s.data[0] == "state":
+                _, name, index = s.data
+                read = Part(label_of(name, index), "state", name, index, s)
+                value = self._from_before(self.mean(read))
+                if isinstance(value, NotApplicable):
+                    return NotApplicable(f"it reads the new value of {s!r}: {value.reason}")
+                own[s] = value
+        return substitute([mean], own)[0] if own else mean
 
     def position(self, part: Part) -> Part | None:
         """The state that integrates this one."""

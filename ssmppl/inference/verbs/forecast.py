@@ -20,7 +20,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
-from ssmppl.data.parameters import pack
+from ssmppl.data.parameters import pack, pack_states
 from ssmppl.data.time_steps import lengths
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import ArgumentError
@@ -132,7 +132,7 @@ def forecast(
     check_finite(traced, states, observed)
     if labels is None:
         labels = after(past.time, steps, zone)
-    over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
+    over_time = unpack_states(traced, states, started=False) | unpack_observations(traced, observed)
     return to_dataset(
         over_time | unpack_parameters(traced, theta),
         over_time=set(over_time),
@@ -210,9 +210,8 @@ def _at_known(
         model, data, parameters, proposal=proposal, trajectories=n, quantiles=(), seed=seed
     )
     one = found[which - 1] if isinstance(found, list) else found
-    paths = pack(
-        problem.trace.initial.values(), {name: one[name].values for name in problem.trace.initial}
-    )
+    trace = problem.trace
+    paths = pack_states(trace, {name: one[name].values for name in trace.initial})
     theta = np.tile(check_parameters(problem.trace, parameters), (n, 1))
     time = np.arange(1, e.steps + 1) if e.time is None else e.time
     told = {k: one.attrs[k] for k in ("approximate", "method", "method_chosen") if k in one.attrs}
