@@ -60,6 +60,9 @@ class BatchedFunction:
     def __repr__(self) -> str:
         return self.title
 
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:  # with its simulator
+        return _of_simulator, (self.simulator, self is self.simulator.moves)
+
     def at(self, points: np.ndarray) -> np.ndarray:
         """(B, outputs) at points (B, K + 1): states, inputs, parameters, row.
 
@@ -223,6 +226,11 @@ class BatchedFunction:
         pairs = [f"{n} = {v:.6g}" for n, v in zip(self.arguments, point, strict=False)]
         row = f"row {int(point[-1])}: " if point[-1] > 0 else ""
         return row + ", ".join(pairs)
+
+
+def _of_simulator(simulator: Any, moves: bool) -> BatchedFunction:
+    found: BatchedFunction = simulator.moves if moves else simulator.senses
+    return found
 
 
 def _identifier(title: str) -> str:

@@ -14,8 +14,13 @@ U = np.sin(np.arange(T) / 4.0)
 AT = {"k": 0.8, "c": 0.5, "s": 0.3}
 
 
-@ssm.simulator(state=["q", "v"], inputs=["u"], parameters=["k", "c"], output=lambda x, u, p: x[:, :1],
-               outputs=["z"])  # fmt: skip
+def position(state, inputs, parameters):
+    return state[:, :1]
+
+
+@ssm.simulator(
+    state=["q", "v"], inputs=["u"], parameters=["k", "c"], output=position, outputs=["z"]
+)
 def spring(state, inputs, parameters):
     """Linear: two steps of a damped spring."""
     (q, v), (u,), (k, c) = state.T, inputs.T, parameters.T

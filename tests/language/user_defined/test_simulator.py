@@ -55,6 +55,11 @@ def log_likelihood(function, **options):
     return ssm.log_likelihood(model_of(function, **options), DATA, AT)
 
 
+def particles(function, n):
+    options = {"particles": n, "proposal": "bootstrap", "seed": 1}
+    return ssm.log_likelihood(model_of(function), DATA, AT, **options)
+
+
 def called(function):
     """The values at three points, by a simulator of this function."""
     own = ssm.simulator(state=["q", "v"], inputs=["u"], parameters=["k"])(function)
@@ -153,9 +158,7 @@ class TestFunctionsThatCannotBeComputedWith:
             return step(state, inputs, parameters)
 
         with pytest.raises(ssm.SimulatorError, match="too many"):
-            ssm.log_likelihood(
-                model_of(fails), DATA, AT, particles=100, proposal="bootstrap", seed=1
-            )
+            particles(fails, 100)
 
     @pytest.mark.parametrize(
         ("result", "words"),
@@ -247,11 +250,11 @@ class TestFunctionsThatCannotBeComputedWith:
             new[new[:, 0] > 0.2] = np.nan
             return new
 
-        with pytest.warns(UserWarning, match="gives NaN"):
-            value = ssm.log_likelihood(
-                model_of(strict), DATA, AT, particles=50, proposal="bootstrap", seed=1
-            )
-        assert not np.isnan(value).any()
+        with (
+            pytest.warns(UserWarning, match="gives NaN for q, v at row"),
+            pytest.raises(ssm.SamplingError, match="nan at t=2"),
+        ):
+            particles(strict, 50)
 
 
 class TestOtherProcesses:
