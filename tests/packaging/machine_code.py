@@ -15,6 +15,7 @@ No pytest, and nothing of the source tree: this file alone is copied to where it
 """
 
 import contextlib
+import importlib
 import inspect
 import os
 import pickle
@@ -45,7 +46,9 @@ def models():
     yield varves, {"y": 25 * rng.gamma(6.25, 1 / 6.25, size=60)}, {"phi": 0.9, "tau": 20.0}
 
     level = ssm.Model("level")
-    level.prior(lambda: {"q": ssm.InverseGamma(2.0, 1.0), "r": ssm.InverseGamma(2.0, 1.0)})
+    level.prior(
+        lambda: {"q": ssm.InverseGamma(2.0, scale=1.0), "r": ssm.InverseGamma(2.0, scale=1.0)}
+    )
     level.initial(lambda: {"x": ssm.Normal(0, sd=3)})
     level.transition(lambda x, q: {"x": ssm.Normal(x, variance=q)})
     level.observation(lambda x, r: {"y": ssm.Normal(x, variance=r)})
@@ -55,7 +58,7 @@ def models():
     heavy.prior(lambda: {"q": ssm.HalfNormal(sd=1.0), "r": ssm.HalfNormal(sd=1.0)})
     heavy.initial(lambda: {"x": ssm.Normal(0, sd=3)})
     heavy.transition(lambda x, q: {"x": ssm.Normal(x + 0.1 * np.sin(x), sd=q)})
-    heavy.observation(lambda x, r: {"y": ssm.StudentT(4.0, x, r)})
+    heavy.observation(lambda x, r: {"y": ssm.StudentT(4.0, x, scale=r)})
     yield heavy, {"y": gaps}, {"q": 1.0, "r": 1.0}
 
     counts = ssm.Model("counts", inputs=("u",))
@@ -85,6 +88,8 @@ def use(model, data, at):
     """What a first session has; what a kind of model cannot do, it does without."""
     import ssmppl as ssm
 
+    ssm.explain(model, data)  # a mistake in the model itself ends the build
+
     def tried(verb, *args, **options):
         with contextlib.suppress(ssm.errors.SSMError):
             return verb(model, *args, **options)
@@ -96,7 +101,7 @@ def use(model, data, at):
     for method in (ssm.PMMH(), ssm.PGAS(), ssm.PGAS(interweave="auto"), ssm.Gibbs(), None):
         drawn = tried(ssm.sample, data, *([] if method is None else [method]), **FEW)
         if drawn is not None and method is None:
-            tried(ssm.forecast, drawn, data, steps=3, seed=1)
+            tried(ssm.forecast, drawn, steps=3, data=data, seed=1)
     tried(ssm.smooth, data, at, seed=1)
     tried(ssm.particle_filter, data, at, seed=1)
     tried(ssm.kalman_filter, data, at)
@@ -131,6 +136,8 @@ def record(chosen):
 
 def compile_all(texts, calls, path):
     """Compile what was asked for, for Numba's processor, into an archive."""
+    from numba.core.errors import TypingError
+
     from ssmppl.codegen.native.library import function_ir
     from ssmppl.codegen.native.translate import Untranslatable
     from ssmppl.codegen.store import folder, shipped
@@ -154,14 +161,17 @@ def compile_all(texts, calls, path):
         if stem in functions:
             functions[stem].compile(signature)
     for name, home in KERNELS.items():
-        function = getattr(__import__(f"{folder.__package__[:-5]}kernels.math.{home}", fromlist=[home]), name)
+        module = importlib.import_module(f"ssmppl.codegen.kernels.math.{home}")
+        function = getattr(module, name)
         parameters = list(inspect.signature(getattr(function, "py_func", function)).parameters)
-        draws = parameters[:1] == ["rng"]
-        with contextlib.suppress(Untranslatable):
-            arity = len(parameters) - draws
+        draws = parameters[:1] in (["rng"], ["state"])
+        arity = len(parameters) - draws
+        with contextlib.suppress(Untranslatable, TypingError):  # of tuples or whole numbers
             entries[f"lib_{name}_{arity}.ll"] = function_ir(name, arity, draws).encode()
     shipped.write(path, entries, folder.kernels_digest())
-    print(f"    {path.name}: {len(entries)} entries, {path.stat().st_size / 1e6:.2f} MB", flush=True)
+    print(
+        f"    {path.name}: {len(entries)} entries, {path.stat().st_size / 1e6:.2f} MB", flush=True
+    )
 
 
 def main():

@@ -15,7 +15,7 @@ import hashlib
 import json
 import lzma
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ LEVELS = {
     "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
     "x86-64-v2": ("cx16", "popcnt", "sse3", "sse4.1", "sse4.2", "ssse3"),
 }
-SHIPPED = tuple(LEVELS)[:2]
+SHIPPED = ("x86-64-v4", "x86-64-v3")
 taken: list[str] = []
 """Names of the entries that this process had from an archive, in order."""
 
@@ -105,13 +105,23 @@ def _index(path: Path) -> tuple[dict[str, Any], int]:
 
 @cache
 def _level() -> str | None:
-    """The best level of this processor that a wheel has code for; None where Numba is told to
-    compile for another one."""
+    """The level whose code is taken; None where Numba is told to compile for another processor."""
     config: Any = numba.config
     if config.CPU_NAME is not None or config.CPU_FEATURES is not None or not FOLDER.is_dir():
         return None
-    here = {name for name, has in llvm.get_host_cpu_features().items() if has}
-    lacks = [level for level, needs in LEVELS.items() if not here.issuperset(needs)]
-    levels = list(LEVELS)
-    above = 1 + max((levels.index(level) for level in lacks), default=-1)
-    return levels[above] if above < len(SHIPPED) else None
+    return level_of(host_features())
+
+
+def host_features() -> set[str]:
+    """What this processor has, by LLVM's names."""
+    return {name for name, has in llvm.get_host_cpu_features().items() if has}
+
+
+def level_of(features: Set[str]) -> str | None:
+    """The best level with these features that a wheel has code for; None where there is none."""
+    reached = None
+    for level in reversed(LEVELS):
+        if not features >= set(LEVELS[level]):
+            break
+        reached = level
+    return reached if reached in SHIPPED else None
