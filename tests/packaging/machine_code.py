@@ -1,13 +1,13 @@
 """Run by the Python of an environment that ssmppl was installed into: makes the archives of machine
-code that a wheel carries (`ssmppl/codegen/store/shipped.py`), one for each level of processors.
+code that a wheel carries (`ssmppl/codegen/store/shipped.py`), one for each target there.
 
     python machine_code.py FOLDER [MODELS]
 
 First models of many kinds are fitted, with every verb that a first session is likely to have, and
 what they ask of the compiler is written down: the text of each kernel that all models share, and
-the types that it is called with. Then all of it is compiled for each level, in a process for which
-Numba's processor is that level, and not this machine: the code is not run here, so that the machine
-need not be of that level itself.
+the types that it is called with. Then all of it is compiled for each target, in a process for which
+Numba's processor is that target, and not this machine: the code is not run here, so that the
+machine need not be of that level itself.
 
 MODELS are the numbers of some of the models, for a smaller archive; all if none are given.
 
@@ -176,17 +176,17 @@ def compile_all(texts, calls, path):
 
 def main():
     out, chosen = Path(sys.argv[1]), [int(k) for k in sys.argv[2:]]
-    if out.suffix:  # of one level, in a process of its own
+    if out.suffix:  # of one target, in a process of its own
         compile_all(*pickle.load(sys.stdin.buffer), out)
         return
     from ssmppl.codegen.store import shipped
 
     asked = pickle.dumps(record(chosen))
-    for level in shipped.SHIPPED:
+    for target, (processor, features) in shipped.TARGETS.items():
         with tempfile.TemporaryDirectory() as cache:
-            env = os.environ | {"SSMPPL_CACHE": cache, "NUMBA_CPU_NAME": level}
-            env["NUMBA_CPU_FEATURES"] = ""
-            command = [sys.executable, __file__, str(out / f"{level}{shipped.SUFFIX}")]
+            env = os.environ | {"SSMPPL_CACHE": cache, "NUMBA_CPU_NAME": processor}
+            env["NUMBA_CPU_FEATURES"] = features
+            command = [sys.executable, __file__, str(out / f"{target}{shipped.SUFFIX}")]
             subprocess.run(command, input=asked, env=env, check=True)
 
 

@@ -1,7 +1,11 @@
 """Machine code that a wheel carries: of kernels that all models share, compiled for a level of
 processors, x86-64-v3 (AVX2) or x86-64-v4 (AVX-512), and not for the machine that built it.
 
-An archive is one file for a level: a first line with the number of bytes of the index and its
+Sums over particles are in an order that goes by the width of the vectors, which LLVM chooses by the
+processor: with AVX-512 half the registers on Intel's, the whole on AMD's. So there is code for
+either, and the numbers are those of code that is compiled here.
+
+An archive is one file for a target: a first line with the number of bytes of the index and its
 digest, the index, a JSON object, then the entries, each compressed by itself. The index says for
 what all of it was compiled; an archive for anything else is left alone, and so is an entry whose
 digest is not that of the index. What is not found is compiled, as from source.
@@ -34,7 +38,13 @@ LEVELS = {
     "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
     "x86-64-v2": ("cx16", "popcnt", "sse3", "sse4.1", "sse4.2", "ssse3"),
 }
-SHIPPED = ("x86-64-v4", "x86-64-v3")
+# What a wheel has code for: LLVM's name of the processor, and features besides.
+TARGETS = {
+    "x86-64-v3": ("x86-64-v3", ""),
+    "x86-64-v4": ("x86-64-v4", ""),
+    "x86-64-v4-wide": ("x86-64-v4", "-prefer-256-bit"),
+}
+WIDE = "znver"  # begins LLVM's names of processors that take whole registers
 taken: list[str] = []
 """Names of the entries that this process had from an archive, in order."""
 
@@ -53,10 +63,10 @@ def built_for(kernels: str) -> dict[str, str]:
 
 def find(name: str, kernels: str) -> bytes | None:
     """An entry for this processor and these kernels; None where there is none that is whole."""
-    level = _level()
-    if level is None:
+    target = _target()
+    if target is None:
         return None
-    path = FOLDER / f"{level}{SUFFIX}"
+    path = FOLDER / f"{target}{SUFFIX}"
     index, begin = _index(path)
     where = index.get("entries", {}).get(name)
     if where is None or index["built for"] != built_for(kernels):
@@ -104,24 +114,27 @@ def _index(path: Path) -> tuple[dict[str, Any], int]:
 
 
 @cache
-def _level() -> str | None:
-    """The level whose code is taken; None where Numba is told to compile for another processor."""
+def _target() -> str | None:
+    """The target whose code is taken; None where Numba is told to compile for another processor."""
     config: Any = numba.config
     if config.CPU_NAME is not None or config.CPU_FEATURES is not None or not FOLDER.is_dir():
         return None
-    return level_of(host_features())
+    return target_here()
 
 
-def host_features() -> set[str]:
-    """What this processor has, by LLVM's names."""
-    return {name for name, has in llvm.get_host_cpu_features().items() if has}
+def target_here() -> str | None:
+    """The target that this processor is; None where there is none."""
+    has = {name for name, there in llvm.get_host_cpu_features().items() if there}
+    return target_of(has, llvm.get_host_cpu_name())
 
 
-def level_of(features: Set[str]) -> str | None:
-    """The best level with these features that a wheel has code for; None where there is none."""
+def target_of(features: Set[str], processor: str) -> str | None:
+    """The target of a processor with these features and this name, both LLVM's; None for none."""
     reached = None
     for level in reversed(LEVELS):
         if not features >= set(LEVELS[level]):
             break
         reached = level
-    return reached if reached in SHIPPED else None
+    if reached == "x86-64-v4" and processor.startswith(WIDE):
+        return "x86-64-v4-wide"
+    return reached if reached in TARGETS else None

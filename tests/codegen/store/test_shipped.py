@@ -2,10 +2,13 @@
 
 import json
 import os
+import platform
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import llvmlite.binding as llvm
 import pytest
 
 from ssmppl.codegen.store import folder, shipped
@@ -74,13 +77,14 @@ def python(script, argument, cache, **more):
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory):
-    """The archive of this processor's level, compiled for the level and not for the processor."""
+    """The archive of this processor's target, compiled for that and not for the processor."""
     place = tmp_path_factory.mktemp("archive")
-    level = shipped.level_of(shipped.host_features())
-    if level is None:
+    target = shipped.target_here()
+    if target is None:
         pytest.skip("no wheel has code for this processor")
-    path = place / f"{level}{shipped.SUFFIX}"
-    python(BUILD, path, place / "cache", NUMBA_CPU_NAME=level, NUMBA_CPU_FEATURES="")
+    path = place / f"{target}{shipped.SUFFIX}"
+    name, features = shipped.TARGETS[target]
+    python(BUILD, path, place / "cache", NUMBA_CPU_NAME=name, NUMBA_CPU_FEATURES=features)
     return path
 
 
@@ -105,7 +109,7 @@ def test_what_is_not_whole_is_refused(archive, tmp_path, monkeypatch, change):
     """`find` gives nothing, and what is not found is compiled: the test below."""
     name, kernels = "lib_exp_1.ll", folder.kernels_digest()
     monkeypatch.setattr(shipped, "FOLDER", archive.parent)
-    monkeypatch.setattr(shipped, "_level", lambda: archive.stem)
+    monkeypatch.setattr(shipped, "_target", lambda: archive.stem)
     assert b"@lib_exp" in shipped.find(name, kernels)
     (tmp_path / archive.name).write_bytes(change(archive.read_bytes()))
     monkeypatch.setattr(shipped, "FOLDER", tmp_path)
@@ -128,7 +132,7 @@ def test_code_of_the_wheel_gives_the_same_numbers_as_code_compiled_here(archive,
 @pytest.mark.parametrize("what", ["python", "numpy", "numba", "llvmlite", "triple"])
 def test_code_for_other_versions_is_left_alone(archive, monkeypatch, what):
     monkeypatch.setattr(shipped, "FOLDER", archive.parent)
-    monkeypatch.setattr(shipped, "_level", lambda: archive.stem)
+    monkeypatch.setattr(shipped, "_target", lambda: archive.stem)
     kernels = folder.kernels_digest()
     assert shipped.find("lib_exp_1.ll", "of other kernels") is None
     here = shipped.built_for(kernels)
@@ -136,11 +140,60 @@ def test_code_for_other_versions_is_left_alone(archive, monkeypatch, what):
     assert shipped.find("lib_exp_1.ll", kernels) is None
 
 
-def test_levels():
-    """By the processors of LLVM's own tables: what each level is defined to have."""
+def test_targets():
+    """By what each level of the psABI is defined to have, and the width that LLVM prefers."""
     v2, v3, v4 = (set(shipped.LEVELS[f"x86-64-v{n}"]) for n in (2, 3, 4))
-    assert shipped.level_of(v2 | v3 | v4 | {"amx-tile"}) == "x86-64-v4"
-    assert shipped.level_of(v2 | v3 | {"avx512f"}) == "x86-64-v3"
-    assert shipped.level_of(v2 | v3 - {"fma"} | v4) is None
-    assert shipped.level_of(v2) is None
-    assert shipped.level_of(set()) is None
+    assert shipped.target_of(v2 | v3 | v4 | {"amx-tile"}, "sapphirerapids") == "x86-64-v4"
+    assert shipped.target_of(v2 | v3 | v4, "znver5") == "x86-64-v4-wide"
+    assert shipped.target_of(v2 | v3 | {"avx512f"}, "znver3") == "x86-64-v3"
+    assert shipped.target_of(v2 | v3 - {"fma"} | v4, "znver5") is None
+    assert shipped.target_of(v2, "nehalem") is None
+    assert shipped.target_of(set(), "apple-m1") is None
+
+
+WIDTHS = """
+define double @f(ptr %x, i64 %n) {
+entry:
+  br label %loop
+loop:
+  %i = phi i64 [0, %entry], [%j, %loop]
+  %a = phi double [0.0, %entry], [%b, %loop]
+  %p = getelementptr double, ptr %x, i64 %i
+  %v = load double, ptr %p
+  %b = fadd fast double %a, %v
+  %j = add nuw nsw i64 %i, 1
+  %c = icmp slt i64 %j, %n
+  br i1 %c, label %loop, label %done
+done:
+  ret double %b
+}
+"""
+
+
+def vectors(processor, features):
+    """The vector additions of a sum, as LLVM writes them for a processor."""
+    llvm.initialize_native_target()
+    machine = llvm.Target.from_default_triple().create_target_machine(
+        cpu=processor, features=features, opt=3, jit=True
+    )
+    module = llvm.parse_assembly(f'target triple = "{llvm.get_process_triple()}"\n{WIDTHS}')
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = True
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    return re.findall(r"fadd \w+ (<\d+ x double>)", str(module))
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="of x86-64")
+@pytest.mark.parametrize(
+    ("processor", "target"),
+    [
+        ("haswell", "x86-64-v3"), ("alderlake", "x86-64-v3"), ("znver3", "x86-64-v3"),
+        ("skylake-avx512", "x86-64-v4"), ("icelake-server", "x86-64-v4"),
+        ("sapphirerapids", "x86-64-v4"), ("znver4", "x86-64-v4-wide"),
+    ],
+)  # fmt: skip
+def test_sums_are_as_wide_as_on_the_processors_themselves(processor, target):
+    expected = vectors(processor, "")
+    assert expected
+    assert vectors(*shipped.TARGETS[target]) == expected
