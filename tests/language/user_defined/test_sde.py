@@ -81,8 +81,10 @@ def test_the_time_step_may_be_given_and_dates_have_a_unit(record):
     model.time_step = ("dt", "min")
     (found,) = ssm.log_likelihood(model, pd.DataFrame({"y": y}, index=dates), {"k": 4.0, "d": 0.6})
     assert found == pytest.approx(given, abs=1e-6)  # dates are whole nanoseconds
-    text = str(ssm.explain(model, pd.DataFrame({"y": y}, index=dates)))
-    assert "dt is the time from each row to the next" in text
+    plan = ssm.explain(model, pd.DataFrame({"y": y}, index=dates))
+    text, parts = str(plan), dict(plan.sections())
+    assert ("steps", "dt is the time from each row to the next, in min") in parts["Data"]
+    assert all(what == "the exponential of a matrix" for _, what in parts["Small steps"])
     assert "approximated" not in text
 
 
@@ -115,6 +117,8 @@ def test_forecasts_at_the_times_that_are_asked_for():
     np.testing.assert_allclose(on["x"].values.mean(axis=0), 8 * np.exp([-1.5, -2.0]), rtol=1e-9)
     with pytest.raises(ssm.SSMError, match="time"):
         ssm.forecast(model, {"rate": 0.5}, steps=2, data=data, seed=1)
+    with pytest.raises(ssm.ArgumentError, match="not after the data"):
+        ssm.forecast(model, {"rate": 0.5}, inputs={"time": [1.0, 3.0]}, data=data, seed=1)
 
 
 def test_what_has_no_times_is_refused(record):
@@ -177,6 +181,37 @@ def test_a_nonlinear_sde_is_near_its_law_over_a_short_time():
     np.testing.assert_allclose(mean, expected[0], atol=4 * np.sqrt(0.01 / 200_000) + 5e-4)
     np.testing.assert_allclose(covariance, expected[1], rtol=0.03, atol=1e-4)
     assert "approximated" in law.approximation
+
+
+def test_loops_are_told_by_name():
+    model = ssm.Model("loops", inputs=("n",))
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1), "w": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x, w, n):
+        def decay(x):
+            return -(x**3)
+
+        def fold(w):
+            return 1.0 - w**2
+
+        after = ssm.integrate(decay, x, 0.5, method="midpoint", steps=7)
+        return {"x": ssm.Normal(after, sd=1), "w": ssm.Normal(ssm.repeat(fold, w, n), sd=1)}
+
+    @model.observation
+    def observation(x, w):
+        return {"y": ssm.Normal(x + w, sd=1)}
+
+    parts = dict(ssm.explain(model).sections())
+    told, laws = dict(parts["Small steps"]), str(parts["Transition, x_prev to x"])
+    assert list(told.values()) == [
+        "decay_midpoint, repeated 7 times",
+        "fold, repeated n_prev times",
+    ]
+    assert all(name in laws for name in told)
 
 
 def test_the_number_of_steps_makes_it_exact_in_the_limit():
