@@ -21,7 +21,7 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.user_defined.simulator import Simulator, simulator
-from ssmppl.simulators.names import Chosen, chosen, identifier, required, unknown
+from ssmppl.simulators.chosen_names import Chosen, chosen, identifier, required, unknown
 
 VERSIONS = ("2", "3")
 REAL = ("Real", "Float64")
@@ -213,23 +213,19 @@ class FMUModel:
         return out
 
     # -- what is called
-    def __call__(
-        self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray
-    ) -> np.ndarray:
+    def __call__(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """The states (B, n) after one interval of states (B, n), inputs (B, m) and parameters
         (B, p); NaN where the unit fails (`reason` says why)."""
         return self._run(state, inputs, parameters, sense=False)[0]
 
-    def output(
-        self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray
-    ) -> np.ndarray:
+    def output(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """The outputs (B, k) at states (B, n)."""
         return self._run(state, inputs, parameters, sense=True)[0]
 
     def reason(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> str:
         """Why a call gives NaN at one point, (n,), (m,) and (p,); empty where it does not."""
-        given = (np.atleast_2d(np.asarray(a, dtype=float)) for a in (state, inputs, parameters))
-        return self._run(*given, sense=False)[1].get(0, "")
+        x, u, p = (np.atleast_2d(np.asarray(a, dtype=float)) for a in (state, inputs, parameters))
+        return self._run(x, u, p, sense=False)[1].get(0, "")
 
     def _run(
         self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, sense: bool
@@ -427,7 +423,7 @@ def fmu(
         raise ModelError(
             f"there is no file {text}", fix="give the path of an FMU", where=user_location()
         )
-    if not (np.isscalar(dt) and np.isreal(dt) and 0.0 < float(dt) < np.inf):
+    if not isinstance(dt, int | float | np.floating) or not 0.0 < dt < np.inf:
         raise ModelError(
             f"dt={dt!r} is no positive number",
             fix="give the seconds between rows",

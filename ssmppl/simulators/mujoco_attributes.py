@@ -173,11 +173,11 @@ def _in_spec(write: Callable[[Any, float], None], read: Callable[[Any, int], flo
     return Attribute(write, read, positive=True, compiled=False)
 
 
-def _set_size(column: int) -> Callable[[Any, float], None]:
+def _size(column: int) -> Attribute:
     def write(geom: Any, value: float) -> None:
         geom.size[column] = value
 
-    return write
+    return _in_spec(write, lambda model, k: float(model.geom_size[k, column]))
 
 
 def _unknown(model: Any, k: int) -> float:
@@ -206,11 +206,8 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
         "friction": _cell("geom_friction", 0),
         "friction_torsional": _cell("geom_friction", 1),
         "friction_rolling": _cell("geom_friction", 2),
-        "size": _in_spec(_set_size(0), lambda model, k: float(model.geom_size[k, 0])),
-        **{
-            f"size_{j}": _in_spec(_set_size(j), lambda model, k, j=j: float(model.geom_size[k, j]))
-            for j in range(3)
-        },
+        "size": _size(0),
+        **{f"size_{j}": _size(j) for j in range(3)},
         "mass": _in_spec(lambda geom, value: setattr(geom, "mass", value), _unknown),
         "density": _in_spec(lambda geom, value: setattr(geom, "density", value), _unknown),
     },

@@ -22,8 +22,8 @@ import numpy as np
 from ssmppl.errors import ModelError
 from ssmppl.expressions.expr import user_location
 from ssmppl.language.user_defined.simulator import Simulator, simulator
+from ssmppl.simulators.chosen_names import Chosen, chosen, identifier, required
 from ssmppl.simulators.mujoco_attributes import Target, target
-from ssmppl.simulators.names import Chosen, chosen, identifier, required
 
 MODELS_BYTES = 64 * 2**20  # of models kept, one for each vector of parameters
 BATCHES = 4  # kept, one for each size of a batch
@@ -39,6 +39,7 @@ REASONS = (
     "it diverged: an acceleration is not finite or huge",
     "a control is not finite",
 )
+
 
 class _Silence:
     """The engine's warnings, which become NaN with a reason, are not printed or written to a file
@@ -162,7 +163,7 @@ class MujocoModel:
     def _targets(self, name: str, given: Any) -> tuple[Target, ...] | Callable[..., None]:
         if callable(given):
             return given
-        texts = [given] if isinstance(given, str) else list(given)
+        texts = [given] if isinstance(given, str) or not np.iterable(given) else list(given)
         if not texts or not all(isinstance(t, str) for t in texts):
             raise ModelError(
                 f"parameters: {name!r} is {given!r}",
@@ -185,23 +186,19 @@ class MujocoModel:
         return row
 
     # -- what is called
-    def __call__(
-        self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray
-    ) -> np.ndarray:
+    def __call__(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """The states (B, n) after one interval of states (B, n), inputs (B, m) and parameters
         (B, p); NaN where MuJoCo warns or fails (`reason` says why)."""
         return self._run(state, inputs, parameters, sense=False)[0]
 
-    def output(
-        self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray
-    ) -> np.ndarray:
+    def output(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """The sensors (B, k) at states (B, n), with the forces that act there."""
         return self._run(state, inputs, parameters, sense=True)[0]
 
     def reason(self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray) -> str:
         """Why a call gives NaN at one point, (n,), (m,) and (p,); empty where it does not."""
-        given = (np.atleast_2d(np.asarray(a, dtype=float)) for a in (state, inputs, parameters))
-        return self._run(*given, sense=False)[1].get(0, "")
+        x, u, p = (np.atleast_2d(np.asarray(a, dtype=float)) for a in (state, inputs, parameters))
+        return self._run(x, u, p, sense=False)[1].get(0, "")
 
     def _run(
         self, state: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, sense: bool
@@ -364,9 +361,10 @@ def mujoco(
         damping, frictionloss, armature, stiffness, springref, range_lower, range_upper (rad or m);
         of bodies: mass (the inertia in proportion), inertia (a factor on the file's), com_x, com_y,
         com_z (m, in the body's frame), gravcomp; of geoms: friction, friction_torsional,
-        friction_rolling, and size, size_0, size_1, size_2, mass, density, from which the inertia
-        follows; of actuators: gain, gear, kp, kv, timeconst; of tendons: stiffness, damping,
-        frictionloss; "option.gravity" (magnitude), "option.gravity_z", "option.timestep",
+        friction_rolling (of two geoms in contact the larger counts), and size, size_0, size_1,
+        size_2, mass, density, from which the inertia follows; of actuators: gain, gear, kp, kv,
+        timeconst; of tendons: stiffness, damping, frictionloss; "option.gravity" (magnitude),
+        "option.gravity_z", "option.timestep",
         "option.density", "option.viscosity", "option.wind_x". "kind:object.attribute" where several
         kinds of objects have the name. Or a function (spec, value) that changes an `MjSpec`, for
         lengths of links and the like; it is compiled again for each value.

@@ -181,9 +181,7 @@ def build(folder, version=2, extra="", hidden_reset="", before="", variables=VAR
     source += "".join(f"int {n}() {{ return 3; }}\n" for n in names if f"{n}(" not in own)
     code, library = folder / "pendulum.c", folder / "pendulum.so"
     code.write_text(source)
-    subprocess.run(
-        ["cc", "-O2", "-shared", "-fPIC", "-o", library, code, "-lm"], check=True
-    )
+    subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", library, code, "-lm"], check=True)
     place = {2: "linux64", 3: "x86_64-linux"}[version]
     if sys.platform == "darwin":
         place = {2: "darwin64", 3: "x86_64-darwin"}[version]

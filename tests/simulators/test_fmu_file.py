@@ -55,7 +55,9 @@ def test_a_step_is_that_of_its_equations(version, tmp_path):
     found = unit.step(*batch(POINTS))
     # Runge-Kutta in steps of 1 ms: an error of order 1e-12 here
     np.testing.assert_allclose(found, [exact(*p) for p in POINTS], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(unit.step.output(*batch(POINTS))[:, 0], np.sin([p[0] for p in POINTS]))
+    np.testing.assert_allclose(
+        unit.step.output(*batch(POINTS))[:, 0], np.sin([p[0] for p in POINTS])
+    )
 
 
 def test_a_point_does_not_depend_on_the_others_or_on_former_calls(pendulum):
@@ -120,7 +122,7 @@ def test_what_does_not_fit_the_file_is_refused(path, options, found):
 
 
 def test_a_state_that_the_unit_sets_otherwise_is_refused(path):
-    with pytest.raises(ssm.ModelError, match="'q' was set to 0.11 and is 0.1 when it begins"):
+    with pytest.raises(ssm.ModelError, match=r"'q' was set to 0\.11 and is 0\.1 when it begins"):
         fmu(path, dt=DT, state={"q": ("d", "q"), "v": "v"})
 
 

@@ -39,7 +39,10 @@ def identifier(name: str) -> str:
 
 
 def chosen(
-    given: Chosen, known: Mapping[str, Sequence[str]], what: str, file: str,
+    given: Chosen,
+    known: Mapping[str, Sequence[str]],
+    what: str,
+    file: str,
     spelled: Callable[[str], str] = identifier,
 ) -> dict[str, str]:
     """Name in the model -> name in the file, for those of `known` that are asked for.
