@@ -227,7 +227,7 @@ def __getattr__(name: str) -> Any:
             f"module {__name__!r} has no attribute {name!r}" + (f": {hint}" if hint else "")
         )
     if name in _MODULES:
-        return importlib.import_module(f"{__name__}.plots")
+        return importlib.import_module(f"{__name__}.{name}")
     globals()[name] = value = getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
     return value
 
