@@ -84,8 +84,8 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
 from ssmppl.language.user_defined.primitive import primitive
-from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.language.user_defined.sde import SDE
+from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:

@@ -6,15 +6,24 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ssmppl.errors import ModelError, NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
-from ssmppl.expressions.expr import Expr, constant, depends_on, substitute, symbols_of
+from ssmppl.expressions.batched.call import OP
+from ssmppl.expressions.expr import (
+    Expr,
+    constant,
+    depends_on,
+    substitute,
+    symbols_of,
+    topological,
+)
 from ssmppl.language.distributions import Dirac, Flat, MvNormal, Normal
-from ssmppl.language.model.trace import Site, Trace, previous
+from ssmppl.language.model.trace import Site, Trace, once_per_trace, previous
 
 
 @dataclass(frozen=True)
@@ -235,6 +244,15 @@ def singular_covariance(trace: Trace) -> NotApplicable | None:
                     site.distribution.location,
                 )
     return None
+
+
+@once_per_trace
+def simulators(trace: Trace) -> tuple[Any, ...]:
+    """The functions under `@ssm.simulator` that the model's laws call, by name."""
+    sites = (trace.parameters, trace.initial, trace.transition, trace.observations)
+    roots = [e for part in sites for site in part.values() for e in site.distribution.expressions()]
+    found = {n.data.function for n in topological(roots) if n.op == OP}
+    return tuple(sorted(found, key=lambda f: f.name))
 
 
 def flat_start(trace: Trace) -> list[Site]:

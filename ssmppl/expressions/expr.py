@@ -18,7 +18,6 @@ from ssmppl.expressions import special
 from ssmppl.expressions.node import (
     BOOLEAN,
     INDEX_BY_SYMBOL,
-    SEVERAL,
     Expr,
     as_expr,
     attributed,

@@ -159,7 +159,9 @@ class _Function(Arithmetic):
         """The results for so many particles."""
         out = self._room(asked.results * width)
         self.simulators.add(asked.symbol)
-        self.lines.append(f"call void @{asked.symbol}(ptr {given}, ptr {out}, i64 {size}, i64 {width})")
+        self.lines.append(
+            f"call void @{asked.symbol}(ptr {given}, ptr {out}, i64 {size}, i64 {width})"
+        )
         return Value(SIMULATED, out, str(width))
 
     def _add_to(self, target: ast.expr, value: ast.expr) -> None:
@@ -296,7 +298,8 @@ class _Function(Arithmetic):
     ) -> None:  # fmt: skip
         """One call of a simulator for all particles of the block."""
         (target,), asked = node.targets, _simulator(node.value)
-        assert isinstance(target, ast.Name) and asked is not None
+        assert isinstance(target, ast.Name)
+        assert asked is not None
         room = self._room(asked.arguments * self.size)
         self._pass([], index, block, outer, kept, set(), (node.value, room))
         outer[target.id] = self._simulate(asked, room, f"%size{block}", self.size)
@@ -394,9 +397,9 @@ def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For | ast.Assign]:
     """The body, cut at the loops and the calls of simulators in it."""
     parts: list[list[ast.stmt] | ast.For | ast.Assign] = []
     for statement in node.body:
-        if isinstance(statement, ast.For):
-            parts.append(statement)
-        elif isinstance(statement, ast.Assign) and _simulator(statement.value) is not None:
+        if isinstance(statement, ast.For) or (
+            isinstance(statement, ast.Assign) and _simulator(statement.value) is not None
+        ):
             parts.append(statement)
         elif parts and isinstance(parts[-1], list):
             parts[-1].append(statement)
@@ -429,8 +432,8 @@ def _read(part: list[ast.stmt] | ast.For | ast.Assign) -> set[str]:
 
 
 def _in_blocks(node: ast.For) -> bool:
-    """Whether particles call simulators, or have small steps of their own, as many for all, and draw
-    nothing besides: the draws' order is that of the text."""
+    """Whether particles call simulators, or have small steps of their own, as many for all, and
+    draw nothing besides: the draws' order is that of the text."""
     inner = [s for s in node.body if isinstance(s, ast.For)]
     own = {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
     alike = all(own.isdisjoint(_names_in(s.iter)) for s in inner)

@@ -24,9 +24,7 @@ from ssmppl.compiling import one_at_a_time
 from ssmppl.expressions.batched.call import computed
 from ssmppl.expressions.batched.differences import Index
 
-Callback = ctypes.CFUNCTYPE(
-    None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64
-)
+Callback = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 REQUESTS: dict[str, Request] = {}  # by name
 PENDING: dict[int, BaseException] = {}  # by thread: the first one that a callback kept
 BUFFER = 1 << 15  # numbers on the stack for arguments and results

@@ -309,7 +309,8 @@ class Section:
 
 
 def is_matrix(node: Expr) -> bool:
-    """Whether the node is a whole matrix, a loop or a simulator: several numbers, no entry of `c` or `s`."""
+    """Whether the node is a whole matrix, a loop or a simulator: several numbers, no entry of `c`
+    or `s`."""
     return node.op in ("cholesky", "inverse", *SEVERAL)
 
 

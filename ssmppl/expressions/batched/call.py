@@ -23,8 +23,8 @@ OP = "simulator"
 class Batched(Protocol):
     """A function of K numbers to `outputs` numbers, which takes a batch.
 
-    title : for people. name : unique in this process. moving : which of the arguments have derivatives. scales : (K,)
-    of the steps of differences.
+    title : for people. name : unique in this process. moving : which of the arguments have
+    derivatives. scales : (K,) of the steps of differences.
     """
 
     title: str
@@ -105,9 +105,16 @@ def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndar
 
 def of_group(group: Sequence[Expr], args: Sequence[Any]) -> list[np.ndarray]:
     """The values of each node, its numbers in the last axis, from those of the arguments."""
-    whole = np.broadcast_arrays(*(np.asarray(a, dtype=float) for a in args))
-    x = np.stack([a.ravel() for a in whole], axis=-1)
+    shape: tuple[int, ...] = ()
+    for a in args:
+        own = np.shape(a)
+        shape = (
+            own if not shape else shape if own in ((), shape) else np.broadcast_shapes(own, shape)
+        )
+    x = np.empty((*shape, len(args)))
+    for j, a in enumerate(args):
+        x[..., j] = a
     function = group[0].data.function
-    found = computed(function, tuple(n.data.index for n in group), x)
-    shape = whole[0].shape
+    wanted = tuple(n.data.index for n in group)
+    found = computed(function, wanted, x.reshape(-1, len(args)))
     return [f.T.reshape(*shape, function.outputs) for f in found]

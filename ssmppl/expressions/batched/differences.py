@@ -24,13 +24,12 @@ HIGHEST = 2  # derivatives
 class Stencil:
     """Where a function is evaluated, and how derivatives follow.
 
-    steps : (P, K) the shift of each point in units of the step of each argument. sizes : (P,) the
-    step relative to the scale. place : of a point by (kind, shifts). wanted : the derivatives.
+    shifts : (P, 1, K) of each point, relative to the scale of each argument. place : of a point by
+    (kind, shifts). wanted : the derivatives.
     """
 
     wanted: tuple[Index, ...]
-    steps: np.ndarray
-    sizes: np.ndarray
+    shifts: np.ndarray
     place: dict[tuple[float, Index], int]
 
     @classmethod
@@ -57,22 +56,19 @@ class Stencil:
                     add(SECOND, -index[0] - 1, -index[1] - 1)
             else:
                 raise ValueError(f"a derivative of order {len(index)}")
-        steps = np.zeros((len(place), arguments))
-        sizes = np.zeros(len(place))
+        shifts = np.zeros((len(place), 1, arguments))
         for (size, moved), p in place.items():
-            sizes[p] = size
             for j in moved:
-                steps[p, abs(j) - 1] = np.sign(j)
-        return cls(tuple(wanted), steps, sizes, place)
+                shifts[p, 0, abs(j) - 1] = np.sign(j) * size
+        return cls(tuple(wanted), shifts, place)
 
     def derivatives(
         self, function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, scales: np.ndarray
     ) -> np.ndarray:
         """(len(wanted), outputs, B) at x (B, K) of a function (P, K) -> (P, outputs)."""
         size, k = x.shape
-        unit = np.maximum(np.abs(x), scales)
-        points = x[None] + self.steps[:, None, :] * (self.sizes[:, None, None] * unit[None])
-        values = function(points.reshape(-1, k)).reshape(len(self.steps), size, -1)
+        points = x + self.shifts * np.maximum(np.abs(x), scales)
+        values = function(points.reshape(-1, k)).reshape(len(self.shifts), size, -1)
         out = np.empty((len(self.wanted), values.shape[2], size))
         for w, index in enumerate(self.wanted):
             if not index:
@@ -83,9 +79,7 @@ class Stencil:
                 out[w] = self._second(index, points, values, x).T
         return out
 
-    def _first(
-        self, j: int, points: np.ndarray, values: np.ndarray, x: np.ndarray
-    ) -> np.ndarray:
+    def _first(self, j: int, points: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
         """(B, outputs); on one side where the other has no value, as beyond the end of a range."""
         up, down = self.place[FIRST, (j + 1,)], self.place[FIRST, (-j - 1,)]
         a, b = values[up], values[down]

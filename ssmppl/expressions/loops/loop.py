@@ -19,7 +19,6 @@ from typing import Any
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     BOOLEAN,
-    SEVERAL,
     Expr,
     as_expr,
     constant,
@@ -30,6 +29,7 @@ from ssmppl.expressions.expr import (
     topological,
     unpack,
 )
+from ssmppl.expressions.node import SEVERAL
 
 _numbers: Iterator[int] = count()
 SWAPPING = {"add", "mul", "maximum", "minimum", "and", "or", "eq", "ne"}  # the order is no matter

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.chains.metropolis_kernel import (
     WALK_STATES,
     ChainPoint,
@@ -30,8 +31,8 @@ from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import (
     ExactModel,
     exact_model,
-    filter_name,
     filter_of,
+    likelihood_by,
 )
 from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.preparation.pilot import Pilot, find_mode
@@ -54,6 +55,12 @@ def needed_model(problem: Problem, method: str) -> ExactModel:
             f"{model.reason}",
             fix="use ssm.PGAS(...) or ssm.PMMH(...), or None, which picks by structure",
             where=model.where,
+        )
+    if method == "Gibbs" and isinstance(model, Extended):
+        raise ArgumentError(
+            "Gibbs draws the states from their exact law, and this model calls a simulator",
+            fix="use ssm.MetropolisHastings(), on the extended Kalman filter's likelihood, or "
+            'ssm.PMMH(proposal="bootstrap"), or None, which picks the former',
         )
     if method == "Gibbs" and isinstance(model, Deterministic):
         site = next(iter(problem.trace.transition.values()))
@@ -125,7 +132,7 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     chains = made.prepared()
     report = {
         "settings": settings_of(replace(method, order=order)),
-        "likelihood": f"exact, by {filter_name(exact)}",
+        "likelihood": likelihood_by(exact),
         **chains.report,
     }
     return replace(chains, report=report)

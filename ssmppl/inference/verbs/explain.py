@@ -22,12 +22,14 @@ from ssmppl.analysis.structure import (
     LinearGaussian,
     deterministic_memory,
     linear_gaussian,
+    simulators,
     singular_covariance,
 )
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
@@ -132,6 +134,8 @@ class Plan:
             return [("finite states", f"{len(self.finite.values)} combinations of values: the "
                      "likelihood is exact, by the forward algorithm; particles are used only where "
                      "they are asked for")]  # fmt: skip
+        if isinstance(exact_model(self.trace), Extended):
+            return self._simulators()
         if isinstance(exact_model(self.trace), Deterministic):
             return [("no noise", "given the parameters the states are known: the likelihood is "
                      "exact, by running them once")]  # fmt: skip
@@ -143,6 +147,16 @@ class Plan:
             return found
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
                  "used only where they are asked for")]  # fmt: skip
+
+    def _simulators(self) -> list[tuple[str, str]]:
+        names = ", ".join(f.title for f in simulators(self.trace))
+        return [
+            ("simulator", f"{names}: its values and derivatives, by central differences, come from "
+             "one call for all points of a row"),
+            ("approximation", "the likelihood is that of the extended Kalman filter, whose update "
+             "is the mode of each row: maximize, sample, smooth, score and kalman_filter go by it; "
+             "particles, proposal=\"bootstrap\", are used where they are asked for"),
+        ]  # fmt: skip
 
     def _laplace(self) -> str:
         if self.laplace is not None:

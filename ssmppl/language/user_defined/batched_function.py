@@ -81,18 +81,22 @@ class BatchedFunction:
 
     # -- one call
     def _called(self, points: np.ndarray) -> np.ndarray:
-        n, m, _ = self.sizes
-        parts = [np.array(p, order="C") for p in np.split(points[:, :-1], [n, n + m], axis=1)]
+        if not np.isfinite(points).all():
+            fine = np.isfinite(points).all(axis=1)
+            values = np.full((len(points), self.outputs), np.nan)
+            if fine.any():
+                values[fine] = self._called(points[fine])
+            return values
         begun = time.perf_counter()
         try:
-            found = self.function(*parts)
+            found = self.function(*self._parts(points))
         except Exception as error:
             raise self._raised(error, points) from None
         self.seconds += time.perf_counter() - begun
         self.calls, self.points = self.calls + 1, self.points + len(points)
         values = self._array(found, len(points))
-        bad = np.isnan(values).any(axis=1) & np.isfinite(points[:, :-1]).all(axis=1)
-        if bad.any():
+        if np.isnan(values).any():
+            bad = np.isnan(values).any(axis=1)
             if not self.undefined:
                 k = int(np.argmax(bad))
                 lost = ", ".join(np.array(self.results)[np.isnan(values[k])])
@@ -100,17 +104,24 @@ class BatchedFunction:
             self.undefined += int(bad.sum())
         return values
 
+    def _parts(self, points: np.ndarray) -> list[np.ndarray]:
+        """States, inputs and parameters, each an array of its own."""
+        n, m, p = self.sizes
+        ends = (0, n, n + m, n + m + p)
+        return [points[:, a:b].copy() for a, b in itertools.pairwise(ends)]
+
     def _array(self, found: Any, size: int) -> np.ndarray:
         wanted = f"an array ({size}, {self.outputs}) of float64, a row for each of {size} points"
         try:
             values = np.asarray(found)
         except Exception as error:
-            raise self._error(f"gives {type(found).__name__}: {error}", f"return {wanted}") from None
+            raise self._error(
+                f"gives {type(found).__name__}: {error}", f"return {wanted}"
+            ) from None
         if values.dtype.kind == "f" and values.dtype.itemsize < 8:
             raise self._error(
                 f"gives {values.dtype}, too few digits for derivatives by differences",
-                "compute in double precision (in JAX: "
-                'jax.config.update("jax_enable_x64", True))',
+                'compute in double precision (in JAX: jax.config.update("jax_enable_x64", True))',
             )
         if values.dtype.kind not in "fiub":
             raise self._error(f"gives an array of {values.dtype}", f"return {wanted}")
@@ -133,7 +144,10 @@ class BatchedFunction:
         again = self._called(sample)
         if not np.array_equal(first, again, equal_nan=True):
             raise self._differs(
-                first, again, sample, "called twice with the same arguments it gives",
+                first,
+                again,
+                sample,
+                "called twice with the same arguments it gives",
                 "keeps something between calls, or draws random numbers",
                 "reset what it keeps at the beginning of each call (a warm start, a clock, a "
                 "generator); noise belongs into the model's laws",
@@ -141,7 +155,10 @@ class BatchedFunction:
         turned = self._called(sample[::-1])[::-1]
         if not self._alike(first, turned):
             raise self._differs(
-                first, turned, sample, "with the same points in another order it gives",
+                first,
+                turned,
+                sample,
+                "with the same points in another order it gives",
                 "does not move each point by itself",
                 "compute each row of the result from the same row of the arguments alone; an "
                 "adaptive step size for the whole batch needs a tighter tolerance, or fixed steps",
@@ -149,7 +166,10 @@ class BatchedFunction:
         alone = self._called(sample[:1])
         if not self._alike(first[:1], alone):
             raise self._differs(
-                first[:1], alone, sample, "with one point of a batch alone it gives",
+                first[:1],
+                alone,
+                sample,
+                "with one point of a batch alone it gives",
                 "does not move each point by itself",
                 "compute each row of the result from the same row of the arguments alone",
             )
@@ -174,11 +194,9 @@ class BatchedFunction:
     def _raised(self, error: Exception, points: np.ndarray) -> SimulatorError:
         point = points[0]
         if 1 < len(points) <= LOOKED_INTO:
-            n, m, _ = self.sizes
             for k in range(len(points)):
-                parts = np.split(np.array(points[k : k + 1, :-1]), [n, n + m], axis=1)
                 try:
-                    self.function(*parts)
+                    self.function(*self._parts(points[k : k + 1]))
                 except Exception as own:
                     point, error = points[k], own
                     break

@@ -159,7 +159,7 @@ class Simulator:
             if name not in self.arguments:
                 known = ", ".join(nearest_first(name, self.arguments))
                 raise self._wrong(f"an unknown {name!r}", f"use: {known}")
-        found = {name: 0.0 for name in self.forces} | found
+        found = dict.fromkeys(self.forces, 0.0) | found
         missing = [n for n in self.arguments if n not in found]
         if missing:
             raise self._wrong(
