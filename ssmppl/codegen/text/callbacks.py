@@ -70,7 +70,8 @@ class Request:
 
 
 def _view(address: int, size: int) -> np.ndarray:
-    return np.frombuffer((ctypes.c_double * size).from_address(address))
+    buffer: Any = (ctypes.c_double * size).from_address(address)
+    return np.frombuffer(buffer)
 
 
 @one_at_a_time

@@ -27,6 +27,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_of, topological
+from ssmppl.expressions.node import SEVERAL
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.trace import Trace, previous, symbols
 
@@ -322,7 +323,8 @@ def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
             continue
         seen.add(node)
         law = any(s.data[0] == "parameter" for s in symbols_of(node))
-        if law and node in elsewhere and node is not mean:
+        number = node.op not in (*SEVERAL, "cholesky", "inverse")
+        if law and number and node in elsewhere and node is not mean:
             out.append(node)
         stack += node.args
     return out

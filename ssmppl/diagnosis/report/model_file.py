@@ -32,6 +32,7 @@ from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive
+from ssmppl.language.user_defined.simulator import Simulator
 
 LINE = 96
 INDENT = "    "
@@ -156,7 +157,7 @@ class _Writer:
         arguments = [n for n in known if n in wanted]
         taken = {*self.names, *arguments, *self.imports, "np", "ssm", "special"}
         lines = Lines(roots, self._arrays(used), taken, self._marks(roots), _wishes(role, sites),
-                      lambda call: str(call.data.__name__))  # fmt: skip
+                      _called)  # fmt: skip
         entries = []
         for s in sites:
             key = f'"{s.name}": '
@@ -332,9 +333,34 @@ class Import:
         return cls("primitive", p.__name__, p.name, p.location, f.__module__, f.__qualname__)
 
     @classmethod
+    def of_simulator(cls, s: Simulator) -> Import:
+        """The import that a call of it needs: by the name under which a module has it."""
+        module, name = holding(s)
+        return cls("simulator", name, id(s), s.location or Location("", 0), module, name)
+
+    @classmethod
     def of_law(cls, o: Origin) -> Import:
         """The import that naming it needs."""
         return cls("distribution", o.name, o, o.location, o.module, o.qualname)
+
+
+def _called(call: Expr) -> str:
+    """The name by which a primitive or a simulator is called."""
+    if call.op == "simulator":
+        function = call.data.function
+        sense = "" if function is function.simulator.moves else ".sense"
+        return holding(function.simulator)[1] + sense
+    return str(call.data.__name__)
+
+
+def holding(simulator: Simulator) -> tuple[str, str]:
+    """(module, name) under which a module has a simulator; its own name where none has."""
+    home = getattr(simulator.step, "__module__", "__main__")
+    for name in (home, "__main__", *list(sys.modules)):
+        for key, value in list(getattr(sys.modules.get(name), "__dict__", {}).items()):
+            if value is simulator:
+                return name, key
+    return home, simulator.name
 
 
 def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> dict[str, Import]:
@@ -361,6 +387,8 @@ def _wanted(d: Distribution) -> Iterable[Import]:
     for node in topological(nodes_of(d)):
         if node.op == "call":
             yield Import.of_primitive(node.data)
+        if node.op == "simulator":
+            yield Import.of_simulator(node.data.function.simulator)
     for part in _laws(d):
         if isinstance(part, UserDefined):
             yield Import.of_law(part.origin)

@@ -90,7 +90,7 @@ def groups(nodes: Iterable[Expr]) -> dict[Expr, tuple[Expr, ...]]:
     for node in nodes:
         if node.op == OP:
             alike.setdefault((node.data.function, *map(id, node.args)), []).append(node)
-    out = {}
+    out: dict[Expr, tuple[Expr, ...]] = {}
     for group in alike.values():
         ordered = tuple(sorted(group, key=lambda n: (len(n.data.index), n.data.index)))
         out |= dict.fromkeys(group, ordered)

@@ -19,7 +19,7 @@ from ssmppl.codegen.modules.gaussian import GaussianApproximation
 from ssmppl.codegen.modules.program import compile_trace
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
-from ssmppl.inference.batched.filter import BatchedFilter, batched_filter
+from ssmppl.inference.batched.filter import BatchedFilter, Moments, batched_filter
 from ssmppl.inference.exact.derivatives import Scored
 from ssmppl.inference.exact.kalman import KalmanMoments
 from ssmppl.inference.exact.kalman_matrices import SmoothedMoments
@@ -32,7 +32,7 @@ LEAST = 1e-6  # parameters nearer to zero count as this large
 TELLING = 1e-6  # nats that a second difference has to be, above the rounding of differences
 LONGER, ATTEMPTS = 10.0, 6  # by which a step grows that tells less, and how often
 CURVE_STEP = 0.05  # of the differences for curvatures, in standard deviations
-FLAT = 1e-12  # curvature relative to the step's own, below which there is none
+ROUNDING = 1e-12  # of an eigenvalue of a correlation matrix, below which it is none
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,29 @@ class Extended(Scored):
         """(B,) likewise, of each row of theta (B, P), with one call of a simulator a row."""
         data = tuple(experiments)
         return self._filter(data).log_likelihoods(data, theta)
+
+    def trajectories(
+        self, experiment: Experiment, theta: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """(B, T, D) a draw of x_{1:T} given y_{1:T} for each row of theta (B, P), by backward
+        sampling (Rauch, Tung and Striebel's gains); NaN where the filter comes to no number."""
+        rows: list[Moments] = []
+        data = (experiment,)
+        value = self._filter(data).log_likelihoods(data, theta, rows)
+        steps, (lanes, d) = len(rows), rows[0].mean.shape
+        out = np.full((lanes, experiment.steps, d), np.nan)
+        for t in range(steps - 1, -1, -1):
+            mean, covariance = rows[t].mean, rows[t].covariance
+            if t + 1 < steps:
+                later = rows[t + 1]
+                gain = later.cross @ _pseudoinverse(later.predicted_covariance)
+                off = (out[:, t + 1] - later.predicted)[:, :, None]
+                mean = mean + (gain @ off)[:, :, 0]
+                covariance = covariance - gain @ later.cross.transpose(0, 2, 1)
+            noise = rng.standard_normal((lanes, d, 1))
+            out[:, t] = mean + (_roots(covariance) @ noise)[:, :, 0]
+        out[~(value > -np.inf)] = np.nan
+        return out
 
     def filter(self, experiment: Experiment, theta: np.ndarray) -> KalmanMoments:
         """The filter's moments and predictions.
@@ -212,6 +235,24 @@ class Extended(Scored):
     def _kalman(self, e: Experiment) -> ApproximateKalman:
         problem = Problem(self.trace, (e,), compile_trace(self.trace, missing_of([e])))
         return ApproximateKalman(problem, self._approximation([e]), "extended")
+
+
+def _pseudoinverse(covariance: np.ndarray) -> np.ndarray:
+    """(L, D, D) of covariances that may be singular, by their correlations."""
+    scale = np.sqrt(np.maximum(np.einsum("lii->li", covariance), 0.0))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    both = scale[:, :, None] * scale[:, None, :]
+    alike = np.where(np.isfinite(covariance), covariance / both, 0.0)
+    found: np.ndarray = np.linalg.pinv(alike, ROUNDING, hermitian=True) / both
+    return found
+
+
+def _roots(covariance: np.ndarray) -> np.ndarray:
+    """(L, D, D) of covariances that are positive semidefinite up to rounding."""
+    fine = np.where(np.isfinite(covariance), covariance, 0.0)
+    values, vectors = np.linalg.eigh(0.5 * (fine + fine.transpose(0, 2, 1)))
+    found: np.ndarray = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    return found
 
 
 @once_per_trace

@@ -8,6 +8,7 @@ so that a simulator in the transition is called once a row, whatever the number 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,18 @@ NEWTON_STEPS, HALVINGS, CLOSE = 10, 40, 0.05  # as in the compiled filter
 RESOLVED = 1e-13
 
 
+@dataclass(frozen=True)
+class Moments:
+    """Of x_t in each of L lanes: mean (L, D) and covariance (L, D, D) given y_{1:t}, predicted
+    (L, D) and its covariance (L, D, D) given y_{1:t-1}, cross (L, D, D) of x_{t-1} with x_t."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    predicted: np.ndarray
+    predicted_covariance: np.ndarray
+    cross: np.ndarray
+
+
 class BatchedFilter:
     """The filter of a model. found : the model by its noises."""
 
@@ -38,9 +51,15 @@ class BatchedFilter:
         )
         self._look = _Part(trace, [found.observed, *found.slope, *half])
 
-    def log_likelihoods(self, experiments: Sequence[Experiment], theta: np.ndarray) -> np.ndarray:
+    def log_likelihoods(
+        self, experiments: Sequence[Experiment], theta: np.ndarray,
+        record: list[Moments] | None = None,
+    ) -> np.ndarray:  # fmt: skip
         """(B,) log p(y | theta) of each row of theta (B, P), summed over the data sets; -inf where
-        it comes to no number, or to none that floating point resolves."""
+        it comes to no number, or to none that floating point resolves.
+
+        record : takes the moments of each row; of a single data set.
+        """
         lanes = _Lanes(self.trace, experiments, np.asarray(theta, dtype=float))
         total = np.zeros(lanes.count)
         dead = np.zeros(lanes.count, dtype=bool)
@@ -51,10 +70,11 @@ class BatchedFilter:
                 if t == 0:
                     rest, spread = self._started(lanes)
                     p = spread @ spread.transpose(0, 2, 1)
+                    cross = np.zeros_like(p)
                 else:
                     rest, slope, spread = self._moved(lanes, x)
-                    p = slope @ covariance @ slope.transpose(0, 2, 1)
-                    p = p + spread @ spread.transpose(0, 2, 1)
+                    cross = covariance @ slope.transpose(0, 2, 1)
+                    p = slope @ cross + spread @ spread.transpose(0, 2, 1)
                 increment, x, covariance = self._updated(lanes, rest, p)
                 after, before = (np.einsum("lii->li", c) for c in (covariance, p))
                 fine = (after >= RESOLVED * before) & np.isfinite(x)
@@ -64,6 +84,8 @@ class BatchedFilter:
                     if dead.all():
                         break
                 total += increment if going is True else np.where(going, increment, 0.0)
+                if record is not None:
+                    record.append(Moments(x, covariance, rest, p, cross))
                 if dead.any():  # in place of what is no number
                     alive = int(np.argmin(dead))
                     x = np.where(dead[:, None], x[alive], x)

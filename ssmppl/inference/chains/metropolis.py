@@ -13,6 +13,7 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.batched.extended import Extended
+from ssmppl.inference.batched.independence import Standing, independent_chains
 from ssmppl.inference.chains.metropolis_kernel import (
     WALK_STATES,
     ChainPoint,
@@ -39,6 +40,8 @@ from ssmppl.inference.preparation.pilot import Pilot, find_mode
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.problem import Problem
+
+LEAST_SHARE = 0.05  # effective draws of independent proposals, below which chains walk
 
 
 def needed_model(problem: Problem, method: str) -> ExactModel:
@@ -112,6 +115,10 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     """
     problem, space = setup.problem, setup.space
     exact = needed_model(problem, "MetropolisHastings")
+    if isinstance(exact, Extended) and method == MetropolisHastings() and len(space.positions):
+        chains = _independent(setup, exact)
+        if chains is not None:
+            return chains
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
     if method.covariance is not None:
@@ -133,9 +140,27 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     report = {
         "settings": settings_of(replace(method, order=order)),
         "likelihood": likelihood_by(exact),
+        **({"approximate": 1} if isinstance(exact, Extended) else {}),
         **chains.report,
     }
     return replace(chains, report=report)
+
+
+def _independent(setup: SamplingSetup, model: Extended) -> PreparedChains | None:
+    """Chains with proposals that do not depend on where they stand; None where no proposal is
+    close enough to the posterior, so that a walk is better."""
+    rng = np.random.default_rng(np.random.SeedSequence(setup.root.entropy, spawn_key=(19,)))
+    kernel, states, report = independent_chains(
+        setup.space, model, lambda i: setup.streams(i)[0], setup.chains, rng, setup.warmup,
+        setup.thin, setup.states,
+    )  # fmt: skip
+    if report["proposal_ess_share"] < LEAST_SHARE:
+        return None
+    report |= {
+        "settings": settings_of(MetropolisHastings()),
+        "likelihood": likelihood_by(model), "approximate": 1,
+    }  # fmt: skip
+    return PreparedChains(kernel.step_block, states, report)
 
 
 def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray) -> str:
@@ -145,6 +170,6 @@ def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray)
 
 METHOD = SamplingMethod(
     prepare,
-    state_classes=(*WALK_STATES, LocalProposal, Pilot),
+    state_classes=(*WALK_STATES, LocalProposal, Pilot, Standing),
     where_slow=", or another method, such as ssm.Gibbs()",
 )

@@ -50,6 +50,7 @@ class BatchedFunction:
         self.moving = (*(True for _ in arguments), False)
         self.scales = np.append(scales, 1.0)
         self.where = where
+        self.simulator: Any = None  # whose it is
         self.calls = self.points = self.undefined = 0
         self.seconds, self.first_undefined = 0.0, ""
         self._checked = False

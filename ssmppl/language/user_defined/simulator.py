@@ -95,6 +95,8 @@ class Simulator:
         if output is not None:
             title = f"{name}.sense"
             self.senses = BatchedFunction(title, output, *given, self.outputs, own, where)
+        for function in self.functions:
+            function.simulator = self
         _made[self._token] = self
 
     @property
@@ -306,10 +308,12 @@ def simulator(
                 where=user_location(),
             )
         where = location_of(step) if inspect.isfunction(step) else user_location()
-        title = name or getattr(step, "__name__", type(step).__name__)
+        title = str(name or getattr(step, "__name__", type(step).__name__))
         return Simulator(
-            step, output=output, name=title, scales=dict(scales or {}), where=where, **columns
-        )
+            step, state=columns["state"], inputs=columns["inputs"],
+            parameters=columns["parameters"], output=output, outputs=columns["outputs"],
+            forces=columns["forces"], name=title, scales=dict(scales or {}), where=where,
+        )  # fmt: skip
 
     return decorate
 
