@@ -1,7 +1,7 @@
 """A two-link arm in MuJoCo with noise in its torques: parameters from simulated records, by ssmppl
 and by `mujoco.sysid`.
 
-    python bench/arms.py [--records 20] [--rows 500]
+    python bench/arms.py [--records 20] [--rows 500] [--threads 1]
 
 Each record is simulated by the model itself: ten steps of 2 ms a row, independent torque noise of
 0.3 N m in each row on both joints, encoders with 2 mrad of noise. ssmppl maximises the likelihood of
@@ -44,10 +44,10 @@ START = {"d1": 0.5, "d2": 0.5, "m": 1.0}  # where mujoco.sysid begins
 DT, SUBSTEPS, ENCODER = 0.02, 10, 0.002
 
 
-def model() -> ssm.Model:
+def model(threads: int) -> ssm.Model:
     """The arm, with the noise of each row's torques as states that the next row draws anew."""
     step = ssm.simulators.mujoco(
-        XML, dt=DT, name="arm",
+        XML, dt=DT, name="arm", threads=threads,
         parameters={"d1": "shoulder.damping", "d2": "elbow.damping", "m": "fore.mass"},
     )  # fmt: skip
     arm = ssm.Model("two-link arm", inputs=("u1", "u2"))
@@ -158,9 +158,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--records", type=int, default=20)
     parser.add_argument("--rows", type=int, default=500)
+    parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     logging.getLogger("absl").setLevel(logging.ERROR)  # encoders stand for sensors: it warns
-    arm = model()
+    arm = model(options.threads)
     rivals: dict[str, Any] = {"ssmppl": lambda data: by_ssmppl(arm, data)}
     if importlib.util.find_spec("colorama") and importlib.util.find_spec("mujoco.sysid"):
         rivals["mujoco.sysid"] = by_sysid
