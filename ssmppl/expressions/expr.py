@@ -23,6 +23,7 @@ from ssmppl.expressions.node import (
     attributed,
     behaviour,
     constant,
+    is_tuple,
     item,
     matrix_op,
     recording,
@@ -49,6 +50,7 @@ __all__ = [
     "as_expr",
     "attributed",
     "constant",
+    "is_tuple",
     "item",
     "matrix_op",
     "recording",
@@ -469,6 +471,8 @@ def _written(node: Expr, parts: list[Text]) -> Text:
     inside = _matrix_name(node) if op in MATRIX_OPS else None
     if inside is None:
         inside = ", ".join(text for text, _ in parts)
+    if op == "call":  # by the name that its user gave it
+        return f"{getattr(node.data, '__name__', op)}({inside})", Level.ATOM
     return f"{node.data[0] if op == 'random' else op}({inside})", Level.ATOM
 
 

@@ -24,7 +24,7 @@ from ssmppl.codegen.text.render import (
     symbol_name,
 )
 from ssmppl.codegen.text.specialise import specialise
-from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.expr import Expr, is_tuple, topological
 from ssmppl.expressions.operations import KERNELS
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
@@ -307,8 +307,9 @@ class Section:
 
 
 def is_matrix(node: Expr) -> bool:
-    """Whether the node is a whole matrix, or a loop: several numbers, no entry of `c` or `s`."""
-    return node.op in ("cholesky", "inverse", "loop")
+    """Whether the node is a whole matrix, a loop or a call that gives several numbers: no entry of
+    `c` or `s`."""
+    return node.op in ("cholesky", "inverse", "loop") or is_tuple(node)
 
 
 def _grouped(targets: Sequence[Target]) -> list[list[Target]]:
@@ -393,7 +394,7 @@ class ModuleText:
         called = sorted(words & set(REGISTRY))  # the user's primitives
         if called:
             lines += ["from ssmppl.language.user_defined.primitive import REGISTRY", ""]
-            lines += [f'{name} = REGISTRY["{name}"]' for name in called]
+            lines += [f'{name} = REGISTRY["{name}"].compiled' for name in called]
         lines += ["", 'entry = numba.njit(nogil=True, error_model="numpy")', "", ""]
         return "\n".join(lines) + "\n\n".join(self.parts)
 
