@@ -1,6 +1,6 @@
 """Scalar functions for translated code: the kernels' own and primitives, as LLVM IR by Numba.
 
-Each kernel is compiled by Numba once, and its IR kept on disk; translated code takes it in and
+Each of them is compiled by Numba once, and its IR kept on disk; translated code takes it in and
 inlines it, so that a loop that calls exp still vectorises. Of the user's primitives those are taken
 in that need nothing of Python at run time: no exception to be raised, no memory to be managed, no
 address of this process.
@@ -35,16 +35,17 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
     ------
     Untranslatable : there is no such function of floats.
     """
-    if name in REGISTRY and not draws:
-        return _of_primitive(name, arity)
-    if name not in KERNELS or name in MATRIX_OPS:  # these take tuples, and give arrays
+    primitive = name in REGISTRY and not draws
+    if not primitive and (name not in KERNELS or name in MATRIX_OPS):  # of tuples, and of arrays
         raise Untranslatable(f"{name} is not a function of numbers", fix="")
     file = f"lib_{name}_{arity}"
     text = folder.kept(file, ".ll")
     if text is None:
         with folder.one_process(file):
-            text = folder.kept(file, ".ll") or _made(name, arity, draws)
-            folder.keep(file, ".ll", text)
+            text = folder.kept(file, ".ll")
+            if text is None:
+                text = _of_primitive(name, arity) if primitive else _made(name, arity, draws)
+                folder.keep(file, ".ll", text)
     return text
 
 

@@ -31,7 +31,7 @@ from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace, symbols
-from ssmppl.language.user_defined.primitive import Primitive
+from ssmppl.language.user_defined.primitive import Primitive, primitives_in
 
 LINE = 96
 INDENT = "    "
@@ -156,7 +156,7 @@ class _Writer:
         arguments = [n for n in known if n in wanted]
         taken = {*self.names, *arguments, *self.imports, "np", "ssm", "special"}
         lines = Lines(roots, self._arrays(used), taken, self._marks(roots), _wishes(role, sites),
-                      lambda call: str(call.data.__name__))  # fmt: skip
+                      lambda call: str(call.data.spelled))  # fmt: skip
         entries = []
         for s in sites:
             key = f'"{s.name}": '
@@ -358,9 +358,7 @@ def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> di
 
 
 def _wanted(d: Distribution) -> Iterable[Import]:
-    for node in topological(nodes_of(d)):
-        if node.op == "call":
-            yield Import.of_primitive(node.data)
+    yield from map(Import.of_primitive, primitives_in(nodes_of(d)))
     for part in _laws(d):
         if isinstance(part, UserDefined):
             yield Import.of_law(part.origin)

@@ -23,8 +23,8 @@ import numba
 
 EPS = 2.0**-52
 LARGEST = 4  # order of a derivative
-# By order: the first step, relative to the argument; how much larger the next (the square of it, its
-# fourth and sixth power those after it); how many roundings the difference must be to be taken; the
+# By order: the first step, relative to the argument; how much larger the next (its square, fourth
+# and sixth power those after it); how many roundings the difference must be to be taken; the
 # share of the values from which the step is in doubt.
 STEPS = {1: 2.0**-23, 2: 2.0**-13, 3: 2.0**-10, 4: 2.0**-8}
 GROWTH = {1: 64.0, 2: 16.0, 3: 16.0, 4: 16.0}

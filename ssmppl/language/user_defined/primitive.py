@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, overload
 
@@ -20,9 +20,9 @@ import numba
 import numpy as np
 
 from ssmppl.compiling import once_property, one_at_a_time
-from ssmppl.errors import ModelError
+from ssmppl.errors import Location, ModelError
 from ssmppl.expressions.arrays import ExprArray, array, scalar_or_array
-from ssmppl.expressions.expr import Expr
+from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.model.closure_digest import fingerprint, outer_values
 from ssmppl.language.model.model import location_of
 from ssmppl.language.model.pickling import holder_of
@@ -38,23 +38,67 @@ def outputs_of(name: str) -> int:
     return REGISTRY[name].outputs if name in REGISTRY else 1
 
 
+def primitives_in(roots: Iterable[Expr]) -> list[Primitive]:
+    """The user's primitives that expressions call, in loops too, each once."""
+    found: dict[Primitive, None] = {}
+    waiting = topological(roots)
+    while waiting:
+        node = waiting.pop(0)
+        if node.op == "call" and isinstance(node.data, Opaque):
+            found[node.data.root] = None
+        elif node.op == "loop":
+            waiting += topological(node.data.update)
+    return list(found)
+
+
 class Opaque:
     """A compiled function of floats to a float, or to a tuple of `outputs` of them, as it is called
     in expressions.
 
     name : of it in generated code, the same in every process. compiled : the function, by Numba.
-    numbers : the same as Python calls it, without compiling anything further.
+    numbers : the same as Python calls it, without compiling anything further. plain : what is
+    called on numbers. root : the user's primitive that it is, or whose derivative it is.
+    spelled : how it is called in a law. key : what it and its derivatives are known by.
     """
 
     name: str
     __name__: str
     arguments: list[str]
     outputs: int
+    root: Primitive
+    location: Location
+    spelled: str
+    key: str
     compiled: Any
     numbers: Function
+    plain: Function
 
     def __init__(self) -> None:
         self._differences: dict[tuple[int, ...], Difference] = {}
+
+    def __call__(self, *values: Any) -> Any:
+        """Of numbers what the function returns; of symbols an expression for each number of it."""
+        if len(values) != len(self.arguments):
+            raise ModelError(
+                f"the primitive {self.__name__} takes {len(self.arguments)} arguments "
+                f"({', '.join(self.arguments)}), {len(values)} given",
+                fix="pass each by position",
+                where=self.location,
+            )
+        if not any(_symbolic(v) for v in values):
+            return self.plain(*values)
+        self.check_as_compiled()
+        arrays: Any = np.broadcast_arrays(*(array(v).view(np.ndarray) for v in values))
+        out = [np.empty(arrays[0].shape, dtype=object) for _ in range(self.outputs)]
+        for i in np.ndindex(arrays[0].shape):
+            for own, node in zip(out, self.nodes(tuple(a[i] for a in arrays)), strict=True):
+                own[i] = node
+        made = tuple(scalar_or_array(o) for o in out)
+        return made if self.outputs > 1 else made[0]
+
+    def check_as_compiled(self) -> None:
+        """Check that what is compiled is what the user's function is now."""
+        raise NotImplementedError
 
     def nodes(self, args: tuple[Expr, ...]) -> list[Expr]:
         """What a call gives, one expression for each output."""
@@ -84,7 +128,7 @@ class Primitive(Opaque):
         self.location = location_of(function)
         self.arguments = _arguments(function)
         self.compiled, self.outputs = _compile(function, len(self.arguments))
-        self.numbers = self.compiled
+        self.numbers, self.plain = self.compiled, function
         word = re.sub(r"\W+", "_", function.__name__).strip("_")  # <lambda> is no identifier
         self._compiled_of = fingerprint(function)
         self.name = f"{word}_{self._compiled_of[:8]}"
@@ -98,28 +142,18 @@ class Primitive(Opaque):
             self.given = _given(self, derivative)
 
     @property
-    def key(self) -> str:
-        """What it and its derivatives are known by."""
+    def key(self) -> str:  # type: ignore[override]
         return " ".join([self.name, *(f"{j} {p.key}" for j, p in self.given.items())])
 
-    def __call__(self, *values: Any) -> Any:
-        if len(values) != len(self.arguments):
-            raise ModelError(
-                f"the primitive {self.__name__} takes {len(self.arguments)} arguments "
-                f"({', '.join(self.arguments)}), {len(values)} given",
-                fix="pass each by position",
-                where=self.location,
-            )
-        if not any(_symbolic(v) for v in values):
-            return self.function(*values)
-        self._check_as_compiled()
-        arrays: Any = np.broadcast_arrays(*(array(v).view(np.ndarray) for v in values))
-        out = [np.empty(arrays[0].shape, dtype=object) for _ in range(self.outputs)]
-        for i in np.ndindex(arrays[0].shape):
-            for own, node in zip(out, self.nodes(tuple(a[i] for a in arrays)), strict=True):
-                own[i] = node
-        made = tuple(scalar_or_array(o) for o in out)
-        return made if self.outputs > 1 else made[0]
+    @property
+    def root(self) -> Primitive:  # type: ignore[override]
+        return self if self._origin is None else self._origin[0].root
+
+    @property
+    def spelled(self) -> str:  # type: ignore[override]
+        if self._origin is None:
+            return self.__name__
+        return f"{self._origin[0].spelled}.given[{self._origin[1]}]"
 
     def slope(self, args: tuple[Expr, ...], place: int, output: int) -> Expr:
         if place in self.given:
@@ -132,13 +166,17 @@ class Primitive(Opaque):
         """Where its derivatives come from, for people."""
         names = [self.arguments[j] for j in self.given if j is not None]
         if None in self.given or len(names) == len(self.arguments):
-            return "the first ones as given (derivative=), higher ones by central differences of it"
-        told = "central differences of the compiled function"
+            return "as given (derivative=), those of second order by central differences of these"
+        told = (
+            "central differences of the compiled function, with steps that begin at 1e-7 of an "
+            "argument (1e-4 for second derivatives) and adapt to its scale: exact to about 1e-9 "
+            "(1e-7) where it is smooth"
+        )
         if names:
-            told = f"that in {', '.join(names)} as given (derivative=), else {told}"
+            told = f"in {', '.join(names)} as given (derivative=), else {told}"
         return told
 
-    def _check_as_compiled(self) -> None:
+    def check_as_compiled(self) -> None:
         """Numba has frozen what the function reads from outside."""
         if fingerprint(self.function) != self._compiled_of:
             read = sorted(outer_values(self.function))
@@ -150,7 +188,7 @@ class Primitive(Opaque):
                 where=self.location,
             )
         for given in self.given.values():
-            given._check_as_compiled()
+            given.check_as_compiled()
 
     def __reduce__(self):  # by name where a module holds it, else by the function
         if self._origin is not None:
@@ -175,14 +213,17 @@ class Difference(Opaque):
             raise ModelError(
                 f"a derivative of order {sum(index)} of the primitive {base.__name__} is asked for",
                 fix="give its first derivatives by derivative=",
-                where=getattr(base, "location", None),
+                where=base.location,
             )
         self.base, self.index = base, index
         self.arguments, self.outputs = base.arguments, base.outputs
+        self.root, self.location = base.root, base.location
+        self.spelled = f"{base.spelled}.difference({index})"
         self.text = differences.difference_text(index, self.outputs)
         self.name = f"{base.name}_d{''.join(map(str, index))}_{differences.VERSION}"
         below = "".join(f"_{a}" * k for a, k in zip(self.arguments, index, strict=True))
         self.__name__ = f"d{base.__name__}_d{below.strip('_')}"
+        self.key = self.name
         REGISTRY[self.name] = self
 
     @once_property
@@ -193,23 +234,22 @@ class Difference(Opaque):
     def numbers(self) -> Function:  # type: ignore[override]
         return self._made(True)
 
+    @property
+    def plain(self) -> Function:  # type: ignore[override]
+        return self.numbers
+
     def _made(self, as_python: bool) -> Function:
         names = differences.names_for(self.base.compiled, as_python)
         exec(self.text, names)
         made: Function = names["difference"]
         return made
 
-    def __call__(self, *values: float) -> Any:
-        return self.numbers(*values)
+    def check_as_compiled(self) -> None:
+        self.base.check_as_compiled()
 
     def slope(self, args: tuple[Expr, ...], place: int, output: int) -> Expr:
         index = tuple(k + (j == place) for j, k in enumerate(self.index))
         return self.base.difference(index).nodes(args)[output]
-
-    @property
-    def key(self) -> str:
-        """What it is known by."""
-        return self.name
 
     def __reduce__(self):
         return _difference_of, (self.base, self.index)
@@ -378,9 +418,9 @@ def _given(owner: Primitive, derivative: Derivative) -> dict[int | None, Primiti
             place = owner.arguments.index(name)
             found[place] = _of_one(owner, f, place, who)
     elif isinstance(derivative, Sequence) and len(derivative) == n:
-        for place, f in enumerate(derivative):
-            if f is not None:
-                found[place] = _of_one(owner, f, place, who)
+        for place, own in enumerate(derivative):
+            if own is not None:
+                found[place] = _of_one(owner, own, place, who)
     else:
         raise ModelError(
             f"{who} is {derivative!r}",
@@ -423,8 +463,8 @@ def _flattened(f: Function, owner: Primitive, who: str) -> Function:
     inner, names = differences.compiled(f), [f"x{j}" for j in range(len(_arguments(f)))]
     inner.compile((numba.float64,) * len(names))
     result = inner.overloads[(numba.float64,) * len(names)].signature.return_type
-    rows = tuple(result) if isinstance(result, numba.types.BaseTuple) else ()
-    tuples = all(isinstance(r, numba.types.BaseTuple) and len(r) == n for r in rows)
+    rows: tuple[Any, ...] = tuple(result) if _is_tuple(result) else ()
+    tuples = all(_is_tuple(r) and len(r) == n for r in rows)
     if len(rows) != m or not (tuples or (n == 1 and not any(map(_is_tuple, rows)))):
         raise ModelError(
             f"{who} returns {result}",
