@@ -14,6 +14,7 @@ from ssmppl.errors import (
     ExecutorError,
     ModelError,
     SamplingError,
+    SimulatorError,
     SSMError,
 )
 from ssmppl.expressions.loops.integrate import expm, integrate, repeat
@@ -84,6 +85,7 @@ from ssmppl.language.model.name_hints import name_hint
 from ssmppl.language.user_defined.distribution import distribution
 from ssmppl.language.user_defined.primitive import primitive
 from ssmppl.language.user_defined.sde import SDE
+from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:
@@ -170,6 +172,8 @@ __all__ = [
     "SSMError",
     "SamplingError",
     "ScoreAscent",
+    "Simulator",
+    "SimulatorError",
     "StudentT",
     "Truncated",
     "Uniform",
@@ -208,6 +212,7 @@ __all__ = [
     "sample",
     "score",
     "simulate",
+    "simulator",
     "smooth",
     "summary",
 ]

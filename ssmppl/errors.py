@@ -4,6 +4,7 @@
 class               whose fault, and what its message names
 ==================  =========================================================================
 ModelError          the model file: function, file, line, what was found, what to write
+SimulatorError      a ModelError of what a simulator does: row, arguments, the user's traceback
 DataError           the data: data set, variable, row (and column), the value, what to change
 ArgumentError       the call: the argument, its value, the valid options
 SamplingError       the numbers at run time: time step, site, the user's line, parameter values
@@ -100,6 +101,10 @@ class ModelError(SSMError):
 
 class UnsupportedOperation(ModelError, TypeError):
     """An operation on symbols that has no symbolic meaning (a Python `if`, `float(x)`, ...)."""
+
+
+class SimulatorError(ModelError):
+    """A function under `@ssm.simulator` raised an error, or is none that can be computed with."""
 
 
 class UnknownName(ModelError, AttributeError):

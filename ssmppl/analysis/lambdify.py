@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.expressions.batched.call import computed
 from ssmppl.expressions.evaluate import MEANING, evaluate
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
 from ssmppl.expressions.loops.loop import Loop
@@ -148,6 +149,8 @@ def _written(node: Expr, parts: list[str]) -> str:
         return f"{parts[0]}[{', '.join(map(str, node.data))}]"
     if node.op == "loop":
         return f"loops[{id(node.data)}]({', '.join(parts)})"
+    if node.op == "simulator":
+        return f"simulators[{id(node.data.function)}]({node.data.index}, ({', '.join(parts)},))"
     if node.op == "call":
         return f"calls[{id(node.data)}]({', '.join(parts)})"
     if node.op == "pow" and node.args[1].op == "const" and node.args[1].data == 2.0:
@@ -186,6 +189,13 @@ def _loop(loop: Loop) -> Callable[..., tuple[float, ...]]:
     return run
 
 
+def _simulator(function: Any) -> Callable[..., np.ndarray]:
+    def run(index: tuple[int, ...], args: tuple[float, ...]) -> np.ndarray:
+        return computed(function, (index,), np.array([args], dtype=float))[0, :, 0]
+
+    return run
+
+
 def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
     """What the texts refer to."""
     return {
@@ -195,6 +205,11 @@ def _names(expressions: Sequence[Expr]) -> dict[str, Any]:
         "DOMAIN": DOMAIN,
         "meaning": MEANING,
         "loops": {id(n.data): _loop(n.data) for n in topological(expressions) if n.op == "loop"},
+        "simulators": {
+            id(n.data.function): _simulator(n.data.function)
+            for n in topological(expressions)
+            if n.op == "simulator"
+        },
         "calls": {id(n.data): n.data for n in topological(expressions) if n.op == "call"},
         **{f"matrix_{op}": _matrix(function) for op, (_, function) in MATRICES.items()},
     }

@@ -21,6 +21,7 @@ import numpy as np
 
 from ssmppl.errors import SSMError
 from ssmppl.expressions.arrays import ExprArray, array, inverse
+from ssmppl.expressions.batched import call as batched
 from ssmppl.expressions.expr import (
     BOOLEAN,
     Expr,
@@ -161,11 +162,36 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
             matrix_tangent[node] = array(loop_slopes(node, symbol, differentiate))
         elif node.op == "item" and node.args[0].op == "call":
             tangent[node] = _chain_of_call(node.args[0], node.data[0], tangent)
+        elif node.op == batched.OP:
+            matrix_tangent[node] = array(_simulated_slopes(node, tangent))
         elif node.op == "item":
             tangent[node] = _Slope(matrix_tangent[node.args[0]][node.data])
         elif not is_tuple(node):
             tangent[node] = _chain(node, tangent)
     return [tangent.get(e, _NONE).whole() for e in expressions]
+
+
+def _simulated_slopes(node: Expr, tangent: dict[Expr, _Slope]) -> list[Expr]:
+    """Of the values of a simulator."""
+    total = [constant(0.0)] * node.data.function.outputs
+    for j, argument in enumerate(node.args):
+        if argument in tangent and not _is_zero(tangent[argument].value):
+            own = _partial(node, j)
+            if own is not None:
+                slope = tangent[argument].whole()
+                total = [t + e * slope for t, e in zip(total, batched.items(own), strict=True)]
+    return total
+
+
+def _partial(node: Expr, j: int) -> Expr | None:
+    """The derivative of a simulator in its j-th argument."""
+    own = batched.partial(node, j)
+    if own is not None and batched.too_high(node):
+        raise NotDifferentiable(
+            f"the simulator {node.data.function.title} has derivatives by differences, of which "
+            "third ones would be too rough"
+        )
+    return own
 
 
 class _Slope(NamedTuple):
@@ -435,13 +461,19 @@ def reverse_gradient(expression: Expr, symbols: Sequence[Expr]) -> list[Expr]:
                 for argument, value in zip(node.args, _of_matrix(node, entries[node]), strict=True):
                     add(argument, _Slope(value))
             continue
-        if node not in slopes or _is_zero(slopes[node].value):
+        if node.op == batched.OP or node not in slopes or _is_zero(slopes[node].value):
             continue
         if node.op == "item" and node.args[0].op == "loop":
             for s in symbols:  # at once: the slopes in the arguments between would be many more
                 if s in involved and depends_on(node, [s]):
                     value = loop_slopes(node.args[0], s, differentiate)[node.data[0]]
                     add(s, _Slope(slopes[node].whole() * value))
+        elif node.op == "item" and node.args[0].op == batched.OP:
+            for j, argument in enumerate(node.args[0].args):
+                own = _partial(node.args[0], j) if argument in involved else None
+                if own is not None:
+                    value = batched.items(own)[node.data[0]]
+                    add(argument, _Slope(slopes[node].whole() * value))
         elif node.op == "item":
             matrix = node.args[0]
             shape = (matrix.data.outputs,) if is_tuple(matrix) else (matrix.data, matrix.data)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ssmppl.expressions.batched.call import groups, of_group
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, topological
 from ssmppl.expressions.operations import MATRICES, OPERATIONS
 
@@ -50,7 +51,10 @@ def evaluate(
 def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> list[Any]:
     done: dict[Expr, Any] = {}
     with np.errstate(all="ignore"):
-        for node in _order(tuple(roots)):
+        order, together = _order(tuple(roots))
+        for node in order:
+            if node in done:
+                continue
             args = [done[a] for a in node.args]
             if node in values:
                 done[node] = np.asarray(values[node], dtype=float)
@@ -62,6 +66,8 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
                 done[node] = args[0][(..., *node.data)]
             elif node.op == "loop":
                 done[node] = _repeated(node, args)
+            elif node in together:
+                done |= zip(together[node], of_group(together[node], args), strict=True)
             elif node.op in MATRIX_OPS:
                 done[node] = _matrix(node.op, node.data, args)
             elif node.op == "random":
@@ -95,10 +101,13 @@ def _repeated(node: Expr, args: list[Any]) -> np.ndarray:
 
 
 @lru_cache(maxsize=256)
-def _order(roots: tuple[Expr, ...]) -> list[Expr]:
-    """Kept, as the same expressions are evaluated at point after point, of which the walk over a
+def _order(roots: tuple[Expr, ...]) -> tuple[list[Expr], dict[Expr, tuple[Expr, ...]]]:
+    """The nodes in order, and what of simulators is computed together.
+
+    Kept, as the same expressions are evaluated at point after point, of which the walk over a
     large graph takes longer than its few numbers."""
-    return topological(roots)
+    order = topological(roots)
+    return order, groups(order)
 
 
 def _matrix(op: str, n: int, entries: list[Any]) -> np.ndarray:

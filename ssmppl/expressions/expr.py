@@ -18,6 +18,7 @@ from ssmppl.expressions import special
 from ssmppl.expressions.node import (
     BOOLEAN,
     INDEX_BY_SYMBOL,
+    SEVERAL,
     Expr,
     as_expr,
     attributed,
@@ -238,6 +239,12 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
             number, e = number / e.args[1].data, e.args[0]
         else:
             return number, e
+
+
+def several(node: Expr) -> bool:
+    """Whether the node is several numbers, a matrix, the end of a loop or what a simulator or a
+    primitive gives, of which "item" nodes take one."""
+    return node.op in ("cholesky", "inverse", *SEVERAL) or is_tuple(node)
 
 
 # -- walks over the graph
@@ -463,6 +470,8 @@ def _written(node: Expr, parts: list[Text]) -> Text:
         return symbol_text(node), Level.ATOM
     if op == "item":
         return f"{parts[0][0]}[{', '.join(map(str, node.data))}]", Level.ATOM
+    if op == "simulator":  # the last argument is the row, for messages
+        return f"{node.data!r}({', '.join(text for text, _ in parts[:-1])})", Level.ATOM
     if op == "loop":  # what it depends on, and a mark of how
         whole = f"{node.data!r}({', '.join(text for text, _ in parts)})"
         mark = hashlib.sha256(whole.encode()).hexdigest()[:6]

@@ -34,6 +34,8 @@ INDEX_BY_SYMBOL = (
     "made it of its elements or rows (np.array makes a plain one)"
 )
 
+SEVERAL = ("loop", "simulator")  # nodes of several numbers, in one axis
+
 # What Expr does that is defined in modules above this one, which fill it when they are imported
 # (all of them by `ssmppl.expressions`):
 #   "apply"     (op, *operands): the node of an operation, simplified     expr.py

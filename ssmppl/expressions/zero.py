@@ -37,6 +37,7 @@ from ssmppl.expressions.expr import (
     to_text,
     topological,
 )
+from ssmppl.expressions.node import SEVERAL
 from ssmppl.expressions.properties import affirmed, conditions_of
 
 NEAR = 3  # points of moderate size in each case of the conditions
@@ -144,9 +145,9 @@ def _rational(parts: list[Expr]) -> list[Expr]:
         moved = rebuilt(node, tuple(new[a] for a in node.args))
         if moved.op == "exp":
             moved = _exponential(moved.args[0], own)
-        elif moved.op == "loop" or is_tuple(moved):
+        elif moved.op in SEVERAL or is_tuple(moved):
             pass  # what is taken from it is a symbol
-        elif (moved.op == "item" and moved.args[0].op in ("loop", "call")) or (
+        elif (moved.op == "item" and moved.args[0].op in (*SEVERAL, "call")) or (
             moved.op not in _FOLLOWED and not (moved.op == "pow" and moved.args[1].op == "const")
         ):
             moved = own.setdefault(moved, symbol("function", str(len(own))))

@@ -13,7 +13,7 @@ from ssmppl.expressions.operations import MATRIX_OPS
 from ssmppl.language.user_defined.primitive import outputs_of
 
 FLOAT, BOOLEAN, INTEGER, ROW, PLANE, STREAM = "float", "boolean", "integer", "row", "plane", "rng"
-FLAG_ROW, MATRIX = "row of flags", "matrix"
+FLAG_ROW, MATRIX, SIMULATED = "row of flags", "matrix", "results of a simulator"
 COMPARISONS = {ast.Lt: "olt", ast.LtE: "ole", ast.Gt: "ogt", ast.GtE: "oge", ast.Eq: "oeq",
                ast.NotEq: "une"}  # fmt: skip
 ARITHMETIC = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
@@ -50,6 +50,7 @@ class Arithmetic:
         self.count = 0
         self.calls: set[tuple[str, int, bool]] = set()
         self.in_loop = self.over_steps = False
+        self.here = "0"  # the place of a particle among those that a simulator moves together
 
     def value(self, node: ast.expr) -> Value:
         """The value of an expression, after the lines that compute it."""
@@ -145,6 +146,11 @@ class Arithmetic:
             at = literal(ast.unparse(node.slice))
             i, j = at if isinstance(at, tuple) else (0, at)
             return Value(FLOAT, array.entries[i][j])
+        if array.kind == SIMULATED:
+            row = int(literal(ast.unparse(node.slice))) * int(array.length)
+            at = self.let(f"add i64 {row}, {self.here}")
+            where = self.let(f"getelementptr double, ptr {array.text}, i64 {at}")
+            return Value(FLOAT, self.load(where))
         if array.kind == PLANE and not isinstance(node.slice, ast.Tuple):
             first = self.value(node.slice)
             offset = self.let(f"mul i64 {first.text}, {array.length}")

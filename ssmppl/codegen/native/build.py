@@ -70,6 +70,7 @@ def _compiled(text: str) -> tuple[bytes, list[str]]:
         '!0 = distinct !{}\n!1 = distinct !{!1, !2}\n!2 = !{!"llvm.loop.parallel_accesses", !0}\n'
     )
     own = [f"declare double @llvm.{n}.f64(double)" for n in ("fabs", "sqrt")]
+    own += [f"declare void @{symbol}(ptr, ptr, i64, i64)" for symbol in sorted(found.simulators)]
     own.append("declare double @llvm.copysign.f64(double, double)")
     module = llvm.parse_assembly("\n".join([head, *own, *declared, body, metadata]))
     for ir in libraries:

@@ -20,6 +20,7 @@ from ssmppl.codegen.kernels.particle import particle_filter
 from ssmppl.codegen.kernels.particle.simulation import predict_step
 from ssmppl.codegen.native.translate import PLANES, WHOLE, Untranslatable
 from ssmppl.codegen.store import folder
+from ssmppl.codegen.text.callbacks import PENDING, raise_pending
 from ssmppl.codegen.text.module import Algorithm
 from ssmppl.codegen.text.specialise import specialise
 from ssmppl.compiling import literal, once, one_at_a_time
@@ -186,7 +187,10 @@ class ByAddress:
         self.run, self.constants, self.codes, self.further = run, constants, codes, further
 
     def __call__(self, theta: np.ndarray, *rest: Any) -> Any:
-        return self.run(*self.constants, (self.codes, theta, *self.further), *rest)
+        found = self.run(*self.constants, (self.codes, theta, *self.further), *rest)
+        if PENDING:
+            raise_pending()
+        return found
 
 
 class Predicting(ByAddress):

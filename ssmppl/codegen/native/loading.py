@@ -31,6 +31,7 @@ from ssmppl.codegen.native.build import addresses
 from ssmppl.codegen.native.entries import Aside, entry
 from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.store import folder
+from ssmppl.codegen.text.callbacks import watched
 from ssmppl.codegen.text.module import ModuleText, Section
 from ssmppl.compiling import LOCK, one_at_a_time
 
@@ -101,6 +102,7 @@ class Loaded:
     def __init__(self, out: ModuleText, name: str, module: ModuleType):
         self.module, self.why = module, dict[str, str]()
         self._out, self._name = out, name
+        self._simulates = hasattr(module, "simulated")
         self._made: dict[str, Callable[..., Any]] = {}
 
     def __getattr__(self, name: str) -> Any:
@@ -125,6 +127,8 @@ class Loaded:
 
     def _algorithm(self, name: str) -> Callable[..., Any]:
         algorithm, numba_made = self._out.algorithms[name], getattr(self.module, name)
+        if self._simulates:
+            numba_made = watched(numba_made)
         if config.DISABLE_JIT:  # type: ignore[attr-defined]
             return numba_made
         helpers = tuple((HELPERS[n], n) for n in algorithm.bound.values() if n in HELPERS)

@@ -24,11 +24,13 @@ from ssmppl.codegen.native.arithmetic import (
     MATRIX,
     PLANE,
     ROW,
+    SIMULATED,
     STREAM,
     Arithmetic,
     Untranslatable,
     Value,
 )
+from ssmppl.codegen.text.callbacks import REQUESTS, Request
 from ssmppl.compiling import parse
 
 PLANES = frozenset(
@@ -39,16 +41,19 @@ WHOLE = frozenset(["t", "steps"])  # parameters that are whole numbers
 STREAMS = frozenset(["rng"])  # of unsigned words, for draws
 BLOCK = 64  # particles whose small steps are made together
 Rows = tuple[tuple[str, ...], ...]
+BLOCK_OF_CALLS = 512  # likewise, where simulators are called
 KINDS = {PLANE: PLANES, STREAM: STREAMS, FLAG_ROW: FLAGS}
 
 
 @dataclass
 class Translated:
-    """IR of some functions. calls : (name, arity, draws) of scalar functions that they call."""
+    """IR of some functions. calls : (name, arity, draws) of scalar functions that they call.
+    simulators : symbols of the callbacks."""
 
     text: str
     names: list[str]
     calls: set[tuple[str, int, bool]] = field(default_factory=set)
+    simulators: set[str] = field(default_factory=set)
 
 
 def translate(text: str) -> Translated:
@@ -62,13 +67,15 @@ def translate(text: str) -> Translated:
     functions = [n for n in tree.body if isinstance(n, ast.FunctionDef)]
     known = {f.name for f in functions}
     calls: set[tuple[str, int, bool]] = set()
+    simulators: set[str] = set()
     parts = []
     for f in functions:
         fast = any(isinstance(d, ast.Name) and d.id == "kernel" for d in f.decorator_list)
         body = _Function(f, fast, known)
         parts.append(body.text())
         calls |= body.calls
-    return Translated("\n".join(parts), [f.name for f in functions], calls)
+        simulators |= body.simulators
+    return Translated("\n".join(parts), [f.name for f in functions], calls, simulators)
 
 
 class _Function(Arithmetic):
@@ -78,7 +85,9 @@ class _Function(Arithmetic):
         super().__init__(node.name, " ".join(sorted(FAST)) + " " if fast else "")
         self.node, self.known = node, set(known)
         self.block = "entry"
-        self.buffers: list[str] = []  # room on the stack, of `BLOCK` numbers each
+        self.buffers: list[tuple[str, int]] = []  # room on the stack, of so many numbers each
+        self.simulators: set[str] = set()
+        self.size = BLOCK  # particles of a block
 
     def text(self) -> str:
         parameters = [a.arg for a in self.node.args.args]
@@ -91,7 +100,7 @@ class _Function(Arithmetic):
             kind = next((k for k, names in KINDS.items() if name in names), ROW)
             self.names[name] = Value(kind, pointer, words[1])
         self._statements(self.node.body)
-        room = [f"{name} = alloca [{BLOCK} x double], align 64" for name in self.buffers]
+        room = [f"{name} = alloca [{n} x double], align 64" for name, n in self.buffers]
         lines = [*room, *self.lines]
         body = "\n".join(f"  {line}" if not line.endswith(":") else line for line in lines)
         head = f"define void @{self.node.name}(ptr %words) nounwind {{"
@@ -119,6 +128,12 @@ class _Function(Arithmetic):
 
     def _assign(self, target: ast.expr, value: ast.expr) -> None:
         if isinstance(target, ast.Name):
+            if (asked := _simulator(value)) is not None:
+                if self.in_loop and not self.over_steps:
+                    raise self.unknown(value)
+                self._store_arguments(value, given := self._room(asked.arguments), 1)
+                self.names[target.id] = self._simulate(asked, given, "1", 1)
+                return
             self.names[target.id] = self.value(value)
             return
         if isinstance(target, ast.Subscript) and isinstance(target.slice, ast.Slice):
@@ -126,6 +141,30 @@ class _Function(Arithmetic):
             return
         where = self.element(target)
         self.store(self.float(self.value(value)), where)
+
+    # -- calls of simulators
+    def _room(self, numbers: int) -> str:
+        """A new buffer on the stack."""
+        name = f"%room{len(self.buffers)}"
+        self.buffers.append((name, numbers))
+        return name
+
+    def _store_arguments(self, call: ast.expr, room: str, width: int) -> None:
+        """The arguments of a simulator for one particle, in rows of this width."""
+        assert isinstance(call, ast.Call)
+        for k, argument in enumerate(call.args):
+            number = self.float(self.value(argument))
+            at = self.let(f"add i64 {k * width}, {self.here}")
+            self.store(number, self.let(f"getelementptr double, ptr {room}, i64 {at}"))
+
+    def _simulate(self, asked: Request, given: str, size: str, width: int) -> Value:
+        """The results for so many particles."""
+        out = self._room(asked.results * width)
+        self.simulators.add(asked.symbol)
+        self.lines.append(
+            f"call void @{asked.symbol}(ptr {given}, ptr {out}, i64 {size}, i64 {width})"
+        )
+        return Value(SIMULATED, out, str(width))
 
     def _add_to(self, target: ast.expr, value: ast.expr) -> None:
         if isinstance(target, ast.Name):
@@ -162,6 +201,7 @@ class _Function(Arithmetic):
         length = self.value(call.args[0])
         over_steps = ast.unparse(call.args[0]) == "steps"
         if not over_steps and _in_blocks(node):
+            self.size = min([BLOCK_OF_CALLS if _asks(node) else BLOCK, *_widths(node)])
             self._loop_in_blocks(node, target.id, length.text)
             return
         index = self._begin_loop(length.text, over_steps)
@@ -212,8 +252,8 @@ class _Function(Arithmetic):
             f"%b{k} = phi i64 [ 0, %{before} ], [ %c{k}, %end{k} ]",
             f"%some{k} = icmp slt i64 %b{k}, {length}",
             f"br i1 %some{k}, label %into{k}, label %over{k}", f"into{k}:",
-            f"%left{k} = sub i64 {length}, %b{k}", f"%few{k} = icmp slt i64 %left{k}, {BLOCK}",
-            f"%size{k} = select i1 %few{k}, i64 %left{k}, i64 {BLOCK}",
+            f"%left{k} = sub i64 {length}, %b{k}", f"%few{k} = icmp slt i64 %left{k}, {self.size}",
+            f"%size{k} = select i1 %few{k}, i64 %left{k}, i64 {self.size}",
         ]  # fmt: skip
         self.block, outer = f"into{k}", dict(self.names)
         kept: dict[str, Value] = {}  # name -> the buffer with its values
@@ -222,10 +262,12 @@ class _Function(Arithmetic):
             later = {n for p in parts[place + 1 :] for n in _read(p)}
             if isinstance(part, ast.For):
                 self._step_of_block(part, index, k, outer, kept, later | _read(part))
+            elif isinstance(part, ast.Assign):
+                self._call_of_block(part, index, k, outer, kept)
             else:
                 self._pass(part, index, k, outer, kept, later)
         self.lines += [
-            f"br label %end{k}", f"end{k}:", f"%c{k} = add i64 %b{k}, {BLOCK}",
+            f"br label %end{k}", f"end{k}:", f"%c{k} = add i64 %b{k}, {self.size}",
             f"br label %block{k}", f"over{k}:",
         ]  # fmt: skip
         self.block, self.names = f"over{k}", outer
@@ -252,42 +294,62 @@ class _Function(Arithmetic):
         self.lines += [f"%next{k} = add nuw nsw i64 %i{k}, 1", f"br label %step{k}", f"done{k}:"]
         self.block = f"done{k}"
 
+    def _call_of_block(
+        self, node: ast.Assign, index: str, block: int, outer: dict[str, Value],
+        kept: dict[str, Value],
+    ) -> None:  # fmt: skip
+        """One call of a simulator for all particles of the block."""
+        (target,), asked = node.targets, _simulator(node.value)
+        assert isinstance(target, ast.Name)
+        assert asked is not None
+        room = self._room(asked.arguments * self.size)
+        self._pass([], index, block, outer, kept, set(), (node.value, room))
+        outer[target.id] = self._simulate(asked, room, f"%size{block}", self.size)
+
     def _pass(
         self, body: list[ast.stmt], index: str, block: int, outer: dict[str, Value],
         kept: dict[str, Value], later: set[str],
+        called: tuple[ast.expr, str] | None = None,
     ) -> None:  # fmt: skip
-        """Statements for each particle of the block; what is read later is kept in buffers."""
-        here = self._begin_loop(f"%size{block}")
+        """Statements for each particle of the block; what is read later is kept in buffers.
+
+        called : of a simulator, whose arguments go to this room.
+        """
+        here = self.here = self._begin_loop(f"%size{block}")
         self.names = dict(outer)
         self.names[index] = Value(INTEGER, self.let(f"add i64 %b{block}, {here}"))
         before = {}
-        for name in sorted(_read(body) & set(kept)):
+        read = _read(body) if called is None else _names_in(called[0])
+        for name in sorted(read & set(kept)):
             self.names[name] = before[name] = self._loaded(kept[name], here)
         self._statements(body)
+        if called is not None:
+            self._store_arguments(*called, self.size)
         for name, value in self.names.items():
             if name == index or name not in later or value is before.get(name):
                 continue
             if name in outer and outer[name] == value:
                 continue
             if name not in kept:
-                kept[name] = self._room(value)
+                kept[name] = self._buffers_for(value)
             for buffer, number in zip(
                 _flat(kept[name].entries), _flat(self._numbers(value)), strict=True
             ):
                 at = self.let(f"getelementptr double, ptr {buffer}, i64 {here}")
                 self.store(number, at)
         self._end_loop()
+        self.here = "0"
 
     def _numbers(self, value: Value) -> Rows:
         """A number, or the entries of a matrix, row by row."""
         return value.entries if value.kind == MATRIX else ((self.float(value),),)
 
-    def _room(self, value: Value) -> Value:
+    def _buffers_for(self, value: Value) -> Value:
         """A buffer for each number."""
         rows = []
         for row in self._numbers(value):
             rows.append(tuple(f"%kept{len(self.buffers) + k}" for k in range(len(row))))
-            self.buffers += rows[-1]
+            self.buffers += [(name, self.size) for name in rows[-1]]
         return Value(MATRIX if value.kind == MATRIX else FLOAT, "", entries=tuple(rows))
 
     def _loaded(self, buffers: Value, here: str) -> Value:
@@ -358,11 +420,13 @@ def _flat(rows: Rows) -> list[str]:
     return [number for row in rows for number in row]
 
 
-def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For]:
-    """The body, cut at the loops in it."""
-    parts: list[list[ast.stmt] | ast.For] = []
+def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For | ast.Assign]:
+    """The body, cut at the loops and the calls of simulators in it."""
+    parts: list[list[ast.stmt] | ast.For | ast.Assign] = []
     for statement in node.body:
-        if isinstance(statement, ast.For):
+        if isinstance(statement, ast.For) or (
+            isinstance(statement, ast.Assign) and _simulator(statement.value) is not None
+        ):
             parts.append(statement)
         elif parts and isinstance(parts[-1], list):
             parts[-1].append(statement)
@@ -371,19 +435,37 @@ def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For]:
     return parts
 
 
-def _read(part: list[ast.stmt] | ast.For) -> set[str]:
+def _simulator(node: ast.expr) -> Request | None:
+    """What is asked of a simulator, where the expression calls one."""
+    called = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    return REQUESTS.get(node.func.id) if called else None  # type: ignore[attr-defined]
+
+
+def _widths(node: ast.For) -> list[int]:
+    """The most particles that each of the simulators takes that are called in a loop."""
+    called = [_simulator(s.value) for s in node.body if isinstance(s, ast.Assign)]
+    return [c.most for c in called if c is not None]
+
+
+def _asks(node: ast.For) -> bool:
+    return bool(_widths(node))
+
+
+def _read(part: list[ast.stmt] | ast.For | ast.Assign) -> set[str]:
     """The names that it reads."""
-    nodes = [part] if isinstance(part, ast.For) else part
+    nodes = part if isinstance(part, list) else [part]
     return {n.id for s in nodes for n in ast.walk(s)
             if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)}  # fmt: skip
 
 
 def _in_blocks(node: ast.For) -> bool:
-    """Whether particles have small steps of their own, as many for all, and draw nothing besides:
-    the draws' order is that of the text."""
+    """Whether particles call simulators, or have small steps of their own, as many for all, and
+    draw nothing besides: the draws' order is that of the text."""
     inner = [s for s in node.body if isinstance(s, ast.For)]
     own = {n.id for n in ast.walk(node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
     alike = all(own.isdisjoint(_names_in(s.iter)) for s in inner)
+    if _asks(node):
+        return alike
     return bool(inner) and alike and "rng" not in _names_in(node)
 
 

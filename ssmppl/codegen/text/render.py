@@ -12,7 +12,9 @@ import keyword
 import os
 from collections.abc import Callable, Iterable, Mapping
 
+from ssmppl.codegen.text.callbacks import request
 from ssmppl.errors import Location
+from ssmppl.expressions.batched.call import OP, groups
 from ssmppl.expressions.expr import MATRIX_OPS, Expr, is_tuple, symbol_text, to_text, topological
 from ssmppl.expressions.operations import KERNELS, OPERATIONS, WRITTEN, Level, Text, call, within
 
@@ -77,13 +79,18 @@ class Writer:
         """Append the statements `target = expression` for all targets."""
         roots = [e for _, e in targets]
         uses, finals = _uses(roots, self.text), set(roots)
-        for node in topological(roots, until=self.text):
+        order = topological(roots, until=self.text)
+        together = groups(n for n in order if n not in self.text)
+        for node in order:
             if node in self.text or node.op == "const":
                 continue
             if node.op == "symbol":
                 raise KeyError(f"symbol {node!r} of kind {node.data[0]} has no name here")
             if node.op == "loop":
                 self._loop(node)
+                continue
+            if node.op == OP:
+                self._simulated(together[node])
                 continue
             written = self._written(node)
             named = uses.get(node, 0) > 1 or len(written[0]) > MAX_INLINE
@@ -125,6 +132,20 @@ class Writer:
             self.lines.append(f"{self.indent}    {own} = {other}")
         for i, own in enumerate(moving):
             self.text[Expr("item", (node,), (i,))] = own, Level.ATOM
+
+    def _simulated(self, group: tuple[Expr, ...]) -> None:
+        """The call of a simulator, for all that is wanted of it at the same arguments."""
+        function, args = group[0].data.function, group[0].args
+        own = request(function, [n.data.index for n in group])
+        name = self.fresh.fresh(f"{identifier(function.title)}_{self.loops}")
+        self.loops += 1
+        given = ", ".join(self._part(a)[0] for a in args)
+        self._line(f"{name} = {own.name}({given})", group[0])
+        for k, node in enumerate(group):
+            self.text[node] = name, Level.ATOM
+            for i in range(function.outputs):
+                place = k * function.outputs + i
+                self.text[Expr("item", (node,), (i,))] = f"{name}[{place}]", Level.ATOM
 
     def _times(self, node: Expr) -> str:
         """How often, as a whole number."""

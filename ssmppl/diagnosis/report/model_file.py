@@ -13,7 +13,7 @@ import linecache
 import sys
 import sysconfig
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from keyword import iskeyword
 from pathlib import Path
 from typing import Any
@@ -22,16 +22,19 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.candidates import slug
+from ssmppl.diagnosis.model.changed_laws import substituted
 from ssmppl.diagnosis.report.spelling import Lines
 from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
+from ssmppl.language.checks.new_values import SUFFIX
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
 from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace, symbols
 from ssmppl.language.user_defined.primitive import Primitive, primitives_in
+from ssmppl.language.user_defined.simulator import Simulator
 
 LINE = 96
 INDENT = "    "
@@ -102,7 +105,10 @@ class _Writer:
     def file(self, title: str, notes: Sequence[str], known: Collection[str] = ()) -> str:
         """known : names of what needs no import."""
         laws = [self._law("prior", group) for group in self._priors()]
-        for role in ("initial", "transition", "observations", "proposal"):
+        initial = [s for s in self.trace.initial.values() if s.name not in self.trace.auxiliary]
+        laws.append(self._law("initial", initial))
+        laws += [self._law("transition", group) for group in self._steps()]
+        for role in ("observations", "proposal"):
             if group := list(getattr(self.trace, role).values()):
                 laws.append(self._law(role.rstrip("s"), group))
         body = "\n\n\n".join(_numbered(laws))
@@ -147,16 +153,38 @@ class _Writer:
             current.add(site.name)
         return groups
 
+    def _steps(self) -> list[list[Site]]:
+        """The transitions, cut where one reads the new value of one of its group, with new values
+        under the names that a transition gives them."""
+        new = {
+            s: Expr("symbol", (), ("state", s.data[1] + SUFFIX, s.data[2]))
+            for s in self.trace.state_symbols
+        }
+        groups: list[list[Site]] = []
+        current: set[Expr] = set()
+        for site in self.trace.transition.values():
+            read = {s for s in symbols_of(nodes_of(site.distribution)) if s in new}
+            if not groups or read & current:
+                groups.append([])
+                current = set()
+            for s in read:
+                self.quantities[s.data[1] + SUFFIX] = self.quantities[s.data[1]]
+            law = substituted(site.distribution, new) if read else site.distribution
+            groups[-1].append(replace(site, distribution=law))
+            current |= set(site.components)
+        return groups
+
     def _law(self, role: str, sites: list[Site]) -> str:
         roots = [e for s in sites for e in nodes_of(s.distribution)]
         used = symbols_of(roots)
         wanted = {s.data[1] for s in used}
-        known = [*self.trace.initial, *self.trace.observations, *self.trace.inputs,
+        new = [n + SUFFIX for n in self.trace.initial if role == "transition"]
+        known = [*self.trace.initial, *new, *self.trace.observations, *self.trace.inputs,
                  *self.trace.parameters, "t"]  # fmt: skip
-        arguments = [n for n in known if n in wanted]
+        arguments = list(dict.fromkeys(n for n in known if n in wanted))
         taken = {*self.names, *arguments, *self.imports, "np", "ssm", "special"}
         lines = Lines(roots, self._arrays(used), taken, self._marks(roots), _wishes(role, sites),
-                      lambda call: str(call.data.spelled))  # fmt: skip
+                      _called)  # fmt: skip
         entries = []
         for s in sites:
             key = f'"{s.name}": '
@@ -332,9 +360,34 @@ class Import:
         return cls("primitive", p.__name__, p.name, p.location, f.__module__, f.__qualname__)
 
     @classmethod
+    def of_simulator(cls, s: Simulator) -> Import:
+        """The import that a call of it needs: by the name under which a module has it."""
+        module, name = holding(s)
+        return cls("simulator", name, id(s), s.location or Location("", 0), module, name)
+
+    @classmethod
     def of_law(cls, o: Origin) -> Import:
         """The import that naming it needs."""
         return cls("distribution", o.name, o, o.location, o.module, o.qualname)
+
+
+def _called(call: Expr) -> str:
+    """The name by which a primitive or a simulator is called."""
+    if call.op == "simulator":
+        function = call.data.function
+        sense = "" if function is function.simulator.moves else ".sense"
+        return holding(function.simulator)[1] + sense
+    return str(call.data.spelled)
+
+
+def holding(simulator: Simulator) -> tuple[str, str]:
+    """(module, name) under which a module has a simulator; its own name where none has."""
+    home = getattr(simulator.step, "__module__", "__main__")
+    for name in (home, "__main__", *list(sys.modules)):
+        for key, value in list(getattr(sys.modules.get(name), "__dict__", {}).items()):
+            if value is simulator:
+                return name, key
+    return home, simulator.name
 
 
 def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> dict[str, Import]:
@@ -359,6 +412,9 @@ def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> di
 
 def _wanted(d: Distribution) -> Iterable[Import]:
     yield from map(Import.of_primitive, primitives_in(nodes_of(d)))
+    for node in topological(nodes_of(d)):
+        if node.op == "simulator":
+            yield Import.of_simulator(node.data.function.simulator)
     for part in _laws(d):
         if isinstance(part, UserDefined):
             yield Import.of_law(part.origin)

@@ -137,7 +137,7 @@ class Lines:
             made = self._combined(node)
         if node in self._apart:
             return self._local(node, made[0], *self._apart[node])
-        if node in self._shared or node.op in ("cholesky", "inverse"):
+        if node in self._shared or node.op in ("cholesky", "inverse", "simulator"):
             return self._local(node, made[0])
         return made
 
@@ -147,6 +147,11 @@ class Lines:
             return f"-{parts[0][0]}", Level.SIGN
         if node.op in PHRASES:
             return self._phrase(node, parts)
+        if node.op == "item" and node.args[0].op == "simulator":
+            name = node.args[0].data.function.results[node.data[0]]
+            return f"{parts[0][0]}[{name!r}]".replace("'", '"'), Level.ATOM
+        if node.op == "simulator" and self._primitive is not None:
+            return f"{self._primitive(node)}({_vectors(node, parts)})", Level.ATOM
         if node.op == "item":
             return f"{parts[0][0]}[{', '.join(map(str, node.data))}]", Level.ATOM
         if node.op in MATRIX_OPS:
@@ -358,3 +363,12 @@ def _name(node: Expr) -> str:
         return "holds"
     return {"where": "chosen", "add": "total", "sub": "total", "mul": "product",
             "div": "ratio"}.get(node.op, "term")  # fmt: skip
+
+
+def _vectors(node: Expr, parts: list[Text]) -> str:
+    """The arguments of a simulator: states, inputs and parameters, each a list."""
+    texts, out, at = [text for text, _ in parts], [], 0
+    for size in node.data.function.sizes:
+        out.append(f"[{', '.join(texts[at : at + size])}]")
+        at += size
+    return ", ".join(out)

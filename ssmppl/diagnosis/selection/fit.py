@@ -34,14 +34,17 @@ from ssmppl.diagnosis.model.initial_law import InitialStateMeans, ProperInitialL
 from ssmppl.diagnosis.model.score_columns import ScoreExpressions, score_columns
 from ssmppl.diagnosis.model.smoothing import Pass, Settings, Simulator, Smoother
 from ssmppl.diagnosis.run.seeds import Stream
-from ssmppl.errors import SamplingError
+from ssmppl.diagnosis.selection.densities import best_of_many, densities_of, density_of
+from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import symbols_of
+from ssmppl.inference.batched.extended import extended_model
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.maximum.ascent import Maximization, UnconstrainedTransform
 from ssmppl.inference.maximum.direct_optimization import climb as climb_exactly
 from ssmppl.inference.maximum.direct_optimization import observed_information
 from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.newton import GOOD, Top, climb, information_at, newton_step
 from ssmppl.inference.particles.backward import particle_system
 from ssmppl.inference.particles.filtering import FilterSettings
@@ -271,6 +274,9 @@ class Fitter:
         if information is not None:
             information = self._unconstrained(space, space.theta, information, seed)
         smooth = self._extended_log_likelihood(problem)
+        many = self._extended_of_many(problem)
+        if smooth is not None and many is not None:
+            return self._fit_together(space, smooth, many, seed, effort)
         if effort.pilot:
 
             def estimate(theta: np.ndarray, seed: np.random.SeedSequence) -> float:
@@ -331,6 +337,45 @@ class Fitter:
             return total if np.isfinite(total) else -np.inf
 
         return value
+
+    def _extended_of_many(self, problem: Problem) -> Callable[[np.ndarray], np.ndarray] | None:
+        """(B, P) parameter vectors -> (B,) log p(y | theta) by the extended Kalman filter, where
+        the model calls a simulator, so that many at once take little longer than one; else None."""
+        found = extended_model(problem.trace)
+        if isinstance(found, NotApplicable) or self.settings.proposal != "twisted":
+            return None
+        shift = len(problem.experiments) * self.log_correction
+        return lambda theta: found.log_likelihoods(problem.experiments, theta) + shift
+
+    def _fit_together(
+        self, space: Space, smooth: Callable[[np.ndarray], float],
+        many: Callable[[np.ndarray], np.ndarray], seed: np.random.SeedSequence, effort: Effort,
+    ) -> Fit:  # fmt: skip
+        """The top of the extended filter's likelihood, whose points are looked at together."""
+        z = space.z[space.positions]
+        densities = densities_of(space, many)
+        starts = z[None]
+        if effort.pilot:
+            begun = [self._with_process_noise(space, share) for share in NOISE_SHARES[1:]]
+            starts = best_of_many(densities, [z, *(s.z[s.positions] for s in begun)], seed)
+        found = climb_together(densities, starts)
+        if found is None:
+            raise ArgumentError(
+                "the extended Kalman filter comes to no number at every point that was tried",
+                fix="give the parameters priors round plausible values, or look whether the "
+                "simulator gives NaN",
+            )
+        top = found.top
+        there = at(space, space.parameters(top.z)[0].copy())
+        fit = self._better_of(None, there, top, seed)
+        if effort.approximate:
+            return fit
+        z, mask = hold_at_bounds(density_of(there, smooth), fit.z, ~there.on_the_line)
+        if not mask.any():
+            return fit
+        theta = there.parameters(z)[0].copy()
+        return replace(fit, space=at(there, theta), theta=theta, z=z, log_likelihood=smooth(theta),
+                       at_bound=mask)  # fmt: skip
 
     def _top_of_extended_filter(
         self, space: Space, smooth: Callable[[np.ndarray], float], seed: np.random.SeedSequence,
@@ -504,6 +549,9 @@ class Fitter:
         if isinstance(self.kalman, KalmanModel):
             return self.kalman.log_likelihood(experiments, theta), 0.0
         problem = replace(self.problem, experiments=tuple(experiments))
+        smooth = self._extended_log_likelihood(problem)
+        if smooth is not None and self._extended_of_many(problem) is not None:
+            return smooth(theta), 0.0  # the approximation that fits of simulators go by
         value, error = -np.inf, 0.0
         for doubling in range(DOUBLINGS + 1):
             n = self.settings.particles * 2**doubling
@@ -624,21 +672,6 @@ class Fitter:
             )
         square = np.mean([np.outer(s, s) for s in scores], axis=0)
         return self._unconstrained(space, theta, square, seed)
-
-
-def density_of(
-    space: Space, log_likelihood: Callable[[np.ndarray], float]
-) -> Callable[[np.ndarray], float]:
-    """z (F,) -> log likelihood + log prior density of theta, -inf off the support."""
-
-    def value(z: np.ndarray) -> float:
-        theta, log_prior, log_jacobian = space.point(z)
-        if not log_prior + log_jacobian > -np.inf:
-            return -np.inf
-        found = log_likelihood(theta) + log_prior
-        return found if np.isfinite(found) else -np.inf
-
-    return value
 
 
 def hold_at_bounds(

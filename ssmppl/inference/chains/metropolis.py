@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
+from ssmppl.inference.batched.extended import Extended
+from ssmppl.inference.batched.independence import Standing, independent_chains
 from ssmppl.inference.chains.metropolis_kernel import (
     WALK_STATES,
     ChainPoint,
@@ -30,14 +32,16 @@ from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import (
     ExactModel,
     exact_model,
-    filter_name,
     filter_of,
+    likelihood_by,
 )
 from ssmppl.inference.preparation.exact_score import exact_score
 from ssmppl.inference.preparation.pilot import Pilot, find_mode
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.problem import Problem
+
+LEAST_SHARE = 0.05  # effective draws of independent proposals, below which chains walk
 
 
 def needed_model(problem: Problem, method: str) -> ExactModel:
@@ -54,6 +58,12 @@ def needed_model(problem: Problem, method: str) -> ExactModel:
             f"{model.reason}",
             fix="use ssm.PGAS(...) or ssm.PMMH(...), or None, which picks by structure",
             where=model.where,
+        )
+    if method == "Gibbs" and isinstance(model, Extended):
+        raise ArgumentError(
+            "Gibbs draws the states from their exact law, and this model calls a simulator",
+            fix="use ssm.MetropolisHastings(), on the extended Kalman filter's likelihood, or "
+            'ssm.PMMH(proposal="bootstrap"), or None, which picks the former',
         )
     if method == "Gibbs" and isinstance(model, Deterministic):
         site = next(iter(problem.trace.transition.values()))
@@ -105,6 +115,10 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     """
     problem, space = setup.problem, setup.space
     exact = needed_model(problem, "MetropolisHastings")
+    if isinstance(exact, Extended) and method == MetropolisHastings() and len(space.positions):
+        chains = _independent(setup, exact)
+        if chains is not None:
+            return chains
     kind = filter_of(exact)
     where = coordinates(space, method.scale, method.transform)
     if method.covariance is not None:
@@ -125,10 +139,28 @@ def prepare(setup: SamplingSetup, method: MetropolisHastings) -> PreparedChains:
     chains = made.prepared()
     report = {
         "settings": settings_of(replace(method, order=order)),
-        "likelihood": f"exact, by {filter_name(exact)}",
+        "likelihood": likelihood_by(exact),
+        **({"approximate": 1} if isinstance(exact, Extended) else {}),
         **chains.report,
     }
     return replace(chains, report=report)
+
+
+def _independent(setup: SamplingSetup, model: Extended) -> PreparedChains | None:
+    """Chains with proposals that do not depend on where they stand; None where no proposal is
+    close enough to the posterior, so that a walk is better."""
+    rng = np.random.default_rng(np.random.SeedSequence(setup.root.entropy, spawn_key=(19,)))
+    kernel, states, report = independent_chains(
+        setup.space, model, lambda i: setup.streams(i)[0], setup.chains, rng, setup.warmup,
+        setup.thin, setup.states,
+    )  # fmt: skip
+    if report["proposal_ess_share"] < LEAST_SHARE:
+        return None
+    report |= {
+        "settings": settings_of(MetropolisHastings()),
+        "likelihood": likelihood_by(model), "approximate": 1,
+    }  # fmt: skip
+    return PreparedChains(kernel.step_block, states, report)
 
 
 def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray) -> str:
@@ -138,6 +170,6 @@ def _without_gradient(exact: ExactModel, setup: SamplingSetup, free: np.ndarray)
 
 METHOD = SamplingMethod(
     prepare,
-    state_classes=(*WALK_STATES, LocalProposal, Pilot),
+    state_classes=(*WALK_STATES, LocalProposal, Pilot, Standing),
     where_slow=", or another method, such as ssm.Gibbs()",
 )

@@ -27,14 +27,16 @@ from ssmppl.codegen.kernels.particle.weights import OK
 from ssmppl.codegen.modules.filter_variants import compile_smooth_filter
 from ssmppl.compiling import once_property
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum.ascent import ELSEWHERE, Ascent, Edges, Maximization
 from ssmppl.inference.maximum.edges import AT_MOST, FLAT, INWARDS, edges, held_at
 from ssmppl.inference.maximum.gaussian_climb import GaussianClimb
 from ssmppl.inference.methods.methods import DirectOptimization
+from ssmppl.inference.optimisation.batched_newton import climb_together
 from ssmppl.inference.optimisation.quasi_newton import quasi_newton
-from ssmppl.inference.preparation.exact_models import ExactModel, filter_name
+from ssmppl.inference.preparation.exact_models import ExactModel, likelihood_by
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import without_maximum
 from ssmppl.inference.run.invalid_laws import total_of
@@ -53,6 +55,8 @@ EXACT_RESTARTS = 2
 # round the start, the best of which are gone on with (Biernacki, Celeux and Govaert 2003).
 SHORT_CLIMBS, SHORT_STEPS, SPREAD, GONE_ON_WITH = 24, 10, 2.0, 3
 FLATS = 3  # that a climb leaves
+LOOKED_AT = 47  # points round the start, where many cost little more than one
+SIDE_BY_SIDE = 2  # climbs beside the first
 
 
 def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
@@ -79,6 +83,8 @@ def climb(setup: Maximization, method: DirectOptimization) -> Ascent:
         if isinstance(setup.exact, NotApplicable):
             with ThreadPoolExecutor() as pool:  # the filter runs without Python's lock
                 return SmoothClimb(setup, method, pool).run()
+        if isinstance(setup.exact, Extended):
+            return BatchedClimb(setup, setup.exact, method).run()
         return ExactClimb(setup, setup.exact, method).run()
 
 
@@ -305,7 +311,7 @@ class ExactClimb:
         point = self.setup.transform.at(self.best)
         report = {
             "converged": bool(gap < 1e-4), "stopped": stopped, "evaluations": self.evaluations,
-            "likelihood": f"exact, by {filter_name(self.model)}", "restarts": restarts,
+            "likelihood": likelihood_by(self.model), "restarts": restarts,
         }  # fmt: skip
         if unbounded:
             report["without_maximum"] = True
@@ -432,6 +438,89 @@ class ExactClimb:
         self.iterates.append(self.setup.space.parameters(z)[0].copy())
         self.values.append(self.known.get(z.tobytes(), -np.inf))
         self.known.clear()
+
+
+class BatchedClimb:
+    """Ascent of the extended Kalman filter's log-likelihood where the model calls a simulator: all
+    points of a step together, from the best of some places round the start."""
+
+    def __init__(self, setup: Maximization, model: Extended, method: DirectOptimization):
+        self.setup, self.model, self.method = setup, model, method
+        self.evaluations = 0
+        self.best, self.best_value = np.empty(0), -np.inf
+
+    def run(self) -> Ascent:
+        """The climb. Ctrl-C ends it early, with the best so far."""
+        setup = self.setup
+        try:
+            found = climb_together(self.objectives, self._starts())
+        except KeyboardInterrupt:
+            if not len(self.best):
+                raise
+            report: dict[str, Any] = {"converged": False, "evaluations": self.evaluations}
+            report["likelihood"] = likelihood_by(self.model)
+            theta = self._theta(self.best)
+            return Ascent(theta, None, theta[None], report, interrupted=True)
+        if found is None:
+            raise ArgumentError(
+                "the extended Kalman filter comes to no number at every point that was tried",
+                fix="give start={name: value} near plausible values, or look whether the simulator "
+                "gives NaN",
+            )
+        top, path = found.top, [self._theta(z) for z in found.path]
+        information, held, report = top.information, None, {
+            "converged": found.ended, "evaluations": self.evaluations,
+            "likelihood": likelihood_by(self.model),
+        }  # fmt: skip
+        theta = self._theta(top.z)
+        if setup.with_prior:
+            nothing = np.zeros(len(theta))
+            information = information + setup.transform.curvature(top.z, nothing).log_prior
+        natural = setup.natural(top.z, information)
+        if _lowest(top.information) < FLAT:
+            held = edges(setup, theta, natural, self.objective)
+            if held is not None:
+                report["converged"] = True
+        return Ascent(
+            theta, self.model.log_likelihood(setup.problem.experiments, theta), np.array(path),
+            report, natural, held=held,
+        )  # fmt: skip
+
+    def _starts(self) -> np.ndarray:
+        """The user's own point where all is given; else the best of some round the start."""
+        space, trace = self.setup.space, self.setup.problem.trace
+        z = space.z[space.positions]
+        restarts = self.method.restarts
+        if set(trace.parameters) - set(self.setup.fixed) <= set(self.setup.near) and not restarts:
+            return z[None]
+        rng = np.random.default_rng(self.setup.seed(0))
+        points = np.vstack([z, z + SPREAD * rng.standard_normal((LOOKED_AT, len(z)))])
+        values = self.objectives(points)
+        best = np.argsort(-values)[: 1 + (SIDE_BY_SIDE if restarts is None else restarts)]
+        return points[best]
+
+    def objectives(self, z: np.ndarray) -> np.ndarray:
+        """(B,) the log-likelihood at z (B, F), with the prior where it counts; -inf for none."""
+        self.evaluations += len(z)
+        out = np.full(len(z), -np.inf)
+        found = [self.setup.space.point(row) for row in z]
+        inside = [k for k, (_, log_prior, _) in enumerate(found) if log_prior > -np.inf]
+        if inside:
+            theta = np.array([found[k][0] for k in inside])
+            out[inside] = self.model.log_likelihoods(self.setup.problem.experiments, theta)
+        if self.setup.with_prior:
+            out[inside] += [found[k][1] for k in inside]
+        k = int(np.argmax(out))
+        if out[k] > self.best_value:
+            self.best, self.best_value = z[k].copy(), float(out[k])
+        return out
+
+    def objective(self, z: np.ndarray) -> float:
+        """Likewise, of one point."""
+        return float(self.objectives(z[None])[0])
+
+    def _theta(self, z: np.ndarray) -> np.ndarray:
+        return self.setup.space.parameters(z)[0].copy()
 
 
 def observed_information(setup: Maximization, z: np.ndarray) -> np.ndarray:

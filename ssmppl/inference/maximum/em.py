@@ -37,6 +37,7 @@ from ssmppl.errors import ArgumentError, NotApplicable, SamplingError
 from ssmppl.expressions.calculus import gradient as gradient_of
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import Expr, symbol
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov
 from ssmppl.inference.exact.histories import Histories
 from ssmppl.inference.exact.kalman import KalmanModel
@@ -161,6 +162,11 @@ def climb(setup: Maximization, method: EM) -> Ascent:
             "parameters",
             fix="use ssm.DirectOptimization(), whose likelihood and score are exact",
             where=site.distribution.location,
+        )
+    if isinstance(setup.exact, Extended):
+        raise ArgumentError(
+            "EM needs the exact law of the states, and this model calls a simulator",
+            fix="use ssm.DirectOptimization(), on the extended Kalman filter's likelihood, or None",
         )
     need_density(setup.problem.trace, "EM", "maximize")
     return _Climb(setup, setup.exact, method).run()

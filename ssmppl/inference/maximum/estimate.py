@@ -122,6 +122,8 @@ class Estimate:
     def notes(self) -> list[str]:
         """What has to be known before the figures are used."""
         out = []
+        if self.attrs.get("approximate"):
+            out.append(f"the likelihood is {self.attrs.get('likelihood', 'an approximation')}")
         if self.attrs.get("interrupted"):
             out.append("interrupted; this is the best point so far")
         elif self.attrs.get("converged") is False:

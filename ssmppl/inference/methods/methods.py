@@ -412,7 +412,8 @@ class IF2:
 
     The transition is only simulated: it may have no density (deterministic components, discrete
     states) and no derivatives. Parameters that act in the initial law alone are found in the model
-    and take their step at the first row only. Several experiments are passed over one after another.
+    and take their step at the first row only. Several experiments are passed over one after
+    another.
 
     Parameters
     ----------

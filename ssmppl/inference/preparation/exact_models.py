@@ -1,4 +1,5 @@
-"""Models whose likelihood and smoothing distributions are exact, of each kind."""
+"""Models whose likelihood and smoothing distributions need no particles, of each kind: exact ones,
+and, by an approximation, those that call a simulator."""
 
 from __future__ import annotations
 
@@ -8,45 +9,51 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.batched.extended import Extended, extended_model
 from ssmppl.inference.exact.hidden_markov import HiddenMarkov, hidden_markov
 from ssmppl.inference.exact.kalman import KalmanModel, kalman_model
 from ssmppl.inference.particles.deterministic import Deterministic, deterministic_model
 from ssmppl.inference.run.problem import EXACT
 from ssmppl.language.model.trace import Trace
 
-ExactModel = KalmanModel | HiddenMarkov | Deterministic
+ExactModel = KalmanModel | HiddenMarkov | Deterministic | Extended
 
 # What the filter behind each is called where a proposal is asked for, and in words; the kind of
 # model; and what finds it.
-FILTER = dict(zip((KalmanModel, HiddenMarkov, Deterministic), EXACT, strict=True))
+FILTER = dict(zip((KalmanModel, HiddenMarkov, Deterministic, Extended), EXACT, strict=True))
 FILTER_NAME = {
     KalmanModel: "the Kalman filter",
     HiddenMarkov: "the forward algorithm",
     Deterministic: "running the states once",
+    Extended: "the extended Kalman filter",
 }
 KIND = {
     KalmanModel: "linear Gaussian",
     HiddenMarkov: "of finitely many states",
     Deterministic: "without noise in its states",
+    Extended: "one that calls a simulator",
 }
 NEEDED = {
     "kalman": "linear Gaussian model",
     "forward": "model of finite states",
     "deterministic": "model without noise in its states",
+    "extended": "model that calls a simulator",
 }
 _FORMS: dict[str, Callable[[Trace], ExactModel | NotApplicable]] = {
     "kalman": kalman_model,
     "forward": hidden_markov,
     "deterministic": deterministic_model,
+    "extended": extended_model,
 }
 
 
 def exact_model(trace: Trace) -> ExactModel | NotApplicable:
-    """The exact form of a traced model, or why it has none."""
+    """The exact form of a traced model, or, where it calls a simulator, its extended Kalman filter;
+    or why it has none."""
     first = kalman_model(trace)
     if not isinstance(first, NotApplicable):
         return first
-    others = (hidden_markov(trace), deterministic_model(trace))
+    others = (hidden_markov(trace), deterministic_model(trace), extended_model(trace))
     return next((m for m in others if not isinstance(m, NotApplicable)), first)
 
 
@@ -56,13 +63,19 @@ def form_of(proposal: str, trace: Trace) -> ExactModel | NotApplicable:
 
 
 def filter_of(model: ExactModel) -> str:
-    """ "kalman", "forward" or "deterministic"."""
+    """ "kalman", "forward", "deterministic" or "extended"."""
     return FILTER[type(model)]
 
 
 def filter_name(model: ExactModel) -> str:
     """In words."""
     return FILTER_NAME[type(model)]
+
+
+def likelihood_by(model: ExactModel) -> str:
+    """What its likelihood is: "exact, by the Kalman filter"."""
+    kind = "approximate" if isinstance(model, Extended) else "exact"
+    return f"{kind}, by {filter_name(model)}"
 
 
 def exact_kind(model: ExactModel | NotApplicable) -> str | NotApplicable:

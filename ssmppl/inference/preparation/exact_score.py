@@ -13,6 +13,7 @@ import numpy as np
 
 from ssmppl.data import Experiment
 from ssmppl.errors import ArgumentError
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.exact.derivatives import jacobian, observed_information
 from ssmppl.inference.preparation.exact_models import ExactModel
 
@@ -60,8 +61,11 @@ class ExactScore:
         Kept for the last thetas that were asked for, as a climb and what reports it ask twice."""
         key = np.asarray(theta, dtype=float).tobytes()
         if key not in self._known:
-            with np.errstate(invalid="ignore"):
-                found = observed_information(lambda v: self.score(v)[1], theta, self.free)[0]
+            if isinstance(self.model, Extended):  # all points together
+                found = self.model.information(self.experiments, theta, self.free)
+            else:
+                with np.errstate(invalid="ignore"):
+                    found = observed_information(lambda v: self.score(v)[1], theta, self.free)[0]
             if len(self._known) >= KEPT:
                 self._known.clear()
             self._known[key] = found

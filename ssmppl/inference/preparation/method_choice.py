@@ -8,6 +8,7 @@ from ssmppl.analysis.conjugacy.update import Update
 from ssmppl.analysis.proposals.smooth import smooth_filter_applies
 from ssmppl.analysis.structure import deterministic_memory, noisy_start, singular_covariance
 from ssmppl.errors import NotApplicable
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.methods.methods import (
     IF2,
     PGAS,
@@ -66,7 +67,7 @@ def choose_sampler(
             "over twisted particle filters, where a pilot on the data finds that these know the "
             f"likelihood; else {type(other).__name__}: {why}"
         )
-    if singular is not None:
+    if singular is not None and kind != KIND[Extended]:
         if isinstance(kind, NotApplicable):
             return (
                 PMMH(),
@@ -93,6 +94,11 @@ def choose_sampler(
             f"{stuck}, but {numbers} parameters are too many for a random walk: conditional SMC "
             "without ancestor sampling; see the attribute trajectory_update_rate, and take more "
             "particles where it is low"
+        )
+    if kind == KIND[Extended]:
+        return MetropolisHastings(), (
+            f"the model is {kind}: a chain on the likelihood of the extended Kalman filter, an "
+            "approximation"
         )
     if kind == KIND[Deterministic]:
         return MetropolisHastings(), (
@@ -182,6 +188,11 @@ def choose_maximiser(
 
     laplace : why it cannot go by way of Laplace's approximation, None where it can.
     """
+    if kind == KIND[Extended]:
+        return DirectOptimization(), (
+            f"the model is {kind}: the likelihood of the extended Kalman filter, an approximation, "
+            "is climbed by differences"
+        )
     if not isinstance(kind, NotApplicable):
         return DirectOptimization(), (
             f"the model is {kind}, so that its likelihood and score are exact"
@@ -224,6 +235,10 @@ def choose_smoother(
                 f"{singular.reason}: the ancestors of the filter's own particles, which need none"
             )
         return FFBSi(), f"the model is not linear and Gaussian: {kind.reason}"
+    if kind == KIND[Extended]:
+        return KalmanSmoother("extended"), (
+            f"the model is {kind}: the smoother of the extended Kalman filter, an approximation"
+        )
     if kind == KIND[Deterministic]:
         return FFBSi(kernel="genealogy"), f"the model is {kind}, and every trajectory is the same"
     chosen = KalmanSmoother() if kind == "linear Gaussian" else ForwardBackward()

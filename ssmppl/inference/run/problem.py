@@ -21,8 +21,9 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.tracing import trace
 
-# What filters without particles are called where a proposal is asked for.
-EXACT = ("kalman", "forward", "deterministic")
+# What filters without particles are called where a proposal is asked for; the last one, of models
+# that call a simulator, is an approximation.
+EXACT = ("kalman", "forward", "deterministic", "extended")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,12 +22,15 @@ from ssmppl.analysis.structure import (
     LinearGaussian,
     deterministic_memory,
     linear_gaussian,
+    simulators,
     singular_covariance,
 )
 from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
 from ssmppl.inference.preparation.exact_models import exact_kind, exact_model
@@ -99,12 +102,15 @@ class Plan:
             Of each part its title, and its rows: what, and how.
         """
         t = self.trace
+        first = {n: s for n, s in t.initial.items() if n not in t.auxiliary}
         out = [
             ("Priors", _laws(t.parameters)),
-            ("Initial law, t = 1", _laws(t.initial)),
-            ("Transition, x_prev to x", _laws(t.transition)),
+            ("Initial law, t = 1", _laws(first)),
+            ("Transition, x_prev to x", _laws(t.transition, t.auxiliary)),
             ("Observation", _laws(t.observations)),
         ]
+        if loops := _loops(t):
+            out.append(("Small steps", loops))
         if t.inputs:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
@@ -134,6 +140,8 @@ class Plan:
             return [("finite states", f"{len(self.finite.values)} combinations of values: the "
                      "likelihood is exact, by the forward algorithm; particles are used only where "
                      "they are asked for")]  # fmt: skip
+        if isinstance(exact_model(self.trace), Extended):
+            return self._simulators()
         if isinstance(exact_model(self.trace), Deterministic):
             return [("no noise", "given the parameters the states are known: the likelihood is "
                      "exact, by running them once")]  # fmt: skip
@@ -153,6 +161,16 @@ class Plan:
         laws = [s.distribution for sites in groups for s in sites.values()]
         found = primitives_in(e for law in laws for e in law.expressions())
         return [(p.__name__, p.how_derived()) for p in found]
+
+    def _simulators(self) -> list[tuple[str, str]]:
+        names = ", ".join(f.title for f in simulators(self.trace))
+        return [
+            ("simulator", f"{names}: its values and derivatives, by central differences, come from "
+             "one call for all points of a row"),
+            ("approximation", "the likelihood is that of the extended Kalman filter, whose update "
+             "is the mode of each row: maximize, sample, smooth, score and kalman_filter go by it; "
+             "particles, proposal=\"bootstrap\", are used where they are asked for"),
+        ]  # fmt: skip
 
     def _laplace(self) -> str:
         if self.laplace is not None:
@@ -228,13 +246,38 @@ def _integrated(split: ConditionallyLinear) -> str:
     )
 
 
-def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
+def _laws(sites: dict[str, Site], auxiliary: Collection[str] = ()) -> list[tuple[str, str]]:
     rows = []
     for s in sites.values():
         rows.append((s.name, _cut(f"~ {s.distribution!r}")))
+        if s.name in auxiliary:
+            rows.append(("", "a draw of the step, without a value at the first row"))
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows
+
+
+def _loops(trace: Trace) -> list[tuple[str, str]]:
+    """What the names of loops in the laws stand for, and of how many steps they are."""
+    sites = (trace.parameters, trace.initial, trace.transition, trace.observations)
+    laws = [s.distribution for group in sites for s in group.values()]
+    waiting = [e for law in reversed(laws) for e in reversed(law.expressions())]
+    found, seen = dict[str, str](), set[Expr]()
+    while waiting:
+        node = waiting.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        if node.op != "loop":
+            waiting += reversed(node.args)
+            continue
+        times, name = node.args[-1], node.data.name
+        count = f"{times.data:.0f}" if times.op == "const" else f"{times!r}"
+        text = (
+            "the exponential of a matrix" if name == "expm" else f"{name}, repeated {count} times"
+        )
+        found[repr(node).partition("(")[0]] = text
+    return list(found.items())
 
 
 def _cut(law: str) -> str:
@@ -314,7 +357,9 @@ def _labels(trace: Trace, experiments: Sequence[Experiment]) -> tuple[tuple[str,
     ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
     uneven = next((found for t in times if (found := spacing(t))), "")
     if trace.time_step is not None:
-        uneven = f"{trace.time_step[0]} is the time from each row to the next"
+        name, unit = trace.time_step
+        unit = f", in {unit}" if any(t.dtype.kind == "M" for t in times) else ""
+        uneven = f"{name} is the time from each row to the next{unit}"
     return (("labels", ends), *([("steps", uneven)] if uneven else []))
 
 

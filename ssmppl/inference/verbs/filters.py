@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from ssmppl.analysis.structure import simulators
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import Experiment, check_parameters, unpack_observations, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable
@@ -259,7 +260,7 @@ def kalman_filter(
     data: Any,
     parameters: Mapping[str, Any],
     *,
-    proposal: str = "kalman",
+    proposal: str = "auto",
     quantiles: tuple[float, ...] = LEVELS,
 ) -> xr.Dataset | list[xr.Dataset]:
     """Run the exact filter of a linear Gaussian model (Kalman 1960), or an approximate one.
@@ -269,7 +270,8 @@ def kalman_filter(
     model : the model, as declared.
     data : mapping of arrays, pandas DataFrame, xarray Dataset, or a list of those.
     parameters : value of each parameter of the model, {} where it has none.
-    proposal : "kalman", exact, for linear Gaussian models; or, where states are driven by Gaussian
+    proposal : "kalman", exact, for linear Gaussian models, which "auto" takes unless the model
+        calls a simulator: then "extended". Or, where states are driven by Gaussian
         noise, one of the approximations "extended" (the update is the mode of each row),
         "unscented" (Julier and Uhlmann 1997) and "laplace" (the law round the mode of all states
         given the data up to each row, whose cost grows with the square of the rows).
@@ -290,6 +292,8 @@ def kalman_filter(
     problem = pose(model, data)
     theta = check_parameters(problem.trace, parameters)
     levels = quantile_levels(quantiles)
+    if proposal == "auto":
+        proposal = "extended" if simulators(problem.trace) else "kalman"
     attrs: dict[str, Any] = {"model": problem.trace.name, "proposal": proposal}
     if proposal in APPROXIMATE:
         attrs["approximate"] = 1
@@ -420,6 +424,8 @@ def _probabilities(
         values, index = np.unique(columns, return_inverse=True)
         shares = np.eye(len(values))[index.reshape(columns.shape)]  # (K, size, values)
         chances = np.einsum("tk,kdv->tdv", law, shares).reshape(-1, *site.shape, len(values))
+        if name in exact.trace.auxiliary:
+            chances[0] = np.nan
         out[f"{name}_probability"] = xr.DataArray(
             chances[None], dims=(*dataset[name].dims, f"{name}_value"),
             coords={**dataset[name].coords, f"{name}_value": values},

@@ -14,6 +14,7 @@ import numpy as np
 from ssmppl.analysis.structure import noisy_start
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
+from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum import (
     direct_optimization,
@@ -145,6 +146,8 @@ def maximize(
         "interrupted": ascent.interrupted,
         "seed": str(root.entropy),
     }
+    if isinstance(setup.exact, Extended) and isinstance(chosen, DirectOptimization):
+        attrs["approximate"] = True
     value = _log_likelihood(setup, ascent, attrs)
     covariance = _covariance(setup, ascent, attrs)
     if ascent.error is not None:

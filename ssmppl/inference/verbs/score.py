@@ -41,6 +41,7 @@ SCORED = {
     "kalman": "the sensitivities of the Kalman filter",
     "forward": "Fisher's identity over the forward and backward algorithm",
     "deterministic": "the sensitivities of the states",
+    "extended": "differences of the extended Kalman filter's likelihood",
 }
 
 
@@ -146,7 +147,8 @@ def score(
     if settings.proposal in EXACT and not isinstance(form, NotApplicable):
         exact = exact_score(form, problem.experiments, free, theta)
         found = _exact(exact, theta)
-        attrs["method"] = f"exact, by {SCORED[settings.proposal]}"
+        kind = "approximate" if settings.proposal == "extended" else "exact"
+        attrs["method"] = f"{kind}, by {SCORED[settings.proposal]}"
         if exact.differences:
             attrs["method"] = "differences of the exact likelihood"
             attrs["central_differences"] = exact.differences

@@ -81,8 +81,10 @@ def test_the_time_step_may_be_given_and_dates_have_a_unit(record):
     model.time_step = ("dt", "min")
     (found,) = ssm.log_likelihood(model, pd.DataFrame({"y": y}, index=dates), {"k": 4.0, "d": 0.6})
     assert found == pytest.approx(given, abs=1e-6)  # dates are whole nanoseconds
-    text = str(ssm.explain(model, pd.DataFrame({"y": y}, index=dates)))
-    assert "dt is the time from each row to the next" in text
+    plan = ssm.explain(model, pd.DataFrame({"y": y}, index=dates))
+    text, parts = str(plan), dict(plan.sections())
+    assert ("steps", "dt is the time from each row to the next, in min") in parts["Data"]
+    assert all(what == "the exponential of a matrix" for _, what in parts["Small steps"])
     assert "approximated" not in text
 
 
@@ -115,6 +117,8 @@ def test_forecasts_at_the_times_that_are_asked_for():
     np.testing.assert_allclose(on["x"].values.mean(axis=0), 8 * np.exp([-1.5, -2.0]), rtol=1e-9)
     with pytest.raises(ssm.SSMError, match="time"):
         ssm.forecast(model, {"rate": 0.5}, steps=2, data=data, seed=1)
+    with pytest.raises(ssm.ArgumentError, match="not after the data"):
+        ssm.forecast(model, {"rate": 0.5}, inputs={"time": [1.0, 3.0]}, data=data, seed=1)
 
 
 def test_what_has_no_times_is_refused(record):
@@ -177,6 +181,84 @@ def test_a_nonlinear_sde_is_near_its_law_over_a_short_time():
     np.testing.assert_allclose(mean, expected[0], atol=4 * np.sqrt(0.01 / 200_000) + 5e-4)
     np.testing.assert_allclose(covariance, expected[1], rtol=0.03, atol=1e-4)
     assert "approximated" in law.approximation
+
+
+def test_loops_are_told_by_name():
+    model = ssm.Model("loops", inputs=("n",))
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Normal(0, sd=1), "w": ssm.Normal(0, sd=1)}
+
+    @model.transition
+    def transition(x, w, n):
+        def decay(x):
+            return -(x**3)
+
+        def fold(w):
+            return 1.0 - w**2
+
+        after = ssm.integrate(decay, x, 0.5, method="midpoint", steps=7)
+        return {"x": ssm.Normal(after, sd=1), "w": ssm.Normal(ssm.repeat(fold, w, n), sd=1)}
+
+    @model.observation
+    def observation(x, w):
+        return {"y": ssm.Normal(x + w, sd=1)}
+
+    parts = dict(ssm.explain(model).sections())
+    told, laws = dict(parts["Small steps"]), str(parts["Transition, x_prev to x"])
+    assert list(told.values()) == [
+        "decay_midpoint, repeated 7 times",
+        "fold, repeated n_prev times",
+    ]
+    assert all(name in laws for name in told)
+
+
+def van_der_pol(method, steps):
+    model = ssm.Model("van der pol")
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Dirac(np.array([0.7, -0.4]))}
+
+    @model.transition
+    def transition(x):
+        def drift(x):
+            return np.stack([x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]])
+
+        def spread(x):
+            return np.stack([0.05 * np.exp(0.2 * x[1]), 0.6 * np.abs(x[0])])
+
+        return {"x": ssm.SDE(drift, spread, 0.4, steps=steps, method=method)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x[0], sd=0.1)}
+
+    return model
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_small_steps_of_euler_and_maruyama(steps):
+    """Draws have the moments of steps by hand; the noises of all but the last are a quantity."""
+    model, n = van_der_pol("euler-maruyama", steps), 20_000
+    seed = seed_of("euler maruyama", steps)
+    found = ssm.simulate(model, {}, steps=2, draws=n, seed=seed)
+    x = found["x"].values.reshape(n, 2, 2)[:, 1]
+    by_hand = by_euler(
+        lambda x: np.stack([x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]]),
+        lambda x: np.stack([0.05 * np.exp(0.2 * x[1]), 0.6 * np.abs(x[0])]),
+        0.4, steps=steps, seed=seed,
+    )  # fmt: skip
+    spread = np.sqrt(np.diag(by_hand[1]) * (1 / n + 1 / 200_000))
+    np.testing.assert_array_less(np.abs(x.mean(axis=0) - by_hand[0]), 4.5 * spread)
+    np.testing.assert_allclose(np.diag(np.cov(x.T)), np.diag(by_hand[1]), rtol=0.06)
+    traced = trace(model)
+    assert list(traced.transition) == (["x_noise", "x"] if steps > 1 else ["x"])
+    assert "Euler and Maruyama" in traced.transition["x"].distribution.approximation
+    assert ("x_noise" in found) == (steps > 1)
+    with pytest.raises(ssm.ModelError, match="method"):
+        ssm.SDE(lambda x: x, 0.1, 0.1, method="milstein")
 
 
 def test_the_number_of_steps_makes_it_exact_in_the_limit():

@@ -1,0 +1,55 @@
+"""The log posterior density on the unconstrained scale, without its Jacobian: what fits climb."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ssmppl.inference.preparation.space import Space
+
+POINTS, SPREAD, CLIMBS = 45, 1.5, 3  # round a start, where many points are looked at together
+
+
+def density_of(
+    space: Space, log_likelihood: Callable[[np.ndarray], float]
+) -> Callable[[np.ndarray], float]:
+    """z (F,) -> log likelihood + log prior density of theta, -inf off the support."""
+
+    def value(z: np.ndarray) -> float:
+        theta, log_prior, log_jacobian = space.point(z)
+        if not log_prior + log_jacobian > -np.inf:
+            return -np.inf
+        found = log_likelihood(theta) + log_prior
+        return found if np.isfinite(found) else -np.inf
+
+    return value
+
+
+def densities_of(
+    space: Space, log_likelihoods: Callable[[np.ndarray], np.ndarray]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """As `density_of`, of many points z (B, F) at once."""
+
+    def values(z: np.ndarray) -> np.ndarray:
+        out = np.full(len(z), -np.inf)
+        found = [space.point(row) for row in z]
+        inside = [k for k, (_, *logs) in enumerate(found) if sum(logs) > -np.inf]
+        if inside:
+            theta = np.array([found[k][0] for k in inside])
+            prior = np.array([found[k][1] for k in inside])
+            out[inside] = log_likelihoods(theta) + prior
+        return np.where(np.isfinite(out), out, -np.inf)
+
+    return values
+
+
+def best_of_many(
+    densities: Callable[[np.ndarray], np.ndarray], points: Sequence[np.ndarray],
+    seed: np.random.SeedSequence,
+) -> np.ndarray:  # fmt: skip
+    """(K, F) the best of these points and of others round the first."""
+    rng = np.random.default_rng(seed)
+    z = points[0]
+    every = np.vstack([*points, z + SPREAD * rng.standard_normal((POINTS, len(z)))])
+    return every[np.argsort(-densities(every))[:CLIMBS]]

@@ -1,0 +1,120 @@
+"""The "simulator" node: the values of a function that moves a batch, or a partial derivative of
+all of them.
+
+Its arguments are those of the function; "item" nodes take the values. Nodes with the same function
+and arguments are computed together, by one call, wherever several of them are needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+
+from ssmppl.expressions.batched.differences import HIGHEST, Index, Stencil
+from ssmppl.expressions.node import Expr
+
+OP = "simulator"
+
+
+class Batched(Protocol):
+    """A function of K numbers to `outputs` numbers, which takes a batch.
+
+    title : for people. name : unique in this process. moving : which of the arguments have
+    derivatives. scales : (K,) of the steps of differences.
+    """
+
+    title: str
+    name: str
+    outputs: int
+    moving: tuple[bool, ...]
+    scales: np.ndarray
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """(B, outputs) at points (B, K)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Derivative:
+    """Data of a node: the function, and the arguments in which it is differentiated."""
+
+    function: Any
+    index: Index = ()
+
+    @property
+    def name(self) -> str:
+        """Unique in this process."""
+        return "_".join([self.function.name, *(f"d{j}" for j in self.index)])
+
+    def __repr__(self) -> str:
+        return "_".join([self.function.title, *(f"d{j}" for j in self.index)])
+
+
+def values_of(function: Any, args: Sequence[Expr]) -> list[Expr]:
+    """The values of a function, as nodes."""
+    return items(Expr(OP, tuple(args), Derivative(function)))
+
+
+def items(node: Expr) -> list[Expr]:
+    """The numbers of a node."""
+    return [Expr("item", (node,), (k,)) for k in range(node.data.function.outputs)]
+
+
+def partial(node: Expr, j: int) -> Expr | None:
+    """The node of the derivative in the j-th argument; None where it does not move with it, and
+    where derivatives of so high an order are not taken."""
+    data = node.data
+    if not data.function.moving[j] or node.args[j].op == "const":
+        return None
+    return Expr(OP, node.args, Derivative(data.function, tuple(sorted((*data.index, j)))))
+
+
+def too_high(node: Expr) -> bool:
+    """Whether its derivatives are of a higher order than differences give."""
+    return len(node.data.index) >= HIGHEST
+
+
+@lru_cache(maxsize=4096)
+def stencil_of(wanted: tuple[Index, ...], arguments: int) -> Stencil:
+    return Stencil.of(wanted, arguments)
+
+
+def groups(nodes: Iterable[Expr]) -> dict[Expr, tuple[Expr, ...]]:
+    """For each node of this kind those that are computed with it, by one call, itself among them;
+    in the order of their derivatives."""
+    alike: dict[tuple[Any, ...], list[Expr]] = {}
+    for node in nodes:
+        if node.op == OP:
+            alike.setdefault((node.data.function, *map(id, node.args)), []).append(node)
+    out: dict[Expr, tuple[Expr, ...]] = {}
+    for group in alike.values():
+        ordered = tuple(sorted(group, key=lambda n: (len(n.data.index), n.data.index)))
+        out |= dict.fromkeys(group, ordered)
+    return out
+
+
+def computed(function: Any, wanted: tuple[Index, ...], x: np.ndarray) -> np.ndarray:
+    """(len(wanted), outputs, B) at x (B, K)."""
+    stencil = stencil_of(wanted, x.shape[1])
+    return stencil.derivatives(function.at, x, function.scales)
+
+
+def of_group(group: Sequence[Expr], args: Sequence[Any]) -> list[np.ndarray]:
+    """The values of each node, its numbers in the last axis, from those of the arguments."""
+    shape: tuple[int, ...] = ()
+    for a in args:
+        own = np.shape(a)
+        shape = (
+            own if not shape else shape if own in ((), shape) else np.broadcast_shapes(own, shape)
+        )
+    x = np.empty((*shape, len(args)))
+    for j, a in enumerate(args):
+        x[..., j] = a
+    function = group[0].data.function
+    wanted = tuple(n.data.index for n in group)
+    found = computed(function, wanted, x.reshape(-1, len(args)))
+    return [f.T.reshape(*shape, function.outputs) for f in found]

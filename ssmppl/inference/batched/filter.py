@@ -1,0 +1,309 @@
+"""The extended Kalman filter of many parameter vectors at once, in NumPy.
+
+The same filter as `codegen/kernels/twisted/lookahead.py:follow_filter`, whose update is the mode of
+each row; here every number is an array over lanes, a lane for each parameter vector and data set,
+so that a simulator in the transition is called once a row, whatever the number of vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ssmppl.analysis.density import Missing
+from ssmppl.analysis.proposals.twisted import LookaheadModel, jacobian, lookahead_model
+from ssmppl.analysis.vectorised import vectorised
+from ssmppl.data import Experiment
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr, symbols_of
+from ssmppl.language.model.trace import Trace
+
+NEWTON_STEPS, HALVINGS, CLOSE = 10, 40, 0.05  # as in the compiled filter
+RESOLVED = 1e-13
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Of x_t in each of L lanes: mean (L, D) and covariance (L, D, D) given y_{1:t}, predicted
+    (L, D) and its covariance (L, D, D) given y_{1:t-1}, cross (L, D, D) of x_{t-1} with x_t."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    predicted: np.ndarray
+    predicted_covariance: np.ndarray
+    cross: np.ndarray
+
+
+class BatchedFilter:
+    """The filter of a model. found : the model by its noises."""
+
+    def __init__(self, trace: Trace, found: LookaheadModel):
+        self.trace, self.flat = trace, found.flat
+        d = self.size = len(trace.state_symbols)
+        first, later = found.initial, found.transition
+        half = [found.curvature[i, j] for i in range(d) for j in range(i + 1)]
+        self._begin = _Part(trace, [*first.at_rest(), *first.spread().ravel()])
+        self._move = _Part(
+            trace, [*later.at_rest(), *jacobian(later, trace).ravel(), *later.spread().ravel()]
+        )
+        self._look = _Part(trace, [found.observed, *found.slope, *half])
+
+    def log_likelihoods(
+        self, experiments: Sequence[Experiment], theta: np.ndarray,
+        record: list[Moments] | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """(B,) log p(y | theta) of each row of theta (B, P), summed over the data sets; -inf where
+        it comes to no number, or to none that floating point resolves.
+
+        record : takes the moments of each row; of a single data set.
+        """
+        lanes = _Lanes(self.trace, experiments, np.asarray(theta, dtype=float))
+        total = np.zeros(lanes.count)
+        dead = np.zeros(lanes.count, dtype=bool)
+        x = covariance = np.empty(0)
+        with np.errstate(all="ignore"):
+            for t in range(lanes.steps):
+                lanes.at(t)
+                if t == 0:
+                    rest, spread = self._started(lanes)
+                    p = spread @ spread.transpose(0, 2, 1)
+                    cross = np.zeros_like(p)
+                else:
+                    rest, slope, spread = self._moved(lanes, x)
+                    cross = covariance @ slope.transpose(0, 2, 1)
+                    p = slope @ cross + spread @ spread.transpose(0, 2, 1)
+                increment, x, covariance = self._updated(lanes, rest, p)
+                after, before = (np.einsum("lii->li", c) for c in (covariance, p))
+                fine = (after >= RESOLVED * before) & np.isfinite(x)
+                going = lanes.going
+                if not (fine.all() and np.isfinite(increment).all()):
+                    dead |= ~(fine.all(axis=1) & np.isfinite(increment)) & going
+                    if dead.all():
+                        break
+                total += increment if going is True else np.where(going, increment, 0.0)
+                if record is not None:
+                    record.append(Moments(x, covariance, rest, p, cross))
+                if dead.any():  # in place of what is no number
+                    alive = int(np.argmin(dead))
+                    x = np.where(dead[:, None], x[alive], x)
+                    covariance = np.where(dead[:, None, None], covariance[alive], covariance)
+        total[dead] = -np.inf
+        return lanes.summed(total)
+
+    def _started(self, lanes: _Lanes) -> tuple[np.ndarray, np.ndarray]:
+        d = self.size
+        values = self._begin(lanes, None, None)
+        return values[:, :d], values[:, d:].reshape(len(values), d, -1)
+
+    def _moved(self, lanes: _Lanes, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        d = self.size
+        values = self._move(lanes, None, x)
+        n = len(values)
+        slope = values[:, d : d + d * d].reshape(n, d, d)
+        return values[:, :d], slope, values[:, d + d * d :].reshape(n, d, -1)
+
+    def _seen(self, lanes: _Lanes, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """log g (L,), its slope (L, D) and minus its curvature (L, D, D), not negative."""
+        d = self.size
+        values = self._look(lanes, x, None)
+        h = np.empty((len(values), d, d))
+        for k, (i, j) in enumerate(zip(*np.tril_indices(d), strict=True)):
+            h[:, i, j] = h[:, j, i] = values[:, 1 + d + k]
+        if not self.flat:
+            h = _positive_part(h)
+        return values[:, 0], values[:, 1 : 1 + d], h
+
+    def _updated(
+        self, lanes: _Lanes, rest: np.ndarray, p: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Increments (L,) of the log-likelihood, means (L, D) and covariances (L, D, D) after."""
+        height, g, h = self._seen(lanes, rest)
+        log_det, after, move = _step(p, h, g, np.zeros_like(rest))
+        if self.flat:  # quadratic: one step, whose gain is known
+            # log g at the mode, less (g - H move)' move / 2, the prior's part
+            gained = 0.5 * np.einsum("li,li->l", g, move)
+            return height + gained - 0.5 * log_det, rest + move, after
+        return self._climbed(lanes, rest, p, (height, g, h), (log_det, after, move))
+
+    def _climbed(
+        self, lanes: _Lanes, rest: np.ndarray, p: np.ndarray, seen: tuple[np.ndarray, ...],
+        step: tuple[np.ndarray, ...],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+        """Newton's method, each lane with its own share of a step and its own end."""
+        (height, g, h), (log_det, after, move) = seen, step
+        toward, lead = np.zeros_like(rest), np.zeros_like(rest)
+        active = np.ones(len(rest), dtype=bool)
+        for _ in range(NEWTON_STEPS):
+            target = g + np.einsum("lij,lj->li", h, toward - move)
+            share = np.ones(len(rest))
+            waiting = active.copy()
+            best = height.copy()
+            found = np.zeros(len(rest), dtype=bool)
+            for _ in range(HALVINGS):
+                gone = toward + share[:, None] * (move - toward)
+                ahead = lead + share[:, None] * (target - lead)
+                value = self._seen(lanes, rest + gone)[0]
+                new = value - 0.5 * np.sum(ahead * gone, axis=1)
+                better = (new >= height) | (np.isfinite(new) & ~np.isfinite(height))
+                taken = waiting & better
+                best, found = np.where(taken, new, best), found | taken
+                waiting &= ~better
+                if not waiting.any():
+                    break
+                share = np.where(waiting, 0.5 * share, share)
+            went = (share * found)[:, None]
+            lead, toward = lead + went * (target - lead), toward + went * (move - toward)
+            gained, height = best - height, best
+            _, g_new, h_new = self._seen(lanes, rest + toward)
+            g = np.where(found[:, None], g_new, g)
+            h = np.where(found[:, None, None], h_new, h)
+            new_det, new_after, new_move = _step(p, h, g, toward)
+            log_det = np.where(found, new_det, log_det)
+            after = np.where(found[:, None, None], new_after, after)
+            move = np.where(found[:, None], new_move, move)
+            active &= found & ~(gained < CLOSE)
+            if not active.any():
+                break
+        return height - 0.5 * log_det, rest + toward, after
+
+
+class _Part:
+    """Expressions of one law, evaluated for all lanes."""
+
+    def __init__(self, trace: Trace, expressions: Sequence[Expr]):
+        self.size = len(expressions)
+        self.fixed = np.zeros(self.size)
+        self.at: list[int] = []
+        moving = []
+        for k, e in enumerate(expressions):
+            if e.op == "const":
+                self.fixed[k] = e.data
+            else:
+                self.at.append(k)
+                moving.append(e)
+        known = {s for e in moving for s in symbols_of([e])}
+        self.symbols = sorted(known, key=lambda s: repr(s.data))
+        self.run: Callable[[Sequence[Any]], list[Any]] = vectorised(moving, self.symbols)
+        states = {s.data[1:]: k for k, s in enumerate(trace.state_symbols)}
+        self.sources = [(s.data[0], states.get(s.data[1:], s)) for s in self.symbols]
+
+    def __call__(
+        self, lanes: _Lanes, x: np.ndarray | None, x_prev: np.ndarray | None
+    ) -> np.ndarray:
+        """(L, expressions)."""
+        given: list[Any] = []
+        for (kind, place), symbol in zip(self.sources, self.symbols, strict=True):
+            if kind == "state":
+                assert x is not None
+                given.append(x[:, place])
+            elif kind == "state_prev":
+                assert x_prev is not None
+                given.append(x_prev[:, place])
+            else:
+                given.append(lanes.value(symbol))
+        out = np.empty((lanes.count, self.size))
+        out[:] = self.fixed
+        for k, value in zip(self.at, self.run(given), strict=True):
+            out[:, k] = value
+        return out
+
+
+class _Lanes:
+    """Parameters and data of each lane: lane e B + b has the data set e and the vector b."""
+
+    def __init__(self, trace: Trace, experiments: Sequence[Experiment], theta: np.ndarray):
+        self.vectors, self.sets = len(theta), len(experiments)
+        self.count = self.vectors * self.sets
+        self.ends = np.repeat([e.steps for e in experiments], self.vectors)
+        self.steps, self.shortest = int(self.ends.max()), int(self.ends.min())
+        self.columns: dict[tuple[str, Any], int] = {}
+        for kind, symbols in (
+            ("observation", trace.observation_symbols), ("input", trace.input_symbols),
+        ):  # fmt: skip
+            self.columns |= {(kind, s.data[1:]): k for k, s in enumerate(symbols)}
+        tiled = np.tile(theta, (self.sets, 1))
+        self.theta = {s: tiled[:, k] for k, s in enumerate(trace.parameter_symbols)}
+        self.arrays = {
+            "observation": [e.y for e in experiments], "seen": [e.seen for e in experiments],
+            "input": [e.u for e in experiments],
+        }  # fmt: skip
+        self.t, self.kept = 0, dict[Expr, Any]()
+
+    def at(self, t: int) -> None:
+        """Go to a row."""
+        self.t, self.kept = t, {}
+
+    @property
+    def going(self) -> Any:
+        """(L,) whether the lane's data have this row; True where all have."""
+        return True if self.t < self.shortest else self.t < self.ends
+
+    def value(self, symbol: Expr) -> Any:
+        """A number, or (L,), of a symbol that is no state's."""
+        found = self.theta.get(symbol)
+        if found is not None:
+            return found
+        if symbol not in self.kept:
+            self.kept[symbol] = self._of_row(symbol)
+        return self.kept[symbol]
+
+    def _of_row(self, symbol: Expr) -> Any:
+        kind, name, index = symbol.data
+        if kind in ("time", "time_prev"):
+            return self.t + (1.0 if kind == "time" else 0.0)
+        base = kind.removesuffix("_prev")
+        column = self.columns["observation" if base == "seen" else base, (name, index)]
+        row = max(self.t - 1, 0) if kind.endswith("_prev") else self.t
+        values = [a[min(row, len(a) - 1), column] for a in self.arrays[base]]
+        return values[0] if self.sets == 1 else np.repeat(values, self.vectors)
+
+    def summed(self, total: np.ndarray) -> np.ndarray:
+        """(B,) over the data sets."""
+        whole: np.ndarray = total.reshape(self.sets, self.vectors).sum(axis=0)
+        return whole
+
+
+def _step(
+    p: np.ndarray, h: np.ndarray, g: np.ndarray, toward: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One step of the update in information form: log det(I + P H), (I + P H)^-1 P, the step."""
+    d = p.shape[1]
+    s = p @ h
+    np.einsum("lii->li", s)[:] += 1.0
+    if d == 1:
+        determinant, after = s[:, 0, 0], p / s
+    elif d == 2:  # written out: a call of LAPACK for many small matrices takes longer
+        determinant = s[:, 0, 0] * s[:, 1, 1] - s[:, 0, 1] * s[:, 1, 0]
+        adjugate = np.empty_like(s)
+        adjugate[:, 0, 0], adjugate[:, 1, 1] = s[:, 1, 1], s[:, 0, 0]
+        adjugate[:, 0, 1], adjugate[:, 1, 0] = -s[:, 0, 1], -s[:, 1, 0]
+        after = (adjugate @ p) / determinant[:, None, None]
+    else:
+        fine = np.isfinite(s).all(axis=(1, 2))
+        safe = np.where(fine[:, None, None], s, np.eye(d))
+        determinant = np.where(fine, np.linalg.det(safe), np.nan)
+        regular = fine & (determinant != 0.0)
+        safe = np.where(regular[:, None, None], s, np.eye(d))
+        after = np.where(regular[:, None, None], np.linalg.solve(safe, p), np.nan)
+    after = 0.5 * (after + after.transpose(0, 2, 1))
+    pull = g + np.einsum("lij,lj->li", h, toward)
+    return np.log(np.abs(determinant)), after, np.einsum("lij,lj->li", after, pull)
+
+
+def _positive_part(h: np.ndarray) -> np.ndarray:
+    if h.shape[1] == 1:
+        return np.maximum(h, 0.0)
+    fine = np.isfinite(h).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.where(fine[:, None, None], h, 0.0))
+    lifted = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    below = (values < 0.0).any(axis=1)
+    return np.where((fine & below)[:, None, None], lifted, h)
+
+
+def batched_filter(trace: Trace, missing: Missing) -> BatchedFilter | NotApplicable:
+    """The filter of a traced model, or why there is none."""
+    found = lookahead_model(trace, missing)
+    return found if isinstance(found, NotApplicable) else BatchedFilter(trace, found)

@@ -1,0 +1,191 @@
+"""Newton's ascent of a function that takes many points at once, where many cost little more than
+one.
+
+Value, gradient and second derivatives are differences over one set of points, and the shares of a
+step are tried together with the differences at its whole, so that a step that climbs costs one
+call. Several climbs go on side by side in the same calls. Where the function is not concave,
+eigenvalues count by their size (`newton.newton_step`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ssmppl.inference.optimisation.newton import Top, newton_step
+
+Function = Callable[[np.ndarray], np.ndarray]  # (B, F) -> (B,), -inf where there is no value
+
+STEPS = 60
+FIRST, SHORTEST, LONGEST = 0.02, 1e-4, 0.1  # steps of differences in z
+WIDTH = 0.05  # of the steps of differences, in standard deviations by the last curvature
+FARTHEST = 2.0  # of a step in any coordinate, in units of it where it is larger than one
+LATE = 3  # steps of the others once the highest is at its end
+SHARES = (1.0, 0.6, 0.3, 0.1, 0.03, 0.01, 1e-3)  # of a step that are tried
+GOOD = 1e-7  # that the quadratic still expects to gain, where a climb is at its end
+FINAL = 1e-3  # from where on differences are extrapolated to zero step
+
+
+@dataclass
+class Climber:
+    """One of the climbs. size : (F,) of its differences. path : where it has been."""
+
+    z: np.ndarray
+    value: float
+    size: np.ndarray
+    slope: np.ndarray = field(default_factory=lambda: np.empty(0))
+    information: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    distance: float = np.inf
+    reach: float = FARTHEST
+    ended: bool = False
+    path: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def top(self) -> Top:
+        return Top(self.z, self.value, self.information, self.distance)
+
+
+def climb_together(function: Function, starts: np.ndarray) -> Climber | None:
+    """The highest of the climbs from starts (K, F); None where none has a value.
+
+    Ctrl-C is left to the caller, who sees every point that the function is asked for.
+    """
+    starts = np.atleast_2d(starts)
+    values = function(starts)
+    climbers = [
+        Climber(z.copy(), float(v), np.full(len(z), FIRST), path=[z.copy()])
+        for z, v in zip(starts, values, strict=True)
+        if np.isfinite(v)
+    ]
+    if not climbers:
+        return None
+    _differentiate(function, climbers)
+    further = LATE
+    for _ in range(STEPS):
+        going = [c for c in climbers if not c.ended]
+        best = max(climbers, key=lambda c: c.value)
+        if best.ended:
+            going = [c for c in going if c.value + c.distance > best.value]
+            further -= 1
+        if not (going and further):
+            break
+        _step(function, going)
+    return max(climbers, key=lambda c: c.value)
+
+
+def _step(function: Function, climbers: list[Climber]) -> None:
+    """One step of each."""
+    moves, points, counts = [], [], []
+    for c in climbers:
+        move = newton_step(c.slope, c.information)
+        size = float(np.max(np.abs(move) / np.maximum(1.0, np.abs(c.z))))
+        moves.append(move * min(1.0, c.reach / max(size, 1e-300)))
+        own = [c.z + share * moves[-1] for share in SHARES[1:]]
+        own += _stencil(c.z + moves[-1], c.size, c.distance < FINAL)
+        points += own
+        counts.append(len(own))
+    found = np.split(function(np.array(points)), np.cumsum(counts)[:-1])
+    later = []
+    for c, move, values in zip(climbers, moves, found, strict=True):
+        shares, stencil = values[: len(SHARES) - 1], values[len(SHARES) - 1 :]
+        tried = np.concatenate([stencil[:1], shares])
+        k = int(np.argmax(np.where(np.isfinite(tried), tried, -np.inf)))
+        if not tried[k] > c.value:
+            # a gain below the rounding of the function: the step is as right as can be told
+            c.ended = c.distance < FINAL or c.reach < SHORTEST
+            c.reach *= 0.1
+            continue
+        c.z, c.value = c.z + SHARES[k] * move, float(tried[k])
+        c.path.append(c.z.copy())
+        c.reach = FARTHEST if k == 0 else max(c.reach * 0.5, 10.0 * SHORTEST)
+        if k == 0:
+            _take(c, stencil)
+        else:
+            later.append(c)
+    if later:
+        _differentiate(function, later)
+
+
+def _differentiate(function: Function, climbers: list[Climber]) -> None:
+    """The derivatives of each where it stands."""
+    sets = [_stencil(c.z, c.size, c.distance < FINAL) for c in climbers]
+    found = function(np.array([z for own in sets for z in own]))
+    for c, values in zip(
+        climbers, np.split(found, np.cumsum([len(s) for s in sets])[:-1]), strict=True
+    ):
+        _take(c, values)
+
+
+def _stencil(z: np.ndarray, size: np.ndarray, fine: bool) -> list[np.ndarray]:
+    """z, then for each step its two sides of each coordinate, and of each pair together."""
+    points, n = [z], len(z)
+    for times in (1.0, 2.0) if fine else (1.0,):
+        for sign in (times, -times):
+            for i in range(n):
+                points.append(_moved(z, {i: sign * size[i]}))
+        for sign in (times, -times):
+            for i in range(n):
+                points += [_moved(z, {i: sign * size[i], j: sign * size[j]}) for j in range(i)]
+    return points
+
+
+def _moved(z: np.ndarray, by: dict[int, float]) -> np.ndarray:
+    out = z.copy()
+    for i, step in by.items():
+        out[i] += step
+    return out
+
+
+def _take(c: Climber, values: np.ndarray) -> None:
+    """Slope, curvature and the next steps from the values at a stencil."""
+    slope, curvature = derivatives(values, c.size)
+    missing = ~np.isfinite(slope)
+    c.slope = np.where(missing, 0.0, slope)
+    c.information = np.where(np.isfinite(curvature), -curvature, 0.0)
+    step = newton_step(c.slope, c.information)
+    c.distance = 0.5 * float(c.slope @ step)
+    fine = len(values) > 1 + 2 * len(c.z) + len(c.z) * (len(c.z) - 1)
+    c.ended = c.distance < GOOD and fine and not missing.any()
+    with np.errstate(divide="ignore"):
+        wanted = WIDTH / np.sqrt(np.abs(np.diagonal(c.information)))
+    wanted = np.where(missing, 0.1 * c.size, wanted)
+    c.size = np.clip(wanted, SHORTEST, LONGEST)
+
+
+def derivatives(values: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (F,) and second derivatives (F, F) by central differences over steps `size` (F,),
+    extrapolated to zero step where there are two of them; NaN where there are none.
+
+    values : at the points of a stencil.
+    """
+    n = len(size)
+    pairs = n * (n - 1) // 2
+    each = 2 * n + 2 * pairs
+    slopes, curves = [], []
+    with np.errstate(invalid="ignore"):
+        for k in range((len(values) - 1) // each if n else 0):
+            h = (k + 1.0) * size
+            own = values[1 + k * each : 1 + (k + 1) * each]
+            up, down = own[:n], own[n : 2 * n]
+            alone = up - 2.0 * values[0] + down
+            slope = (up - down) / (2.0 * h)
+            one_sided = np.where(np.isfinite(up), up - values[0], values[0] - down) / h
+            slopes.append(np.where(np.isfinite(slope), slope, one_sided))
+            curve = np.diag(alone / h**2)
+            ahead, back = own[2 * n : 2 * n + pairs], own[2 * n + pairs :]
+            for p, (i, j) in enumerate(zip(*np.tril_indices(n, -1), strict=True)):
+                both = ahead[p] - 2.0 * values[0] + back[p]
+                curve[i, j] = curve[j, i] = (both - alone[i] - alone[j]) / (2.0 * h[i] * h[j])
+            curves.append(curve)
+        if not slopes:
+            return np.zeros(n), np.zeros((n, n))
+        if len(slopes) == 1:
+            return slopes[0], curves[0]
+        out = ((4.0 * a[0] - a[1]) / 3.0 for a in (slopes, curves))
+        slope, curve = out
+    return (
+        np.where(np.isfinite(slope), slope, slopes[0]),
+        np.where(np.isfinite(curve), curve, curves[0]),
+    )
