@@ -1,8 +1,8 @@
 """An epidemic in a school, of which only some cases are reported: SEIR in whole persons and days.
 
 Every day, out of S susceptible, E exposed and I infectious persons, some are infected, some fall
-ill, and some recover: three binomial variables. A state may not look at the new value of another
-one, so the flows of a day are states themselves, and the next day starts by carrying them out.
+ill, and some recover: three binomial variables, the flows. They are drawn first, and the
+compartments are then what they were with the flows taken out and put in.
 """
 
 import numpy as np
@@ -30,22 +30,25 @@ def initial():
         "S": ssm.Dirac(POPULATION - 5),
         "E": ssm.Dirac(5),
         "I": ssm.Dirac(0),
-        "infected": ssm.Dirac(0),
         "onsets": ssm.Dirac(0),
-        "recovered": ssm.Dirac(0),
     }
 
 
 @epidemic.transition
-def transition(S, E, I, infected, onsets, recovered, beta, fall_ill, recover):
-    s, e, i = S - infected, E + infected - onsets, I + onsets - recovered
+def flows(S, E, I, beta, fall_ill, recover):
     return {
-        "S": ssm.Dirac(s),
-        "E": ssm.Dirac(e),
-        "I": ssm.Dirac(i),
-        "infected": ssm.Binomial(s, 1 - np.exp(-beta * i / POPULATION)),
-        "onsets": ssm.Binomial(e, fall_ill),
-        "recovered": ssm.Binomial(i, recover),
+        "infected": ssm.Binomial(S, 1 - np.exp(-beta * I / POPULATION)),
+        "onsets": ssm.Binomial(E, fall_ill),
+        "recovered": ssm.Binomial(I, recover),
+    }
+
+
+@epidemic.transition
+def compartments(S, E, I, infected_next, onsets_next, recovered_next):
+    return {
+        "S": ssm.Dirac(S - infected_next),
+        "E": ssm.Dirac(E + infected_next - onsets_next),
+        "I": ssm.Dirac(I + onsets_next - recovered_next),
     }
 
 

@@ -4,12 +4,13 @@ and which observations are affine and Gaussian in them.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ssmppl.analysis.new_values import reads_of
 from ssmppl.errors import ModelError, NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
@@ -28,42 +29,101 @@ from ssmppl.language.model.trace import Site, Trace, once_per_trace, previous
 
 @dataclass(frozen=True)
 class GaussianBlock:
-    """Components that are jointly Gaussian: symbols (n,), mean (n,), covariance (n, n)."""
+    """Components that are jointly Gaussian: symbols (n,), mean (n,), covariance (n, n).
+
+    The mean and the covariance may hold new values of other components, as of a discrete one. late
+    : Gaussian sites that read new values of the block in another way than by an affine mean, so
+    that they are no part of it, and why.
+    """
 
     symbols: tuple[Expr, ...]
     mean: ExprArray
     covariance: ExprArray
     diagonal: bool
+    late: tuple[tuple[Site, NotApplicable], ...] = ()
 
     def __len__(self) -> int:
         return len(self.symbols)
 
 
-def gaussian_block(sites: Sequence[Site]) -> GaussianBlock:
-    """The Normal and MvNormal sites stacked; empty where there are none."""
+def gaussian_block(
+    sites: Sequence[Site], dirac: bool = False, given: Collection[Expr] = ()
+) -> GaussianBlock:
+    """The Normal and MvNormal sites stacked, in the order of their laws; empty where there are
+    none. A mean m + B x in new values x of the block has them put in: m + B mean(x), with the
+    covariance B cov(x) B' beside its own.
+
+    dirac : the deterministic sites too, with no variance of their own. given : components that are
+    no part of it, whatever their laws.
+    """
     symbols: list[Expr] = []
-    stacked: list[Expr] = []
-    blocks: list[np.ndarray] = []
+    mean: list[Expr] = []
+    covariance = np.empty((0, 0), dtype=object)
+    diagonal = True
+    late: list[tuple[Site, NotApplicable]] = []
+    behind: set[Expr] = set()  # components that are drawn given some of the block
     for site in sites:
         d = site.distribution
-        if isinstance(d, Normal):
-            blocks += [np.array([[v]], dtype=object) for v in d.variance_in_range().ravel()]
-            stacked += list(array(d.mean()).ravel())
-        elif isinstance(d, MvNormal):
-            blocks.append(d.covariance_matrix().view(np.ndarray))
-            stacked += list(d.mean())
-        else:
+        inside = _gaussian(site, dirac) and not set(site.components) & set(given)
+        own_mean = list(array(d.mean()).ravel()) if inside else []
+        if not own_mean:
+            if reads_of(site) & {*symbols, *behind}:
+                behind |= set(site.components)
             continue
+        if isinstance(d, MvNormal):
+            own = d.covariance_matrix().view(np.ndarray)
+        else:
+            variances = d.variance_in_range() if isinstance(d, Normal) else np.zeros(site.shape)
+            own = _diagonal(list(array(variances).ravel()))
+        diagonal &= len(own) == 1 or not isinstance(d, MvNormal)
+        cross = np.full((len(own), len(symbols)), constant(0.0), dtype=object)
+        read = [s for s in symbols if s in reads_of(site)]
+        if read or reads_of(site) & behind:
+            form = _affine_in(site, own_mean, read, behind)
+            if isinstance(form, NotApplicable):
+                late.append((site, form))
+                behind |= set(site.components)
+                continue
+            at = [i for i, s in enumerate(symbols) if s in set(read)]
+            matrix = form[0].view(np.ndarray)
+            own_mean = list(array(form[0] @ array([mean[i] for i in at]) + form[1]))
+            cross = matrix @ covariance[at]
+            own = own + cross[:, at] @ matrix.T
+            diagonal = False
         symbols += list(site.value.ravel())
-    n, at = len(symbols), 0
-    covariance = np.empty((n, n), dtype=object)
-    covariance[...] = [[constant(0.0)] * n] * n if n else covariance
-    for block in blocks:
-        k = len(block)
-        covariance[at : at + k, at : at + k] = block
-        at += k
-    diagonal = all(len(b) == 1 for b in blocks)
-    return GaussianBlock(tuple(symbols), array(stacked), array(covariance), diagonal)
+        mean += own_mean
+        covariance = np.block([[covariance, cross.T], [cross, own]])
+    return GaussianBlock(tuple(symbols), array(mean), array(covariance), diagonal, tuple(late))
+
+
+def _gaussian(site: Site, dirac: bool) -> bool:
+    return isinstance(site.distribution, (Normal, MvNormal, *((Dirac,) if dirac else ())))
+
+
+def _diagonal(values: list[Expr]) -> np.ndarray:
+    out = np.full((len(values), len(values)), constant(0.0), dtype=object)
+    for i, e in enumerate(values):
+        out[i, i] = e
+    return out
+
+
+def _affine_in(
+    site: Site, mean: list[Expr], read: list[Expr], behind: set[Expr]
+) -> tuple[ExprArray, ExprArray] | NotApplicable:
+    """The mean as affine in new values that are read; why it is not, or they are not all."""
+    where = site.distribution.location
+    names = ", ".join(sorted({repr(s) for s in (*read, *(reads_of(site) & behind))}))
+    if reads_of(site) & behind:
+        return NotApplicable(f"{site.name} follows from new values, of {names}", where)
+    form = affine(mean, read)
+    if isinstance(form, NotApplicable):
+        reason = f"the mean of the transition of {site.name} in the new value of {names}: "
+        return NotApplicable(reason + form.reason, where)
+    moved = [p for n, p in site.distribution.parameters.items() if n not in ("mean_", "value")]
+    if any(depends_on(e, read) for p in moved for e in p.ravel()):
+        reason = f"the spread of the transition of {site.name} depends on the new value of {names}"
+        return NotApplicable(reason, where)
+    return form
 
 
 def deterministic(sites: Sequence[Site]) -> list[Site]:
@@ -189,6 +249,11 @@ def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
     form = affine(mean, prev)
     if isinstance(form, NotApplicable):
         return form
+    if any(depends_on(e, prev) for e in q.ravel()):  # a factor of a new value, as in x * z_next
+        site = next(s for s in trace.transition.values() if reads_of(s) & set(states))
+        return NotApplicable(
+            "the states before are factors of new values", site.distribution.location
+        )
     if not trace.observations:
         return NotApplicable("there is no observation")
     observation = affine_observation(list(trace.observations.values()), states)
@@ -218,13 +283,13 @@ def _gaussian_law(
         if not isinstance(d, (Normal, MvNormal, Dirac)) and type(d) is not Flat:
             reason = f"the {role} law of {site.name} is {type(d).__name__}"
             return NotApplicable(reason, d.location)
-    block = gaussian_block(sites)
+    block = gaussian_block(sites, dirac=True)
+    if block.late:
+        return block.late[0][1]
     index = [place[s] for s in block.symbols]
     mean[index] = list(block.mean)
     if index:
         covariance[np.ix_(index, index)] = block.covariance.view(np.ndarray)
-    for s, e in component_means(deterministic(sites)).items():
-        mean[place[s]] = e
     return array(mean), array(covariance)
 
 

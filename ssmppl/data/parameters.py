@@ -173,9 +173,30 @@ def spelled(trace: Trace, theta: np.ndarray) -> str:
     return ", ".join(each) or "none"
 
 
-def unpack_states(trace: Trace, x: np.ndarray) -> dict[str, np.ndarray]:
-    """States (..., D) as name -> (..., *shape)."""
-    return unpack(trace.initial.values(), x)
+def unpack_states(trace: Trace, x: np.ndarray, started: bool = True) -> dict[str, np.ndarray]:
+    """States (..., T, D) as name -> (..., T, *shape).
+
+    started : the first of the T rows is that of the data, to which no step has led: draws of a step
+        are NaN there.
+    """
+    out = unpack(trace.initial.values(), x)
+    if started:
+        first: tuple[Any, ...] = (*(slice(None),) * (np.ndim(x) - 2), 0)
+        for name in trace.auxiliary:
+            out[name] = np.array(out[name])
+            out[name][first] = np.nan
+    return out
+
+
+def pack_states(trace: Trace, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The reverse of `unpack_states`."""
+    known = {n: values[n] for n in trace.initial}
+    for name in trace.auxiliary:
+        axis = np.ndim(known[name]) - len(trace.initial[name].shape) - 1
+        first: tuple[Any, ...] = (*(slice(None),) * axis, 0)
+        known[name] = np.array(known[name])
+        known[name][first] = 0.0
+    return pack(trace.initial.values(), known)
 
 
 def unpack_observations(trace: Trace, y: np.ndarray) -> dict[str, np.ndarray]:

@@ -289,7 +289,7 @@ class _Separator:
         parts = [self.done.get(a, {}) for a in args]
         if op in ("cholesky", "inverse"):
             return {}  # taken apart by its items
-        if op == "item":
+        if op == "item" and args[0].op != "loop":
             return self._matrix_item(node)
         if op == "logdet":
             return self._logdet(node)

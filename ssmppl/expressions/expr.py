@@ -18,6 +18,7 @@ from ssmppl.expressions import special
 from ssmppl.expressions.node import (
     BOOLEAN,
     INDEX_BY_SYMBOL,
+    SEVERAL,
     Expr,
     as_expr,
     attributed,
@@ -236,6 +237,12 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
             number, e = number / e.args[1].data, e.args[0]
         else:
             return number, e
+
+
+def several(node: Expr) -> bool:
+    """Whether the node is several numbers, a matrix, the end of a loop or what a simulator gives,
+    of which "item" nodes take one."""
+    return node.op in ("cholesky", "inverse", *SEVERAL)
 
 
 # -- walks over the graph

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import inspect
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from ssmppl.compiling import LOCK
-from ssmppl.errors import Location, ModelError, listing
+from ssmppl.errors import Location, ModelError, SSMError, listing
 from ssmppl.expressions.arrays import ExprArray
 from ssmppl.expressions.expr import Expr, recording, symbol
 from ssmppl.expressions.node import choosing
 from ssmppl.language.checks.indexes import check_indexes
+from ssmppl.language.checks.new_values import (
+    DRAW,
+    NewValues,
+    Refusal,
+    check_draws_of_step,
+    names_given,
+    stem,
+)
 from ssmppl.language.checks.rules import (
     RESERVED,
     a,
@@ -23,11 +31,11 @@ from ssmppl.language.checks.rules import (
     check_returned,
     check_states,
 )
-from ssmppl.language.model.calling import call, check_outer_names, return_location
+from ssmppl.language.model.calling import call, call_once, check_outer_names, return_location
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.trace import Site, Trace, symbols
-from ssmppl.language.user_defined.sde import started
+from ssmppl.language.user_defined.sde import noises, started
 
 
 def _time(role: str) -> str:
@@ -66,7 +74,8 @@ class _Tracer:
         self.known: dict[str, tuple[str, tuple[int, ...]]] = {}  # name -> (role, shape)
         self.owner: dict[str, Location] = {}
         self.symmetric: set[str] = set()  # parameters that are symmetric matrices
-        self.defaults: list[tuple[str, str, Location]] = []  # taken: argument, role, function
+        self.defaults: list[tuple[str, str, Callable[..., Any]]] = []  # taken: argument, role
+        self.new = NewValues()
 
     def run(self) -> Trace:
         model = self.model
@@ -86,7 +95,10 @@ class _Tracer:
             observations = self._sites("observation", "observation")
             transition = self._sites("transition", "state")
             proposal = self._sites("proposal", "state")
-        check_states(initial, transition, proposal)
+        check_draws_of_step(initial, transition, self.new)
+        draws = self.new.draws_of_step(initial, transition)
+        check_states(initial | draws, transition, proposal, draws)
+        initial |= draws
         check_dims(self.known, self.owner)
         self._check_outer_names()
         self._check_defaults()
@@ -94,7 +106,7 @@ class _Tracer:
             name=model.name,
             parameters=parameters,
             initial=initial,
-            transition={n: transition[n] for n in initial},
+            transition=self.new.ordered(initial, transition),
             observations=observations,
             proposal=proposal,
             inputs=dict(model.inputs),
@@ -102,6 +114,7 @@ class _Tracer:
             locations=locations,
             functions={r: [location_of(f) for f in fs] for r, fs in model.functions.items()},
             choices=choices,
+            auxiliary=frozenset(draws),
         )
         check_indexes(traced)
         return traced
@@ -112,12 +125,17 @@ class _Tracer:
             where = location_of(function)
             returned = self._call(function, function_role, where)
             line = return_location(function)
+            asked = returned
             returned = started(returned, function_role, function.__name__, line, self._before)
             laws = check_returned(returned, function_role, function.__name__, line)
+            handed = self.new.symbols(list(inspect.signature(function).parameters))
+            for name in noises(returned, asked):
+                self.new.read.setdefault(name, line)
+                handed |= set(symbols("state", name, laws[name].shape).ravel())
             for name, distribution in laws.items():
                 check_name(name, role, line)
                 check_law(name, distribution, function_role)
-                check_read(name, distribution, function_role, self._kinds(function_role))
+                check_read(name, distribution, function_role, self._kinds(function_role), handed)
                 if function_role != "prior":
                     distribution = independent(distribution)
                 if function_role in ("initial", "transition"):
@@ -130,12 +148,16 @@ class _Tracer:
                         "ssm.Model(...) again before its functions",
                         where=where,
                     )
-                if function_role in ("prior", "initial", "observation"):
-                    self._claim(name, role, distribution.shape, line)
+                fresh = function_role == "transition" and name not in self.known
+                if fresh or function_role in ("prior", "initial", "observation"):
+                    self._claim(name, DRAW if fresh else role, distribution.shape, line)
                     if distribution.symmetric:
                         self.symmetric.add(name)
                 value = symbols(role, name, distribution.shape, name in self.symmetric)
                 sites[name] = Site(name, role, distribution, value, where)
+            if function_role == "transition":
+                for name in laws:
+                    self.new.give(sites[name])
         return sites
 
     def _before(self, name: str) -> Any:
@@ -166,11 +188,13 @@ class _Tracer:
                     where=where,
                 )
             value = self._argument(name, role)
+            if value is None and role == "transition":
+                value = self.new.value(name, where)
             if value is None:
                 if parameter.default is not parameter.empty:
-                    self.defaults.append((name, role, where))
+                    self.defaults.append((name, role, function))
                     continue  # a plain Python constant of the user's
-                raise self._unknown(name, role, where)
+                raise self._unknown(name, role, function)
             arguments[name] = value
         return call(function, role, arguments, self._roles())
 
@@ -182,13 +206,17 @@ class _Tracer:
         for role, functions in self.model.functions.items():
             for function in functions:
                 known = self._roles() | ({} if role == "prior" else {"t": "the row number"})
+                if role == "transition":
+                    new = {f"{n}_next": f"the new value of {n!r}" for n in self.new.read}
+                    known = new | known
                 check_outer_names(function, role, known)
 
     def _check_defaults(self) -> None:
         """Refuse a default that was taken where the name is a quantity, which it would hide."""
-        for name, role, where in self.defaults:
-            if name in self.known or name == "t":
-                unknown = self._unknown(name, role, where)
+        for name, role, function in self.defaults:
+            new = role == "transition" and stem(name) in self.new.given
+            if name in self.known or name == "t" or new:
+                unknown, where = self._unknown(name, role, function), location_of(function)
                 raise ModelError(
                     f"@{role} {where.function} takes the default of {name!r}, which hides the "
                     f"model's {name!r}: {unknown.found}",
@@ -229,7 +257,28 @@ class _Tracer:
         value = symbols(kind, name, shape, name in self.symmetric)
         return value[()] if shape == () else value
 
-    def _unknown(self, name: str, role: str, where: Location) -> ModelError:
+    def _given_by(self, function: Callable[..., Any]) -> Mapping[str, Any]:
+        """The laws that a transition function would return, run on stand-ins for new values."""
+        arguments = {}
+        for name in inspect.signature(function).parameters:
+            value = self._argument(name, "transition")
+            if value is None:
+                base = stem(name) or name
+                own = symbols("state", base, self.known.get(base, ("", ()))[1])
+                value = own[()] if own.shape == () else own
+            arguments[name] = value
+        try:
+            return names_given(call_once(function, "transition", arguments, self._roles()))
+        except SSMError:
+            return {}
+
+    def _unknown(self, name: str, role: str, function: Callable[..., Any]) -> ModelError:
+        where = location_of(function)
+        roles = {n: kind for n, (kind, _) in self.known.items()}
+        steps = self.model.functions["transition"]
+        about = Refusal(steps, self._given_by, roles, self.new).of(name, role, function)
+        if about is not None:
+            return ModelError(about[0], fix=about[1], where=where)
         allowed = self._allowed(role)
         names = [n for n, (kind, _) in self.known.items() if kind in allowed]
         names += ["t"] if role != "prior" else []

@@ -169,7 +169,7 @@ def test_joining_a_reference(case):
         close(log_w, expected, f"{name} weigh_observed")
         joined = np.full(numbers.states[t].shape, np.nan)
         generated.pass_("connect", numbers.states[t - 1], reference, joined)
-        known = numbers.values(t)
+        known = numbers.values(t) | dict(zip(traced.state_symbols, reference, strict=True))
         for k, s in enumerate(traced.state_symbols):
             site = traced.transition[s.data[1]]
             expected = reference[k]

@@ -89,7 +89,7 @@ def _compiled(name):
 
 
 STATEMENTS = [
-    "for i in range(3): a += 1.0",
+    "for i in range(3): a = states",
     "while a < 1.0: a = 2.0", "x = [a]", "states[0, 0], b = 1.0, 2.0", "b = a ** 2.0", "b = c.real",
     "for i in range(1, 3): a = 1.0", "b = unknown", "b = a < 1.0 < 2.0", "other(states)",
 ]  # fmt: skip
@@ -385,3 +385,54 @@ def test_damaged_code_is_made_again(tmp_path, monkeypatch):
         assert values["c"][0] == 6.0
         (kept,) = folder.cache_folder().glob("doubled_*.o")
         kept.write_bytes(damage(kept.read_bytes()))
+
+
+SMALL_STEPS = '''
+@kernel
+def run(states, theta, c):
+    """A matrix before small steps that is read in them and after them; steps in turn, as many as
+    there are numbers of a row, and none."""
+    n = states.shape[1]
+    row = states[0]
+    for i in range(n):
+        m = inverse((2.0, theta[0], 0.3, 3.0 + row[i] * row[i]), 2)
+        large = row[i] > 0.5
+        z = 0.0 + row[i]
+        y = 0.0 + 1.0
+        for k in range(whole(theta[1])):
+            new = z * m[0, 1] + (0.1 if large else -0.2)
+            z = new + 0.01 * y
+            y = y - z
+        after = z + m[1, 1]
+        x = 0.0 + after
+        for k in range(whole(theta[2])):
+            x = 2.0 * x
+        states[1, i] = x + (1.0 if large else y)
+    for k in range(3):
+        c[k] = theta[k]
+'''
+
+
+@pytest.mark.parametrize("particles", [1, 63, 64, 65, 200])
+def test_small_steps_of_many_particles(particles):
+    theta = np.array([0.4, 5.0, 2.0])
+    states = np.zeros((2, particles))
+    states[0] = np.random.default_rng(2).normal(size=particles)
+    values = {"states": states, "theta": theta, "c": np.zeros(3)}
+    called(addresses("small_steps", SMALL_STEPS)["run"], list(values), values)
+    for x0, found in zip(states[0], states[1], strict=True):
+        m = np.linalg.inv([[2.0, 0.4], [0.3, 3.0 + x0 * x0]])
+        z, y = x0, 1.0
+        for _ in range(5):
+            z = z * m[0, 1] + (0.1 if x0 > 0.5 else -0.2) + 0.01 * y
+            y -= z
+        expected = 4.0 * (z + m[1, 1]) + (1.0 if x0 > 0.5 else y)
+        assert found == pytest.approx(expected, rel=1e-13)
+
+
+def test_small_steps_may_be_none():
+    values = {"states": np.full((2, 70), 0.7), "theta": np.array([0.4, np.nan, -3.0]),
+              "c": np.zeros(3)}  # fmt: skip
+    called(addresses("small_steps", SMALL_STEPS)["run"], list(values), values)
+    m = np.linalg.inv([[2.0, 0.4], [0.3, 3.49]])
+    np.testing.assert_allclose(values["states"][1], 0.7 + m[1, 1] + 1.0, rtol=1e-14)

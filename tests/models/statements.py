@@ -497,3 +497,33 @@ def small_steps():
 
     return declare("small_steps", prior=prior, initial=initial, transition=transition,
                    observation=observation, inputs=("torque", "dt"))  # fmt: skip
+
+
+@register
+def new_values():
+    def prior():
+        return {"a": D.Beta(2, 2), "b": D.Normal(0, sd=1), "q": D.InverseGamma(3, scale=1)}
+
+    def initial():
+        return {"x": D.Normal(np.zeros(2), sd=1), "k": D.Bernoulli(0.5), "n": D.Poisson(2)}
+
+    def shared(q, x):
+        return {"shock": D.Normal(0, variance=q), "moved": D.Poisson(np.exp(0.2 * x[0]))}
+
+    def position(x, a, shock_next):
+        return {"x": D.Normal(np.stack([a * x[0], 0.5 * x[1]]) + shock_next, sd=0.5)}
+
+    def kind(x_next, k):
+        return {"k": D.Bernoulli(np.where(k > 0, 0.8, 1 / (1 + np.exp(-x_next[1]))))}
+
+    def number(n, k_next, moved_next):
+        return {"n": D.Dirac(np.floor(0.5 * n) + k_next + moved_next)}
+
+    def observation(x, n, b):
+        return {"y": D.Normal(x[0] + b * x[1], sd=0.5), "c": D.Poisson(n + 0.5)}
+
+    model = declare("new_values", prior=prior, initial=initial, transition=shared,
+                    observation=observation)  # fmt: skip
+    for step in (position, kind, number):
+        model.transition(step)
+    return model

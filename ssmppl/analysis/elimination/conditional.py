@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ssmppl.analysis.structure import GaussianBlock, component_means, gaussian_block
+from ssmppl.analysis.new_values import reads_of
+from ssmppl.analysis.structure import component_means, gaussian_block
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import array
@@ -72,11 +73,12 @@ def gaussian(site: Site) -> bool:
 
 
 def _laws(trace: Trace) -> Iterable[tuple[Site, dict[Expr, Expr]]]:
-    """Every law that may depend on states, and the states behind its symbols."""
+    """Every law that may depend on states, and the states behind its symbols: of a transition those
+    before and new values of others."""
     prev = {previous(s): s for s in trace.state_symbols}
     own = {s: s for s in trace.state_symbols}
     for site in trace.transition.values():
-        yield site, prev
+        yield site, prev | {s: s for s in trace.state_symbols if s in reads_of(site)}
     for site in trace.observations.values():
         yield site, own
 
@@ -163,7 +165,8 @@ def _noisy(trace: Trace, linear: set[Expr]) -> set[Expr]:
     while grown:
         before = len(reached)
         for s, e in component_means(trace.transition.values()).items():
-            if s in linear and any(previous(r) in symbols_of([e]) for r in reached):
+            inside = symbols_of([e])
+            if s in linear and any(previous(r) in inside or r in inside for r in reached):
                 reached.add(s)
         grown = len(reached) > before
     return reached
@@ -172,22 +175,24 @@ def _noisy(trace: Trace, linear: set[Expr]) -> set[Expr]:
 def _coupled(trace: Trace, linear: set[Expr]) -> set[Expr]:
     """Components of x that are Gaussian jointly with z."""
     sites = [s for s in trace.transition.values() if gaussian(s)]
-    before = {previous(s) for s in linear}
+    before = {previous(s) for s in linear} | linear
     depending = {s for s, e in component_means(sites).items() if before & set(symbols_of([e]))}
     found = depending - linear
-    return found | correlated(gaussian_block(sites), linear | found) - linear
+    return found | correlated(sites, linear | found) - linear
 
 
-def correlated(block: GaussianBlock, seeds: Iterable[Expr]) -> set[Expr]:
+def correlated(sites: Iterable[Site], seeds: Iterable[Expr]) -> set[Expr]:
     """The components beside `seeds` whose noise is correlated with theirs, or with such ones."""
+    blocks = [gaussian_block([site]) for site in sites]
     found, more = set(seeds), True
     while more:
         size = len(found)
-        for i, a in enumerate(block.symbols):
-            for j, b in enumerate(block.symbols):
-                joint = block.covariance[i, j]
-                if b in found and not (joint.op == "const" and joint.data == 0.0):
-                    found.add(a)
+        for block in blocks:
+            for i, a in enumerate(block.symbols):
+                for j, b in enumerate(block.symbols):
+                    joint = block.covariance[i, j]
+                    if b in found and not (joint.op == "const" and joint.data == 0.0):
+                        found.add(a)
         more = len(found) > size
     return found - set(seeds)
 

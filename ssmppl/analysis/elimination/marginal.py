@@ -38,7 +38,13 @@ from ssmppl.analysis.elimination.moments import (
     objects,
     updated_by_channels,
 )
-from ssmppl.analysis.structure import LinearGaussian, component_means, gaussian_block, unused_name
+from ssmppl.analysis.new_values import in_order, reads_of
+from ssmppl.analysis.structure import (
+    GaussianBlock,
+    LinearGaussian,
+    gaussian_block,
+    unused_name,
+)
 from ssmppl.errors import Location, NotApplicable
 from ssmppl.expressions.algebra import affine
 from ssmppl.expressions.arrays import ExprArray, array
@@ -98,11 +104,20 @@ class _Build:
                 s = symbol("state", covariance, (i, j))
                 self.covariance[i, j] = self.covariance[j, i] = s
 
-    def marginal(self) -> Marginal:
+    def marginal(self) -> Marginal | NotApplicable:
         trace = self.trace
+        late = _block(trace.transition, self.order).late
+        if late:
+            return late[0][1]
         filtered, observations = self._observe()
         initial = self._sites(trace.initial, None)
-        transition = self._sites(trace.transition, filtered)
+        transition = in_order(self._sites(trace.transition, filtered))
+        if transition is None:
+            first = trace.transition[self.split.linear[0].data[1]].distribution
+            reason = (
+                "states that move with the linear ones, and others, read each other's new values"
+            )
+            return NotApplicable(reason, first.location)
         made = replace(
             trace, initial=initial, transition=transition, observations=observations, proposal={}
         )
@@ -181,9 +196,8 @@ class _Build:
         self, sites: Mapping[str, Site], filtered: GaussianMoments | None
     ) -> tuple[GaussianMoments, list[Expr]]:
         """The law of (coupled x, z) given the past, and which x these are."""
-        block = gaussian_block(list(sites.values()))
         if filtered is None:
-            coupled = correlated(block, self.linear)
+            coupled = correlated(sites.values(), self.linear)
             order = [*(s for s in self.trace.state_symbols if s in coupled), *self.split.linear]
             mean, q = _law(sites, order)
             return GaussianMoments(mean, q), order[: len(coupled)]
@@ -243,17 +257,23 @@ def _previous(expressions: Iterable[Expr]) -> list[Expr]:
     return substitute(expressions, earlier)
 
 
+def _block(sites: Mapping[str, Site], order: Sequence[Expr]) -> GaussianBlock:
+    """The components of `order`, Gaussian or deterministic ones, given new values of others."""
+    own = [s for s in sites.values() if gaussian(s) and set(s.components) & set(order)]
+    beside = {c for s in own for c in s.components} - set(order)
+    if any(reads_of(s) & beside for s in own):
+        own = [_restricted(s, [c for c in s.components if c in set(order)]) for s in own]
+    return gaussian_block(own, dirac=True)
+
+
 def _law(sites: Mapping[str, Site], order: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of components with Gaussian or deterministic laws, in this order."""
-    own = [s for s in sites.values() if gaussian(s) and set(s.components) & set(order)]
-    block, mean = gaussian_block(own), component_means(own)
+    block = _block(sites, order)
     place = {s: i for i, s in enumerate(block.symbols)}
-    q = np.full((len(order), len(order)), ZERO, dtype=object)
-    for i, a in enumerate(order):
-        for j, b in enumerate(order):
-            if a in place and b in place:
-                q[i, j] = block.covariance[place[a], place[b]]
-    return objects([mean[s] for s in order]), q
+    index = [place[s] for s in order]
+    return objects([block.mean[i] for i in index]), block.covariance.view(np.ndarray)[
+        np.ix_(index, index)
+    ]
 
 
 def _affine(site: Site, z: Sequence[Expr]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing, terms
+from ssmppl.analysis.new_values import resolved
 from ssmppl.analysis.proposals.twisted import GivenDraws, LookaheadModel, lookahead_model
 from ssmppl.analysis.structure import component_means
 from ssmppl.errors import NotApplicable
@@ -96,7 +97,7 @@ def noises(trace: Trace, missing: Missing) -> Noises | NotApplicable:
 
 def non_centred(sites: Sequence[Site], states: Sequence[Expr]) -> NonCentred:
     """The laws of one role by their noises."""
-    value: dict[Expr, Expr] = {s: s for s in states}
+    value: dict[Expr, Expr] = {}
     noise: list[Expr] = []
     recovered: list[Expr] = []
     log_volume, centred = constant(0.0), []
@@ -114,10 +115,11 @@ def non_centred(sites: Sequence[Site], states: Sequence[Expr]) -> NonCentred:
         value.update(zip(own, pair[0].ravel(), strict=True))
         recovered += list(pair[1].ravel())
         for s, e in zip(own, pair[1].ravel(), strict=True):
-            # de / dx is triangular within a site
+            # de / dx is triangular, within a site and from one to those that read its new value
             (slope,) = differentiate([e], s)
             log_volume = log_volume - apply("log", apply("abs", slope))
-    ordered = array([value[s] for s in states])
+    moved = resolved(value)
+    ordered = array([moved.get(s, s) for s in states])
     return NonCentred(tuple(noise), ordered, array(recovered), log_volume, tuple(centred))
 
 

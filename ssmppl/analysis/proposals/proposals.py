@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, mask_covariance, terms, where_measured
+from ssmppl.analysis.new_values import reached, reads_of, resolved
 from ssmppl.analysis.structure import (
     GaussianBlock,
     affine_observation,
@@ -47,6 +48,7 @@ from ssmppl.expressions.expr import (
     constant,
     depends_on,
     substitute,
+    symbols_of,
     topological,
 )
 from ssmppl.language.distributions import Draws
@@ -172,26 +174,18 @@ def drawn(site: Site, draws: Draws | None = None) -> ExprArray:
     return sample if inside is None else array(elementwise("where", inside, sample, math.nan))
 
 
-def resolved(values: dict[Expr, Expr]) -> dict[Expr, Expr]:
-    """Such draws in terms of x_{t-1} alone."""
-    if not any(depends_on(e, list(values)) for e in values.values()):
-        return values
-    known: dict[Expr, Expr] = {}
-    for s, e in values.items():  # what follows stands behind what it follows from
-        (known[s],) = substitute([e], known)
-    return known
-
-
 @dataclass(frozen=True)
 class Split:
     """The states of one law: Gaussian ones, and the others with their draws.
 
-    following : those of the others that are functions of the Gaussian ones of the same step.
+    others : as functions of the past, and of new values of the Gaussian ones. random : whether some
+    of them is random. following : those of them that are functions of the Gaussian ones of the same
+    step without further randomness.
     """
 
     gaussian: GaussianBlock
     others: dict[Expr, Expr]
-    random: bool  # whether some other state is random
+    random: bool
     following: dict[Expr, Expr]
 
     def insert(self, expressions: dict[Expr, Expr]) -> dict[Expr, Expr]:
@@ -202,18 +196,38 @@ class Split:
     def complete(self, draw: dict[Expr, Expr]) -> dict[Expr, Expr]:
         """The draws of all states, given those of the Gaussian ones."""
         draw = self.insert(draw)
-        after = substitute(list(self.following.values()), draw)
-        return {**self.others, **draw, **dict(zip(self.following, after, strict=True))}
+        after = {s: e for s, e in self.others.items() if depends_on(e, list(draw))}
+        moved = substitute(list(after.values()), draw)
+        return {**self.others, **draw, **dict(zip(after, moved, strict=True))}
 
 
 def split(trace: Trace, sites: list[Site]) -> Split:
-    """The initial law or the transition, taken apart."""
-    block = gaussian_block(sites)
-    own = set(block.symbols)
-    others = {s: e for s, e in draws_of(trace, sites).items() if s not in own}
-    following = {s: e for s, e in others.items() if depends_on(e, block.symbols)}
-    random = any(n.op == "random" for n in topological(others.values()))
-    return Split(block, others, random, following)
+    """The initial law or the transition, taken apart.
+
+    A Gaussian state that reads new values of others in another way than by an affine mean is
+    Gaussian given these: where it is observed they are drawn first, else it is drawn last.
+    """
+    laws = [site.distribution for site in trace.observations.values()]
+    observed = symbols_of(e for law in laws for e in law.arguments())
+    reads = {s: reads_of(site) for site in sites for s in site.components}
+    draws = draws_of(trace, sites)
+    first: set[Expr] = set()
+    while True:
+        block = gaussian_block(sites, given=first)
+        inside = set(block.symbols)
+        others = resolved({s: e for s, e in draws.items() if s not in inside})
+        following = {s: e for s, e in others.items() if depends_on(e, block.symbols)}
+        last = {s for s, e in following.items() if _random(e)}
+        before = reached(reads, last & observed) & inside
+        if not before:
+            break
+        first |= before
+    following = {s: e for s, e in following.items() if s not in last}
+    return Split(block, others, any(map(_random, others.values())), following)
+
+
+def _random(e: Expr) -> bool:
+    return any(n.op == "random" for n in topological([e]))
 
 
 # -- tier 2: locally optimal
@@ -505,7 +519,7 @@ def _user(trace: Trace, missing: Missing) -> Proposal:
     if not missing.none:
         for s in named:
             measured = seen(s) if measured is None else apply("minimum", measured, seen(s))
-    draw = dict(base.draw)
+    draw = draws_of(trace, list(trace.transition.values()))
     correction = constant(0.0)
     own: set[Expr] = set()
     for site in trace.proposal.values():
@@ -522,7 +536,7 @@ def _user(trace: Trace, missing: Missing) -> Proposal:
     return replace(
         base,
         name="user",
-        draw=draw,
+        draw=resolved(draw),
         weight=(*base.weight, *ratio),
         # no file and line: a generated text must not change with the number of a notebook's cell
         explanation=f"as written in {next(iter(trace.proposal.values())).where.function}()",

@@ -3,7 +3,7 @@
 Between two temperatures particles take random-walk steps in x_t that leave the law of density
 proportional to f(x_t | x_{t-1}) g(y_t | x_t)^temperature invariant. That needs a density of x_t,
 and room to move: components of a continuous law have both. The others stay where the transition put
-them, deterministic ones too, as long as they follow from x_{t-1} alone.
+them, deterministic ones too, as long as they follow from no state that moves in the same step.
 """
 
 from __future__ import annotations
@@ -47,14 +47,15 @@ def tempered(trace: Trace, missing: Missing) -> Tempered | NotApplicable:
     densities: list[tuple[Term, ...]] = []
     for role, sites in (("initial", trace.initial), ("transition", trace.transition)):
         known = deterministic(list(sites.values()))
+        own = {s for site in sites.values() if _continuous(site) for s in site.components}
         for site in known:
-            if any(depends_on(e, states) for e in array(site.distribution.mean()).ravel()):
+            if any(depends_on(e, list(own)) for e in array(site.distribution.mean()).ravel()):
                 return NotApplicable(
                     f"the {role} law of {site.name!r} is Dirac and follows from states of the same "
                     "step, which cannot be moved by themselves",
                     site.distribution.location,
                 )
-        moving.append({s for site in sites.values() if _continuous(site) for s in site.components})
+        moving.append(own)
         names = {site.name for site in known}
         densities.append(tuple(t for t in terms(trace, role) if t.site.name not in names))
     first, later = moving

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.analysis.density import Missing, Term, terms
+from ssmppl.analysis.new_values import resolved
 from ssmppl.analysis.proposals.proposals import (
     Proposal,
     drawn,
@@ -135,6 +136,7 @@ def noise_form(sites: list[Site], states: list[Expr]) -> NoiseForm | NotApplicab
         sample = drawn(site, GivenDraws(site.name, new)).ravel()
         value.update(zip(own, sample, strict=True))
         recovered += list(d.standard(site.value).ravel())
+    value = resolved(value)
     return NoiseForm(tuple(noise), array([value[s] for s in states]), array(recovered))
 
 

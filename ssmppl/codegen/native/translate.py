@@ -21,6 +21,7 @@ from ssmppl.codegen.native.arithmetic import (
     FLAG_ROW,
     FLOAT,
     INTEGER,
+    MATRIX,
     PLANE,
     ROW,
     SIMULATED,
@@ -39,6 +40,7 @@ FLAGS = frozenset(["free"])  # of truth values
 WHOLE = frozenset(["t", "steps"])  # parameters that are whole numbers
 STREAMS = frozenset(["rng"])  # of unsigned words, for draws
 BLOCK = 64  # particles whose small steps are made together
+Rows = tuple[tuple[str, ...], ...]
 BLOCK_OF_CALLS = 512  # likewise, where simulators are called
 KINDS = {PLANE: PLANES, STREAM: STREAMS, FLAG_ROW: FLAGS}
 
@@ -254,7 +256,7 @@ class _Function(Arithmetic):
             f"%size{k} = select i1 %few{k}, i64 %left{k}, i64 {self.size}",
         ]  # fmt: skip
         self.block, outer = f"into{k}", dict(self.names)
-        kept: dict[str, str] = {}  # name -> the buffer with its values
+        kept: dict[str, Value] = {}  # name -> the buffer with its values
         parts = _segments(node)
         for place, part in enumerate(parts):
             later = {n for p in parts[place + 1 :] for n in _read(p)}
@@ -272,7 +274,7 @@ class _Function(Arithmetic):
 
     def _step_of_block(
         self, node: ast.For, index: str, block: int, outer: dict[str, Value],
-        kept: dict[str, str], later: set[str],
+        kept: dict[str, Value], later: set[str],
     ) -> None:  # fmt: skip
         """The small steps, each of all particles of the block."""
         assert isinstance(node.iter, ast.Call)
@@ -294,7 +296,7 @@ class _Function(Arithmetic):
 
     def _call_of_block(
         self, node: ast.Assign, index: str, block: int, outer: dict[str, Value],
-        kept: dict[str, str],
+        kept: dict[str, Value],
     ) -> None:  # fmt: skip
         """One call of a simulator for all particles of the block."""
         (target,), asked = node.targets, _simulator(node.value)
@@ -306,7 +308,8 @@ class _Function(Arithmetic):
 
     def _pass(
         self, body: list[ast.stmt], index: str, block: int, outer: dict[str, Value],
-        kept: dict[str, str], later: set[str], called: tuple[ast.expr, str] | None = None,
+        kept: dict[str, Value], later: set[str],
+        called: tuple[ast.expr, str] | None = None,
     ) -> None:  # fmt: skip
         """Statements for each particle of the block; what is read later is kept in buffers.
 
@@ -318,8 +321,7 @@ class _Function(Arithmetic):
         before = {}
         read = _read(body) if called is None else _names_in(called[0])
         for name in sorted(read & set(kept)):
-            at = self.let(f"getelementptr double, ptr {kept[name]}, i64 {here}")
-            self.names[name] = before[name] = Value(FLOAT, self.load(at))
+            self.names[name] = before[name] = self._loaded(kept[name], here)
         self._statements(body)
         if called is not None:
             self._store_arguments(*called, self.size)
@@ -329,12 +331,33 @@ class _Function(Arithmetic):
             if name in outer and outer[name] == value:
                 continue
             if name not in kept:
-                kept[name] = f"%kept{len(self.buffers)}"
-                self.buffers.append((kept[name], self.size))
-            at = self.let(f"getelementptr double, ptr {kept[name]}, i64 {here}")
-            self.store(self.float(value), at)
+                kept[name] = self._buffers_for(value)
+            for buffer, number in zip(
+                _flat(kept[name].entries), _flat(self._numbers(value)), strict=True
+            ):
+                at = self.let(f"getelementptr double, ptr {buffer}, i64 {here}")
+                self.store(number, at)
         self._end_loop()
         self.here = "0"
+
+    def _numbers(self, value: Value) -> Rows:
+        """A number, or the entries of a matrix, row by row."""
+        return value.entries if value.kind == MATRIX else ((self.float(value),),)
+
+    def _buffers_for(self, value: Value) -> Value:
+        """A buffer for each number."""
+        rows = []
+        for row in self._numbers(value):
+            rows.append(tuple(f"%kept{len(self.buffers) + k}" for k in range(len(row))))
+            self.buffers += [(name, self.size) for name in rows[-1]]
+        return Value(MATRIX if value.kind == MATRIX else FLOAT, "", entries=tuple(rows))
+
+    def _loaded(self, buffers: Value, here: str) -> Value:
+        rows = tuple(
+            tuple(self.load(self.let(f"getelementptr double, ptr {b}, i64 {here}")) for b in row)
+            for row in buffers.entries
+        )
+        return Value(FLOAT, rows[0][0]) if buffers.kind == FLOAT else Value(MATRIX, "", "", rows)
 
     def _times(self, node: ast.expr) -> str:
         """How often: a whole number, or `whole(number)`."""
@@ -391,6 +414,10 @@ class _Function(Arithmetic):
         if not isinstance(call.func, ast.Name) or call.func.id not in self.known or given != own:
             raise self.unknown(call)
         self.lines.append(f"call void @{call.func.id}(ptr %words)")
+
+
+def _flat(rows: Rows) -> list[str]:
+    return [number for row in rows for number in row]
 
 
 def _segments(node: ast.For) -> list[list[ast.stmt] | ast.For | ast.Assign]:

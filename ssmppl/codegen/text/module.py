@@ -25,8 +25,7 @@ from ssmppl.codegen.text.render import (
     symbol_name,
 )
 from ssmppl.codegen.text.specialise import specialise
-from ssmppl.expressions.expr import Expr, topological
-from ssmppl.expressions.node import SEVERAL
+from ssmppl.expressions.expr import Expr, several, topological
 from ssmppl.expressions.operations import KERNELS
 from ssmppl.language.model.trace import Trace
 from ssmppl.language.user_defined.primitive import REGISTRY
@@ -219,7 +218,7 @@ class Section:
         self, roots: list[Expr], level: dict[Expr, int], fits: dict[Expr, int]
     ) -> list[Expr]:
         """The largest subexpressions that are known before the loop over particles."""
-        outer = {n: True for n, lv in level.items() if lv in (THETA, STEP) and not is_matrix(n)}
+        outer = {n: True for n, lv in level.items() if lv in (THETA, STEP) and not several(n)}
         used = topological(roots, until={**outer, **fits})
         inside = [n for n in used if n not in outer and n not in fits]
         needed = {a for n in inside for a in n.args} | set(roots)
@@ -293,7 +292,7 @@ class Section:
         roots = list(slots)
         level = depends(roots, level_of)
         if array == "s":
-            outer = {n: True for n, lv in level.items() if lv == THETA and not is_matrix(n)}
+            outer = {n: True for n, lv in level.items() if lv == THETA and not several(n)}
             used = topological(roots, until=outer)
             inside = {a for n in used if n not in outer for a in n.args}
             for node in used:
@@ -306,12 +305,6 @@ class Section:
         writer.assign([(f"{array}[{k}]", node) for node, k in slots.items()])
         text = [f"@exact\ndef {self.name(role)}({arguments}):", f'    """{doc}"""']
         return "\n".join([*text, *head, *writer.lines]) + "\n"
-
-
-def is_matrix(node: Expr) -> bool:
-    """Whether the node is a whole matrix, a loop or a simulator: several numbers, no entry of `c`
-    or `s`."""
-    return node.op in ("cholesky", "inverse", *SEVERAL)
 
 
 def _grouped(targets: Sequence[Target]) -> list[list[Target]]:

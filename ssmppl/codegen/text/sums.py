@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ssmppl.codegen.text.module import THETA, Layout, ModuleText, Section, is_matrix, level_of
+from ssmppl.codegen.text.module import THETA, Layout, ModuleText, Section, level_of
 from ssmppl.codegen.text.render import Names, Writer, depends
-from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.expr import Expr, several, topological
 
 SUM = "theta, y_data, seen_data, u_data, steps, trajectory, total"
 
@@ -69,7 +69,7 @@ def time_sum(
     needed = [n for n in used if n in outer and n in inside]
     head = layout.read(needed, names, reserved)
     writer = Writer(names, reserved, layout.trace.locations)
-    compound = [n for n in needed if n.op != "symbol" and not is_matrix(n)]
+    compound = [n for n in needed if n.op != "symbol" and not several(n)]
     targets = [(reserved.fresh(f"c{k}"), n) for k, n in enumerate(compound)]
     writer.assign(targets)
     head += writer.lines

@@ -26,14 +26,22 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, gradient
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, constant, substitute, symbol, symbols_of, topological
-from ssmppl.expressions.node import SEVERAL
+from ssmppl.expressions.expr import (
+    Expr,
+    constant,
+    several,
+    substitute,
+    symbol,
+    symbols_of,
+    topological,
+)
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.trace import Trace, previous, symbols
 
 Reaction = tuple[tuple[str, Expr], ...]  # (label of another state, its increment over the own one)
 
 _POINTS, _SMALL = 12, 1e-9  # random points of a numerical identity; its relative tolerance
+_NEAR = 0.02  # that of what moves in small steps
 _TERM = symbol("flow", "F")  # stands for a shared term
 
 
@@ -97,6 +105,8 @@ class Equations:
         for role, sites in (("state", trace.initial), ("channel", trace.observations),
                             ("parameter", trace.parameters)):  # fmt: skip
             for site in sites.values():
+                if site.name in trace.auxiliary:
+                    continue  # of which nothing is read a row later
                 for s in site.components:
                     self._add(role, s)
         for name, shape in trace.inputs.items():
@@ -128,13 +138,29 @@ class Equations:
         return scale if isinstance(scale, NotApplicable) else noise_free(d, part.index)
 
     def step(self, part: Part) -> Expr | NotApplicable:
-        """mean - x_prev: how far a state moves in a step, without noise."""
-        mean = self.mean(part)
+        """mean - x_prev: how far a state moves in a step, without noise in it nor in new values of
+        others that its law reads."""
+        mean = self._from_before(self.mean(part))
         if isinstance(mean, NotApplicable):
             return mean
         if scale_of_mean(self.law(part)) != "identity":
             return NotApplicable("its transition is no step from where it was")
         return mean - previous(part.symbol)
+
+    def _from_before(self, mean: Expr | NotApplicable) -> Expr | NotApplicable:
+        """A mean with new values that it reads replaced by their own means."""
+        if isinstance(mean, NotApplicable):
+            return mean
+        own: dict[Expr, Expr] = {}
+        for s in symbols_of(mean):
+            if s.data[0] == "state":
+                _, name, index = s.data
+                read = Part(label_of(name, index), "state", name, index, s)
+                value = self._from_before(self.mean(read))
+                if isinstance(value, NotApplicable):
+                    return NotApplicable(f"it reads the new value of {s!r}: {value.reason}")
+                own[s] = value
+        return substitute([mean], own)[0] if own else mean
 
     def position(self, part: Part) -> Part | None:
         """The state that integrates this one."""
@@ -187,8 +213,9 @@ class Equations:
     def _integrals(self) -> dict[str, str]:
         """x with mean - x_prev = a v_prev + b mean(v), a, b >= 0 the same whatever the parameters.
 
-        Which covers explicit, semi-implicit and trapezoidal steps. The parameters are varied, so
-        that -k x in the equation of v does not make v an integral of x.
+        Which covers explicit, semi-implicit and trapezoidal steps; of what moves in small steps
+        within a row it is so up to their higher orders. The parameters are varied, so that -k x in
+        the equation of v does not make v an integral of x.
         """
         states = [p for p in self.of_role("state") if isinstance(self.step(p), Expr)]
         steps = {p.label: self.step(p) for p in states}
@@ -199,7 +226,8 @@ class Equations:
             if p.label in self.copies:
                 continue
             for v in states:
-                if v is not p and all(_is_integral(p.label, v.label, s) for s in samples):
+                near = _NEAR if _in_small_steps(steps[p.label]) else _SMALL
+                if v is not p and all(_is_integral(p.label, v.label, s, near) for s in samples):
                     if out.get(v.label) != p.label:
                         out[p.label] = v.label
                     break
@@ -221,7 +249,11 @@ def _values(trace: Trace, steps: dict[str, Any], rng: Any) -> dict[str, tuple[An
     return {k: (own[k], wide + m) for k, m in zip(steps, moved, strict=True)}
 
 
-def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]]) -> bool:
+def _in_small_steps(step: Any) -> bool:
+    return any(n.op == "loop" for n in topological([step]))
+
+
+def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]], near: float) -> bool:
     moved = values[x][1]
     own, by = values[v]
     if not (np.all(np.isfinite(moved)) and np.all(np.isfinite(by))):
@@ -231,7 +263,7 @@ def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]]) -> bool:
     basis = np.stack([own, own + by], axis=1)
     coefficients, *_ = np.linalg.lstsq(basis, moved, rcond=1e-10)
     rest = moved - basis @ coefficients
-    exact = np.max(np.abs(rest)) <= _SMALL * np.max(np.abs(moved))
+    exact = np.max(np.abs(rest)) <= near * np.max(np.abs(moved))
     return bool(exact and np.all(coefficients >= -_SMALL))
 
 
@@ -323,8 +355,7 @@ def _shared(mean: Expr, others: Mapping[str, Expr]) -> list[Expr]:
             continue
         seen.add(node)
         law = any(s.data[0] == "parameter" for s in symbols_of(node))
-        number = node.op not in (*SEVERAL, "cholesky", "inverse")
-        if law and number and node in elsewhere and node is not mean:
+        if law and node in elsewhere and node is not mean and not several(node):
             out.append(node)
         stack += node.args
     return out

@@ -13,7 +13,7 @@ import linecache
 import sys
 import sysconfig
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from keyword import iskeyword
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,12 @@ import numpy as np
 
 from ssmppl.diagnosis.effects.candidate import Candidate
 from ssmppl.diagnosis.model.candidates import slug
+from ssmppl.diagnosis.model.changed_laws import substituted
 from ssmppl.diagnosis.report.spelling import Lines
 from ssmppl.errors import ArgumentError, Location
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.expr import Expr, dependent, depends_on, symbols_of, topological
+from ssmppl.language.checks.new_values import SUFFIX
 from ssmppl.language.distributions import Distribution, Flat, Mixture, Truncated, ZeroInflated
 from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
@@ -103,7 +105,10 @@ class _Writer:
     def file(self, title: str, notes: Sequence[str], known: Collection[str] = ()) -> str:
         """known : names of what needs no import."""
         laws = [self._law("prior", group) for group in self._priors()]
-        for role in ("initial", "transition", "observations", "proposal"):
+        initial = [s for s in self.trace.initial.values() if s.name not in self.trace.auxiliary]
+        laws.append(self._law("initial", initial))
+        laws += [self._law("transition", group) for group in self._steps()]
+        for role in ("observations", "proposal"):
             if group := list(getattr(self.trace, role).values()):
                 laws.append(self._law(role.rstrip("s"), group))
         body = "\n\n\n".join(_numbered(laws))
@@ -148,13 +153,35 @@ class _Writer:
             current.add(site.name)
         return groups
 
+    def _steps(self) -> list[list[Site]]:
+        """The transitions, cut where one reads the new value of one of its group, with new values
+        under the names that a transition gives them."""
+        new = {
+            s: Expr("symbol", (), ("state", s.data[1] + SUFFIX, s.data[2]))
+            for s in self.trace.state_symbols
+        }
+        groups: list[list[Site]] = []
+        current: set[Expr] = set()
+        for site in self.trace.transition.values():
+            read = {s for s in symbols_of(nodes_of(site.distribution)) if s in new}
+            if not groups or read & current:
+                groups.append([])
+                current = set()
+            for s in read:
+                self.quantities[s.data[1] + SUFFIX] = self.quantities[s.data[1]]
+            law = substituted(site.distribution, new) if read else site.distribution
+            groups[-1].append(replace(site, distribution=law))
+            current |= set(site.components)
+        return groups
+
     def _law(self, role: str, sites: list[Site]) -> str:
         roots = [e for s in sites for e in nodes_of(s.distribution)]
         used = symbols_of(roots)
         wanted = {s.data[1] for s in used}
-        known = [*self.trace.initial, *self.trace.observations, *self.trace.inputs,
+        new = [n + SUFFIX for n in self.trace.initial if role == "transition"]
+        known = [*self.trace.initial, *new, *self.trace.observations, *self.trace.inputs,
                  *self.trace.parameters, "t"]  # fmt: skip
-        arguments = [n for n in known if n in wanted]
+        arguments = list(dict.fromkeys(n for n in known if n in wanted))
         taken = {*self.names, *arguments, *self.imports, "np", "ssm", "special"}
         lines = Lines(roots, self._arrays(used), taken, self._marks(roots), _wishes(role, sites),
                       _called)  # fmt: skip

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from ssmppl.errors import ModelError, listing
-from ssmppl.expressions.arrays import ExprArray, array, inverse
+from ssmppl.expressions.arrays import array, inverse
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
+from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
     BOOLEAN,
     Expr,
@@ -28,6 +30,7 @@ from ssmppl.expressions.expr import (
     constant,
     depends_on,
     substitute,
+    symbols_in,
     user_location,
 )
 from ssmppl.expressions.loops.affine import (
@@ -35,6 +38,7 @@ from ssmppl.expressions.loops.affine import (
     applied,
     array_of,
     exponential,
+    numbers_of,
     power_and_sum,
 )
 from ssmppl.expressions.loops.loop import fresh, repeated
@@ -68,7 +72,8 @@ def integrate(
 
     Returns
     -------
-    The state at the end, of the form of `state`.
+    number or symbol, vector, or dict
+        The state at the end, of the form of `state`: numbers where all that it depends on are.
 
     Raises
     ------
@@ -105,7 +110,7 @@ def integrate(
         return substitute(rates, dict(zip(symbols, values, strict=True)))
 
     step = STEPS[method](by, symbols, time / float(steps))
-    name = getattr(rhs, "__name__", "step").strip("<>")
+    name = f"{_name(rhs)}_{method.replace('-', '_')}"
     return form.like(repeated(name, symbols, form.values, step, constant(float(steps))))
 
 
@@ -123,7 +128,8 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
 
     Returns
     -------
-    The state at the end, of the form of `state`.
+    number or symbol, vector, or dict
+        The state at the end, of the form of `state`: numbers where all that it depends on are.
 
     Raises
     ------
@@ -135,7 +141,7 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
     form = _Form.of(state)
     symbols = fresh(len(form.values))
     update = form.call(step, symbols, "state")
-    name = getattr(step, "__name__", "step").strip("<>")
+    name = _name(step)
     count = as_expr(times)
     found = affine_form(update, symbols) if linear else None
     if found is None:
@@ -146,8 +152,17 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
     return form.like(applied(power, form.values, total, [rest[i] for i in columns]))
 
 
-def expm(matrix: Any) -> ExprArray:
+def expm(matrix: Any) -> np.ndarray:
     """The exponential of a square matrix (n, n), of numbers or symbols.
+
+    Parameters
+    ----------
+    matrix : made by np.array([[...], ...]), np.block or the like.
+
+    Returns
+    -------
+    array
+        The exponential (n, n), of numbers where the matrix is.
 
     Raises
     ------
@@ -160,7 +175,9 @@ def expm(matrix: Any) -> ExprArray:
             fix="give a square matrix, made by np.array([[...], ...]) or np.block",
             where=user_location(),
         )
-    return array(exponential(values.view(np.ndarray)))
+    found = exponential(values.view(np.ndarray))
+    numbers = numbers_of(found)
+    return array(found) if numbers is None else numbers
 
 
 def _solved(rows: np.ndarray, rest: list[Expr], state: Sequence[Expr], time: Expr) -> list[Expr]:
@@ -265,21 +282,22 @@ class _Form:
         if isinstance(state, Mapping):
             parts = {name: array(value) for name, value in state.items()}
             values = [e for part in parts.values() for e in part.ravel()]
-            plain = all(e.op == "const" for e in values)
+            plain = _known(values)
             return cls(values, tuple(parts), tuple(p.shape for p in parts.values()), plain)
         whole = array(state)
         values = list(whole.ravel())
-        return cls(values, None, (whole.shape,), all(e.op == "const" for e in values))
+        return cls(values, None, (whole.shape,), _known(values))
 
     def like(self, values: Sequence[Expr]) -> Any:
         """The numbers in the form of the state."""
         parts: list[Any] = []
-        at, numbers = 0, self.plain and all(e.op == "const" for e in values)
+        at, numbers = 0, self.plain and _known(values)
+        found = evaluate(list(values)) if numbers else []
         for shape in self.shapes:
             size = math.prod(shape)
             whole: Any = array(array_of(list(values[at : at + size]), shape))
             if numbers:
-                whole = np.array([e.data for e in whole.ravel()]).reshape(shape)
+                whole = np.array(found[at : at + size], dtype=float).reshape(shape)
             parts.append(whole[()] if not shape else whole)
             at += size
         if self.names is None:
@@ -317,6 +335,16 @@ class _Form:
                 where=where,
             )
         return [_number(e, f"{name}()", where) for p in parts for e in array(p).ravel()]
+
+
+def _known(values: Sequence[Expr]) -> bool:
+    """Whether these are numbers, without symbols."""
+    return not any(symbols_in(e) for e in values)
+
+
+def _name(function: Callable[..., Any]) -> str:
+    """For people; without the number that tells two of one name apart in a file that is written."""
+    return re.sub(r"_\d+$", "", getattr(function, "__name__", "step").strip("<>"))
 
 
 def _by_name(function: Callable[..., Any], names: Sequence[str]) -> bool:

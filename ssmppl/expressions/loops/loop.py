@@ -23,13 +23,13 @@ from ssmppl.expressions.expr import (
     as_expr,
     constant,
     pack,
+    several,
     substitute,
     symbol,
     symbols_in,
     topological,
     unpack,
 )
-from ssmppl.expressions.node import SEVERAL
 
 _numbers: Iterator[int] = count()
 SWAPPING = {"add", "mul", "maximum", "minimum", "and", "or", "eq", "ne"}  # the order is no matter
@@ -138,16 +138,12 @@ def _outer(update: Sequence[Expr], symbols: Sequence[Expr]) -> list[Expr]:
             continue
         seen.add(node)
         # a condition is no number, and a loop or a matrix are several
-        if own.isdisjoint(symbols_in(node)) and node.op not in BOOLEAN and _is_number(node):
+        if own.isdisjoint(symbols_in(node)) and node.op not in BOOLEAN and not several(node):
             largest[node] = None
         else:
             waiting += node.args
     leaves = [n for n in topological(largest) if not n.args and n.op != "const"]
     return list(largest) if len(largest) <= len(leaves) else leaves
-
-
-def _is_number(node: Expr) -> bool:
-    return node.op not in (*SEVERAL, "cholesky", "inverse")
 
 
 def closed(
@@ -224,6 +220,6 @@ def _forms(update: list[Expr], change: dict[Expr, Expr]) -> list[int]:
         if node.op in SWAPPING:
             inner = tuple(sorted(inner))
         what = change.get(node, node) if not node.args else node
-        key = (id(what),) if not node.args else (node.op, repr(node.data), inner)
+        key = (id(what),) if not node.args else (node.op, node.data, inner)
         form[node] = known.setdefault(key, len(known))
     return [form[e] for e in update]

@@ -3,7 +3,8 @@
 x' = f(x, a) has the slopes S' = J S + P da, with J and P the derivatives of f in x and in a
 (forward sensitivities; Griewank and Walther 2008, chapter 3). The slopes in all symbols of one kind
 (the states, the parameters) are moved by one loop: they share the values, and who asks for one of
-them nearly always asks for the others too.
+them nearly always asks for the others too. Where these are more than the loop's arguments, it is
+the slopes in the arguments.
 """
 
 from __future__ import annotations
@@ -23,19 +24,43 @@ def loop_slopes(node: Expr, wanted: Expr, differentiate: Differentiate) -> list[
         return _slopes(node, (wanted,), differentiate)[0]
     kind = wanted.data[0]
     alike = [s for s in symbols_of(node.args) if s.data[0] == kind]
-    together = tuple(sorted(alike, key=lambda s: (s.data[1], s.data[2])))
-    place = {s: k for k, s in enumerate(together)}
+    place = {s: k for k, s in enumerate(sorted(alike, key=lambda s: (s.data[1], s.data[2])))}
     if wanted not in place:
         return [constant(0.0)] * node.data.states
-    return _slopes(node, together, differentiate)[place[wanted]]
+    if len(place) <= sum(a.op != "const" for a in node.args[:-1]):
+        return _slopes(node, tuple(place), differentiate)[place[wanted]]
+    out = [constant(0.0)] * node.data.states
+    for slopes, own in zip(_in_arguments(node, differentiate), node.args, strict=False):
+        (moved,) = differentiate([own], wanted)
+        out = [total + slope * moved for total, slope in zip(out, slopes, strict=True)]
+    return out
+
+
+def _slopes(node: Expr, wanted: tuple[Expr, ...], differentiate: Differentiate) -> list[list[Expr]]:
+    """In each of these symbols."""
+    first, fixed, _ = parts(node)
+    begun = [tuple(differentiate(first, w)) for w in wanted]
+    outer = [tuple(differentiate(fixed, w)) for w in wanted]
+    return _moved(node, tuple(begun), tuple(outer), differentiate)
+
+
+def _in_arguments(node: Expr, differentiate: Differentiate) -> list[list[Expr]]:
+    """In each argument but the number of times: what does for any number of symbols."""
+    n, m = node.data.states, node.data.fixed
+    unit = [[constant(float(i == k)) for i in range(n + m)] for k in range(n + m)]
+    begun, outer = [tuple(u[:n]) for u in unit], [tuple(u[n:]) for u in unit]
+    return _moved(node, tuple(begun), tuple(outer), differentiate)
 
 
 @lru_cache(maxsize=64)
-def _slopes(node: Expr, wanted: tuple[Expr, ...], differentiate: Differentiate) -> list[list[Expr]]:
+def _moved(
+    node: Expr, begun: tuple[tuple[Expr, ...], ...], outer: tuple[tuple[Expr, ...], ...],
+    differentiate: Differentiate,
+) -> list[list[Expr]]:  # fmt: skip
+    """The slopes at the end in some directions (directions, n), from those of the values to begin
+    with (directions, n) and of what stays (directions, m)."""
     first, fixed, times = parts(node)
-    n, m, size = node.data.states, node.data.fixed, len(wanted)
-    begun = [differentiate(first, w) for w in wanted]
-    outer = [differentiate(fixed, w) for w in wanted]
+    n, m, size = node.data.states, node.data.fixed, len(begun)
     update = list(node.data.update)
     in_state = [differentiate(update, moving(k)) for k in range(n)]
     in_held = [differentiate(update, held(j)) for j in range(m)]

@@ -29,6 +29,7 @@ FITTED, ROUNDS = 256, 3  # draws behind a fit of the proposal, and fits
 ENOUGH = 40.0  # effective draws from which moments are taken
 AHEAD = 128  # steps that are made together
 ROUND_START, SPREAD, CLIMBS = 47, 2.0, 3  # points looked at for a start, their spread, climbs
+PREPARING = 25  # passes over the data before the chains begin, most often
 LEAST = 1e-8  # of an eigenvalue of the proposal's scale, as a correlation
 BURNT = 50  # steps of the warmup that are made: starts are drawn from the fitted posterior
 

@@ -308,17 +308,19 @@ def backward_pass(
         x = paths[:, t + 1].T
         uniforms, chosen = np.empty(trajectories), np.empty(trajectories, dtype=np.int64)
         fill_uniform(stream, uniforms)
-        with np.errstate(**WITHOUT_WEIGHT):
-            step = law.step(t)
-        width = max(1, MOST_PAIRS // n)
-        for first in range(0, trajectories, width):
-            part = slice(first, min(first + width, trajectories))
+        width, earlier = max(1, MOST_PAIRS // n), np.empty_like(z)
+        for own in law.alike(x):
             with np.errstate(**WITHOUT_WEIGHT):
-                log_w = step.log_weights(x[:, part], z[:, part])
-            if not np.all(np.isfinite(log_w.max(axis=0))):
-                raise pair_failure(problem, theta, NAN, t, experiment)
-            chosen[part] = _drawn_indices(log_w, uniforms[part])
-        z = step.draw(x, z, chosen, stream)
+                step = law.step(t, x[:, own[0]])
+            for first in range(0, len(own), width):
+                part = own[first : first + width]
+                with np.errstate(**WITHOUT_WEIGHT):
+                    log_w = step.log_weights(x[:, part], z[:, part])
+                if not np.all(np.isfinite(log_w.max(axis=0))):
+                    raise pair_failure(problem, theta, NAN, t, experiment)
+                chosen[part] = _drawn_indices(log_w, uniforms[part])
+            earlier[:, own] = step.draw(x[:, own], z[:, own], chosen[own], stream)
+        z = earlier
         paths[:, t], linear[:, t] = system.particles[t][:, chosen].T, z.T
     return paths, linear
 
@@ -346,7 +348,19 @@ class _Law:
             t for t in terms(found.trace, "transition")
             if not moments & set(t.site.components) and not isinstance(t.site.distribution, Dirac)
         ]  # fmt: skip
+        forms = (found.given.A, found.given.b, found.given.Q)
+        inside = symbols_of(e for f in forms for e in f.ravel())
+        self.read = [i for i, s in enumerate(found.trace.state_symbols) if s in inside]
         self._rows, self._moments = range(0), (np.empty(0), np.empty(0))
+
+    def alike(self, x: np.ndarray) -> list[np.ndarray]:
+        """Indices of trajectories, of new values (D', M), under the same law of (coupled x, z): all
+        of them, or where it reads new values, those that agree in these."""
+        if not self.read:
+            return [np.arange(x.shape[1])]
+        _, which = np.unique(x[self.read], axis=1, return_inverse=True)
+        order = np.argsort(which.ravel(), kind="stable")
+        return np.split(order, np.flatnonzero(np.diff(which.ravel()[order])) + 1)
 
     def filtered(self, t: int) -> tuple[np.ndarray, np.ndarray]:
         """Means (n, N) and covariances (n, n, N) of z_t given y_t."""
@@ -360,17 +374,19 @@ class _Law:
         at = t - self._rows.start
         return self._moments[0][at], self._moments[1][at]
 
-    def step(self, t: int) -> _Step:
-        """The law of row t + 1 given the particles of row t."""
+    def step(self, t: int, x: np.ndarray) -> _Step:
+        """The law of row t + 1 given the particles of row t, and new values (D',) where it reads
+        any."""
         given, n = self.found.given, self.system.particles.shape[2]
         row = slice(t + 1, t + 2)
         values = {s: at_rows(v, row) for s, v in self.values.items()}
         for i, s in enumerate(self.found.trace.state_symbols):
             values[previous(s)] = self.system.particles[t, i][:, None]
+        given_new = {self.found.trace.state_symbols[i]: x[i] for i in self.read}
         k = len(self.found.split.coupled)
         a_form = given.A[:, k:]
         flat = [*a_form.ravel(), *given.b, *given.Q.ravel()]
-        found = [np.broadcast_to(v, (n, 1))[:, 0] for v in evaluate(flat, values)]
+        found = [np.broadcast_to(v, (n, 1))[:, 0] for v in evaluate(flat, values | given_new)]
         size = len(given.b)
         a = np.reshape(found[: a_form.size], (*a_form.shape, n))
         b = np.reshape(found[a_form.size : a_form.size + size], (size, n))

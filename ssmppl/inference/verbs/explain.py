@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,7 @@ from ssmppl.codegen.modules.program import Program, compile_trace
 from ssmppl.data import Experiment, bind, unread
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import NotApplicable
+from ssmppl.expressions.expr import Expr
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.chains.sampling import TRAJECTORIES, PlanRows, reason_and_line
 from ssmppl.inference.particles.deterministic import Deterministic
@@ -100,12 +101,15 @@ class Plan:
             Of each part its title, and its rows: what, and how.
         """
         t = self.trace
+        first = {n: s for n, s in t.initial.items() if n not in t.auxiliary}
         out = [
             ("Priors", _laws(t.parameters)),
-            ("Initial law, t = 1", _laws(t.initial)),
-            ("Transition, x_prev to x", _laws(t.transition)),
+            ("Initial law, t = 1", _laws(first)),
+            ("Transition, x_prev to x", _laws(t.transition, t.auxiliary)),
             ("Observation", _laws(t.observations)),
         ]
+        if loops := _loops(t):
+            out.append(("Small steps", loops))
         if t.inputs:
             out.append(("Inputs", [(n, "scalar" if not s else f"shape {s}")
                                    for n, s in t.inputs.items()]))  # fmt: skip
@@ -232,13 +236,38 @@ def _integrated(split: ConditionallyLinear) -> str:
     )
 
 
-def _laws(sites: dict[str, Site]) -> list[tuple[str, str]]:
+def _laws(sites: dict[str, Site], auxiliary: Collection[str] = ()) -> list[tuple[str, str]]:
     rows = []
     for s in sites.values():
         rows.append((s.name, _cut(f"~ {s.distribution!r}")))
+        if s.name in auxiliary:
+            rows.append(("", "a draw of the step, without a value at the first row"))
         if s.distribution.approximation:
             rows.append(("", s.distribution.approximation))
     return rows
+
+
+def _loops(trace: Trace) -> list[tuple[str, str]]:
+    """What the names of loops in the laws stand for, and of how many steps they are."""
+    sites = (trace.parameters, trace.initial, trace.transition, trace.observations)
+    laws = [s.distribution for group in sites for s in group.values()]
+    waiting = [e for law in reversed(laws) for e in reversed(law.expressions())]
+    found, seen = dict[str, str](), set[Expr]()
+    while waiting:
+        node = waiting.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        if node.op != "loop":
+            waiting += reversed(node.args)
+            continue
+        times, name = node.args[-1], node.data.name
+        count = f"{times.data:.0f}" if times.op == "const" else f"{times!r}"
+        text = (
+            "the exponential of a matrix" if name == "expm" else f"{name}, repeated {count} times"
+        )
+        found[repr(node).partition("(")[0]] = text
+    return list(found.items())
 
 
 def _cut(law: str) -> str:
@@ -318,7 +347,9 @@ def _labels(trace: Trace, experiments: Sequence[Experiment]) -> tuple[tuple[str,
     ends = ", ".join(f"{label_text(t[0])} to {label_text(t[-1])}" for t in times)
     uneven = next((found for t in times if (found := spacing(t))), "")
     if trace.time_step is not None:
-        uneven = f"{trace.time_step[0]} is the time from each row to the next"
+        name, unit = trace.time_step
+        unit = f", in {unit}" if any(t.dtype.kind == "M" for t in times) else ""
+        uneven = f"{name} is the time from each row to the next{unit}"
     return (("labels", ends), *([("steps", uneven)] if uneven else []))
 
 

@@ -424,6 +424,8 @@ def _probabilities(
         values, index = np.unique(columns, return_inverse=True)
         shares = np.eye(len(values))[index.reshape(columns.shape)]  # (K, size, values)
         chances = np.einsum("tk,kdv->tdv", law, shares).reshape(-1, *site.shape, len(values))
+        if name in exact.trace.auxiliary:
+            chances[0] = np.nan
         out[f"{name}_probability"] = xr.DataArray(
             chances[None], dims=(*dataset[name].dims, f"{name}_value"),
             coords={**dataset[name].coords, f"{name}_value": values},

@@ -20,7 +20,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
-from ssmppl.data.parameters import pack
+from ssmppl.data.parameters import pack, pack_states
 from ssmppl.data.time_steps import lengths
 from ssmppl.data.times import label_text, spacing
 from ssmppl.errors import ArgumentError
@@ -122,6 +122,7 @@ def forecast(
         f"{len(paths)} draws of {steps} rows", len(paths) * steps * (d + k), "ask for fewer rows"
     )
     u = np.concatenate([past.u, future])
+    _check_after(past.time, labels)  # before a time step between them is made of it
     _set_step_between(traced, u, past.time, labels)
     check_defined(traced, source, u, after=rows)
     feedback = feeds_back(traced)
@@ -129,10 +130,9 @@ def forecast(
     program, root = compile_trace(traced, Missing(none=True)), seed_sequence(seed)
     states, observed = _continued(program, theta, paths, y, u, feedback, root)
     check_finite(traced, states, observed)
-    _check_after(past.time, labels)
     if labels is None:
         labels = after(past.time, steps, zone)
-    over_time = unpack_states(traced, states) | unpack_observations(traced, observed)
+    over_time = unpack_states(traced, states, started=False) | unpack_observations(traced, observed)
     return to_dataset(
         over_time | unpack_parameters(traced, theta),
         over_time=set(over_time),
@@ -210,9 +210,8 @@ def _at_known(
         model, data, parameters, proposal=proposal, trajectories=n, quantiles=(), seed=seed
     )
     one = found[which - 1] if isinstance(found, list) else found
-    paths = pack(
-        problem.trace.initial.values(), {name: one[name].values for name in problem.trace.initial}
-    )
+    trace = problem.trace
+    paths = pack_states(trace, {name: one[name].values for name in trace.initial})
     theta = np.tile(check_parameters(problem.trace, parameters), (n, 1))
     time = np.arange(1, e.steps + 1) if e.time is None else e.time
     told = {k: one.attrs[k] for k in ("approximate", "method", "method_chosen") if k in one.attrs}

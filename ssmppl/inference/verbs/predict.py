@@ -21,7 +21,7 @@ from ssmppl.data import (
     unpack_parameters,
     unpack_states,
 )
-from ssmppl.data.parameters import pack
+from ssmppl.data.parameters import pack, pack_states
 from ssmppl.errors import ArgumentError, ModelError, listing
 from ssmppl.inference.run.labels import Labels, check_names, observes
 from ssmppl.inference.run.prior import draw_prior
@@ -106,7 +106,7 @@ def states_of(trace: Trace, posterior: Any, mark: str, axis: str) -> np.ndarray 
     }
     if len(values) < len(trace.initial):
         return None
-    return pack(trace.initial.values(), values)
+    return pack_states(trace, values)
 
 
 def _drawn(posterior: Any, name: str, shape: tuple[int, ...], over: tuple[str, ...]) -> np.ndarray:

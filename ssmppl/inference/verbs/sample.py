@@ -16,6 +16,8 @@ from ssmppl.analysis.structure import singular_covariance
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
+from ssmppl.inference.batched.independence import AHEAD, PREPARING
+from ssmppl.inference.batched.reckoning import reckon
 from ssmppl.inference.chains import gibbs, ismcmc, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.gibbs_updates import plan_updates
 from ssmppl.inference.chains.sampling import GO_ON, SamplingMethod, SamplingSetup
@@ -154,6 +156,9 @@ def sample(
     fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     space = space_of(problem, fixed_values, near)
+    if method is None:
+        passes = PREPARING + chains * (draws * thin / AHEAD) * (1 + states)
+        reckon("sample", problem, space.theta, passes, progress)
     chosen, reason = (method, "") if method is not None else _chosen(space, fixed_values)
     sampling_method = METHODS.get(type(chosen))
     if sampling_method is None:

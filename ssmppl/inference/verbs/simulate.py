@@ -143,10 +143,15 @@ def check_finite(traced: Trace, states: np.ndarray, observations: np.ndarray) ->
         bad = np.argwhere(np.isnan(values))
         if len(bad):
             draw, t, k = bad[np.argmin(bad[:, 1])]
+            if t and sites is traced.transition:  # what others read in the step comes before them
+                order = [c for site in sites.values() for c in site.components]
+                place = {c: i for i, c in enumerate(order)}
+                at_fault = np.flatnonzero(np.isnan(values[draw, t]))
+                k = min(at_fault, key=lambda i: place[symbols[i]])
             site = (traced.initial if t == 0 and sites is traced.transition else sites)[
                 symbols[k].data[1]
             ]
-            now = traced.state_symbols if sites is traced.observations else []
+            now = traced.state_symbols if t or sites is traced.observations else []
             before = traced.state_prev_symbols if t else []
             known = dict(zip(now, states[draw, t], strict=False))
             known |= dict(zip(before, states[draw, t - 1], strict=False))

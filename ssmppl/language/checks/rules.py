@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from ssmppl.errors import Location, ModelError, listing
-from ssmppl.expressions.expr import symbols_of, to_text, topological
+from ssmppl.expressions.expr import Expr, symbols_of, to_text, topological
 from ssmppl.language.distributions import Dirac, Distribution
 
 RESERVED = {
@@ -149,10 +149,16 @@ def check_law(name: str, distribution: Distribution, role: str) -> None:
             )
 
 
-def check_read(name: str, distribution: Distribution, role: str, kinds: Collection[str]) -> None:
-    """Refuse symbols of other kinds than the arguments of the function: another law kept them."""
+def check_read(
+    name: str, distribution: Distribution, role: str, kinds: Collection[str],
+    handed: Collection[Expr] = (),
+) -> None:  # fmt: skip
+    """Refuse symbols of other kinds than the arguments of the function: another law kept them.
+
+    handed : further symbols, in the new values that it asked for.
+    """
     for s in symbols_of(distribution.arguments()):
-        if s.data[0] not in kinds:
+        if s.data[0] not in kinds and s not in handed:
             raise ModelError(
                 f"the law of {name!r} reads {to_text(s)}, a symbol of another law than this "
                 f"@{role}",
@@ -163,9 +169,13 @@ def check_read(name: str, distribution: Distribution, role: str, kinds: Collecti
 
 
 def check_states(
-    initial: Mapping[str, Any], transition: Mapping[str, Any], proposal: Mapping[str, Any]
-) -> None:
-    """Every state has its laws, and they agree; arguments are sites by name."""
+    initial: Mapping[str, Any], transition: Mapping[str, Any], proposal: Mapping[str, Any],
+    draws: Collection[str] = (),
+) -> None:  # fmt: skip
+    """Every state has its laws, and they agree; arguments are sites by name.
+
+    draws : names of those that are draws of a step: their initial laws are no user's.
+    """
     for name, site in initial.items():
         if name not in transition:
             raise ModelError(
@@ -176,9 +186,11 @@ def check_states(
             )
     for role, sites in (("transition", transition), ("proposal", proposal)):
         for name, site in sites.items():
+            if role == "transition" and (name in draws or name not in initial):
+                continue
             _check_against_initial(role, name, site, initial)
     if proposal:
-        _check_proposal(transition, proposal)
+        _check_proposal({n: transition[n] for n in initial}, proposal, draws)
 
 
 def _check_against_initial(role: str, name: str, site: Any, initial: Mapping[str, Any]) -> None:
@@ -208,12 +220,14 @@ def _check_against_initial(role: str, name: str, site: Any, initial: Mapping[str
         )
 
 
-def _check_proposal(transition: Mapping[str, Any], proposal: Mapping[str, Any]) -> None:
+def _check_proposal(
+    transition: Mapping[str, Any], proposal: Mapping[str, Any], draws: Collection[str]
+) -> None:
     some = next(iter(proposal.values()))
     for name, site in transition.items():
         fixed = isinstance(site.distribution, Dirac)
         if name not in proposal:
-            if fixed:
+            if fixed or name in draws:
                 continue
             raise ModelError(
                 f"@proposal gives no law for the state {name!r}",

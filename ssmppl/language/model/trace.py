@@ -11,6 +11,11 @@ observation       y_t;  seen: 1 where that component of y_t was measured
 observation_prev  y_{t-1}, where a transition names a channel
 input, input_prev u_t and u_{t-1};  time, time_prev: the row number, from 1
 ================  ============================================================
+
+The law of a transition may read new values too, `NAME_next` in the user's function: those of the
+noisy components that stand before it in `Trace.transition`, by their symbols of kind "state"; of a
+deterministic state it holds the value's own expression. So p(x_t | x_{t-1}) is the product of the
+laws in that order.
 """
 
 from __future__ import annotations
@@ -58,7 +63,10 @@ class Site:
 class Trace:
     """The traced model; see the module's docstring for its symbols.
 
+    transition : in an order in which each law reads new values of earlier ones only.
     choices : element of an array that a symbol chose -> (the index, the number of elements).
+    auxiliary : names of the states that are draws of a step: read by later laws of the same step
+        only. At the first row, where no step has led to, they are 0.
     time_step : the input that is the time to the next row, and its unit where times are dates.
     """
 
@@ -72,6 +80,7 @@ class Trace:
     locations: dict[Expr, Location]
     functions: dict[str, list[Location]] = field(default_factory=dict)
     choices: dict[Expr, tuple[Expr, int]] = field(default_factory=dict)
+    auxiliary: frozenset[str] = frozenset()
     time_step: tuple[str, str] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:

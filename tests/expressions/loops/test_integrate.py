@@ -92,6 +92,24 @@ def test_forms_of_a_state():
     assert list(single) == ["q", "v"]
 
 
+@pytest.mark.parametrize("method", ORDERS)
+@pytest.mark.parametrize("steps", [1, 3])
+def test_of_numbers_there_are_numbers(method, steps):
+    def swing(q, v):
+        return {"q": v, "v": 0.7 - 9.0 * np.sin(q) - 0.4 * v}
+
+    begin = {"q": 0.5, "v": -1.0}
+    found = ssm.integrate(swing, begin, 0.37, method=method, steps=steps)
+    traced = ssm.integrate(swing, {"q": Q, "v": V}, 0.37, method=method, steps=steps)
+    assert all(isinstance(e, float) for e in found.values())
+    np.testing.assert_allclose(
+        list(found.values()), evaluate(list(traced.values()), AT), rtol=1e-13
+    )
+    matrix = np.array([[0.0, 1.0], [-2.0, -0.3]])
+    assert ssm.expm(matrix).dtype == float
+    np.testing.assert_allclose(ssm.expm(matrix), linalg.expm(matrix), rtol=1e-14)
+
+
 def test_one_step_and_a_hundred_are_as_long():
     def length(steps):
         new = ssm.integrate(swing, {"q": Q, "v": V}, 0.5, steps=steps)

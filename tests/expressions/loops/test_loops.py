@@ -9,6 +9,8 @@ from scipy import linalg
 import ssmppl as ssm
 from ssmppl.analysis.bounds import interval
 from ssmppl.analysis.lambdify import python_function
+from ssmppl.errors import NotApplicable
+from ssmppl.expressions.algebra import separate
 from ssmppl.expressions.calculus import differentiate, gradient, hessian, reverse_gradient
 from ssmppl.expressions.evaluate import evaluate
 from ssmppl.expressions.expr import (
@@ -206,7 +208,7 @@ def test_the_exponential_of_a_matrix(size, scale):
     expected = linalg.expm(numbers)
     size_of = np.abs(expected).max()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * size_of * (1 + scale))
-    np.testing.assert_allclose(evaluate(ssm.expm(numbers)), expected, rtol=1e-15)
+    np.testing.assert_allclose(ssm.expm(numbers), expected, rtol=1e-15)
     direction = np.zeros((size, size))
     direction[0, size - 1] = 1.0
     slope = differentiate(list(ssm.expm(entries).ravel()), entries[0, size - 1])
@@ -230,3 +232,26 @@ def test_the_number_of_times_may_be_a_symbol():
         evaluate(found, values), [0.4, expected[3], 0.4, 0.4, expected[1]], rtol=1e-14
     )
     assert isinstance(found, Expr)
+
+
+def test_two_functions_of_one_name_are_two():
+    def made(factor):
+        @ssm.primitive
+        def push(x):
+            return factor * x
+
+        return push
+
+    first, second = made(2.0), made(3.0)
+    s = fresh(2)
+    values = repeated("made", s, [X, X], [first(s[0]), second(s[1])], 3)
+    np.testing.assert_allclose(evaluate(values, AT), [0.4 * 8, 0.4 * 27])
+
+
+def test_a_loop_of_the_block_alone_is_one_of_its_functions():
+    end = ssm.integrate(lambda x: -(x**3), X, 0.5, steps=3)
+    found = separate(A * end + B, [X])
+    assert not isinstance(found, NotApplicable)
+    assert evaluate(found.assemble(), AT) == pytest.approx(evaluate(A * end + B, AT), rel=1e-15)
+    mixed = ssm.integrate(lambda x: -A * x**3, X, 0.5, steps=3)
+    assert isinstance(separate(mixed, [X]), NotApplicable)
