@@ -4,15 +4,15 @@ and by `mujoco.sysid`.
     python bench/arms.py [--records 20] [--rows 500] [--threads 1]
 
 Each record is simulated by the model itself: ten steps of 2 ms a row, independent torque noise of
-0.3 N m in each row on both joints, encoders with 2 mrad of noise. ssmppl maximises the likelihood of
-the extended Kalman filter, of two dampings, a mass and the sd of the noise. `mujoco.sysid` (extra
-`mujoco[sysid]`), told the true initial state, fits dampings and mass by least squares over the whole
-record at once, which takes all that the arm does for an effect of parameters and encoders; its
+0.3 N m in each row on both joints, encoders with 2 mrad of noise. ssmppl maximises the likelihood
+of the extended Kalman filter, of two dampings, a mass and the sd of the noise. `mujoco.sysid`
+(extra `mujoco[sysid]`), told the true initial state, fits dampings and mass by least squares over
+the whole record at once, which takes all that the arm does for an effect of parameters and encoders; its
 intervals are those that it computes from the residuals.
 
 Printed for both: mean and root mean square of the errors, in how many of the records an interval of
 two standard errors holds the truth, and the median time of a record. Two standard errors hold it in
-95 of 100, of 20 records in 17 or more with a probability of 0.98.
+95 of 100, of 20 records in 17 or more with a probability of 0.99.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def by_ssmppl(arm: ssm.Model, data: Mapping[str, np.ndarray]) -> tuple[dict, dic
 
 
 def by_sysid(data: Mapping[str, np.ndarray]) -> tuple[dict, dict]:
-    """Least squares of MuJoCo's own toolbox; half its 95% interval over the quantile is the error."""
+    """Least squares of MuJoCo's own toolbox; standard errors of its covariance."""
     import mujoco
     from mujoco import sysid
 
