@@ -7,8 +7,8 @@ Each record is simulated by the model itself: ten steps of 2 ms a row, independe
 0.3 N m in each row on both joints, encoders with 2 mrad of noise. ssmppl maximises the likelihood
 of the extended Kalman filter, of two dampings, a mass and the sd of the noise. `mujoco.sysid`
 (extra `mujoco[sysid]`), told the true initial state, fits dampings and mass by least squares over
-the whole record at once, which takes all that the arm does for an effect of parameters and encoders; its
-intervals are those that it computes from the residuals.
+the whole record at once, which takes all that the arm does for an effect of parameters and
+encoders; its intervals are those that it computes from the residuals.
 
 Printed for both: mean and root mean square of the errors, in how many of the records an interval of
 two standard errors holds the truth, and the median time of a record. Two standard errors hold it in

@@ -26,7 +26,7 @@ check_built = script(DOCS / "check_built.py")
 
 def test_every_public_name_is_in_the_reference():
     named = set(re.findall(r"(?m)^ {3}([\w.]+)$", (DOCS / "api.md").read_text(encoding="utf-8")))
-    # the catalogue stands there under its class, the module of plots under its functions
+    # the catalogue stands there under its class, modules under their functions
     assert set(ssm.__all__) - named == {"effects", "plots", "simulators"}
 
 

@@ -301,6 +301,11 @@ def item(node: Expr, i: int, j: int) -> Expr:
     return Expr("item", (node,), (i, j))
 
 
+def is_tuple(node: Expr) -> bool:
+    """Whether the node is a call that gives several numbers, which "item" nodes (i,) take apart."""
+    return node.op == "call" and getattr(node.data, "outputs", 1) > 1
+
+
 def as_expr(value: Any) -> Expr:
     """`value` as a node: nodes as they are, numbers as constants; TypeError for all else."""
     if isinstance(value, Expr):
