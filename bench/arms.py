@@ -12,7 +12,7 @@ encoders; its intervals are those that it computes from the residuals.
 
 Printed for both: mean and root mean square of the errors, in how many of the records an interval of
 two standard errors holds the truth, and the median time of a record. Two standard errors hold it in
-95 of 100, of 20 records in 17 or more with a probability of 0.98.
+95 of 100, of 20 records in 17 or more with a probability of 0.99.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def by_ssmppl(arm: ssm.Model, data: Mapping[str, np.ndarray]) -> tuple[dict, dic
 
 
 def by_sysid(data: Mapping[str, np.ndarray]) -> tuple[dict, dict]:
-    """Least squares of MuJoCo's own toolbox; the error from half its 95% interval."""
+    """Least squares of MuJoCo's own toolbox; standard errors of its covariance."""
     import mujoco
     from mujoco import sysid
 
