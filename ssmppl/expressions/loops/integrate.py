@@ -72,7 +72,8 @@ def integrate(
 
     Returns
     -------
-    The state at the end, of the form of `state`.
+    number or symbol, vector, or dict
+        The state at the end, of the form of `state`: numbers where all that it depends on are.
 
     Raises
     ------
@@ -127,7 +128,8 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
 
     Returns
     -------
-    The state at the end, of the form of `state`.
+    number or symbol, vector, or dict
+        The state at the end, of the form of `state`: numbers where all that it depends on are.
 
     Raises
     ------
@@ -153,9 +155,14 @@ def repeat(step: Callable[..., Any], state: Any, times: Any, *, linear: bool = T
 def expm(matrix: Any) -> np.ndarray:
     """The exponential of a square matrix (n, n), of numbers or symbols.
 
+    Parameters
+    ----------
+    matrix : made by np.array([[...], ...]), np.block or the like.
+
     Returns
     -------
-    (n, n), numbers where all of the matrix are.
+    array
+        The exponential (n, n), of numbers where the matrix is.
 
     Raises
     ------

@@ -44,6 +44,16 @@ METHODS = ("linearised", "euler-maruyama")
 class SDE:
     """The law of a state that moves by dx = drift(x) dt + diffusion(x) dW until the next row.
 
+    In a `@transition` function it stands as the law of the state by whose name it is returned, and
+    starts from that state's value. The law is Gaussian: the exact one where the drift is linear and
+    the diffusion does not depend on the state (then `steps` does not matter), else an approximation
+    that is the better the shorter `dt` is; `explain` says which.
+
+    With `method="euler-maruyama"` the state moves in small steps with a noise each, x + f h + G
+    sqrt(h) e, which is the better the more steps there are, whatever the law's shape. The noises of
+    all but the last step are drawn within the row, as a quantity of their own, `NAME_noise`; the
+    last one's is the law's. For particles; each step adds to the model's text.
+
     Parameters
     ----------
     drift : function of the state, a number or a vector (d,), that gives one of the same form.
@@ -54,16 +64,6 @@ class SDE:
     steps : of the integration of mean and covariance, by the classical Runge-Kutta method; or the
         small steps of Euler and Maruyama.
     method : "linearised" or "euler-maruyama".
-
-    In a `@transition` function it stands as the law of the state by whose name it is returned, and
-    starts from that state's value. The law is Gaussian: the exact one where the drift is linear and
-    the diffusion does not depend on the state (then `steps` does not matter), else an approximation
-    that is the better the shorter `dt` is; `explain` says which.
-
-    With `method="euler-maruyama"` the state moves in small steps with a noise each, x + f h + G
-    sqrt(h) e, which is the better the more steps there are, whatever the law's shape. The noises of
-    all but the last step are drawn within the row, as a quantity of their own, `NAME_noise`; the
-    last one's is the law's. For particles; each step adds to the model's text.
 
     Raises
     ------
@@ -109,7 +109,19 @@ class SDE:
         self.steps, self.method = int(steps), method
 
     def laws(self, name: str, before: Any) -> dict[str, Distribution]:
-        """The laws by name, that of the state last, whose value at the row before is given."""
+        """The laws at a row, from the state's value at the row before: of the small steps' noises,
+        where there are any, and of the state.
+
+        Parameters
+        ----------
+        name : of the state.
+        before : its value at the row before, a number or a vector (d,).
+
+        Returns
+        -------
+        dict
+            Laws by name, that of the state last.
+        """
         if self.method == "linearised":
             return {name: self.law(name, before)}
         state, x, h = array(before), before, array(self.dt)[()] / self.steps
@@ -142,7 +154,18 @@ class SDE:
         return laws
 
     def law(self, name: str, before: Any) -> Distribution:
-        """The linearised law of the state of this name, whose value at the row before is given."""
+        """The linearised law of the state at a row, from its value at the row before.
+
+        Parameters
+        ----------
+        name : of the state.
+        before : its value at the row before, a number or a vector (d,).
+
+        Returns
+        -------
+        Distribution
+            Normal of a number, MvNormal of a vector.
+        """
         state = array(before)
         own = fresh(state.size)
         x = array(array_of(own, state.shape))
