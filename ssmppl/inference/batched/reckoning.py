@@ -37,16 +37,17 @@ def reckon(title: str, problem: Problem, theta: np.ndarray, passes: float, shown
     calls, begun = sum(f.calls for f in functions), time.perf_counter()
     points = sum(f.points for f in functions)
     model.log_likelihoods([few], many)
-    seconds = (time.perf_counter() - begun) / max(n, 1)
+    seconds = (time.perf_counter() - begun) / n
     calls = sum(f.calls for f in functions) - calls
     points = sum(f.points for f in functions) - points
     rows = max(e.steps for e in problem.experiments)
+    whole = calls * max(rows - 1, 1) // max(n - 1, 1)
     if seconds * rows < SHORT or not calls:
         return
     names = ", ".join(f.title for f in functions)
     print(
         f"{title}: the simulator {names}, {1e3 * seconds:.2g} ms a row with {points // calls} "
-        f"points a call; about {calls * rows // max(n, 1)} calls a pass over {rows} rows, and "
+        f"points a call; about {whole} calls a pass over {rows} rows, and "
         f"{passes:.0f} passes: {_spelled(seconds * rows * passes)}",
         file=sys.stderr, flush=True,
     )  # fmt: skip
