@@ -35,6 +35,12 @@ def test_the_nile_is_the_published_series():
     assert datasets.load("nile")["time"].tolist() == nile["year"].tolist()
 
 
+def test_the_boys_in_bed():
+    y = datasets.boarding_school()
+    assert y.tolist() == [3, 8, 28, 75, 221, 291, 255, 235, 190, 125, 70, 28, 12, 5]
+    assert datasets.load("boarding_school")["time"].tolist() == list(range(1, 15))
+
+
 def test_loaded_arrays_belong_to_the_caller():
     datasets.ice_varves()[:] = 0
     assert datasets.ice_varves().min() > 0

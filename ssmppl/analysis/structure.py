@@ -251,8 +251,9 @@ def linear_gaussian(trace: Trace) -> LinearGaussian | NotApplicable:
         return form
     if any(depends_on(e, prev) for e in q.ravel()):  # a factor of a new value, as in x * z_next
         site = next(s for s in trace.transition.values() if reads_of(s) & set(states))
-        reason = "the states before are factors of new values"
-        return NotApplicable(reason, site.distribution.location)
+        return NotApplicable(
+            "the states before are factors of new values", site.distribution.location
+        )
     if not trace.observations:
         return NotApplicable("there is no observation")
     observation = affine_observation(list(trace.observations.values()), states)

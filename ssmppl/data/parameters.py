@@ -181,7 +181,7 @@ def unpack_states(trace: Trace, x: np.ndarray, started: bool = True) -> dict[str
     """
     out = unpack(trace.initial.values(), x)
     if started:
-        first = (*(slice(None),) * (np.ndim(x) - 2), 0)
+        first: tuple[Any, ...] = (*(slice(None),) * (np.ndim(x) - 2), 0)
         for name in trace.auxiliary:
             out[name] = np.array(out[name])
             out[name][first] = np.nan
@@ -193,7 +193,7 @@ def pack_states(trace: Trace, values: Mapping[str, np.ndarray]) -> np.ndarray:
     known = {n: values[n] for n in trace.initial}
     for name in trace.auxiliary:
         axis = np.ndim(known[name]) - len(trace.initial[name].shape) - 1
-        first = (*(slice(None),) * axis, 0)
+        first: tuple[Any, ...] = (*(slice(None),) * axis, 0)
         known[name] = np.array(known[name])
         known[name][first] = 0.0
     return pack(trace.initial.values(), known)

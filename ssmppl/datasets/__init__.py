@@ -10,7 +10,15 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, listing
 
-__all__ = ["ice_varves", "lgss_appendix", "lgss_main_text", "load", "names", "nile"]
+__all__ = [
+    "boarding_school",
+    "ice_varves",
+    "lgss_appendix",
+    "lgss_main_text",
+    "load",
+    "names",
+    "nile",
+]
 
 
 def names() -> tuple[str, ...]:
@@ -50,6 +58,19 @@ def load(name: str) -> dict[str, np.ndarray]:
     header, *rows = csv.reader(text.splitlines())
     columns = np.array(rows, dtype=np.float64).T
     return {column: values.copy() for column, values in zip(header, columns, strict=True)}
+
+
+def boarding_school() -> np.ndarray:
+    """Boys in bed with influenza in an English boarding school of 763 boys, on 14 days in a row.
+
+    "Influenza in a boarding school", *British Medical Journal* 1978; 1:587.
+
+    Returns
+    -------
+    float64 array (14,)
+        How many were in bed, day by day.
+    """
+    return load("boarding_school")["in_bed"]
 
 
 def ice_varves() -> np.ndarray:

@@ -35,7 +35,7 @@ from ssmppl.language.model.calling import call, call_once, check_outer_names, re
 from ssmppl.language.model.covariances import find_root, independent
 from ssmppl.language.model.model import Model, location_of
 from ssmppl.language.model.trace import Site, Trace, symbols
-from ssmppl.language.user_defined.sde import started
+from ssmppl.language.user_defined.sde import noises, started
 
 
 def _time(role: str) -> str:
@@ -125,9 +125,13 @@ class _Tracer:
             where = location_of(function)
             returned = self._call(function, function_role, where)
             line = return_location(function)
+            asked = returned
             returned = started(returned, function_role, function.__name__, line, self._before)
             laws = check_returned(returned, function_role, function.__name__, line)
             handed = self.new.symbols(list(inspect.signature(function).parameters))
+            for name in noises(returned, asked):
+                self.new.read.setdefault(name, line)
+                handed |= set(symbols("state", name, laws[name].shape).ravel())
             for name, distribution in laws.items():
                 check_name(name, role, line)
                 check_law(name, distribution, function_role)

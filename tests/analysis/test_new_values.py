@@ -1,26 +1,32 @@
 """Laws that read new values of other states: every algorithm against answers by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from scipy import optimize, special
+from scipy import optimize, special, stats
 
 import ssmppl as ssm
 from ssmppl.analysis.new_values import in_order
 from ssmppl.analysis.proposals.proposals import split
 from ssmppl.analysis.structure import gaussian_block, linear_gaussian
-from ssmppl.errors import NotApplicable
+from ssmppl.datasets import boarding_school
+from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.language.tracing import trace
+from ssmppl.modelfile import load_model, read_csv
 from tests.models import new_values as models
 from tests.statistics.checks import (
     LEVEL,
     MCSE,
     assert_within,
     deviations,
+    mcse_mean,
     mean_one_p,
     seed_of,
     some,
 )
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 THETA = {"a": 0.6, "rho": 0.9, "q": 0.3}
 SHARES = {"p": 0.4, "r": 0.7}
 STEPS = {"correlated": 8, "counts": 5, "regimes": 6, "volatility": 4}
@@ -134,6 +140,11 @@ def test_the_order_of_laws():
     assert list(in_order(sites)) == list(sites)
 
 
+def test_what_follows_from_a_new_value_keeps_that_from_moving_by_itself():
+    with pytest.raises(ArgumentError, match="law of 'lag' is Dirac and follows from states of the"):
+        ssm.log_likelihood(models.correlated, DATA["correlated"], THETA, proposal="tempered")
+
+
 # -- likelihoods
 UNBIASED = [
     ("correlated", "bootstrap"), ("correlated", "guided"), ("correlated", "auxiliary"),
@@ -143,7 +154,6 @@ UNBIASED = [
     pytest.param("volatility", "marginal_guided", marks=pytest.mark.slow),
     pytest.param("volatility", "marginal_auxiliary", marks=pytest.mark.slow),
     pytest.param("volatility", "tempered", marks=pytest.mark.slow),
-    pytest.param("correlated", "tempered", marks=pytest.mark.slow),
 ]  # fmt: skip
 
 
@@ -254,6 +264,129 @@ def test_em_climbs_to_the_maximum_of_the_likelihood():
     top = ssm.maximize(models.correlated, data, **call)
     em = ssm.maximize(models.correlated, data, ssm.EM(), **call)
     assert em.log_likelihood == pytest.approx(top.log_likelihood, abs=1e-6)
+
+
+# -- epidemics
+def epidemic(flows):
+    """Influenza in a boarding school, with the flows of a day by this function."""
+    model = ssm.Model("flu")
+    model.prior(lambda: {"beta": ssm.LogNormal(0.4, sd=0.5), "recover": ssm.Beta(2, 2)})
+    model.initial(lambda: {"S": ssm.Dirac(760), "I": ssm.Dirac(3)})
+    model.transition(flows)
+
+    @model.transition
+    def boys(S, I, infected_next, recovered_next):
+        return {
+            "S": ssm.Dirac(S - infected_next),
+            "I": ssm.Dirac(I + infected_next - recovered_next),
+        }
+
+    model.observation(lambda I: {"in_bed": ssm.Poisson(I + 0.1)})
+    return model
+
+
+def mean_flows(S, I, beta, recover):
+    return {
+        "infected": ssm.Dirac(S * (1 - np.exp(-beta * I / 763))),
+        "recovered": ssm.Dirac(I * recover),
+    }
+
+
+def drawn_flows(S, I, beta, recover):
+    return {"infected": ssm.Binomial(S, 1 - np.exp(-beta * I / 763)),
+            "recovered": ssm.Binomial(I, recover)}  # fmt: skip
+
+
+def lagged_epidemic():
+    """The same epidemic with the flows as states, which the next step carries out."""
+    model = ssm.Model("lagged flu")
+    model.prior(lambda: {"beta": ssm.LogNormal(0.4, sd=0.5), "recover": ssm.Beta(2, 2)})
+    zero = {n: ssm.Dirac(0) for n in ("infected", "recovered")}
+    model.initial(lambda: {"S": ssm.Dirac(760), "I": ssm.Dirac(3), **zero})
+
+    @model.transition
+    def step(S, I, infected, recovered, beta, recover):
+        s, i = S - infected, I + infected - recovered
+        return {"S": ssm.Dirac(s), "I": ssm.Dirac(i),
+                "infected": ssm.Binomial(s, 1 - np.exp(-beta * i / 763)),
+                "recovered": ssm.Binomial(i, recover)}  # fmt: skip
+
+    @model.observation
+    def in_bed(I, infected, recovered):
+        return {"in_bed": ssm.Poisson(I + infected - recovered + 0.1)}
+
+    return model
+
+
+FLU = {"beta": 2.3, "recover": 0.47}
+
+
+def test_an_epidemic_without_chance_is_run_once():
+    y = boarding_school()
+    s, i, exact = 760.0, 3.0, 0.0
+    for t, value in enumerate(y):
+        if t:
+            infected, recovered = s * (1 - np.exp(-FLU["beta"] * i / 763)), FLU["recover"] * i
+            s, i = s - infected, i + infected - recovered
+        exact += stats.poisson.logpmf(value, i + 0.1)
+    model = epidemic(mean_flows)
+    assert list(trace(model).initial) == ["S", "I"]
+    found = ssm.log_likelihood(model, {"in_bed": y}, FLU)
+    assert found[0] == pytest.approx(exact, abs=1e-8)
+
+
+def test_flows_drawn_first_are_the_lagged_form():
+    """Both estimates are unbiased for the same likelihood."""
+    data = {"in_bed": boarding_school()[:6]}
+    one, two = (
+        ssm.log_likelihood(model, data, FLU, particles=300, repeats=200, seed=seed_of("flu", k))
+        for k, model in enumerate((epidemic(drawn_flows), lagged_epidemic()))
+    )
+    top = max(one.max(), two.max())
+    one, two = np.exp(one - top), np.exp(two - top)
+    error = np.sqrt(one.var(ddof=1) / len(one) + two.var(ddof=1) / len(two))
+    assert abs(one.mean() - two.mean()) < MCSE * error
+    assert error < 0.1 * one.mean()
+
+
+@pytest.mark.slow
+def test_flows_drawn_first_have_the_posterior_of_the_lagged_form():
+    """The SEIR example, and its earlier form with the flows as states of their own."""
+    data = read_csv(EXAMPLES / "seir" / "data.csv")[["reported"]]
+    drawn = [
+        ssm.sample(
+            model, data, ssm.PMMH(particles=150), draws=4000, warmup=1000, chains=4,
+            seed=seed_of("seir", k), progress=False, states=False,
+        )["posterior"]
+        for k, model in enumerate((load_model(str(EXAMPLES / "seir" / "model.py")), lagged_seir()))
+    ]  # fmt: skip
+    for name in ("beta", "fall_ill", "recover", "rho"):
+        one, two = (np.asarray(d[name].values) for d in drawn)
+        for values in ((one, two), ((one - one.mean()) ** 2, (two - two.mean()) ** 2)):
+            error = np.hypot(*(mcse_mean(v) for v in values))
+            assert abs(values[0].mean() - values[1].mean()) < MCSE * error, name
+
+
+def lagged_seir():
+    model = ssm.Model("lagged SEIR")
+    model.prior(lambda: {
+        "beta": ssm.LogNormal(np.log(0.6), sd=0.5), "fall_ill": ssm.Beta(20, 40),
+        "recover": ssm.Beta(20, 60), "rho": ssm.Beta(2, 2),
+    })  # fmt: skip
+    zero = {n: ssm.Dirac(0) for n in ("I", "infected", "onsets", "recovered")}
+    model.initial(lambda: {"S": ssm.Dirac(795), "E": ssm.Dirac(5), **zero})
+
+    @model.transition
+    def step(S, E, I, infected, onsets, recovered, beta, fall_ill, recover):
+        s, e, i = S - infected, E + infected - onsets, I + onsets - recovered
+        return {
+            "S": ssm.Dirac(s), "E": ssm.Dirac(e), "I": ssm.Dirac(i),
+            "infected": ssm.Binomial(s, 1 - np.exp(-beta * i / 800)),
+            "onsets": ssm.Binomial(e, fall_ill), "recovered": ssm.Binomial(i, recover),
+        }  # fmt: skip
+
+    model.observation(lambda onsets, rho: {"reported": ssm.Binomial(onsets, rho)})
+    return model
 
 
 # -- results

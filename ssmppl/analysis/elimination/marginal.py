@@ -258,7 +258,7 @@ def _previous(expressions: Iterable[Expr]) -> list[Expr]:
 
 
 def _block(sites: Mapping[str, Site], order: Sequence[Expr]) -> GaussianBlock:
-    """The components of `order`, which are Gaussian or deterministic, given new values of others."""
+    """The components of `order`, Gaussian or deterministic ones, given new values of others."""
     own = [s for s in sites.values() if gaussian(s) and set(s.components) & set(order)]
     beside = {c for s in own for c in s.components} - set(order)
     if any(reads_of(s) & beside for s in own):

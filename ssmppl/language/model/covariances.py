@@ -38,7 +38,7 @@ def independent(law: Distribution) -> Distribution:
     name = {"covariance": "variance", "precision": "precision", "cholesky": "sd"}[law.spread]
     spread: dict[str, ExprArray] = {name: array(np.diagonal(matrix))}
     normal = Normal(law.mean_, **spread)  # type: ignore[arg-type]
-    normal.location = law.location
+    normal.location, normal.approximation = law.location, law.approximation
     return normal
 
 

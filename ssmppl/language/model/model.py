@@ -169,7 +169,9 @@ class Model:
         Parameters
         ----------
         function : returns the laws of states by name; its arguments are parameters, states,
-            inputs, observation channels and ``t``.
+            inputs, observation channels and ``t``, and ``NAME_next``, the new value that a
+            transition function declared earlier has given to the state NAME. What has no initial
+            law is a draw of the step, which later transition functions read so, and nothing else.
 
         Returns
         -------

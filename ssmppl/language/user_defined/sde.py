@@ -23,6 +23,7 @@ from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
 from ssmppl.expressions.expr import (
     Expr,
+    apply,
     constant,
     depends_on,
     substitute,
@@ -34,8 +35,10 @@ from ssmppl.expressions.loops.loop import fresh
 from ssmppl.language.distributions.base import Distribution
 from ssmppl.language.distributions.continuous import Normal
 from ssmppl.language.distributions.multivariate import MvNormal
+from ssmppl.language.model.trace import symbols
 
 Matrix = np.ndarray
+METHODS = ("linearised", "euler-maruyama")
 
 
 class SDE:
@@ -46,6 +49,11 @@ class SDE:
     the diffusion does not depend on the state (then `steps` does not matter), else an approximation
     that is the better the shorter `dt` is; `explain` says which.
 
+    With `method="euler-maruyama"` the state moves in small steps with a noise each, x + f h + G
+    sqrt(h) e, which is the better the more steps there are, whatever the law's shape. The noises of
+    all but the last step are drawn within the row, as a quantity of their own, `NAME_noise`; the
+    last one's is the law's. For particles; each step adds to the model's text.
+
     Parameters
     ----------
     drift : function of the state, a number or a vector (d,), that gives one of the same form.
@@ -53,7 +61,9 @@ class SDE:
         independent, or a matrix (d, m); or a function of the state that gives one of these.
     dt : the time to the next row, in the unit of the drift's; a number, or a symbol such as the
         time step of `ssm.Model(..., time_step="dt")`.
-    steps : of the integration of mean and covariance, by the classical Runge-Kutta method.
+    steps : of the integration of mean and covariance, by the classical Runge-Kutta method; or the
+        small steps of Euler and Maruyama.
+    method : "linearised" or "euler-maruyama".
 
     Raises
     ------
@@ -74,7 +84,10 @@ class SDE:
     ...     return {"x": ssm.SDE(lambda x: rate * (15 - x), sigma, dt)}
     """
 
-    def __init__(self, drift: Callable[..., Any], diffusion: Any, dt: Any, *, steps: int = 10):
+    def __init__(
+        self, drift: Callable[..., Any], diffusion: Any, dt: Any, *, steps: int = 10,
+        method: str = "linearised",
+    ):  # fmt: skip
         self.location = user_location()
         self.drift, self.diffusion, self.dt = drift, diffusion, dt
         if not isinstance(steps, int | np.integer) or isinstance(steps, bool) or steps < 1:
@@ -87,10 +100,60 @@ class SDE:
                 fix="give a function of the state: ssm.SDE(lambda x: -k * x, sigma, dt)",
                 where=self.location,
             )
-        self.steps = int(steps)
+        if method not in METHODS:
+            raise ModelError(
+                f"SDE: method={method!r}",
+                fix=f"use {' or '.join(map(repr, METHODS))}",
+                where=self.location,
+            )
+        self.steps, self.method = int(steps), method
+
+    def laws(self, name: str, before: Any) -> dict[str, Distribution]:
+        """The laws that it stands for, from the state's value at the row before.
+
+        Parameters
+        ----------
+        name : of the state.
+        before : its value at the row before, a number or a vector (d,).
+
+        Returns
+        -------
+        dict of str to Distribution
+            By name; that of the state is the last.
+        """
+        if self.method == "linearised":
+            return {name: self.law(name, before)}
+        state, x, h = array(before), before, array(self.dt)[()] / self.steps
+        width = self._root(name, before, state.shape).shape[1]
+        noise = f"{name}_noise"
+        drawn = symbols("state", noise, ((self.steps - 1) * width,))
+        for k in range(self.steps - 1):
+            e = array(drawn[k * width : (k + 1) * width])
+            moved = array(self._root(name, x, state.shape) @ e).reshape(state.shape)
+            f = array(self._of_form(name, self.drift(x), state.shape)).reshape(state.shape)
+            new = array(x) + h * f + apply("sqrt", h) * moved
+            x = new[()] if not state.shape else array(new)
+        root = self._root(name, x, state.shape)
+        f = array(self._of_form(name, self.drift(x), state.shape)).reshape(state.shape)
+        mean, spread = array(array(x) + h * f), array(dot(root, root.T) * array_of([h], (1,)))
+        made: Distribution
+        if state.shape:
+            made = MvNormal(mean, covariance=spread)
+        else:
+            made = Normal(mean[()], variance=spread[0, 0])
+        laws: dict[str, Distribution] = {noise: Normal(np.zeros(len(drawn)), sd=1), name: made}
+        if not len(drawn):
+            del laws[noise]
+        for law in laws.values():
+            law.location = self.location
+        made.approximation = (
+            f"the law of an SDE in {self.steps} small steps of Euler and Maruyama"
+            + (f": that of the last one; the noises of the others are {noise}" * (self.steps > 1))
+        )
+        return laws
 
     def law(self, name: str, before: Any) -> Distribution:
-        """The law of the state at a row, from its value at the row before.
+        """The linearised law of the state at a row, from its value at the row before.
 
         Parameters
         ----------
@@ -103,17 +166,17 @@ class SDE:
             Normal of a number, MvNormal of a vector.
         """
         state = array(before)
-        symbols = fresh(state.size)
-        x = array(array_of(symbols, state.shape))
+        own = fresh(state.size)
+        x = array(array_of(own, state.shape))
         given = x[()] if not state.shape else x
         rates = self._of_form(name, self.drift(given), state.shape)
         noise = self._square(name, given, state.shape)
-        linear = affine_form(rates, symbols)
-        still = not any(depends_on(e, symbols) for e in noise.ravel())
+        linear = affine_form(rates, own)
+        still = not any(depends_on(e, own) for e in noise.ravel())
         if linear is not None and still:
             mean, covariance = self._exact(linear[0], noise, before)
         else:
-            mean, covariance = self._linearised(name, rates, noise, symbols, state)
+            mean, covariance = self._linearised(name, rates, noise, own, state)
         made: Distribution
         if not state.shape:
             made = Normal(mean, variance=covariance[0, 0])
@@ -140,11 +203,11 @@ class SDE:
         return integrate(self.drift, before, self.dt), covariance
 
     def _linearised(
-        self, name: str, rates: list[Expr], noise: Matrix, symbols: list[Expr], state: Any
+        self, name: str, rates: list[Expr], noise: Matrix, own: list[Expr], state: Any
     ) -> tuple[Any, Matrix]:
-        n = len(symbols)
+        n = len(own)
         try:
-            slopes = np.array([differentiate(rates, s) for s in symbols], dtype=object).T
+            slopes = np.array([differentiate(rates, s) for s in own], dtype=object).T
         except NotDifferentiable as error:
             raise ModelError(
                 f"the drift of the SDE of {name!r} has no derivative: {error}",
@@ -154,7 +217,7 @@ class SDE:
         places = [(i, j) for i in range(n) for j in range(i + 1)]
 
         def moments(m: Any, p: Any) -> dict[str, Any]:
-            known = dict(zip(symbols, array(m).ravel(), strict=True))
+            known = dict(zip(own, array(m).ravel(), strict=True))
             flat = substitute([*rates, *slopes.ravel(), *noise.ravel()], known)
             drift, rest = flat[:n], flat[n:]
             jacobian = array_of(rest[: n * n], (n, n))
@@ -171,6 +234,11 @@ class SDE:
 
     def _square(self, name: str, x: Any, shape: tuple[int, ...]) -> Matrix:
         """G G' (d, d)."""
+        root = self._root(name, x, shape)
+        return dot(root, root.T)
+
+    def _root(self, name: str, x: Any, shape: tuple[int, ...]) -> Matrix:
+        """G (d, m)."""
         given = array(self.diffusion(x) if callable(self.diffusion) else self.diffusion)
         n = int(np.prod(shape, dtype=int))
         if given.ndim == 0:
@@ -187,9 +255,8 @@ class SDE:
                 "each number of the state",
                 where=self.location,
             )
-        zeros = array_of([e if isinstance(e, Expr) else constant(e) for e in root.ravel()],
-                         root.shape)  # fmt: skip
-        return dot(zeros, zeros.T)
+        nodes = [e if isinstance(e, Expr) else constant(e) for e in root.ravel()]
+        return array_of(nodes, root.shape)
 
     def _of_form(self, name: str, found: Any, shape: tuple[int, ...]) -> list[Expr]:
         rates = array(found)
@@ -213,7 +280,8 @@ def _symmetric(values: Any, places: list[tuple[int, int]], n: int) -> Matrix:
 def started(
     laws: Any, role: str, function: str, where: Location, before: Callable[[str], Any]
 ) -> Any:
-    """What a function of the user's returned, with the laws that its SDEs are.
+    """What a function of the user's returned, with the laws that its SDEs are; those of their small
+    steps' noises before them.
 
     before : (name) -> the value of that state at the row before; None where there is no such state.
     """
@@ -232,5 +300,12 @@ def started(
                 "@initial function gives",
                 where=where,
             )
-        out[name] = law.law(name, value)
+        out |= law.laws(name, value)
     return out
+
+
+def noises(laws: Any, asked: Any) -> list[str]:
+    """The names of the small steps' noises among these laws: what the user's function did not
+    return."""
+    same = laws is asked or not isinstance(laws, Mapping)
+    return [] if same else [name for name in laws if name not in asked]

@@ -214,6 +214,53 @@ def test_loops_are_told_by_name():
     assert all(name in laws for name in told)
 
 
+def van_der_pol(method, steps):
+    model = ssm.Model("van der pol")
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Dirac(np.array([0.7, -0.4]))}
+
+    @model.transition
+    def transition(x):
+        def drift(x):
+            return np.stack([x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]])
+
+        def spread(x):
+            return np.stack([0.05 * np.exp(0.2 * x[1]), 0.6 * np.abs(x[0])])
+
+        return {"x": ssm.SDE(drift, spread, 0.4, steps=steps, method=method)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x[0], sd=0.1)}
+
+    return model
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_small_steps_of_euler_and_maruyama(steps):
+    """Draws have the moments of steps by hand; the noises of all but the last are a quantity."""
+    model, n = van_der_pol("euler-maruyama", steps), 20_000
+    seed = seed_of("euler maruyama", steps)
+    found = ssm.simulate(model, {}, steps=2, draws=n, seed=seed)
+    x = found["x"].values.reshape(n, 2, 2)[:, 1]
+    by_hand = by_euler(
+        lambda x: np.stack([x[1], 1.5 * (1 - x[0] ** 2) * x[1] - x[0]]),
+        lambda x: np.stack([0.05 * np.exp(0.2 * x[1]), 0.6 * np.abs(x[0])]),
+        0.4, steps=steps, seed=seed,
+    )  # fmt: skip
+    spread = np.sqrt(np.diag(by_hand[1]) * (1 / n + 1 / 200_000))
+    np.testing.assert_array_less(np.abs(x.mean(axis=0) - by_hand[0]), 4.5 * spread)
+    np.testing.assert_allclose(np.diag(np.cov(x.T)), np.diag(by_hand[1]), rtol=0.06)
+    traced = trace(model)
+    assert list(traced.transition) == (["x_noise", "x"] if steps > 1 else ["x"])
+    assert "Euler and Maruyama" in traced.transition["x"].distribution.approximation
+    assert ("x_noise" in found) == (steps > 1)
+    with pytest.raises(ssm.ModelError, match="method"):
+        ssm.SDE(lambda x: x, 0.1, 0.1, method="milstein")
+
+
 def test_the_number_of_steps_makes_it_exact_in_the_limit():
     def drift(x):
         return np.stack([np.sin(x[1]), -(x[0] ** 2)])
