@@ -133,7 +133,7 @@ class SDE:
             moved = array(self._root(name, x, state.shape) @ e).reshape(state.shape)
             f = array(self._of_form(name, self.drift(x), state.shape)).reshape(state.shape)
             new = array(x) + h * f + apply("sqrt", h) * moved
-            x = new[()] if not state.shape else array(new)
+            x = array(new) if state.shape else array(new)[()]
         root = self._root(name, x, state.shape)
         f = array(self._of_form(name, self.drift(x), state.shape)).reshape(state.shape)
         mean, spread = array(array(x) + h * f), array(dot(root, root.T) * array_of([h], (1,)))
