@@ -96,7 +96,10 @@ def test_a_model_file_with_a_simulator_is_simulated_at_the_command_line(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("of", "truth"), [(arm, ARM), (cart_pole, CART_POLE)])
+@pytest.mark.parametrize(
+    ("of", "truth"),
+    [(arm, ARM), pytest.param(cart_pole, CART_POLE, marks=pytest.mark.exhaustive)],
+)
 def test_maximize_finds_the_parameters_within_three_standard_errors(of, truth):
     module = of()
     model = module.arm if of is arm else module.cart_pole

@@ -17,6 +17,7 @@ STUDIES = [
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("study", STUDIES, ids=lambda s: s.label)
 def test_ranks_are_uniform(study):
     """Every parameter, and a state in the middle."""
