@@ -189,6 +189,8 @@ class Refusal:
         return found, "let it depend on parameters only"
 
     def _draw_of_step(self, name: str, role: str) -> tuple[str, str] | None:
+        if role == "initial":  # it gives the states, which are not known before
+            return None
         if self.known.get(name, "state") == "state" and name in self.known:
             return None
         if name in self.known and self.known[name] != DRAW:
