@@ -89,7 +89,7 @@ from ssmppl.language.user_defined.simulator import Simulator, simulator
 from ssmppl.tables import summary
 
 if TYPE_CHECKING:
-    from ssmppl import plots
+    from ssmppl import plots, simulators
     from ssmppl.diagnosis.diagnose import diagnose
     from ssmppl.diagnosis.effects.catalogue import effects
     from ssmppl.diagnosis.effects.effect import effect
@@ -107,6 +107,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+_MODULES = ("plots", "simulators")
 _LATER = {
     "GapReport": "diagnosis.report.report",
     "diagnose": "diagnosis.diagnose",
@@ -213,19 +214,20 @@ __all__ = [
     "score",
     "simulate",
     "simulator",
+    "simulators",
     "smooth",
     "summary",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name != "plots" and name not in _LATER:
+    if name not in _MODULES and name not in _LATER:
         hint = "" if name.startswith("__") else name_hint(name, __all__)
         raise AttributeError(
             f"module {__name__!r} has no attribute {name!r}" + (f": {hint}" if hint else "")
         )
-    if name == "plots":
-        return importlib.import_module(f"{__name__}.plots")
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
     globals()[name] = value = getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
     return value
 

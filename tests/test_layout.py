@@ -23,7 +23,8 @@ ALLOWED["data"] = {"counts", "errors", "expressions", "language"}
 ALLOWED["results"] = {"errors"}
 ALLOWED["tables"] = {"errors", "results"}
 ALLOWED["datasets"] = {"errors"}
-# ... and serve what follows.
+# ... and serve what follows. Adapters make simulators of the language.
+ALLOWED["simulators"] = {"errors", "expressions", "language"}
 ALLOWED["inference"] = {*CHAIN, "counts", "data", "results"}
 ALLOWED["drawing"] = {"errors", "data"}
 ALLOWED["diagnosis"] = ALLOWED["inference"] | {"inference", "drawing"}

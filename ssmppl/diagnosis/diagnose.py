@@ -23,7 +23,6 @@ from ssmppl.diagnosis.heldout.predictions import Predictions, predict
 from ssmppl.diagnosis.heldout.row_split import FOLDS, RowSplit, long_enough, three_parts
 from ssmppl.diagnosis.model.candidates import Chosen
 from ssmppl.diagnosis.model.candidates import chosen as chosen_effects
-from ssmppl.diagnosis.model.differentiable import check_differentiable
 from ssmppl.diagnosis.model.initial_law import proper_initial_law
 from ssmppl.diagnosis.model.scales import Scales
 from ssmppl.diagnosis.model.smoothing import Settings
@@ -138,7 +137,6 @@ class _Diagnosis:
         check_samplers(self.trace)
         self.experiments = self.problem.experiments
         self.fixed = check_values(self.trace, fixed, argument="fixed")
-        check_differentiable(self.trace, self.fixed)
         self.effects, self.mode, self.alpha = effects, mode, alpha
         self.root = seed_sequence(seed)
         self.split: RowSplit | None = None

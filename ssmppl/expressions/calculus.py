@@ -30,6 +30,7 @@ from ssmppl.expressions.expr import (
     constant,
     dependent,
     depends_on,
+    is_tuple,
     topological,
     without_exponentials,
 )
@@ -147,7 +148,7 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
     Raises
     ------
     NotDifferentiable : a partial derivative without closed form is needed (a shape parameter of
-        an incomplete gamma or beta function, an opaque primitive, a random draw's parameters).
+        an incomplete gamma or beta function, a random draw's parameters).
     """
     involved = dependent(expressions, [symbol])
     tangent: dict[Expr, _Slope] = {symbol: _Slope(constant(1.0))}
@@ -159,11 +160,13 @@ def differentiate(expressions: Sequence[Expr], symbol: Expr) -> list[Expr]:
             matrix_tangent[node] = _matrix_tangent(node, tangent)
         elif node.op == "loop":
             matrix_tangent[node] = array(loop_slopes(node, symbol, differentiate))
+        elif node.op == "item" and node.args[0].op == "call":
+            tangent[node] = _chain_of_call(node.args[0], node.data[0], tangent)
         elif node.op == batched.OP:
             matrix_tangent[node] = array(_simulated_slopes(node, tangent))
         elif node.op == "item":
             tangent[node] = _Slope(matrix_tangent[node.args[0]][node.data])
-        else:
+        elif not is_tuple(node):
             tangent[node] = _chain(node, tangent)
     return [tangent.get(e, _NONE).whole() for e in expressions]
 
@@ -231,6 +234,8 @@ def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
     if node.op in ("logdet", "det"):
         slope = np.sum(_inverse_of(node).T * _entries(node, tangent))
         return _Slope(slope * node if node.op == "det" else slope)
+    if node.op == "call":
+        return _chain_of_call(node, 0, tangent)
     if node.op not in PARTIALS:
         raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
     total = _NONE
@@ -243,11 +248,28 @@ def _chain(node: Expr, tangent: dict[Expr, _Slope]) -> _Slope:
     return total
 
 
+def _chain_of_call(node: Expr, output: int, tangent: dict[Expr, _Slope]) -> _Slope:
+    """The slope of one of the numbers that an opaque function gives."""
+    total = _NONE
+    for place, argument in enumerate(node.args):
+        if argument in tangent and not _is_zero(tangent[argument].value):
+            value, moves = tangent[argument]
+            total = total.plus(_Slope(_partial_of_call(node, place, output) * value, moves))
+    return total
+
+
+def _partial_of_call(node: Expr, place: int, output: int) -> Expr:
+    """The derivative of an opaque function in one argument: a call of another one."""
+    slope = getattr(node.data, "slope", None)
+    if slope is None:
+        raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
+    found: Expr = slope(node.args, place, output)
+    return found
+
+
 def _told(node: Expr) -> str:
     """The expression in a message, of which nobody reads more than a line."""
     text = repr(node)
-    if node.op == "call":  # a primitive, by the name that its user gave it
-        text = getattr(node.data, "__name__", node.op) + text.removeprefix(node.op)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
@@ -428,6 +450,12 @@ def reverse_gradient(expression: Expr, symbols: Sequence[Expr]) -> list[Expr]:
     for node in reversed(order):
         if node not in involved:
             continue
+        if is_tuple(node):
+            for place, argument in enumerate(node.args):
+                for i, value in enumerate(entries.get(node, ())):
+                    if argument in involved and not _is_zero(value):
+                        add(argument, _Slope(value * _partial_of_call(node, place, i)))
+            continue
         if node.op in ("cholesky", "inverse"):
             if node in entries:
                 for argument, value in zip(node.args, _of_matrix(node, entries[node]), strict=True):
@@ -448,8 +476,8 @@ def reverse_gradient(expression: Expr, symbols: Sequence[Expr]) -> list[Expr]:
                     add(argument, _Slope(slopes[node].whole() * value))
         elif node.op == "item":
             matrix = node.args[0]
-            n = matrix.data
-            here = entries.setdefault(matrix, array(np.full((n, n), constant(0.0), dtype=object)))
+            shape = (matrix.data.outputs,) if is_tuple(matrix) else (matrix.data, matrix.data)
+            here = entries.setdefault(matrix, array(np.full(shape, constant(0.0), dtype=object)))
             here[node.data] = here[node.data] + slopes[node].whole()
         else:
             for argument, slope in _of_arguments(node, slopes[node], involved):
@@ -470,6 +498,11 @@ def _of_arguments(node: Expr, slope: _Slope, involved: set[Expr]) -> list[tuple[
         value = inverse(array(node.args).reshape(n, n)).T * slope.whole()
         value = value * node if node.op == "det" else value
         return list(zip(node.args, map(_Slope, array(value).ravel()), strict=True))
+    if node.op == "call":
+        partials = [_partial_of_call(node, k, 0) for k, a in enumerate(node.args) if a in involved]
+        moving = [a for a in node.args if a in involved]
+        slopes = [_Slope(slope.value * p, slope.moves) for p in partials]
+        return list(zip(moving, slopes, strict=True))
     if node.op not in PARTIALS:
         raise NotDifferentiable(f"{_told(node)} has no derivative in closed form")
     out = []

@@ -76,8 +76,10 @@ def _run(roots: list[Expr], values: Mapping[Expr, Any], draw: Draw | None) -> li
                 done[node] = draw(node.data[0], tuple(args))
             elif node.op == "call":
                 # compiled it has no errors of Python's: log(-1) is NaN, as in the kernels
-                function = getattr(node.data, "compiled", node.data)
-                done[node] = np.vectorize(function, otypes=[float])(*args)
+                function = getattr(node.data, "numbers", node.data)
+                outputs = getattr(node.data, "outputs", 1)
+                found = np.vectorize(function, otypes=[float] * outputs)(*args)
+                done[node] = found if outputs == 1 else np.stack(found, axis=-1)
             else:
                 done[node] = MEANING[node.op](*args)
     return [done[r] for r in roots]

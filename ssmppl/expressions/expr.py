@@ -24,6 +24,7 @@ from ssmppl.expressions.node import (
     attributed,
     behaviour,
     constant,
+    is_tuple,
     item,
     matrix_op,
     recording,
@@ -50,6 +51,7 @@ __all__ = [
     "as_expr",
     "attributed",
     "constant",
+    "is_tuple",
     "item",
     "matrix_op",
     "recording",
@@ -240,9 +242,9 @@ def split_constant(e: Expr) -> tuple[float, Expr]:
 
 
 def several(node: Expr) -> bool:
-    """Whether the node is several numbers, a matrix, the end of a loop or what a simulator gives,
-    of which "item" nodes take one."""
-    return node.op in ("cholesky", "inverse", *SEVERAL)
+    """Whether the node is several numbers, a matrix, the end of a loop or what a simulator or a
+    primitive gives, of which "item" nodes take one."""
+    return node.op in ("cholesky", "inverse", *SEVERAL) or is_tuple(node)
 
 
 # -- walks over the graph
@@ -478,6 +480,8 @@ def _written(node: Expr, parts: list[Text]) -> Text:
     inside = _matrix_name(node) if op in MATRIX_OPS else None
     if inside is None:
         inside = ", ".join(text for text, _ in parts)
+    if op == "call":  # by the name that its user gave it
+        return f"{getattr(node.data, '__name__', op)}({inside})", Level.ATOM
     return f"{node.data[0] if op == 'random' else op}({inside})", Level.ATOM
 
 

@@ -301,6 +301,11 @@ def item(node: Expr, i: int, j: int) -> Expr:
     return Expr("item", (node,), (i, j))
 
 
+def is_tuple(node: Expr) -> bool:
+    """Whether the node is a call that gives several numbers, which "item" nodes (i,) take apart."""
+    return node.op == "call" and getattr(node.data, "outputs", 1) > 1
+
+
 def as_expr(value: Any) -> Expr:
     """`value` as a node: nodes as they are, numbers as constants; TypeError for all else."""
     if isinstance(value, Expr):
@@ -320,7 +325,7 @@ _given: ContextVar[Location | None] = ContextVar("given", default=None)
 # Frames of these folders are never where the user wrote it.
 _OWN = tuple(
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), d) + os.sep
-    for d in ("expressions", "language")
+    for d in ("expressions", "language", "simulators")
 )
 _OWN += tuple(  # SciPy lies beside NumPy
     os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(np.__file__))), d) + os.sep

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ssmppl.expressions.evaluate import evaluate
-from ssmppl.expressions.expr import Expr, topological
+from ssmppl.expressions.expr import Expr, is_tuple, topological
 from ssmppl.expressions.node import BOOLEAN, SEVERAL
 
 _OF_ANY = {"exp", "abs", "sqrt"}  # none below 0, of whatever number
@@ -153,7 +153,7 @@ def _state(
     if node in values:
         value = np.asarray(values[node], dtype=float)  # matrices in the last two axes
         wrong = np.isnan(value)
-        if node.op in SEVERAL:  # its numbers in the last axis
+        if node.op in SEVERAL or is_tuple(node):  # its numbers in the last axis
             wrong = wrong.any(axis=-1)
         elif value.ndim >= 2:
             wrong = wrong.any(axis=(-2, -1))

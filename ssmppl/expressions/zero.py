@@ -28,6 +28,7 @@ from ssmppl.expressions.expr import (
     Expr,
     apply,
     constant,
+    is_tuple,
     rebuilt,
     split_constant,
     substitute,
@@ -144,9 +145,9 @@ def _rational(parts: list[Expr]) -> list[Expr]:
         moved = rebuilt(node, tuple(new[a] for a in node.args))
         if moved.op == "exp":
             moved = _exponential(moved.args[0], own)
-        elif moved.op in SEVERAL:
+        elif moved.op in SEVERAL or is_tuple(moved):
             pass  # what is taken from it is a symbol
-        elif (moved.op == "item" and moved.args[0].op in SEVERAL) or (
+        elif (moved.op == "item" and moved.args[0].op in (*SEVERAL, "call")) or (
             moved.op not in _FOLLOWED and not (moved.op == "pow" and moved.args[1].op == "const")
         ):
             moved = own.setdefault(moved, symbol("function", str(len(own))))

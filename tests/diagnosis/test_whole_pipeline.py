@@ -133,7 +133,7 @@ def check(patch, where, name, mode):
                                                      *cases("full", FEW["full"])])  # fmt: skip
 def test_a_diagnosis_ends_in_a_report_or_an_error_of_ours(monkeypatch, where, name, mode):
     found = check(monkeypatch, where, name, mode)
-    assert isinstance(found, GapReport) or name == "pendulum_opaque", found
+    assert isinstance(found, GapReport), found
 
 
 @pytest.mark.exhaustive

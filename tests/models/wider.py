@@ -179,3 +179,41 @@ def garch_transition(h, y, w, a, b):
 @garch.observation
 def garch_observation(h):
     return {"y": ssm.Normal(0, variance=h)}
+
+
+# A count of arrivals, drawn within the step by the new value of a level, feeds a second level.
+arrivals = ssm.Model("arrivals")
+
+
+@arrivals.prior
+def arrivals_prior():
+    return {
+        "phi": ssm.Beta(4, 2),
+        "q": ssm.InverseGamma(4, scale=0.5),
+        "b": ssm.Normal(0.5, sd=0.3),
+    }
+
+
+@arrivals.initial
+def arrivals_initial():
+    return {"x": ssm.Normal(0, sd=0.5), "z": ssm.Normal(0, sd=1)}
+
+
+@arrivals.transition
+def arrivals_level(x, phi, q):
+    return {"x": ssm.Normal(phi * x, variance=q)}
+
+
+@arrivals.transition
+def arrivals_count(x_next):
+    return {"count": ssm.Poisson(np.exp(x_next))}
+
+
+@arrivals.transition
+def arrivals_fed(z, b, count_next, x_next):
+    return {"z": ssm.Normal(0.5 * z + b * count_next - x_next, sd=0.3)}
+
+
+@arrivals.observation
+def arrivals_observation(z):
+    return {"y": ssm.Normal(z, sd=0.3)}

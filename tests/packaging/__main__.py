@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.packaging import archives
+from tests.packaging import archives, platform_wheel
 from tests.packaging.environments import PYTHONS, SETS, SHOWN, Environment, interpreter, run
 from tests.packaging.project import PROJECT, ROOT
 
@@ -77,7 +77,7 @@ def _rows(
         began = time.monotonic()
         place = folder / f"{version}-{name}"
         place.mkdir()
-        result, found = _try(python, place, name, wheel, tools, asked)
+        result, found = _try(python, place, name, version, wheel, tools, asked)
         shutil.rmtree(place)
         if name == "newest":
             newest_arviz = found.get("arviz", "")
@@ -103,6 +103,7 @@ def _try(
     python: Path,
     folder: Path,
     name: str,
+    version: str,
     wheel: Path,
     tools: Environment,
     asked: argparse.Namespace,
@@ -123,6 +124,9 @@ def _try(
         shutil.copy(HERE / "user.py", environment.work)
         run([tools.python, "-m", "mypy", "--strict", "--python-executable", environment.python,
              "--cache-dir", folder / "mypy", "user.py"], environment.work)  # fmt: skip
+        if name == "newest" and platform_wheel.FITS:
+            step = "machine code"
+            _with_machine_code(environment, wheel, version)
         if asked.tests:
             step = "tests"
             _suite(environment, name, asked.workers)
@@ -130,6 +134,18 @@ def _try(
         print(f"==== {step} FAILED: {error}", flush=True)
         return f"{step} FAILED", found
     return "pass", found
+
+
+def _with_machine_code(environment: Environment, wheel: Path, version: str) -> None:
+    """Make the wheel with machine code for this Python, into dist/, and use it."""
+    shutil.copy(HERE / "machine_code.py", environment.work)
+    shutil.copy(HERE / "cold.py", environment.work)
+    environment.run("machine_code.py", "archives")
+    made = sorted((environment.work / "archives").iterdir())
+    full = platform_wheel.with_machine_code(wheel, {f.name: f.read_bytes() for f in made}, version)
+    print(f"{full.name}: {full.stat().st_size / 1e6:.2f} MB", flush=True)
+    environment.run("-m", "pip", "install", "--quiet", "--no-deps", "--force-reinstall", full)
+    environment.run("cold.py")
 
 
 def _suite(environment: Environment, name: str, workers: str) -> None:

@@ -18,6 +18,7 @@ from ssmppl.errors import NotApplicable
 from ssmppl.expressions.algebra import Separation, affine, separate
 from ssmppl.expressions.arrays import ExprArray, array
 from ssmppl.expressions.expr import (
+    MATRIX_OPS,
     Expr,
     constant,
     split_constant,
@@ -502,7 +503,7 @@ def matrix_text(m: ExprArray) -> str:
         inner = array(array([p[1] for p in parts]).reshape(m.shape))
         return f"({number:.6g} {matrix_text(inner)})"
     first = entries[0]
-    if first.op == "item":
+    if first.op == "item" and first.args[0].op in MATRIX_OPS:
         text = to_text(first.args[0])
         same = all(e.op == "item" and e.args[0] is first.args[0] for e in entries)
         return text if same and len(text) < MATRIX_LENGTH else "C"

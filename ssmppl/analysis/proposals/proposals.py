@@ -107,8 +107,12 @@ def derive(trace: Trace, missing: Missing) -> dict[str, Proposal | NotApplicable
     if isinstance(guided, NotApplicable):
         found["auxiliary"] = guided
     elif guided.look_ahead is None:
+        new = set(trace.state_symbols)
+        reading = any(reads_of(site) & new for site in trace.transition.values())
+        which = "that is drawn by its own law, as others read its new value or it is not Gaussian,"
+        plain = "with neither a Gaussian nor a deterministic law"
         found["auxiliary"] = NotApplicable(
-            "a state with neither a Gaussian nor a deterministic law stands between x_{t-1} and y_t"
+            f"a state {which if reading else plain} stands between x_{{t-1}} and y_t"
         )
     else:
         found["auxiliary"] = replace(

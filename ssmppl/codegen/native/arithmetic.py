@@ -10,6 +10,7 @@ from ssmppl.codegen.native import matrices
 from ssmppl.compiling import literal
 from ssmppl.errors import SSMError
 from ssmppl.expressions.operations import MATRIX_OPS
+from ssmppl.language.user_defined.primitive import outputs_of
 
 FLOAT, BOOLEAN, INTEGER, ROW, PLANE, STREAM = "float", "boolean", "integer", "row", "plane", "rng"
 FLAG_ROW, MATRIX, SIMULATED = "row of flags", "matrix", "results of a simulator"
@@ -142,7 +143,8 @@ class Arithmetic:
             at = self.let(f"getelementptr double, ptr {array.text}, i64 {first.text}")
             return Value(ROW, at)
         if array.kind == MATRIX:
-            i, j = literal(ast.unparse(node.slice))
+            at = literal(ast.unparse(node.slice))
+            i, j = at if isinstance(at, tuple) else (0, at)
             return Value(FLOAT, array.entries[i][j])
         if array.kind == SIMULATED:
             row = int(literal(ast.unparse(node.slice))) * int(array.length)
@@ -194,7 +196,13 @@ class Arithmetic:
         self.calls.add((name, len(numbers), bool(stream)))
         if stream:
             numbers = [f"ptr {values[0].text}", f"i64 {values[0].length}", *numbers]
-        return Value(FLOAT, self.let(f"call double @lib_{name}({', '.join(numbers)})"))
+        given, several = ", ".join(numbers), outputs_of(name)
+        if several == 1:
+            return Value(FLOAT, self.let(f"call double @lib_{name}({given})"))
+        kind = f"[{several} x double]"
+        made = self.let(f"call {kind} @lib_{name}({given})")
+        parts = [self.let(f"extractvalue {kind} {made}, {k}") for k in range(several)]
+        return Value(MATRIX, "", entries=(tuple(parts),))
 
     def _matrix(self, name: str, node: ast.Call) -> Value:
         """An operation on a matrix, whose entries stand in a tuple, row by row."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-from ssmppl.codegen.native.library import function_ir
+from ssmppl.codegen.native.library import function_ir, returned
 from ssmppl.codegen.native.translate import Untranslatable, translate
 from ssmppl.codegen.store import folder
 from ssmppl.compiling import once, one_at_a_time
@@ -90,7 +90,7 @@ def _compiled(text: str) -> tuple[bytes, list[str]]:
 
 def _declaration(name: str, arity: int, draws: bool) -> str:
     numbers = ["ptr", "i64"] * draws + ["double"] * arity
-    return f"declare double @lib_{name}({', '.join(numbers)})"
+    return f"declare {returned(name)} @lib_{name}({', '.join(numbers)})"
 
 
 @once

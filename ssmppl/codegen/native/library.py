@@ -1,6 +1,6 @@
 """Scalar functions for translated code: the kernels' own and primitives, as LLVM IR by Numba.
 
-Each kernel is compiled by Numba once, and its IR kept on disk; translated code takes it in and
+Each of them is compiled by Numba once, and its IR kept on disk; translated code takes it in and
 inlines it, so that a loop that calls exp still vectorises. Of the user's primitives those are taken
 in that need nothing of Python at run time: no exception to be raised, no memory to be managed, no
 address of this process.
@@ -20,7 +20,7 @@ from ssmppl.codegen.native.translate import Untranslatable
 from ssmppl.codegen.store import folder
 from ssmppl.compiling import once
 from ssmppl.expressions.operations import KERNELS, MATRIX_OPS
-from ssmppl.language.user_defined.primitive import REGISTRY
+from ssmppl.language.user_defined.primitive import REGISTRY, outputs_of
 
 STREAM = types.Array(types.uint64, 1, "C")
 
@@ -35,16 +35,17 @@ def function_ir(name: str, arity: int, draws: bool) -> str:
     ------
     Untranslatable : there is no such function of floats.
     """
-    if name in REGISTRY and not draws:
-        return _of_primitive(name, arity)
-    if name not in KERNELS or name in MATRIX_OPS:  # these take tuples, and give arrays
+    primitive = name in REGISTRY and not draws
+    if not primitive and (name not in KERNELS or name in MATRIX_OPS):  # of tuples, and of arrays
         raise Untranslatable(f"{name} is not a function of numbers", fix="")
     file = f"lib_{name}_{arity}"
     text = folder.kept(file, ".ll")
     if text is None:
         with folder.one_process(file):
-            text = folder.kept(file, ".ll") or _made(name, arity, draws)
-            folder.keep(file, ".ll", text)
+            text = folder.kept(file, ".ll")
+            if text is None:
+                text = _of_primitive(name, arity) if primitive else _made(name, arity, draws)
+                folder.keep(file, ".ll", text)
     return text
 
 
@@ -60,13 +61,15 @@ def _compiled(dispatcher: Any, name: str, arity: int, draws: bool = False) -> An
     signature = (*([STREAM] if draws else []), *[float64] * arity)
     dispatcher.compile(signature)
     compiled = dispatcher.overloads[signature]
-    if compiled.signature.return_type != float64:
+    several = outputs_of(name)
+    wanted = float64 if several == 1 else types.UniTuple(float64, several)
+    if compiled.signature.return_type != wanted:
         raise Untranslatable(f"{name} gives {compiled.signature.return_type}", fix="")
     return compiled
 
 
 def _of_primitive(name: str, arity: int) -> str:
-    made: Any = REGISTRY[name]
+    made: Any = REGISTRY[name].compiled
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     options |= {k: v for k, v in made.targetoptions.items() if k != "nopython"}
     compiled = _compiled(numba.njit(**options)(made.py_func), name, arity)
@@ -97,16 +100,23 @@ def _wrapped(compiled: Any, name: str, arity: int, draws: bool) -> str:
     array = ["ptr null", "ptr null", "i64 %n", "i64 8", "ptr %rng", "i64 %n", "i64 8"]
     given = ", ".join([*(["ptr %rng", "i64 %n"] if draws else []), *numbers])
     passed = ", ".join(["ptr %out", "ptr %fault", *(array if draws else []), *numbers])
+    kind = returned(name)
     wrapper = f"""
-define linkonce_odr double @lib_{name}({given}) alwaysinline nounwind {{
-  %out = alloca double
+define linkonce_odr {kind} @lib_{name}({given}) alwaysinline nounwind {{
+  %out = alloca {kind}
   %fault = alloca ptr
   %status = call i32 @{_quoted(inner)}({passed})
-  %value = load double, ptr %out
-  ret double %value
+  %value = load {kind}, ptr %out
+  ret {kind} %value
 }}
 """
     return compiled.library.get_llvm_str() + wrapper
+
+
+def returned(name: str) -> str:
+    """The type in IR of what a function gives."""
+    several = outputs_of(name)
+    return "double" if several == 1 else f"[{several} x double]"
 
 
 def _quoted(name: str) -> str:

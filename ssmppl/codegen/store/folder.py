@@ -31,6 +31,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
 
+import llvmlite
 import numba
 import numpy as np
 from numba.core import event
@@ -38,6 +39,7 @@ from numba.core.compiler import CompileResult
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 
+from ssmppl.codegen.store import shipped
 from ssmppl.compiling import LOCK, once, one_at_a_time
 
 try:
@@ -83,14 +85,24 @@ def _is_private(folder: Path) -> bool:
 
 
 @cache
-def _environment() -> bytes:
-    """Text of the kernels and versions: a change in any makes new modules."""
+def kernels_digest() -> str:
+    """Of the text of all kernels."""
     digest = hashlib.sha256()
     for file in sorted((Path(__file__).parents[1] / "kernels").rglob("*.py")):
         digest.update(file.read_bytes())
-    versions = (numba.__version__, np.__version__, platform.python_version())
-    digest.update(repr(versions).encode())
-    return digest.digest()
+    return digest.hexdigest()
+
+
+@cache
+def _environment() -> bytes:
+    """Text of the kernels and versions: a change in any makes new modules."""
+    python = platform.python_version()
+    versions = (numba.__version__, llvmlite.__version__, np.__version__, python)
+    return hashlib.sha256(repr((kernels_digest(), versions)).encode()).digest()
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def digest_of(text: str) -> str:
@@ -99,8 +111,11 @@ def digest_of(text: str) -> str:
 
 
 def kept(name: str, suffix: str) -> str | None:
-    """A text that was kept under this name in this environment; None where there is none."""
+    """A text that was kept under this name in this environment, by this user or in the wheel; None
+    where there is none."""
     found = kept_bytes(f"{name}_{digest_of('')}", suffix)
+    if found is None:
+        found = shipped.find(f"{name}{suffix}", kernels_digest())
     return None if found is None else found.decode()
 
 
@@ -224,21 +239,27 @@ def load(name: str, text: str) -> ModuleType:
         raise
     for value in vars(module).values():
         if isinstance(value, CPUDispatcher) and value.py_func.__module__ == module_name:
-            keeps = Kept(value.py_func, stem)
+            keeps = Kept(value.py_func, stem, f"{name}_{_digest(text)}")
             cast(Any, value)._cache = keeps
             cast(Any, value).compile = keeps.alone(value.compile)
     return module
+
+
+def _rebuilt(target: Any, content: bytes) -> Any:
+    return CompileResult._rebuild(target, *pickle.loads(content))
 
 
 class Kept:
     """What a Numba dispatcher asks for compiled code, and tells of what it compiled.
 
     function : the Python function. stem : of its files' names; names its text and all versions.
+    plain : likewise, of its text alone, as a wheel's archive goes by.
     """
 
-    def __init__(self, function: Callable[..., Any], stem: str):
+    def __init__(self, function: Callable[..., Any], stem: str, plain: str):
         self.cache_path = str(Path(function.__code__.co_filename).parent)
         self._stem = f"{stem}.{function.__qualname__}"
+        self._plain = f"{plain}.{function.__qualname__}"
         self._held = contextlib.ExitStack()
 
     def alone(self, compile: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -256,9 +277,12 @@ class Kept:
         name = self._name(signature, target.codegen())
         found = kept_bytes(name, ".nbc")
         if found is None:
+            from_wheel = shipped.find(self.shipped_name(signature), kernels_digest())
+            if from_wheel is not None:
+                return _rebuilt(target, from_wheel)
             self._held.enter_context(one_process(name))
             found = kept_bytes(name, ".nbc")
-        return None if found is None else CompileResult._rebuild(target, *pickle.loads(found))
+        return None if found is None else _rebuilt(target, found)
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Keep what was compiled, unless it holds addresses of this process."""
@@ -267,9 +291,13 @@ class Kept:
         name = self._name(signature, compiled.library.codegen)
         keep_bytes(name, ".nbc", dumps(compiled._reduce()))
 
+    def shipped_name(self, signature: Any) -> str:
+        """What the entry of a signature is called in an archive."""
+        return f"{self._plain}_{_digest(repr(signature))}"
+
     def _name(self, signature: Any, codegen: Any) -> str:
-        key = repr((signature, codegen.magic_tuple()))  # types of the arguments; the processor
-        return f"{self._stem}_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+        # types of the arguments; the processor
+        return f"{self._stem}_{_digest(repr((signature, codegen.magic_tuple())))}"
 
     def enable(self) -> None:
         """Of Numba's interface."""

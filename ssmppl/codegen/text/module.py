@@ -389,7 +389,7 @@ class ModuleText:
         called = sorted(words & set(REGISTRY))  # the user's primitives
         if called:
             lines += ["from ssmppl.language.user_defined.primitive import REGISTRY", ""]
-            lines += [f'{name} = REGISTRY["{name}"]' for name in called]
+            lines += [f'{name} = REGISTRY["{name}"].compiled' for name in called]
         simulators = sorted(words & set(REQUESTS))
         if simulators:
             lines += ["from ssmppl.codegen.text.callbacks import simulated", ""]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from ssmppl.codegen.text.callbacks import request
 from ssmppl.errors import Location
 from ssmppl.expressions.batched.call import OP, groups
-from ssmppl.expressions.expr import MATRIX_OPS, Expr, symbol_text, to_text, topological
+from ssmppl.expressions.expr import MATRIX_OPS, Expr, is_tuple, symbol_text, to_text, topological
 from ssmppl.expressions.operations import KERNELS, OPERATIONS, WRITTEN, Level, Text, call, within
 
 PHRASES = WRITTEN | {
@@ -160,6 +160,8 @@ class Writer:
             return self.fresh.fresh(f"{kind}_{owner}_{count}")
         if node.op in MATRIX_OPS:
             return self.fresh.fresh(node.op + "_")
+        if is_tuple(node):
+            return self.fresh.fresh(f"{identifier(node.data.__name__)}_")
         self.counter += 1
         return self.fresh.fresh(f"v{self.counter}")
 
@@ -185,7 +187,7 @@ class Writer:
             return PHRASES[op].of(parts)
         inside = ", ".join(text for text, _ in parts)
         if op == "item":
-            return f"{inside}[{node.data[0]}, {node.data[1]}]", Level.ATOM
+            return f"{inside}[{', '.join(map(str, node.data))}]", Level.ATOM
         if op in MATRIX_OPS:
             return f"{op}(({inside},), {node.data})", Level.ATOM
         if op == "random":
@@ -200,8 +202,8 @@ def is_small_power(node: Expr) -> bool:
 
 
 def _must_be_named(node: Expr) -> bool:
-    """Draws happen once; a matrix is factorised once."""
-    return node.op == "random" or node.op in ("cholesky", "inverse")
+    """Draws happen once; a matrix is factorised once, several numbers are computed at once."""
+    return node.op == "random" or node.op in ("cholesky", "inverse") or is_tuple(node)
 
 
 def _uses(roots: list[Expr], named: Mapping[Expr, object]) -> dict[Expr, int]:

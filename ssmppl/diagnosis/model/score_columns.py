@@ -8,7 +8,7 @@ further deterministic components of a model whose other laws are the base model'
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from ssmppl.diagnosis.model.changed_laws import substituted
 from ssmppl.errors import NotApplicable
 from ssmppl.expressions.arrays import array
 from ssmppl.expressions.calculus import NotDifferentiable, differentiate
-from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol, topological
+from ssmppl.expressions.expr import Expr, constant, dependent, substitute, symbol
 from ssmppl.language.distributions import Dirac
 from ssmppl.language.model.trace import Site, Trace, previous
 
@@ -70,7 +70,7 @@ def score_columns(
     free = [s for s in free if repr(s) not in refused]
     derived = CompleteScore(superset, free, missing, inert)
     for s in free:
-        reason = derived.obstacle(s) or opaque_in(derived, s)
+        reason = derived.obstacle(s)
         if reason is None:
             wanted.append(s)
         else:
@@ -111,31 +111,6 @@ def score_columns(
     )  # fmt: skip
 
 
-def opaque_in(derived: CompleteScore, s: Expr) -> NotApplicable | None:
-    """Why the score in a parameter has no closed form: a primitive that changes with it."""
-    node = _opaque(_derived_from(derived), derived.involved(s))
-    return None if node is None else _called(node)
-
-
-def _derived_from(derived: CompleteScore) -> list[Expr]:
-    """The expressions that the score is derived of."""
-    known = [e for values in derived.value.values() for s, e in values.items()
-             if s not in derived.inert]  # fmt: skip
-    return [*derived.density.values(), *known]
-
-
-def _opaque(roots: Iterable[Expr], symbols: Iterable[Expr]) -> Expr | None:
-    """The first call of a primitive that changes with one of the symbols."""
-    changing = dependent(roots, symbols)
-    if not any(node.op == "call" for node in changing):
-        return None
-    return next(n for n in topological(roots) if n.op == "call" and n in changing)
-
-
-def _called(node: Expr) -> NotApplicable:
-    return NotApplicable(f"it would need a derivative of the @ssm.primitive {node.data.__name__}")
-
-
 def _linear_in(
     superset: Trace, strengths: Collection[str], inert: Collection[Expr],
     refused: dict[str, NotApplicable],
@@ -157,8 +132,7 @@ def _linear_in(
                 try:
                     slopes = substitute(differentiate(roots, s), zero)
                 except NotDifferentiable as error:
-                    node = _opaque(roots, [s])
-                    refused[repr(s)] = NotApplicable(error.found) if node is None else _called(node)
+                    refused[repr(s)] = NotApplicable(error.found)
                     continue
                 values = [v + s * d for v, d in zip(values, slopes, strict=True)]
         law = Dirac(array(np.array(values, dtype=object).reshape(site.shape)))

@@ -33,7 +33,7 @@ from ssmppl.language.distributions.base import is_infinite
 from ssmppl.language.distributions.from_density import Origin, UserDefined
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace, symbols
-from ssmppl.language.user_defined.primitive import Primitive
+from ssmppl.language.user_defined.primitive import Primitive, primitives_in
 from ssmppl.language.user_defined.simulator import Simulator
 
 LINE = 96
@@ -377,7 +377,7 @@ def _called(call: Expr) -> str:
         function = call.data.function
         sense = "" if function is function.simulator.moves else ".sense"
         return holding(function.simulator)[1] + sense
-    return str(call.data.__name__)
+    return str(call.data.spelled)
 
 
 def holding(simulator: Simulator) -> tuple[str, str]:
@@ -411,9 +411,8 @@ def imports(distributions: Iterable[Distribution], taken: Collection[str]) -> di
 
 
 def _wanted(d: Distribution) -> Iterable[Import]:
+    yield from map(Import.of_primitive, primitives_in(nodes_of(d)))
     for node in topological(nodes_of(d)):
-        if node.op == "call":
-            yield Import.of_primitive(node.data)
         if node.op == "simulator":
             yield Import.of_simulator(node.data.function.simulator)
     for part in _laws(d):

@@ -13,7 +13,6 @@ import numpy as np
 
 from ssmppl.errors import ArgumentError, NotApplicable
 from ssmppl.inference.batched.extended import Extended
-from ssmppl.inference.batched.independence import Standing, independent_chains
 from ssmppl.inference.chains.metropolis_kernel import (
     WALK_STATES,
     ChainPoint,
@@ -40,6 +39,7 @@ from ssmppl.inference.preparation.pilot import Pilot, find_mode
 from ssmppl.inference.preparation.space import free_components
 from ssmppl.inference.preparation.vanishing import check_mode
 from ssmppl.inference.run.problem import Problem
+from ssmppl.inference.updates.independence import Standing, independent_chains
 
 LEAST_SHARE = 0.05  # effective draws of independent proposals, below which chains walk
 

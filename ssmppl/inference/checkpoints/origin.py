@@ -20,7 +20,7 @@ from ssmppl.expressions.expr import Expr, topological
 from ssmppl.language.distributions import Distribution
 from ssmppl.language.distributions.from_density import UserDefined
 from ssmppl.language.model.trace import Site, Trace
-from ssmppl.language.user_defined.primitive import Primitive
+from ssmppl.language.user_defined.primitive import Opaque
 
 # What the digits of draws depend on besides this package: compilers, random number generators,
 # special functions, factorisations.
@@ -114,7 +114,7 @@ def model_digest(trace: Trace) -> str:
     number: dict[Expr, int] = {}
     for e in topological(roots):
         number[e] = len(number)
-        data = e.data.name if isinstance(e.data, Primitive) else repr(e.data)
+        data = e.data.key if isinstance(e.data, Opaque) else repr(e.data)
         lines.append(f"{e.op} {data} {[number[a] for a in e.args]}")
     lines.append(repr([number[e] for e in roots]))
     return digest("\n".join(lines))

@@ -411,8 +411,9 @@ class IF2:
     steps on the unconstrained scale, smaller ones in each pass.
 
     The transition is only simulated: it may have no density (deterministic components, discrete
-    states, primitives). Parameters that act in the initial law alone are found in the model and
-    take their step at the first row only. Several experiments are passed over one after another.
+    states) and no derivatives. Parameters that act in the initial law alone are found in the model
+    and take their step at the first row only. Several experiments are passed over one after
+    another.
 
     Parameters
     ----------

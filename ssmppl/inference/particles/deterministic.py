@@ -118,8 +118,8 @@ class Deterministic(Scored):
 
         Raises
         ------
-        ArgumentError : the states go through an opaque primitive, or a law's support, or the law
-            by steps, depends on a free parameter.
+        ArgumentError : the states go through a function without a derivative, or a law's support,
+            or the law by steps, depends on a free parameter.
         """
         data = tuple(experiments)
         wanted = np.ones(len(theta), dtype=bool) if free is None else np.asarray(free, dtype=bool)
@@ -152,7 +152,8 @@ class Deterministic(Scored):
             if "score" in found.differences:
                 raise ArgumentError(
                     f"the states have no derivatives in closed form: {found.differences['score']}",
-                    fix="write the primitive in NumPy, or use a method without scores",
+                    fix="write the law by functions that have derivatives, or use a method without "
+                    "scores",
                 )
             self._scores[key] = found
         return self._scores[key].of(problem)

@@ -1,7 +1,7 @@
 """Score and information of exact likelihoods, by differences where there is no closed form.
 
 The sensitivities of the Kalman filter need derivatives of the model's matrices. Where a matrix goes
-through an opaque primitive, the exact likelihood itself is differenced, which is smooth.
+through a function without one, the exact likelihood itself is differenced, which is smooth.
 """
 
 from __future__ import annotations

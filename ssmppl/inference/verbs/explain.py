@@ -48,6 +48,7 @@ from ssmppl.language.model.model import Model
 from ssmppl.language.model.trace import Site, Trace
 from ssmppl.language.model.transforms import transforms
 from ssmppl.language.tracing import trace
+from ssmppl.language.user_defined.primitive import primitives_in
 
 PAGE = 100  # columns
 LONGEST_LAW = 600  # characters of a law, some six lines
@@ -116,6 +117,7 @@ class Plan:
         if self.data:
             out.append(("Data", [("data set", self.data), *self.labels]))
         out.append(("Structure", self._structure()))
+        out.append(("Derivatives of primitives", self._primitives()))
         rows = [self._proposal(n, p) for n, p in self.proposals.items()]
         guided = self.proposals.get("guided")
         if isinstance(guided, NotApplicable) and tempered(t, Missing()):
@@ -151,6 +153,14 @@ class Plan:
             return found
         return [("linear Gaussian", "the likelihood is exact, by the Kalman filter; particles are "
                  "used only where they are asked for")]  # fmt: skip
+
+    def _primitives(self) -> list[tuple[str, str]]:
+        """Where the derivatives of opaque functions come from."""
+        t = self.trace
+        groups = (t.parameters, t.initial, t.transition, t.observations)
+        laws = [s.distribution for sites in groups for s in sites.values()]
+        found = primitives_in(e for law in laws for e in law.expressions())
+        return [(p.__name__, p.how_derived()) for p in found]
 
     def _simulators(self) -> list[tuple[str, str]]:
         names = ", ".join(f.title for f in simulators(self.trace))

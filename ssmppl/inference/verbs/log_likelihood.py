@@ -74,7 +74,7 @@ def log_likelihood(
         all states together (Tierney and Kadane 1986), an extended Kalman filter, whose update is
         the mode of each row, and an unscented one (Julier and Uhlmann 1997), to which observations
         count by their mean and covariance. They are exact where the model is linear and Gaussian,
-        and never taken by "auto".
+        and never taken by "auto", but for "extended" where the model calls a simulator.
     resampling : "systematic", "stratified", "residual" or "multinomial".
     ess_threshold : resample when the effective sample size falls below this share of N; 1: always.
     rescue : where all N particles have weight zero, go on drawing, up to `rescue` times N at a row,

@@ -15,6 +15,7 @@ from ssmppl.analysis.structure import noisy_start
 from ssmppl.data import check_values, unpack_parameters
 from ssmppl.errors import ArgumentError, NotApplicable, SamplingError, listing, written_as
 from ssmppl.inference.batched.extended import Extended
+from ssmppl.inference.batched.reckoning import reckon
 from ssmppl.inference.gaussian.likelihood import laplace_approximation
 from ssmppl.inference.maximum import (
     direct_optimization,
@@ -61,6 +62,7 @@ METHODS: dict[type, Callable[[Maximization, Any], Ascent]] = {
 OBJECTIVES = ("likelihood", "posterior")
 PARTICLES, REPEATS = 1000, 16  # of the log-likelihood and the information at the estimate
 TRAJECTORIES = 1000
+CLIMB = 20  # passes over the data of a climb where a simulator is called, most often
 
 
 def maximize(
@@ -125,6 +127,8 @@ def maximize(
         )
     root = seed_sequence(seed)
     space = space_of(problem, fixed_values, near)
+    if method is None:
+        reckon("maximize", problem, space.theta, CLIMB, progress)
     setup = Maximization(problem, space, objective, fixed_values, near, root, executor, progress)
     if not len(space.positions):
         chosen, reason = None, "every parameter is fixed, or the model has none"

@@ -16,6 +16,7 @@ from ssmppl.analysis.structure import singular_covariance
 from ssmppl.counts import check_count, check_room
 from ssmppl.data import check_values, unpack_parameters, unpack_states
 from ssmppl.errors import ArgumentError, NotApplicable, written_as
+from ssmppl.inference.batched.reckoning import reckon
 from ssmppl.inference.chains import gibbs, ismcmc, metropolis, pgas, pmmh, smc2
 from ssmppl.inference.chains.gibbs_updates import plan_updates
 from ssmppl.inference.chains.sampling import GO_ON, SamplingMethod, SamplingSetup
@@ -42,6 +43,7 @@ from ssmppl.inference.run.executors import check_executor
 from ssmppl.inference.run.labels import Labels, check_names, observes
 from ssmppl.inference.run.problem import Problem, pose
 from ssmppl.inference.run.seeds import seed_sequence
+from ssmppl.inference.updates.independence import AHEAD, PREPARING
 from ssmppl.language.model.model import Model
 from ssmppl.language.model.transforms import transforms
 from ssmppl.results import to_inference_data
@@ -154,6 +156,9 @@ def sample(
     fixed_values = check_values(problem.trace, fixed, argument="fixed")
     near = check_values(problem.trace, start, argument="start")
     space = space_of(problem, fixed_values, near)
+    if method is None:
+        passes = PREPARING + chains * (draws * thin / AHEAD) * (1 + states)
+        reckon("sample", problem, space.theta, passes, progress)
     chosen, reason = (method, "") if method is not None else _chosen(space, fixed_values)
     sampling_method = METHODS.get(type(chosen))
     if sampling_method is None:

@@ -12,6 +12,7 @@ import itertools
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -37,7 +38,7 @@ class BatchedFunction:
     arguments : names (K,) of states, inputs and parameters, then the row. moving : whether each has
         derivatives. scales : (K,) of the steps of differences.
     calls, points, seconds : of the user's function so far.
-    undefined : the calls' points that gave NaN, and the first of them in words.
+    undefined : points that gave NaN.
     """
 
     def __init__(
@@ -52,12 +53,15 @@ class BatchedFunction:
         self.where = where
         self.simulator: Any = None  # whose it is
         self.calls = self.points = self.undefined = 0
-        self.seconds, self.first_undefined = 0.0, ""
+        self.seconds = 0.0
         self._checked = False
         self._lock = threading.RLock()
 
     def __repr__(self) -> str:
         return self.title
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:  # with its simulator
+        return _of_simulator, (self.simulator, self is self.simulator.moves)
 
     def at(self, points: np.ndarray) -> np.ndarray:
         """(B, outputs) at points (B, K + 1): states, inputs, parameters, row.
@@ -98,11 +102,15 @@ class BatchedFunction:
         values = self._array(found, len(points))
         if np.isnan(values).any():
             bad = np.isnan(values).any(axis=1)
-            if not self.undefined:
+            self.undefined += int(bad.sum())
+            if self.undefined == bad.sum():  # the first ones
                 k = int(np.argmax(bad))
                 lost = ", ".join(np.array(self.results)[np.isnan(values[k])])
-                self.first_undefined = f"{lost} at {self._told(points[k])}"
-            self.undefined += int(bad.sum())
+                warnings.warn(
+                    f"the simulator {self.title} gives NaN for {lost} at {self._told(points[k])}; "
+                    "where it does the likelihood is zero",
+                    stacklevel=2,
+                )
         return values
 
     def _parts(self, points: np.ndarray) -> list[np.ndarray]:
@@ -218,6 +226,11 @@ class BatchedFunction:
         pairs = [f"{n} = {v:.6g}" for n, v in zip(self.arguments, point, strict=False)]
         row = f"row {int(point[-1])}: " if point[-1] > 0 else ""
         return row + ", ".join(pairs)
+
+
+def _of_simulator(simulator: Any, moves: bool) -> BatchedFunction:
+    found: BatchedFunction = simulator.moves if moves else simulator.senses
+    return found
 
 
 def _identifier(title: str) -> str:

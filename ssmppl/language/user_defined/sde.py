@@ -109,7 +109,8 @@ class SDE:
         self.steps, self.method = int(steps), method
 
     def laws(self, name: str, before: Any) -> dict[str, Distribution]:
-        """The laws that it stands for, from the state's value at the row before.
+        """The laws at a row, from the state's value at the row before: of the small steps' noises,
+        where there are any, and of the state.
 
         Parameters
         ----------
@@ -118,8 +119,8 @@ class SDE:
 
         Returns
         -------
-        dict of str to Distribution
-            By name; that of the state is the last.
+        dict
+            Laws by name, that of the state last.
         """
         if self.method == "linearised":
             return {name: self.law(name, before)}

@@ -14,6 +14,7 @@ from ssmppl.diagnosis.model.augment import augment
 from ssmppl.diagnosis.model.changed_laws import substituted
 from ssmppl.diagnosis.report.model_file import model_text, to_model
 from ssmppl.errors import ArgumentError, ModelError
+from ssmppl.expressions.calculus import differentiate
 from ssmppl.expressions.expr import symbol
 from ssmppl.language.tracing import trace
 from ssmppl.modelfile import load_model
@@ -163,6 +164,32 @@ def test_primitives_are_imported_from_the_users_file():
     text = model_text(t)
     assert "from tests.diagnosis.report.test_writing import importable" in text
     assert f"sys.path.append({str(Path(__file__).parents[3])!r})" in text
+    assert_round_trip(t)
+
+
+@ssm.primitive(derivative=lambda v: 2.0 * v)
+def square(v):
+    return v * v
+
+
+@ssm.primitive
+def halves(v, w):
+    return 0.5 * v, 0.5 * w
+
+
+def test_derivatives_of_primitives_and_their_several_numbers_are_spelled():
+    """As effects have them that look at the slopes of a step."""
+
+    def mean(x, z, a, P):
+        first, second = halves(x, a)
+        slopes = differentiate([square(x) + halves.difference((1, 0))(x, a)[0]], x)
+        return slopes[0] + first * second
+
+    t = trace(model_of(mean))
+    text = model_text(t)
+    assert "square.given[None](x)" in text
+    assert "halves.difference((2, 0))(x, a)" in text
+    assert "import halves" in text
     assert_round_trip(t)
 
 

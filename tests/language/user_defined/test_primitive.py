@@ -106,7 +106,7 @@ def test_bad_primitives():
 
         @ssm.primitive
         def pair(v):
-            return (v, v)
+            return [v, v]
 
     with pytest.raises(ssm.ModelError, match="arguments"):
 

@@ -22,6 +22,7 @@ import math
 
 import numpy as np
 
+from ssmppl.codegen.kernels.math.copies import copy_rows
 from ssmppl.codegen.kernels.math.flags import exact
 from ssmppl.codegen.kernels.twisted.lookahead import lift
 from ssmppl.codegen.kernels.twisted.lookahead_backward import factorise
@@ -290,7 +291,7 @@ def gaussian_mode(
     value = follow_step(theta, c, s, 0.0, x, e, aim, gain, r, x_new, e_new, slopes)
     if not value > -np.inf:
         return -np.inf, np.nan
-    x[:] = x_new
+    copy_rows(x_new, x)
     log_det, left, curved, last = np.inf, np.nan, True, False
     for _ in range(PASSES):
         curved = True
@@ -321,7 +322,9 @@ def gaussian_mode(
         if not moved:
             break
         value = new
-        x[:], e[:], slopes[:] = x_new, e_new, slopes_new
+        copy_rows(x_new, x)
+        copy_rows(e_new, e)
+        copy_rows(slopes_new, slopes)
     if not curved:
         return np.nan, left
     return value - 0.5 * log_det, left

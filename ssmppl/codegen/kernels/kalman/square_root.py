@@ -34,6 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ssmppl.codegen.kernels.math.copies import copy_row, copy_rows
 from ssmppl.codegen.kernels.math.flags import exact
 
 OK, NOT_COVARIANCE, SINGULAR, NOT_FINITE = 0, 1, 2, 3
@@ -544,18 +545,19 @@ def kalman_filter(
             if not measure_step(C, R, t, seen[t], alike, s):
                 return NOT_COVARIANCE, t
         if t > 0:
-            before[:] = x
+            copy_row(x, before)
             b_t = b[at(t, b.shape[0])]
             affine_known(A[at(t, A.shape[0])], s.a, s.counts[0], before, b_t, x)
         affine_known(c, s.c, s.counts[1], x, d[at(t, d.shape[0])], predicted)
         if moments:
-            mean_predicted[t], observation_mean[t] = x, predicted
+            copy_row(x, mean_predicted[t])
+            copy_row(predicted, observation_mean[t])
             if settled:
-                covariance_predicted[t] = covariance_predicted[t - 1]
-                observation_covariance[t] = observation_covariance[t - 1]
+                copy_rows(covariance_predicted[t - 1], covariance_predicted[t])
+                copy_rows(observation_covariance[t - 1], observation_covariance[t])
             else:
                 square_columns(s.root, covariance_predicted[t])
-                observation_covariance[t] = R[at(t, R.shape[0])]
+                copy_rows(R[at(t, R.shape[0])], observation_covariance[t])
                 add_spread(c, s.root, observation_covariance[t])
         for j in range(k_all):
             residual[j] = y[t, j] - predicted[j]
@@ -568,9 +570,9 @@ def kalman_filter(
             return NOT_FINITE, t
         log_increment[t] = increment
         if moments:
-            mean[t] = x
+            copy_row(x, mean[t])
             if settled:
-                covariance[t] = covariance[t - 1]
+                copy_rows(covariance[t - 1], covariance[t])
             else:
                 square_columns(s.root, covariance[t])
         if constant and not settled:

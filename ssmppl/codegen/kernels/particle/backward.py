@@ -170,7 +170,7 @@ def backward_exact(
         t = n_steps - 2 - back
         step(theta, c, y, seen, u, t + 1, s)
         take_log(weights[t], log_w)
-        following[:] = index
+        copy(index, following)
         order = np.argsort(following)
         total = 0.0
         for r in range(n_paths):

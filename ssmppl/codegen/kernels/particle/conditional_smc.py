@@ -87,9 +87,9 @@ def statistics_by_row(
             initial_statistics(theta, c, s, x, row)
         else:
             transition_statistics(theta, c, s, x_prev, x, row)
-        moved[t] = row[:, 0]
+        copy(row[:, 0], moved[t])
         observed_statistics(theta, c, s, x, row)
-        measured[t] = row[:, 0]
+        copy(row[:, 0], measured[t])
 
 
 @exact

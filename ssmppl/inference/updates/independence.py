@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.special import gammaln
@@ -20,8 +20,8 @@ from scipy.special import gammaln
 from ssmppl.errors import ArgumentError
 from ssmppl.inference.batched.extended import Extended
 from ssmppl.inference.optimisation.batched_newton import climb_together
-from ssmppl.inference.preparation.space import Space
 from ssmppl.inference.run.draws import Block
+from ssmppl.inference.run.problem import Problem
 
 DEGREES = 5.0  # of freedom: tails heavier than a posterior's
 WIDER = 1.1  # than the fitted scale
@@ -29,8 +29,22 @@ FITTED, ROUNDS = 256, 3  # draws behind a fit of the proposal, and fits
 ENOUGH = 40.0  # effective draws from which moments are taken
 AHEAD = 128  # steps that are made together
 ROUND_START, SPREAD, CLIMBS = 47, 2.0, 3  # points looked at for a start, their spread, climbs
+PREPARING = 25  # passes over the data before the chains begin, most often
 LEAST = 1e-8  # of an eigenvalue of the proposal's scale, as a correlation
 BURNT = 50  # steps of the warmup that are made: starts are drawn from the fitted posterior
+
+
+class Space(Protocol):
+    """The free parameters on their unconstrained scale, as of `preparation/space.py`."""
+
+    @property
+    def problem(self) -> Problem: ...
+    @property
+    def z(self) -> np.ndarray: ...
+    @property
+    def positions(self) -> np.ndarray: ...
+
+    def parameters(self, point: np.ndarray, /) -> tuple[np.ndarray, float]: ...
 
 
 @dataclass(frozen=True)

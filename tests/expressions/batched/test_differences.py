@@ -1,0 +1,72 @@
+"""Derivatives of a function that takes a batch, against those on paper."""
+
+import numpy as np
+import pytest
+
+from ssmppl.expressions.batched.differences import FIRST, SECOND, Stencil
+
+X = np.array([[0.3, -1.2], [2.0, 0.0], [-0.7, 40.0]])
+WANTED = [(), (0,), (1,), (0, 0), (0, 1), (1, 1)]
+
+
+def function(p):
+    x, y = p.T
+    return np.stack([np.sin(x) * y**2, np.exp(0.1 * x * y)], axis=1)
+
+
+def exact(p):
+    x, y = p.T
+    e = np.exp(0.1 * x * y)
+    return {
+        (): (np.sin(x) * y**2, e),
+        (0,): (np.cos(x) * y**2, 0.1 * y * e),
+        (1,): (2 * np.sin(x) * y, 0.1 * x * e),
+        (0, 0): (-np.sin(x) * y**2, 0.01 * y**2 * e),
+        (0, 1): (2 * np.cos(x) * y, (0.1 + 0.01 * x * y) * e),
+        (1, 1): (2 * np.sin(x), 0.01 * x**2 * e),
+    }
+
+
+@pytest.mark.parametrize("index", WANTED)
+def test_against_those_on_paper(index):
+    """Errors: truncation h^2 f''' / 6 and rounding eps f / h of first, h^2 f'''' / 6 and 4 eps f /
+    h^2 of second differences, with f and its derivatives below 2,000 here, and h / max(|x|, 1)
+    `FIRST` or `SECOND`."""
+    found = Stencil.of(WANTED, 2).derivatives(function, X, np.ones(2))[WANTED.index(index)]
+    known = np.stack(exact(X)[index])
+    size = np.abs(np.stack(exact(X)[()])).max(axis=0) + 1.0
+    eps = np.finfo(float).eps
+    error = [0.0, 4 * eps / FIRST + 50 * FIRST**2, 16 * eps / SECOND**2 + 50 * SECOND**2]
+    assert np.all(np.abs(found - known) <= error[len(index)] * size * 4 + 1e-300)
+
+
+def test_one_call_for_all_of_them():
+    calls = []
+
+    def counted(p):
+        calls.append(len(p))
+        return function(p)
+
+    Stencil.of(WANTED, 2).derivatives(counted, X, np.ones(2))
+    # the point itself, two of each first, two of each second, two of the mixed one
+    assert calls == [len(X) * (1 + 4 + 4 + 2)]
+
+
+def test_on_one_side_where_the_other_has_no_value():
+    def root(p):
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(p)
+
+    stencil = Stencil.of([(), (0,)], 1)
+    found = stencil.derivatives(lambda p: root(p) ** 2, np.zeros((1, 1)), np.ones(1))
+    assert found[1, 0, 0] == pytest.approx(1.0)
+
+
+def test_steps_go_by_the_scale():
+    """sin(x / 1e-6) at 0 has the slope 1e6; with steps of 6e-6 nothing of it is seen."""
+    stencil = Stencil.of([(0,)], 1)
+    x = np.zeros((1, 1))
+    slope = stencil.derivatives(lambda p: np.sin(p / 1e-6), x, np.array([1e-6]))
+    assert slope[0, 0, 0] == pytest.approx(1e6, rel=1e-9)
+    coarse = stencil.derivatives(lambda p: np.sin(p / 1e-6), x, np.array([1.0]))
+    assert abs(coarse[0, 0, 0] - 1e6) > 1e5
