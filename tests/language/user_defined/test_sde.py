@@ -261,6 +261,28 @@ def test_small_steps_of_euler_and_maruyama(steps):
         ssm.SDE(lambda x: x, 0.1, 0.1, method="milstein")
 
 
+def test_small_steps_of_a_number():
+    model, n = ssm.Model("decay"), 20_000
+
+    @model.initial
+    def initial():
+        return {"x": ssm.Dirac(0.7)}
+
+    @model.transition
+    def transition(x):
+        return {"x": ssm.SDE(lambda x: -2.0 * x, 0.5, 0.3, method="euler-maruyama", steps=3)}
+
+    @model.observation
+    def observation(x):
+        return {"y": ssm.Normal(x, sd=0.1)}
+
+    seed = seed_of("euler maruyama of a number")
+    x = ssm.simulate(model, {}, steps=2, draws=n, seed=seed)["x"].values[:, 1]
+    mean, variance = 0.7 * 0.8**3, 0.025 * (1 + 0.8**2 + 0.8**4)  # h = 0.1: x + h f = 0.8 x
+    assert abs(x.mean() - mean) < 4.5 * np.sqrt(variance / n)
+    assert abs(x.var() / variance - 1) < 4.5 * np.sqrt(2 / n)
+
+
 def test_the_number_of_steps_makes_it_exact_in_the_limit():
     def drift(x):
         return np.stack([np.sin(x[1]), -(x[0] ** 2)])
