@@ -35,6 +35,7 @@ from ssmppl.expressions.expr import (
     symbols_of,
     topological,
 )
+from ssmppl.expressions.node import SEVERAL
 from ssmppl.language.distributions import Dirac, Distribution
 from ssmppl.language.model.trace import Trace, previous, symbols
 
@@ -250,7 +251,8 @@ def _values(trace: Trace, steps: dict[str, Any], rng: Any) -> dict[str, tuple[An
 
 
 def _in_small_steps(step: Any) -> bool:
-    return any(n.op == "loop" for n in topological([step]))
+    """Whether it is made by a loop, or by a simulator, whose steps are not known."""
+    return any(n.op in SEVERAL for n in topological([step]))
 
 
 def _is_integral(x: str, v: str, values: dict[str, tuple[Any, Any]], near: float) -> bool:
