@@ -43,6 +43,10 @@ def main() -> int:
         "--set", nargs="+", choices=SETS, default=list(SETS), dest="sets", help=sets
     )
     parser.add_argument("--tests", action="store_true", help="a part of the test suite, too")
+    parser.add_argument(
+        "--machine-code", action="store_true",
+        help="a wheel with machine code, too: the kernels are compiled for each target",
+    )  # fmt: skip
     parser.add_argument("--workers", default="2", help="of the test suite")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ssmppl-packaging-") as temporary:
@@ -124,7 +128,7 @@ def _try(
         shutil.copy(HERE / "user.py", environment.work)
         run([tools.python, "-m", "mypy", "--strict", "--python-executable", environment.python,
              "--cache-dir", folder / "mypy", "user.py"], environment.work)  # fmt: skip
-        if name == "newest" and platform_wheel.FITS:
+        if asked.machine_code and name == "newest" and platform_wheel.FITS:
             step = "machine code"
             _with_machine_code(environment, wheel, version)
         if asked.tests:
