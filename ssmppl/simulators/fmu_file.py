@@ -391,9 +391,10 @@ def fmu(
     state : variables that are the state; a mapping from the name in the model to a variable, or to
         two of them, the one that sets it and the one that holds it, as ("q_start", "q"). By default
         the continuous states that the file lists. All continuous states have to be among them.
-    inputs, outputs : likewise, or mappings; by default all of the file that are real numbers.
+    inputs : likewise, or a mapping; by default all of the file that are real numbers.
     parameters : variables that are parameters, or a mapping; by default none: the others keep the
         file's values.
+    outputs : as the inputs.
     forces : names among the inputs that are generalised forces, 0 where a call leaves them out.
     start : variable -> a fixed value of any type instead of the file's.
     time : name of a further input, the unit's time at the beginning of a call; needed where it

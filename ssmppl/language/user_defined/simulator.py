@@ -67,12 +67,17 @@ class Simulator:
 
     Made by `ssm.simulator`.
 
-    Attributes
+    Parameters
     ----------
-    state, inputs, parameters : names of the columns of what `step` takes. outputs : of what
-        `output` gives; empty where there is none.
+    step : the user's function.
+    state, inputs, parameters : names of the columns of what `step` takes.
+    output : the user's function of what sensors show; None where there is none.
+    outputs : names of the columns of what `output` gives.
     forces : those of the inputs that are generalised forces; 0 where a call leaves them out.
-    step, output : the user's functions.
+    name : shown in messages.
+    scales : by name, of what moves by amounts far from 1.
+    where : it was written.
+    token : by which copies in other processes know each other.
     """
 
     def __init__(
@@ -119,7 +124,18 @@ class Simulator:
         return self._run(self.moves, self.state, vectors, named)
 
     def sense(self, *vectors: Any, **named: Any) -> Values:
-        """The outputs at a state; arguments as of a call."""
+        """The outputs at a state.
+
+        Parameters
+        ----------
+        *vectors : states, inputs and parameters, as of a call.
+        **named : all of them by name, instead.
+
+        Returns
+        -------
+        Values
+            The outputs by name: `found["y"]` or `found.y`.
+        """
         if self.senses is None:
             raise ModelError(
                 f"the simulator {self.name} has no outputs",
