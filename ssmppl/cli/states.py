@@ -83,9 +83,9 @@ def particle_filter(
 @MODEL
 @NEEDED_DATA
 @PARAMETERS
-@option("--proposal", type=click.Choice(["kalman", *APPROXIMATE]), default="kalman",
-        help="kalman is exact; the others are approximations for states driven by Gaussian "
-        "noise.")  # fmt: skip
+@option("--proposal", type=click.Choice(["auto", "kalman", *APPROXIMATE]), default="auto",
+        help="auto is kalman, of a model with a simulator extended; kalman is exact, the others "
+        "are approximations for states driven by Gaussian noise.")  # fmt: skip
 @QUANTILES
 @FILE_OF_MOMENTS
 def kalman_filter(
